@@ -1,0 +1,23 @@
+"""The person: skeleton, kinematics, flesh, priors, flips, and the camera that looks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.model_file import model_names, read_body
+
+__all__ = ['Body', 'Camera', 'load_body', 'model_names']
+
+
+def load_body(source: str | Path) -> Body:
+    """The body with this name ('human37', 'human34', 'human32'), of a YAML file or of a motion file.
+
+    A motion file (.bvh, .asf, .amc) gives the body of its own skeleton, without flesh.
+
+    Raises:
+        FileNotFoundError: neither a known name nor a file.
+        ValueError: a file that is not a body; one line that says what is wrong.
+    """
+    return read_body(source)

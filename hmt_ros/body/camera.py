@@ -1,0 +1,195 @@
+"""The camera: perspective projection with the distortion models of sensor_msgs/CameraInfo.
+
+Frame: camera optical frame of REP 103, x right, y down, z forward, m. Pixels: column u, row v, the
+centre of the first pixel at (0, 0).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+# Number of coefficients of each model of sensor_msgs/distortion_models.
+DISTORTION_MODELS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}
+
+# Points nearer than this in front of the camera plane are not projected sensibly, m.
+NEAR = 0.01
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A calibrated camera.
+
+    Attributes:
+        fx, fy: focal lengths, px.
+        cx, cy: principal point, px.
+        width, height: of the image, px.
+        distortion: coefficients in the order of CameraInfo.d; empty: none.
+        distortion_model: 'plumb_bob' (k1 k2 p1 p2 [k3]), 'rational_polynomial' (k1 k2 p1 p2 k3 k4 k5
+            k6) or 'equidistant' (k1 k2 k3 k4).
+
+    Raises:
+        ValueError: a focal length that is not positive, values that are not finite, an unknown model,
+            or a number of coefficients that the model does not have.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: tuple[float, ...] = ()
+    distortion_model: str = 'plumb_bob'
+
+    def __post_init__(self) -> None:
+        coefficients = tuple(float(x) for x in self.distortion)
+        if self.distortion_model not in DISTORTION_MODELS:
+            raise ValueError(
+                f'unknown distortion model {self.distortion_model!r}, wanted one of '
+                f'{sorted(DISTORTION_MODELS)}'
+            )
+        counts = DISTORTION_MODELS[self.distortion_model]
+        if coefficients and len(coefficients) not in counts:
+            raise ValueError(
+                f'distortion model {self.distortion_model} has {counts} coefficients, '
+                f'saw {len(coefficients)}'
+            )
+        numbers = (self.fx, self.fy, self.cx, self.cy, *coefficients)
+        if not np.isfinite(numbers).all():
+            raise ValueError(f'camera parameters must be finite, saw {numbers}')
+        if not (self.fx > 0 and self.fy > 0):
+            raise ValueError(f'focal lengths must be positive, saw {self.fx} and {self.fy}')
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f'image size must be positive, saw {self.width} x {self.height}')
+        object.__setattr__(self, 'distortion', coefficients if any(coefficients) else ())
+
+    @property
+    def matrix(self) -> Array:
+        """Intrinsic matrix K (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def project(self, points: ArrayLike) -> Array:
+        """Pixels (..., 2) of points (..., 3) in the camera frame, m.
+
+        A point on or behind the plane z = 0.01 m has no image: its pixel is NaN.
+        """
+        p = np.asarray(points, dtype=np.float64)
+        pixels, _ = self.project_with_derivative(np.moveaxis(p, -1, 0), derivative=False)
+        return np.moveaxis(pixels, 0, -1)
+
+    def project_with_derivative(
+        self, points: Array, *, derivative: bool = True
+    ) -> tuple[Array, Array]:
+        """Pixels (2, ...) of points (3, ...), and their derivatives (2, 3, ...).
+
+        The first axis is the coordinate, so that batches stay contiguous. Points with z below 0.01 m
+        give NaN.
+        """
+        x, y, z = points
+        z = np.where(z > NEAR, z, np.nan)
+        a, b = x / z, y / z
+        focal = (self.fx, self.fy)
+        centre = (self.cx, self.cy)
+        if not self.distortion:
+            pixels = np.stack([self.fx * a + self.cx, self.fy * b + self.cy])
+            if not derivative:
+                return pixels, np.empty(0)
+            jacobian = np.zeros((2, 3, *np.shape(z)))
+            jacobian[0, 0] = self.fx / z
+            jacobian[1, 1] = self.fy / z
+            jacobian[0, 2] = -a * jacobian[0, 0]
+            jacobian[1, 2] = -b * jacobian[1, 1]
+            return pixels, jacobian
+        distorted, inner = self._distort(a, b)
+        pixels = np.stack([focal[i] * distorted[i] + centre[i] for i in range(2)])
+        if not derivative:
+            return pixels, np.empty(0)
+        jacobian = np.empty((2, 3, *np.shape(z)))
+        for i in range(2):
+            jacobian[i, 0] = focal[i] * inner[i][0] / z
+            jacobian[i, 1] = focal[i] * inner[i][1] / z
+            jacobian[i, 2] = -(jacobian[i, 0] * a + jacobian[i, 1] * b)
+        return pixels, jacobian
+
+    def rays(self, pixels: ArrayLike) -> Array:
+        """Unit rays (..., 3) through pixels (..., 2).
+
+        Distortion is undone by Newton's method; pixels that the model does not reach come out as the
+        best that a few iterations find.
+        """
+        uv = np.asarray(pixels, dtype=np.float64)
+        target = np.stack([(uv[..., 0] - self.cx) / self.fx, (uv[..., 1] - self.cy) / self.fy])
+        ab = target.copy()
+        if self.distortion:
+            for _ in range(20):
+                value, inner = self._distort(ab[0], ab[1])
+                error = value - target
+                det = inner[0][0] * inner[1][1] - inner[0][1] * inner[1][0]
+                det = np.where(np.abs(det) > 1e-9, det, 1.0)
+                ab = ab - np.stack(
+                    [
+                        (inner[1][1] * error[0] - inner[0][1] * error[1]) / det,
+                        (inner[0][0] * error[1] - inner[1][0] * error[0]) / det,
+                    ]
+                )
+        rays = np.stack([ab[0], ab[1], np.ones_like(ab[0])], axis=-1)
+        result: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        return result
+
+    def scaled(self, factor: float) -> Camera:
+        """The camera of the image resized by a factor."""
+        return Camera(
+            self.fx * factor,
+            self.fy * factor,
+            (self.cx + 0.5) * factor - 0.5,
+            (self.cy + 0.5) * factor - 0.5,
+            round(self.width * factor),
+            round(self.height * factor),
+            self.distortion,
+            self.distortion_model,
+        )
+
+    def _distort(self, a: Array, b: Array) -> tuple[Array, tuple[tuple[Array, Array], ...]]:
+        """Distorted normalised coordinates (2, ...) and their derivatives d(i) / d(a, b)."""
+        if self.distortion_model == 'equidistant':
+            return self._equidistant(a, b)
+        k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
+        s = a * a + b * b  # r^2
+        top = 1 + s * (k1 + s * (k2 + s * k3))
+        bottom = 1 + s * (k4 + s * (k5 + s * k6))
+        radial = top / bottom
+        d_top = k1 + s * (2 * k2 + s * 3 * k3)
+        d_bottom = k4 + s * (2 * k5 + s * 3 * k6)
+        slope = (d_top - radial * d_bottom) / bottom  # d radial / d s
+        value = np.stack(
+            [
+                a * radial + 2 * p1 * a * b + p2 * (s + 2 * a * a),
+                b * radial + p1 * (s + 2 * b * b) + 2 * p2 * a * b,
+            ]
+        )
+        mixed = 2 * a * b * slope + 2 * p1 * a + 2 * p2 * b
+        inner = (
+            (radial + 2 * a * a * slope + 2 * p1 * b + 6 * p2 * a, mixed),
+            (mixed, radial + 2 * b * b * slope + 6 * p1 * b + 2 * p2 * a),
+        )
+        return value, inner
+
+    def _equidistant(self, a: Array, b: Array) -> tuple[Array, tuple[tuple[Array, Array], ...]]:
+        k1, k2, k3, k4 = self.distortion
+        r = np.sqrt(a * a + b * b)
+        safe = np.maximum(r, 1e-12)
+        theta = np.arctan(r)
+        t = theta * theta
+        bent = theta * (1 + t * (k1 + t * (k2 + t * (k3 + t * k4))))
+        d_bent = 1 + t * (3 * k1 + t * (5 * k2 + t * (7 * k3 + t * 9 * k4)))
+        scale = np.where(r > 1e-8, bent / safe, 1.0)
+        # d scale / d r, divided by r
+        slope = np.where(r > 1e-4, (d_bent / (1 + r * r) - scale) / (safe * safe), 2 * (k1 - 1 / 3))
+        value = np.stack([a * scale, b * scale])
+        mixed = a * b * slope
+        return value, ((scale + a * a * slope, mixed), (mixed, scale + b * b * slope))

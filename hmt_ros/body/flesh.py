@@ -1,0 +1,324 @@
+"""Flesh: superquadric ellipsoids with tapering and bending around the segments (KJS 2, [Barr 1984]).
+
+A part is a stack of rings along the axis of its segment. With s from -1 (start) to 1 (end of the
+segment) and the angle w around the axis, its surface in the frame of the segment is
+
+    x = c_x + b_x (1 - s^2) + r_x(s) C(w),   y = c_y + b_y (1 - s^2) + r_y(s) S(w),   z = c_z - a_z s,
+    r(s) = a (1 + t s) (1 - |s|^(2/e1))^(e1/2),   C = sgn(cos) |cos|^e2,   S = sgn(sin) |sin|^e2
+
+with three radii a, two exponents e, two tapers t and two bends b: nine shape parameters. Contours are
+exact: on every ring the points whose normal is perpendicular to the ray from the camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.kinematics import Frames
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Superquadric:
+    """One part of the flesh; m, in the frame of its segment.
+
+    Attributes:
+        segment: index of the segment that carries it.
+        centre: of the part.
+        radii: semi-axes along x, y and z.
+        exponents: along the axis and around it; 1: elliptic, towards 0: boxy.
+        taper: relative change of the x and y radii from the middle to the end (s = 1).
+        bend: shift in x and y of the middle against both ends, m.
+    """
+
+    segment: int
+    centre: tuple[float, float, float]
+    radii: tuple[float, float, float]
+    exponents: tuple[float, float] = (1.0, 1.0)
+    taper: tuple[float, float] = (0.0, 0.0)
+    bend: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not all(r > 0 for r in self.radii):
+            raise ValueError(f'radii of a superquadric must be positive, saw {self.radii}')
+        if not all(0 < e <= 2 for e in self.exponents):
+            raise ValueError(f'exponents must lie in (0, 2], saw {self.exponents}')
+        if not all(abs(t) < 1 for t in self.taper):
+            raise ValueError(f'tapers must lie in (-1, 1), saw {self.taper}')
+
+    def scaled(self, width: float, length: float = 1.0) -> Superquadric:
+        """The part with its x and y radii and its z radius multiplied."""
+        rx, ry, rz = self.radii
+        return replace(self, radii=(rx * width, ry * width, rz * length))
+
+    def surface(self, s: Array, w: Array) -> tuple[Array, Array]:
+        """Points and outward unit normals (..., 3) at heights s in (-1, 1) and angles w."""
+        ring = rings(self, np.ravel(s))
+        w = np.ravel(w)
+        e2 = self.exponents[1]
+        cos, sin = np.cos(w), np.sin(w)
+        point = ring.centre + np.stack(
+            [
+                ring.radius[:, 0] * _signed_power(cos, e2),
+                ring.radius[:, 1] * _signed_power(sin, e2),
+                np.zeros_like(w),
+            ],
+            axis=1,
+        )
+        lateral = np.stack(
+            [_signed_power(cos, 2 - e2), _signed_power(sin, 2 - e2)], axis=1
+        ) / ring.radius
+        along = -(ring.slope * np.stack([cos * cos, sin * sin], axis=1)).sum(1) - (
+            lateral * ring.lean
+        ).sum(1)
+        normal = np.concatenate([lateral, along[:, None]], axis=1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        return point.reshape(*np.shape(s), 3), normal.reshape(*np.shape(s), 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Rings:
+    """Cross-sections (R,) of a part, in the frame of its segment.
+
+    Attributes:
+        centre: (R, 3) m.
+        radius: (R, 2) along x and y, m.
+        slope: (R, 2) d log(radius) / dz, 1/m.
+        lean: (R, 2) d centre / dz.
+        exponent: (R,) e2, around the ring.
+    """
+
+    centre: Array
+    radius: Array
+    slope: Array
+    lean: Array
+    exponent: Array
+
+
+def rings(part: Superquadric, s: Array) -> Rings:
+    """Rings of a part at heights s (R,) in (-1, 1)."""
+    e1, e2 = part.exponents
+    az = part.radii[2]
+    inside = 1.0 - np.abs(s) ** (2.0 / e1)
+    profile = inside ** (e1 / 2.0)
+    # d log(profile) / ds
+    steep = -np.sign(s) * np.abs(s) ** (2.0 / e1 - 1.0) / inside
+    taper = np.array(part.taper)
+    widening = 1.0 + taper * s[:, None]
+    radius = np.array(part.radii[:2]) * profile[:, None] * widening
+    slope = -(steep[:, None] + taper / widening) / az
+    bend = np.array(part.bend)
+    centre = np.empty((len(s), 3))
+    centre[:, :2] = np.array(part.centre[:2]) + bend * (1.0 - s * s)[:, None]
+    centre[:, 2] = part.centre[2] - az * s
+    lean = 2.0 * bend * s[:, None] / az
+    return Rings(centre, radius, slope, lean, np.full(len(s), e2))
+
+
+@dataclass(frozen=True, eq=False)
+class Flesh:
+    """All parts of a body, and the rings on which its contours are taken.
+
+    Attributes:
+        parts: the superquadrics.
+        ring_count: rings per part that its contour is sampled at.
+    """
+
+    parts: tuple[Superquadric, ...]
+    ring_count: tuple[int, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        if not self.ring_count:
+            object.__setattr__(self, 'ring_count', tuple(5 for _ in self.parts))
+        if len(self.ring_count) != len(self.parts):
+            raise ValueError(f'{len(self.ring_count)} ring counts for {len(self.parts)} parts')
+
+    @cached_property
+    def rings(self) -> Rings:
+        """Rings of all parts, one part after the other."""
+        stacks = [
+            rings(part, np.sin(np.linspace(-0.42, 0.42, n) * np.pi))
+            for part, n in zip(self.parts, self.ring_count, strict=True)
+        ]
+        return Rings(
+            *(
+                np.concatenate([getattr(x, name) for x in stacks])
+                for name in ('centre', 'radius', 'slope', 'lean', 'exponent')
+            )
+        )
+
+    @cached_property
+    def ring_parts(self) -> Index:
+        """Part of each ring."""
+        return np.repeat(np.arange(len(self.parts)), self.ring_count)
+
+    @cached_property
+    def ring_segments(self) -> Index:
+        """Segment of each ring."""
+        return np.array([p.segment for p in self.parts], dtype=np.intp)[self.ring_parts]
+
+    def with_widths(self, factors: Sequence[float]) -> Flesh:
+        """The flesh with the x and y radii of each part multiplied."""
+        if len(factors) != len(self.parts):
+            raise ValueError(f'{len(factors)} factors for {len(self.parts)} parts')
+        parts = tuple(p.scaled(float(f)) for p, f in zip(self.parts, factors, strict=True))
+        return replace(self, parts=parts)
+
+    def mesh(self, stacks: int = 9, slices: int = 12) -> Mesh:
+        """Triangles of all parts: `stacks` rings of `slices` points each, and two tips a part."""
+        return _mesh(self.parts, stacks, slices)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangulated flesh, in the frames of the segments.
+
+    Attributes:
+        vertices, normals: (V, 3) m, outward unit vectors.
+        segments: (V,) segment of each vertex.
+        parts: (V,) part of each vertex.
+        triangles: (F, 3) vertices, counter-clockwise seen from outside.
+    """
+
+    vertices: Array
+    normals: Array
+    segments: Index
+    parts: Index
+    triangles: Index
+
+
+@dataclass(frozen=True, eq=False)
+class Contour:
+    """Occluding contour of the flesh for N poses: two points on each of R rings.
+
+    Attributes:
+        segments, parts: (2R,) of each point.
+        local: (2R, 3, N) places in the frames of the segments, m.
+        points: (2R, 3, N) camera frame, m.
+        normals: (2R, 3, N) outward unit normals, camera frame; perpendicular to the ray.
+        exists: (2R, N) false where a ring is seen from its end and has no contour.
+    """
+
+    segments: Index
+    parts: Index
+    local: Array
+    points: Array
+    normals: Array
+    exists: NDArray[np.bool_]
+
+
+def occluding_contour(flesh: Flesh, frames: Frames) -> Contour:
+    """Points of the flesh whose normal is perpendicular to the ray from the camera.
+
+    On a ring with centre u relative to the camera, in the segment's frame, and angle w the condition
+    normal . point = 0 reads
+
+        g(w) = 1 + U_x C'(w) + U_y S'(w) - u_z (k_x cos^2 w + k_y sin^2 w) = 0,
+
+    with U = (u - u_z lean) / radius, k the slopes, C' and S' the signed powers 2 - e2. With one slope
+    and e2 = 1 it is solved in closed form; elsewhere three Newton steps follow.
+    """
+    ring, segments = flesh.rings, flesh.ring_segments
+    columns, origins = frames.columns[segments], frames.origins[segments]
+    # The camera's centre seen from the segment: -R^T o; u = centre + R^T o.
+    u = np.einsum('rixn,rxn->rin', columns, origins) + ring.centre[:, :, None]
+    uz = u[:, 2]
+    radius, slope, lean = ring.radius[:, :, None], ring.slope[:, :, None], ring.lean[:, :, None]
+    big_u = (u[:, :2] - uz[:, None] * lean) / radius
+    length = np.hypot(big_u[:, 0], big_u[:, 1])
+    k = 1.0 - uz * 0.5 * (slope[:, 0] + slope[:, 1])
+    cosine = -k / np.maximum(length, 1e-12)
+    exists = np.abs(cosine) < 1.0
+    middle = np.arctan2(big_u[:, 1], big_u[:, 0])
+    half = np.arccos(np.clip(cosine, -1.0, 1.0))
+    w = np.stack([middle + half, middle - half])  # (2, R, N)
+    general = np.flatnonzero((ring.exponent != 1.0) | (ring.slope[:, 0] != ring.slope[:, 1]))
+    if len(general):
+        w[:, general] = _refine_angles(
+            w[:, general], big_u[general], uz[general], ring, general
+        )
+    cos, sin = np.cos(w), np.sin(w)
+    e2 = ring.exponent[:, None]
+    powers = np.stack([cos, sin], axis=2)  # (2, R, 2, N)
+    outline, lateral = powers, powers
+    if len(general) and np.any(ring.exponent != 1.0):
+        outline = _signed_power(powers, e2[..., None])
+        lateral = _signed_power(powers, 2 - e2[..., None])
+    count = 2 * len(segments)
+    local = np.empty((2, len(segments), 3, frames.count))
+    local[:, :, :2] = ring.centre[:, :2, None] + radius * outline
+    local[:, :, 2] = ring.centre[:, 2, None]
+    normal = np.empty_like(local)
+    normal[:, :, :2] = lateral / radius
+    normal[:, :, 2] = -(slope * powers * powers).sum(2) - (normal[:, :, :2] * lean).sum(2)
+    normal /= np.sqrt(np.einsum('krin,krin->krn', normal, normal))[:, :, None]
+    local = local.reshape(count, 3, -1)
+    both = np.tile(segments, 2)
+    points = frames.points(both, local)
+    normal = normal.reshape(count, 3, -1)
+    c = frames.columns[both]
+    normals = c[:, 0] * normal[:, 0, None] + c[:, 1] * normal[:, 1, None]
+    normals += c[:, 2] * normal[:, 2, None]
+    return Contour(
+        both, np.tile(flesh.ring_parts, 2), local, points, normals, np.tile(exists, (2, 1))
+    )
+
+
+def _refine_angles(w: Array, big_u: Array, uz: Array, ring: Rings, rows: Index) -> Array:
+    """Newton steps on g(w) = 0, kept within a quarter of a radian each."""
+    e = 2.0 - ring.exponent[rows][:, None]
+    kx, ky = ring.slope[rows].T[:, :, None]
+    for _ in range(3):
+        cos, sin = np.cos(w), np.sin(w)
+        ax, ay = np.abs(cos), np.abs(sin)
+        px, py = ax ** (e - 1.0), ay ** (e - 1.0)
+        value = 1 + big_u[:, 0] * cos * px + big_u[:, 1] * sin * py
+        value -= uz * (kx * cos * cos + ky * sin * sin)
+        slope = e * (-big_u[:, 0] * px * sin + big_u[:, 1] * py * cos)
+        slope -= uz * 2 * (ky - kx) * sin * cos
+        slope = np.where(np.abs(slope) > 1e-9, slope, 1e-9)
+        w = w - np.clip(value / slope, -0.25, 0.25)
+    return w
+
+
+def _signed_power(x: Array, exponent: Array | float) -> Array:
+    result: Array = np.sign(x) * np.abs(x) ** exponent
+    return result
+
+
+def _mesh(parts: Sequence[Superquadric], stacks: int, slices: int) -> Mesh:
+    if stacks < 2 or slices < 3:
+        raise ValueError(f'a mesh needs 2 stacks and 3 slices at least, saw {stacks}, {slices}')
+    s = np.sin(np.linspace(-0.46, 0.46, stacks) * np.pi)
+    w = np.arange(slices) * (2 * np.pi / slices)
+    grid_s, grid_w = (x.ravel() for x in np.meshgrid(s, w, indexing='ij'))
+    body = []
+    for i in range(stacks - 1):
+        for j in range(slices):
+            a, b = i * slices + j, i * slices + (j + 1) % slices
+            body += [(a, a + slices, b + slices), (a, b + slices, b)]
+    first, last = stacks * slices, stacks * slices + 1
+    for j in range(slices):
+        k = (j + 1) % slices
+        body += [(first, j, k), (last, last - 2 - slices + 1 + k, last - 2 - slices + 1 + j)]
+    triangles = np.array(body)
+    # s runs against z: counter-clockwise in (s, w) is clockwise from outside.
+    triangles = triangles[:, ::-1]
+    vertices, normals, segments, part_of, faces = [], [], [], [], []
+    for i, part in enumerate(parts):
+        point, normal = part.surface(grid_s, grid_w)
+        cx, cy, cz = part.centre
+        tips = np.array([[cx, cy, cz + part.radii[2]], [cx, cy, cz - part.radii[2]]])
+        faces.append(triangles + sum(len(v) for v in vertices))
+        vertices.append(np.concatenate([point, tips]))
+        normals.append(np.concatenate([normal, [[0, 0, 1.0], [0, 0, -1.0]]]))
+        segments.append(np.full(len(vertices[-1]), part.segment))
+        part_of.append(np.full(len(vertices[-1]), i))
+    return Mesh(*(np.concatenate(x) for x in (vertices, normals, segments, part_of, faces)))

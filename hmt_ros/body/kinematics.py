@@ -1,0 +1,294 @@
+"""Forward kinematics, exact Jacobians, and the assembly of energies over points into pose space.
+
+Everything works on a batch of N poses with the batch on the last axis, so that every operation runs
+over contiguous memory, and touches only the degrees of freedom that move a segment.
+
+An energy that depends on the pose through points on segments needs no Jacobian of the points. A small
+motion of a segment is a twist (v, w): the point p moves by v + w x p. A residual whose derivative with
+respect to its point is the 3-vector a therefore has, with respect to the twist, the 6-vector
+b = (a, p x a), and a Gauss-Newton term adds `k b b^T` (6 x 6) and `g b` (6) to its segment. Summed from
+the leaves to the root these are all that gradient and Hessian need:
+
+    g_j = s_j . F_j,    H_ij = s_i . K_j s_j    for i on the path from the root to j,
+
+with s_j the twist of degree of freedom j and F_j, K_j the sums over all that j moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmt_ros.body.skeleton import Skeleton
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Where the segments of N poses are; camera frame, m.
+
+    Attributes:
+        columns: (S, 3, 3, N): columns[s, i, :, n] is the i-th axis of segment s.
+        origins: (S, 3, N) of the segments.
+        axes: (d, 3, N) unit vector of each degree of freedom.
+        dof_origins: (d, 3, N) a point on the axis of each rotation.
+    """
+
+    skeleton: Skeleton
+    columns: Array
+    origins: Array
+    axes: Array
+    dof_origins: Array
+
+    @property
+    def count(self) -> int:
+        """Number of poses, N."""
+        return int(self.origins.shape[-1])
+
+    def points(self, segments: Index, local: Array) -> Array:
+        """Points given in segment frames, in the camera frame.
+
+        Args:
+            segments: (P,) the segment of each point.
+            local: (P, 3), or (P, 3, N) where the place differs from pose to pose, m.
+
+        Returns:
+            (P, 3, N) m.
+        """
+        if local.ndim == 2:
+            local = local[:, :, None]
+        c = self.columns[segments]
+        result = c[:, 0] * local[:, 0, None]
+        result += c[:, 1] * local[:, 1, None]
+        result += c[:, 2] * local[:, 2, None]
+        result += self.origins[segments]
+        return result
+
+    def directions(self, segments: Index, local: Array) -> Array:
+        """Directions given in segment frames (P, 3), in the camera frame, (P, 3, N)."""
+        result: Array = np.einsum('pixn,pi->pxn', self.columns[segments], local)
+        return result
+
+    def joints(self) -> Array:
+        """Joint positions, (J, 3, N) m."""
+        return self.points(self.skeleton.joint_segments, self.skeleton.joint_offsets)
+
+    def twists(self) -> Array:
+        """Twists (d, 6, N) of the degrees of freedom: velocity of the point at the camera, rotation."""
+        rotation = self.skeleton.dof_is_rotation[:, None, None]
+        result = np.empty((self.skeleton.dimension, 6, self.count))
+        result[:, :3] = np.where(rotation, _cross(self.dof_origins, self.axes), self.axes)
+        result[:, 3:] = np.where(rotation, self.axes, 0.0)
+        return result
+
+    def rotations(self) -> Array:
+        """Rotation matrices (N, S, 3, 3) from the segments' frames to the camera frame."""
+        return np.ascontiguousarray(self.columns.transpose(3, 0, 2, 1))
+
+
+def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
+    """Frames of all segments for poses (N, d).
+
+    Raises:
+        ValueError: poses that do not have d columns or are not finite.
+    """
+    q = np.asarray(poses, dtype=np.float64)
+    if q.ndim != 2 or q.shape[1] != skeleton.dimension:
+        raise ValueError(
+            f'poses of {skeleton.name} must have shape (N, {skeleton.dimension}), saw {q.shape}'
+        )
+    if not np.isfinite(q).all():
+        raise ValueError(f'poses of {skeleton.name} must be finite')
+    q = np.ascontiguousarray(q.T)
+    sin, cos = np.sin(q), np.cos(q)
+    n = q.shape[1]
+    s_count = len(skeleton.parents)
+    columns = np.empty((s_count, 3, 3, n))
+    origins = np.empty((s_count, 3, n))
+    axes = np.empty((skeleton.dimension, 3, n))
+    dof_origins = np.empty((skeleton.dimension, 3, n))
+    offsets = skeleton.offsets
+
+    for level in _schedule(skeleton):
+        parents = level.parents
+        if parents is None:
+            columns[level.segments] = skeleton.mounts[level.segments].transpose(0, 2, 1)[..., None]
+            origins[level.segments] = offsets[level.segments][..., None]
+        else:
+            c = columns[parents].reshape(len(parents), 3, 3 * n)
+            mounted = level.mounts @ c if level.mounts is not None else c
+            columns[level.segments] = mounted.reshape(-1, 3, 3, n)
+            shift = offsets[level.segments][:, None, :] @ c
+            origins[level.segments] = origins[parents] + shift.reshape(-1, 3, n)
+        for step in level.steps:
+            where, dofs, axis = step.segments, step.dofs, step.axis
+            if step.is_rotation:
+                axes[dofs] = columns[where, axis]
+                i, j = (axis + 1) % 3, (axis + 2) % 3
+                a, b = columns[where, i], columns[where, j]
+                cq, sq = cos[dofs][:, None], sin[dofs][:, None]
+                columns[where, i] = cq * a + sq * b
+                columns[where, j] = cq * b - sq * a
+            else:
+                along = np.eye(3)[axis][None, :, None] if parents is None else columns[
+                    step.parents, axis
+                ]
+                axes[dofs] = along
+                origins[where] += along * q[dofs][:, None]
+    rotational = skeleton.dof_is_rotation
+    dof_origins[rotational] = origins[skeleton.dof_segments[rotational]]
+    dof_origins[~rotational] = 0.0
+    return Frames(skeleton, columns, origins, axes, dof_origins)
+
+
+def joint_positions(skeleton: Skeleton, poses: ArrayLike) -> Array:
+    """Joint positions (N, J, 3) of poses (N, d), camera frame, m."""
+    return np.ascontiguousarray(forward(skeleton, poses).joints().transpose(2, 0, 1))
+
+
+def joint_jacobians(skeleton: Skeleton, poses: ArrayLike) -> Array:
+    """Derivatives (N, J, 3, d) of the joint positions with respect to the poses (N, d)."""
+    frames = forward(skeleton, poses)
+    jacobian = point_jacobians(frames, skeleton.joint_segments, frames.joints())
+    return np.ascontiguousarray(jacobian.transpose(3, 0, 2, 1))
+
+
+def point_jacobians(frames: Frames, segments: Index, points: Array) -> Array:
+    """Derivatives (P, d, 3, N) of points (P, 3, N) fixed to segments (P,)."""
+    skeleton = frames.skeleton
+    result = np.zeros((len(points), skeleton.dimension, 3, frames.count))
+    moves = skeleton.moves[segments]
+    for j in range(skeleton.dimension):
+        where = np.flatnonzero(moves[:, j])
+        if not len(where):
+            continue
+        if skeleton.dof_is_rotation[j]:
+            result[where, j] = _cross(frames.axes[j], points[where] - frames.dof_origins[j])
+        else:
+            result[where, j] = frames.axes[j]
+    return result
+
+
+def joint_length_jacobians(skeleton: Skeleton, poses: ArrayLike) -> Array:
+    """Derivatives (N, J, 3, L) of the joint positions with respect to the lengths."""
+    frames = forward(skeleton, poses)
+    n, count = frames.count, len(skeleton.length_names)
+    of_origin = np.zeros((len(skeleton.parents), 3, count, n))
+    for s, parent in enumerate(skeleton.parents):
+        if parent >= 0:
+            of_origin[s] = of_origin[parent] + np.einsum(
+                'ixn,il->xln', frames.columns[parent], skeleton.offset_basis[s]
+            )
+        else:
+            of_origin[s] = skeleton.offset_basis[s][..., None]
+    segments = skeleton.joint_segments
+    result = of_origin[segments] + np.einsum(
+        'jixn,jil->jxln', frames.columns[segments], skeleton.joint_basis
+    )
+    return np.ascontiguousarray(result.transpose(3, 0, 1, 2))
+
+
+def assemble(frames: Frames, wrenches: Array, stiffnesses: Array) -> tuple[Array, Array]:
+    """Gradient (N, d) and Gauss-Newton Hessian (N, d, d) from sums over the points of each segment.
+
+    Args:
+        frames: of the poses.
+        wrenches: (S, 6, N) sum of g b.
+        stiffnesses: (S, 6, 6, N) sum of k b b^T, symmetric.
+    """
+    skeleton = frames.skeleton
+    force, stiffness = wrenches.copy(), stiffnesses.copy()
+    for s in range(len(skeleton.parents) - 1, 0, -1):
+        parent = skeleton.parents[s]
+        if parent >= 0:
+            force[parent] += force[s]
+            stiffness[parent] += stiffness[s]
+    twists = frames.twists()
+    segments = skeleton.dof_segments
+    gradient = np.einsum('jan,jan->nj', twists, force[segments])
+    pushed = np.einsum('jabn,jbn->jan', stiffness[segments], twists)
+    rows, cols = _coupled_pairs(skeleton)
+    values = np.einsum('pan,pan->np', twists[rows], pushed[cols])
+    hessian = np.zeros((frames.count, skeleton.dimension, skeleton.dimension))
+    hessian[:, rows, cols] = values
+    hessian[:, cols, rows] = values
+    return gradient, hessian
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One degree of freedom of some segments that turn or move about the same axis letter."""
+
+    segments: Index
+    parents: Index
+    dofs: Index
+    axis: int
+    is_rotation: bool
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Segments of equal depth, moved together."""
+
+    segments: Index
+    parents: Index | None
+    mounts: Array | None  # transposed, None where all are the identity
+    steps: tuple[_Step, ...]
+
+
+@lru_cache(maxsize=64)
+def _schedule(skeleton: Skeleton) -> tuple[_Level, ...]:
+    depth = np.zeros(len(skeleton.parents), dtype=int)
+    for s, parent in enumerate(skeleton.parents):
+        depth[s] = 0 if parent < 0 else depth[parent] + 1
+    levels = []
+    for k in range(depth.max() + 1):
+        segments = np.flatnonzero(depth == k)
+        parents = np.array([skeleton.parents[s] for s in segments]) if k else None
+        mounts = skeleton.mounts[segments].transpose(0, 2, 1)
+        identity = np.array_equal(mounts, np.broadcast_to(np.eye(3), mounts.shape))
+        steps = []
+        dofs = [skeleton.segment_dofs[s] for s in segments]
+        for turn in range(max(len(x) for x in dofs)):
+            groups: dict[tuple[int, bool], list[tuple[int, int]]] = {}
+            for s, own in zip(segments, dofs, strict=True):
+                if turn < len(own):
+                    j = own[turn]
+                    key = (int(skeleton.dof_axes[j]), bool(skeleton.dof_is_rotation[j]))
+                    groups.setdefault(key, []).append((int(s), j))
+            for (axis, is_rotation), members in groups.items():
+                where, which = np.array(members).T
+                above = np.array([skeleton.parents[s] for s in where])
+                steps.append(_Step(where, above, which, axis, is_rotation))
+        levels.append(_Level(segments, parents, None if identity else mounts, tuple(steps)))
+    return tuple(levels)
+
+
+@lru_cache(maxsize=64)
+def _coupled_pairs(skeleton: Skeleton) -> tuple[Index, Index]:
+    """Pairs (i, j) of degrees of freedom with i on the path from the root to j, or i = j."""
+    moves = skeleton.moves[skeleton.dof_segments]  # (d, d): column moves the segment of the row
+    rows, cols = [], []
+    for j in range(skeleton.dimension):
+        before = np.flatnonzero(moves[j])
+        before = before[before <= j]
+        rows.extend(before)
+        cols.extend([j] * len(before))
+    return np.array(rows, dtype=np.intp), np.array(cols, dtype=np.intp)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross product over the axis before the last."""
+    return np.stack(
+        [
+            a[..., 1, :] * b[..., 2, :] - a[..., 2, :] * b[..., 1, :],
+            a[..., 2, :] * b[..., 0, :] - a[..., 0, :] * b[..., 2, :],
+            a[..., 0, :] * b[..., 1, :] - a[..., 1, :] * b[..., 0, :],
+        ],
+        axis=-2,
+    )

@@ -1,0 +1,238 @@
+"""Bodies from YAML model files; the format is explained in `models/human37.yaml`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body, PartShape
+from hmt_ros.body.skeleton import Skeleton
+
+Array = NDArray[np.float64]
+
+AXES = {'x': (0, True), 'y': (1, True), 'z': (2, True), 'tx': (0, False), 'ty': (1, False), 'tz': (2, False)}  # fmt: skip
+MIRROR = np.array([-1.0, 1.0, 1.0])
+LARGEST_FILE = 1_000_000  # bytes; a body is a few kB
+
+
+def model_names() -> list[str]:
+    """Names of the bodies that ship with the package."""
+    folder = resources.files('hmt_ros.body') / 'models'
+    return sorted(f.name.removesuffix('.yaml') for f in folder.iterdir() if f.name.endswith('.yaml'))
+
+
+def read_body(source: str | Path) -> Body:
+    """Body of a YAML file, or of a name that ships with the package.
+
+    Raises:
+        FileNotFoundError: neither a file nor a known name.
+        ValueError: a file that is not a body; the message names the file and the entry.
+    """
+    try:
+        return _build(_read(source))
+    except (KeyError, TypeError, AttributeError, IndexError) as fault:
+        raise ValueError(
+            f'{source}: not a body model ({type(fault).__name__}: {fault}); compare with human37.yaml'
+        ) from fault
+    except (ValueError, yaml.YAMLError) as fault:
+        text = ' '.join(str(fault).split())
+        raise ValueError(f'{source}: not a body model ({text}); compare with human37.yaml') from fault
+
+
+def _read(source: str | Path) -> dict[str, Any]:
+    if str(source) in model_names():
+        text = (resources.files('hmt_ros.body') / 'models' / f'{source}.yaml').read_text('utf-8')
+    else:
+        path = Path(source)
+        if not path.is_file():
+            raise FileNotFoundError(
+                f'no body {str(source)!r}: wanted one of {model_names()}, a YAML file, or a motion '
+                f'file (.bvh, .asf, .amc)'
+            )
+        if path.stat().st_size > LARGEST_FILE:
+            raise ValueError(f'the file has {path.stat().st_size} bytes')
+        text = path.read_text('utf-8')
+    content = yaml.safe_load(text)
+    if not isinstance(content, dict):
+        raise ValueError(f'wanted a mapping, saw {type(content).__name__}')
+    if 'extends' in content:
+        base = _read(str(content['extends']))
+        fixed = [*base.get('fixed', []), *content.pop('fixed', [])]
+        content.pop('extends')
+        return {**base, **content, 'fixed': fixed}
+    return content
+
+
+def _sides(template: str) -> list[tuple[str, bool]]:
+    """Names that a template stands for, each with whether it is the mirrored side."""
+    if '{side}' not in template:
+        return [(template, False)]
+    return [(template.format(side='left'), True), (template.format(side='right'), False)]
+
+
+def _expand(entries: list[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], str, bool]]:
+    for entry in entries:
+        for name, mirrored in _sides(entry['name']):
+            yield entry, name, mirrored
+
+
+def _linear(term: Any, names: tuple[str, ...]) -> tuple[float, Array]:
+    """A number, or 'factor * length', as constant and coefficients over the lengths."""
+    coefficients = np.zeros(len(names))
+    if isinstance(term, (int, float)):
+        return float(term), coefficients
+    factor, _, name = (x.strip() for x in str(term).rpartition('*'))
+    if name not in names:
+        raise ValueError(f'{term!r} is neither a number nor a multiple of one of {list(names)}')
+    coefficients[names.index(name)] = float(factor) if factor else 1.0
+    return 0.0, coefficients
+
+
+def _mount(entry: dict[str, Any]) -> Array:
+    """Rotation whose negative z axis points where the segment points and whose x axis is as given."""
+    x = np.array(entry.get('x_axis', [1, 0, 0]), dtype=float)
+    down = np.array(entry.get('points', [0, 0, -1]), dtype=float)
+    x /= np.linalg.norm(x)
+    down = down - x * (x @ down)
+    z = -down / np.linalg.norm(down)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _build(content: dict[str, Any]) -> Body:
+    length_names = tuple(content['lengths'])
+    lengths = np.array([float(v[0]) for v in content['lengths'].values()])
+    relative = np.array([float(v[1]) for v in content['lengths'].values()])
+    fixed_dofs = {name for entry in content.get('fixed', []) for name, _ in _sides(entry)}
+    left_over = set(fixed_dofs)
+
+    names: list[str] = []
+    parents, mounts, fixed, basis = [], [], [], []
+    dofs: list[tuple[str, int, int, bool, float, float, float, float]] = []
+    shapes: list[PartShape] = []
+    own_length: list[int | None] = []
+    for entry, name, mirrored in _expand(content['segments']):
+        parent_name = entry.get('parent')
+        if parent_name is not None:
+            parent_name = parent_name.format(side='left' if mirrored else 'right')
+        parent = -1 if parent_name is None else names.index(parent_name)
+        sign = MIRROR if mirrored else np.ones(3)
+        mount = _mount(entry) * (np.outer(MIRROR, MIRROR) if mirrored else 1.0)
+        constant, coefficients = np.zeros(3), np.zeros((3, len(length_names)))
+        if 'offset' in entry:
+            for i, term in enumerate(entry['offset']):
+                constant[i], coefficients[i] = _linear(term, length_names)
+        elif parent >= 0 and own_length[parent] is not None:
+            coefficients[2, own_length[parent]] = -1.0
+        segment = len(names)
+        names.append(name)
+        parents.append(parent)
+        mounts.append(mount)
+        fixed.append(sign * constant)
+        basis.append(sign[:, None] * coefficients)
+        span = entry.get('length')
+        own_length.append(None if span is None else length_names.index(span))
+        for dof in entry.get('dofs', []):
+            dof_name = dof[0].format(side='left' if mirrored else 'right')
+            if dof_name in fixed_dofs:
+                left_over.discard(dof_name)
+                continue
+            dofs.append((dof_name, segment, *_dof(dof, mirrored)))
+        if 'flesh' in entry:
+            shapes.append(_shape(entry['flesh'], segment, own_length[-1], mirrored))
+    if left_over:
+        raise ValueError(f'`fixed` names {sorted(left_over)}, which the body does not have')
+
+    joint_names, joint_segments, joint_basis = [], [], []
+    for template, (segment_template, end) in content['joints'].items():
+        for joint, mirrored in _sides(template):
+            segment = names.index(segment_template.format(side='left' if mirrored else 'right'))
+            coefficients = np.zeros((3, len(length_names)))
+            if end == 'end':
+                coefficients[2, own_length[segment]] = -1.0
+            elif end != 'start':
+                raise ValueError(f'joint {joint}: wanted start or end of a segment, saw {end!r}')
+            joint_names.append(joint)
+            joint_segments.append(segment)
+            joint_basis.append(coefficients)
+    chains = {}
+    for template, members in content.get('chains', {}).items():
+        for chain, mirrored in _sides(template):
+            side = 'left' if mirrored else 'right'
+            chains[chain] = tuple(names.index(m.format(side=side)) for m in members)
+
+    columns = list(zip(*dofs, strict=True))
+    skeleton = Skeleton(
+        name=str(content['name']),
+        segment_names=tuple(names),
+        parents=tuple(parents),
+        mounts=np.array(mounts),
+        fixed_offsets=np.array(fixed),
+        offset_basis=np.array(basis),
+        dof_names=tuple(columns[0]),
+        dof_segments=np.array(columns[1], dtype=np.intp),
+        dof_axes=np.array(columns[2], dtype=np.intp),
+        dof_is_rotation=np.array(columns[3], dtype=bool),
+        lower=np.array(columns[4]),
+        upper=np.array(columns[5]),
+        joint_names=tuple(joint_names),
+        joint_segments=np.array(joint_segments, dtype=np.intp),
+        joint_fixed=np.zeros((len(joint_names), 3)),
+        joint_basis=np.array(joint_basis),
+        length_names=length_names,
+        lengths=lengths,
+        chains=chains,
+    )
+    return Body(
+        skeleton=skeleton,
+        shapes=tuple(shapes),
+        prior_mean=np.array(columns[6]),
+        prior_sigma=np.array(columns[7]),
+        length_sigma=relative * lengths,
+        stature_lengths=tuple(content['stature']),
+        stature_extra=float(content['stature_extra']),
+        default_lengths=lengths,
+    )
+
+
+def _dof(entry: list[Any], mirrored: bool) -> tuple[int, bool, float, float, float, float]:
+    _, letter, *numbers = entry
+    if letter not in AXES:
+        raise ValueError(f'{entry}: axis {letter!r} is not one of {list(AXES)}')
+    axis, is_rotation = AXES[letter]
+    unit = np.pi / 180 if is_rotation else 1.0
+    low, high, *prior = (float(x) * unit for x in numbers)
+    mean, sigma = prior or (0.0, np.inf)
+    # A mirror turns the sense of rotations about y and z, and of translations along x.
+    if mirrored and is_rotation == (axis != 0):
+        low, high, mean = -high, -low, -mean
+    return axis, is_rotation, low, high, mean, sigma
+
+
+def _shape(flesh: dict[str, Any], segment: int, length: int | None, mirrored: bool) -> PartShape:
+    radii = tuple(float(x) for x in flesh['radii'])
+    spans = len(radii) == 2
+    if spans and length is None:
+        raise ValueError('flesh with two radii needs a segment with a length')
+    sign = -1.0 if mirrored else 1.0
+    cx, cy, cz = (float(x) for x in flesh.get('centre', (0, 0, 0)))
+    bx, by = (float(x) for x in flesh.get('bend', (0, 0)))
+    e1, e2 = (float(x) for x in flesh.get('exponents', (1, 1)))
+    tx, ty = (float(x) for x in flesh.get('taper', (0, 0)))
+    start, end = (float(x) for x in flesh.get('extend', (0, 0)))
+    return PartShape(
+        segment=segment,
+        length=length if spans else None,
+        centre=(sign * cx, cy, cz),
+        radii=radii,
+        exponents=(e1, e2),
+        taper=(tx, ty),
+        bend=(sign * bx, by),
+        extend=(start, end),
+        rings=int(flesh.get('rings', 5)),
+    )

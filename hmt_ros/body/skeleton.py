@@ -1,0 +1,194 @@
+"""The skeleton: a tree of segments, their degrees of freedom, and the lengths that shape them.
+
+Every segment has a frame. Seen from its parent it sits at an offset, moved by its translations, with
+a fixed mount rotation, and is then turned by its rotations, one after the other:
+
+    T_segment = T_parent * Trans(offset + t) * mount * Rot(axis_1, q_1) * ... * Rot(axis_n, q_n)
+
+Translations are along the axes of the parent's frame, rotations about axes of the moving frame. Offsets
+are linear in the lengths (`thigh`, `hip_width`, ...), so lengths can be set, scaled and estimated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """A kinematic tree with S segments, d degrees of freedom, J joints and L lengths.
+
+    Attributes:
+        name: of the body, e.g. 'human34'.
+        segment_names, parents: (S,) names and index of the parent (-1: the camera frame); parents
+            stand before their children.
+        mounts: (S, 3, 3) rotation from the segment's frame at rest to its parent's frame.
+        fixed_offsets, offset_basis: (S, 3), (S, 3, L): offset = fixed + basis @ lengths, m, in the
+            parent's frame.
+        dof_names, dof_segments, dof_axes, dof_is_rotation: (d,) name, segment, axis 0 to 2, kind; in
+            the order in which they act.
+        lower, upper: (d,) hard limits, m or rad.
+        joint_names, joint_segments: (J,) named points and the segment that carries them.
+        joint_fixed, joint_basis: (J, 3), (J, 3, L): place of a joint in the frame of its segment.
+        chains: name -> segments of a limb, from its root outwards.
+        length_names, lengths: (L,) m.
+    """
+
+    name: str
+    segment_names: tuple[str, ...]
+    parents: tuple[int, ...]
+    mounts: Array
+    fixed_offsets: Array
+    offset_basis: Array
+    dof_names: tuple[str, ...]
+    dof_segments: Index
+    dof_axes: Index
+    dof_is_rotation: NDArray[np.bool_]
+    lower: Array
+    upper: Array
+    joint_names: tuple[str, ...]
+    joint_segments: Index
+    joint_fixed: Array
+    joint_basis: Array
+    length_names: tuple[str, ...]
+    lengths: Array
+    chains: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        s, d, j, n = (len(x) for x in (self.segment_names, self.dof_names, self.joint_names, self.length_names))  # fmt: skip
+        wanted = {
+            'mounts': (s, 3, 3), 'fixed_offsets': (s, 3), 'offset_basis': (s, 3, n),
+            'dof_segments': (d,), 'dof_axes': (d,), 'dof_is_rotation': (d,),
+            'lower': (d,), 'upper': (d,), 'joint_segments': (j,), 'joint_fixed': (j, 3),
+            'joint_basis': (j, 3, n), 'lengths': (n,),
+        }  # fmt: skip
+        for key, shape in wanted.items():
+            value = np.array(getattr(self, key))
+            if value.shape != shape:
+                raise ValueError(f'{self.name}: {key} has shape {value.shape}, wanted {shape}')
+            value.setflags(write=False)
+            object.__setattr__(self, key, value)
+        for i, parent in enumerate(self.parents):
+            if not -1 <= parent < i:
+                raise ValueError(
+                    f'{self.name}: segment {self.segment_names[i]} has parent {parent}, '
+                    f'wanted one that stands before it'
+                )
+        if np.any(np.diff(self.dof_segments) < 0):
+            raise ValueError(f'{self.name}: degrees of freedom must stand in the order of segments')
+        for own in self.segment_dofs:
+            kinds = [bool(self.dof_is_rotation[i]) for i in own]
+            if kinds != sorted(kinds):
+                raise ValueError(f'{self.name}: translations of a segment come before its rotations')
+        for kind in ('segment_names', 'dof_names', 'joint_names', 'length_names'):
+            names = getattr(self, kind)
+            twice = sorted({x for x in names if names.count(x) > 1})
+            if twice:
+                raise ValueError(f'{self.name}: {kind} has {twice} more than once')
+        wrong = [self.dof_names[i] for i in np.flatnonzero(~(self.lower < self.upper))]
+        if wrong:
+            raise ValueError(f'{self.name}: lower limit not below upper limit for {wrong}')
+
+    @property
+    def dimension(self) -> int:
+        """Number of degrees of freedom, d."""
+        return len(self.dof_names)
+
+    @cached_property
+    def offsets(self) -> Array:
+        """Offsets (S, 3) of the segments in their parents' frames at the present lengths, m."""
+        result: Array = self.fixed_offsets + self.offset_basis @ self.lengths
+        return result
+
+    @cached_property
+    def joint_offsets(self) -> Array:
+        """Places (J, 3) of the joints in the frames of their segments at the present lengths, m."""
+        result: Array = self.joint_fixed + self.joint_basis @ self.lengths
+        return result
+
+    @cached_property
+    def segment_dofs(self) -> tuple[tuple[int, ...], ...]:
+        """Degrees of freedom of each segment, in the order in which they act."""
+        return tuple(
+            tuple(int(i) for i in np.flatnonzero(self.dof_segments == s))
+            for s in range(len(self.parents))
+        )
+
+    @cached_property
+    def moves(self) -> NDArray[np.bool_]:
+        """(S, d): whether a degree of freedom moves a segment."""
+        result = np.zeros((len(self.parents), self.dimension), dtype=bool)
+        for s, parent in enumerate(self.parents):
+            if parent >= 0:
+                result[s] = result[parent]
+            result[s, list(self.segment_dofs[s])] = True
+        return result
+
+    @cached_property
+    def bones(self) -> tuple[tuple[int, int], ...]:
+        """Pairs (parent joint, child joint) that a drawing of the skeleton connects."""
+        at_start: dict[int, int] = {}  # the first joint that sits at a segment's origin
+        for j, s in enumerate(self.joint_segments):
+            if not np.any(self.joint_offsets[j]):
+                at_start.setdefault(int(s), j)
+        for s, parent in enumerate(self.parents):  # a segment that starts where its sibling does
+            for other, joint in list(at_start.items()):
+                same = parent == self.parents[other] and parent >= 0
+                if s not in at_start and same and np.allclose(self.offsets[s], self.offsets[other]):
+                    at_start[s] = joint
+        result = []
+        for j, s in enumerate(self.joint_segments):
+            step = int(s) if np.any(self.joint_offsets[j]) else self.parents[s]
+            while step >= 0 and step not in at_start:
+                step = self.parents[step]
+            if step >= 0 and at_start[step] != j:
+                result.append((at_start[step], j))
+        return tuple(result)
+
+    def dof_index(self, names: list[str] | tuple[str, ...]) -> Index:
+        """Positions of named degrees of freedom in a pose.
+
+        Raises:
+            KeyError: a name that the skeleton does not have.
+        """
+        return _positions(names, self.dof_names, 'degree of freedom', self.name)
+
+    def joint_index(self, names: list[str] | tuple[str, ...]) -> Index:
+        """Positions of named joints.
+
+        Raises:
+            KeyError: a name that the skeleton does not have.
+        """
+        return _positions(names, self.joint_names, 'joint', self.name)
+
+    def with_lengths(self, lengths: Mapping[str, float]) -> Skeleton:
+        """The same skeleton with some lengths replaced, m.
+
+        Raises:
+            KeyError: a name that the skeleton does not have.
+            ValueError: a length that is not finite.
+        """
+        new = self.lengths.copy()
+        where = _positions(tuple(lengths), self.length_names, 'length', self.name)
+        new[where] = [float(x) for x in lengths.values()]
+        if not np.isfinite(new).all():
+            raise ValueError(f'{self.name}: lengths must be finite, saw {dict(lengths)}')
+        return replace(self, lengths=new)
+
+
+def _positions(
+    names: list[str] | tuple[str, ...], known: tuple[str, ...], kind: str, owner: str
+) -> Index:
+    place = {name: i for i, name in enumerate(known)}
+    missing = [name for name in names if name not in place]
+    if missing:
+        raise KeyError(f'{owner} has no {kind} {missing}; it has {list(known)}')
+    return np.array([place[name] for name in names], dtype=np.intp)

@@ -1,0 +1,6 @@
+"""Mathematics without bodies or images: mixtures and bounded second-order minimisation."""
+
+from hmt_ros.inference.bounded_newton import Minimum, Status, minimise
+from hmt_ros.inference.mixture import GaussianMixture
+
+__all__ = ['GaussianMixture', 'Minimum', 'Status', 'minimise']

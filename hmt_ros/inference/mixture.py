@@ -1,0 +1,243 @@
+"""Mixtures of Gaussians as immutable values.
+
+    p(x) = sum_k w_k N(x; m_k, S_k)
+
+The posterior, the likelihood and the prediction of a pose are all of this form (KJS 4, VMS 4, BME 2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import solve_triangular
+from scipy.special import logsumexp
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianMixture:
+    """A mixture of K Gaussians over R^d.
+
+    Weights need not sum to 1: the modes of a likelihood are an unnormalised mixture. Densities and
+    samples are those of the mixture as it stands; `normalised()` makes the weights sum to 1.
+
+    Attributes:
+        weights: (K,) not negative.
+        means: (K, d).
+        covariances: (K, d, d) symmetric, positive definite.
+
+    Raises:
+        ValueError: shapes that contradict each other, values that are not finite, negative weights.
+    """
+
+    weights: Array
+    means: Array
+    covariances: Array
+
+    def __post_init__(self) -> None:
+        for name, ndim in (('weights', 1), ('means', 2), ('covariances', 3)):
+            value = np.array(getattr(self, name), dtype=np.float64)
+            if value.ndim != ndim:
+                raise ValueError(f'{name} has {value.ndim} axes, wanted {ndim}')
+            if not np.isfinite(value).all():
+                raise ValueError(f'{name} has values that are not finite')
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        k, d = self.means.shape
+        if self.weights.shape != (k,) or self.covariances.shape != (k, d, d):
+            raise ValueError(
+                f'weights {self.weights.shape}, means {self.means.shape} and covariances '
+                f'{self.covariances.shape} do not fit: wanted (K,), (K, d), (K, d, d)'
+            )
+        if (self.weights < 0).any():
+            raise ValueError(f'weights must not be negative, saw {self.weights.min()}')
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, GaussianMixture):
+            return NotImplemented
+        return all(
+            np.array_equal(a, b)
+            for a, b in zip(self._arrays(), other._arrays(), strict=True)
+        )
+
+    def _arrays(self) -> tuple[Array, Array, Array]:
+        return self.weights, self.means, self.covariances
+
+    @property
+    def dimension(self) -> int:
+        """Number of variables, d."""
+        return int(self.means.shape[1])
+
+    def cholesky(self) -> Array:
+        """Lower triangular factors (K, d, d) of the covariances.
+
+        Raises:
+            ValueError: a covariance is not positive definite.
+        """
+        try:
+            return np.linalg.cholesky(self.covariances)
+        except np.linalg.LinAlgError:
+            smallest = np.linalg.eigvalsh(self.covariances)[:, 0]
+            worst = int(np.argmin(smallest))
+            raise ValueError(
+                f'covariance of component {worst} is not positive definite: its smallest '
+                f'eigenvalue is {smallest[worst]:.3g}'
+            ) from None
+
+    def component_log_densities(self, x: ArrayLike) -> Array:
+        """log N(x; m_k, S_k), shape (N, K), of points x (N, d)."""
+        points = _points(x, self.dimension)
+        factors = self.cholesky()
+        result = np.empty((len(points), len(self)))
+        for k, factor in enumerate(factors):
+            z = _solve_lower(factor, (points - self.means[k]).T)
+            log_det = 2.0 * np.log(np.diagonal(factor)).sum()
+            result[:, k] = -0.5 * ((z * z).sum(0) + log_det + self.dimension * np.log(2 * np.pi))
+        return result
+
+    def log_density(self, x: ArrayLike) -> Array:
+        """log p(x), shape (N,), of points x (N, d)."""
+        with np.errstate(divide='ignore'):
+            log_weights = np.log(self.weights)
+        result: Array = logsumexp(self.component_log_densities(x) + log_weights, axis=1)
+        return result
+
+    def sample(self, n: int, rng: np.random.Generator) -> Array:
+        """Draws n points, (n, d)."""
+        k = rng.choice(len(self), size=n, p=self.normalised().weights)
+        noise = rng.standard_normal((n, self.dimension))
+        return self.means[k] + np.einsum('nij,nj->ni', self.cholesky()[k], noise)
+
+    def mean(self) -> Array:
+        """Mean of the normalised mixture, (d,)."""
+        result: Array = self.normalised().weights @ self.means
+        return result
+
+    def covariance(self) -> Array:
+        """Covariance of the normalised mixture, (d, d)."""
+        w = self.normalised().weights
+        offsets = self.means - self.mean()
+        result: Array = np.einsum('k,kij->ij', w, self.covariances) + (w * offsets.T) @ offsets
+        return result
+
+    def normalised(self) -> GaussianMixture:
+        """The same mixture with weights that sum to 1.
+
+        Raises:
+            ValueError: no component, or all weights are zero.
+        """
+        total = self.weights.sum()
+        if not total > 0:
+            raise ValueError(f'a mixture of {len(self)} components with total weight {total}')
+        if total == 1.0:
+            return self
+        return GaussianMixture(self.weights / total, self.means, self.covariances)
+
+    def sorted(self) -> GaussianMixture:
+        """The same mixture, heaviest component first (ties keep their order)."""
+        return self[np.argsort(-self.weights, kind='stable')]
+
+    def __getitem__(self, index: Any) -> GaussianMixture:
+        """The mixture of some of the components; weights are kept as they are."""
+        i = np.atleast_1d(np.arange(len(self))[index])
+        return GaussianMixture(self.weights[i], self.means[i], self.covariances[i])
+
+    def reduce(self, k: int) -> GaussianMixture:
+        """A mixture of at most k components with the same mean and covariance.
+
+        Greedy pairwise merging. The pair that costs least is merged first, by the upper bound on the
+        Kullback-Leibler divergence that the merge causes [Runnalls, IEEE TAES 2007]:
+
+            B(i, j) = 1/2 ((w_i + w_j) log|S_ij| - w_i log|S_i| - w_j log|S_j|)
+
+        Raises:
+            ValueError: k < 1.
+        """
+        if k < 1:
+            raise ValueError(f'k must be at least 1, saw {k}')
+        w, m, s = (a.copy() for a in self._arrays())
+        alive = w > 0
+        if alive.sum() < len(w):
+            w, m, s = w[alive], m[alive], s[alive]
+        if len(w) <= k:
+            return GaussianMixture(w, m, s)
+        log_det = np.linalg.slogdet(s)[1]
+        cost = np.full((len(w), len(w)), np.inf)
+        for i in range(len(w) - 1):
+            cost[i, i + 1 :] = _merge_cost(w, m, s, log_det, i, np.arange(i + 1, len(w)))
+        remaining = len(w)
+        active = np.ones(len(w), dtype=bool)
+        while remaining > k:
+            i, j = np.unravel_index(int(np.argmin(cost)), cost.shape)
+            total, mean, cov = _merged(w, m, s, int(i), np.array([j]))
+            w[i], m[i], s[i] = total[0], mean[0], cov[0]
+            log_det[i] = np.linalg.slogdet(s[i])[1]
+            active[j] = False
+            cost[j, :] = cost[:, j] = np.inf
+            others = np.flatnonzero(active & (np.arange(len(w)) != i))
+            if len(others):
+                new = _merge_cost(w, m, s, log_det, int(i), others)
+                for other, value in zip(others, new, strict=True):
+                    cost[min(i, other), max(i, other)] = value
+            remaining -= 1
+        return GaussianMixture(w[active], m[active], s[active])
+
+
+def bhattacharyya_distances(
+    means_a: Array, covariances_a: Array, means_b: Array, covariances_b: Array
+) -> Array:
+    """Bhattacharyya distances (A, B) between two sets of Gaussians (KJS fig. 4, step 5).
+
+    1/8 (mi-mj)' [(Si+Sj)/2]^-1 (mi-mj) + 1/2 log(|(Si+Sj)/2| / sqrt(|Si||Sj|))
+    """
+    middle = 0.5 * (covariances_a[:, None] + covariances_b[None])
+    offset = means_a[:, None] - means_b[None]
+    factor = np.linalg.cholesky(middle)
+    z = np.linalg.solve(factor, offset[..., None])[..., 0]
+    log_det = 2.0 * np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(-1)
+    log_a = np.linalg.slogdet(covariances_a)[1]
+    log_b = np.linalg.slogdet(covariances_b)[1]
+    result: Array = 0.125 * (z * z).sum(-1) + 0.5 * (
+        log_det - 0.5 * (log_a[:, None] + log_b[None])
+    )
+    return result
+
+
+def _points(x: ArrayLike, dimension: int) -> Array:
+    points = np.asarray(x, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != dimension:
+        raise ValueError(f'points have shape {points.shape}, wanted (N, {dimension})')
+    return points
+
+
+def _solve_lower(factor: Array, right: Array) -> Array:
+    result: Array = solve_triangular(factor, right, lower=True, check_finite=False)
+    return result
+
+
+def _merged(w: Array, m: Array, s: Array, i: int, j: NDArray[np.int_]) -> tuple[Array, Array, Array]:
+    """Moment-preserving merges of component i with each of the components j."""
+    total = w[i] + w[j]
+    a, b = w[i] / total, w[j] / total
+    offset = m[j] - m[i]
+    mean = m[i] + b[:, None] * offset
+    spread = (a * b)[:, None, None] * offset[:, :, None] * offset[:, None, :]
+    cov = a[:, None, None] * s[i] + b[:, None, None] * s[j] + spread
+    return total, mean, cov
+
+
+def _merge_cost(
+    w: Array, m: Array, s: Array, log_det: Array, i: int, j: NDArray[np.int_]
+) -> Array:
+    total, _, cov = _merged(w, m, s, i, j)
+    result: Array = 0.5 * (
+        total * np.linalg.slogdet(cov)[1] - w[i] * log_det[i] - w[j] * log_det[j]
+    )
+    return result
