@@ -193,6 +193,57 @@ def joint_length_jacobians(skeleton: Skeleton, poses: ArrayLike) -> Array:
     return np.ascontiguousarray(result.transpose(3, 0, 1, 2))
 
 
+def segment_sums(
+    segments: Index, points: Array, directions: Array, pull: Array, curvature: Array, count: int
+) -> tuple[Array, Array]:
+    """Sums of g b and k b b^T per segment, for residuals at points that stay on their segments.
+
+    Args:
+        segments: (M,) the segment of each residual, or (M, N) where it differs from pose to pose.
+        points: (M, 3, N) where it acts, camera frame, m.
+        directions: (M, 3, N) derivative a of the residual with respect to its point.
+        pull: (M, N) derivative g of the energy with respect to the residual.
+        curvature: (M, N) second derivative k, not negative.
+        count: number of segments, S.
+
+    Returns:
+        wrenches (S, 6, N) and stiffnesses (S, 6, 6, N), for `assemble`.
+    """
+    n = points.shape[-1]
+    b = np.concatenate([directions, _cross(points, directions)], axis=1)
+    if segments.ndim == 2:
+        return _scattered_sums(segments, b, pull, curvature, count)
+    wrenches = np.zeros((count, 6, n))
+    stiffnesses = np.zeros((count, 6, 6, n))
+    weighted = curvature[:, None] * b
+    order = np.argsort(segments, kind='stable')
+    present, starts = np.unique(segments[order], return_index=True)
+    for s, rows in zip(present, np.split(order, starts[1:]), strict=True):
+        wrenches[s] = np.einsum('mn,man->an', pull[rows], b[rows])
+        stiffnesses[s] = np.einsum('man,mbn->abn', weighted[rows], b[rows])
+    return wrenches, stiffnesses
+
+
+def _scattered_sums(
+    segments: Index, b: Array, pull: Array, curvature: Array, count: int
+) -> tuple[Array, Array]:
+    """`segment_sums` where every pose has its own segments (M, N)."""
+    m, n = segments.shape
+    rows, cols = np.triu_indices(6)
+    terms = np.empty((n, m, 6 + len(rows)))
+    batch_first = np.ascontiguousarray(b.transpose(2, 0, 1))
+    terms[:, :, :6] = batch_first * pull.T[:, :, None]
+    weighted = batch_first * curvature.T[:, :, None]
+    terms[:, :, 6:] = weighted[:, :, rows] * batch_first[:, :, cols]
+    membership = (np.arange(count)[:, None] == segments.T[:, None, :]).astype(np.float64)
+    sums = membership @ terms  # (N, S, 27)
+    stiffnesses = np.empty((count, 6, 6, n))
+    upper = sums[:, :, 6:].transpose(1, 2, 0)
+    stiffnesses[:, rows, cols] = upper
+    stiffnesses[:, cols, rows] = upper
+    return np.ascontiguousarray(sums[:, :, :6].transpose(1, 2, 0)), stiffnesses
+
+
 def assemble(frames: Frames, wrenches: Array, stiffnesses: Array) -> tuple[Array, Array]:
     """Gradient (N, d) and Gauss-Newton Hessian (N, d, d) from sums over the points of each segment.
 

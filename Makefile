@@ -1,0 +1,57 @@
+# make demo   renders, tracks and reports one clip     make lint   ruff and mypy
+# make test   all tests                                make bench  the benchmarks
+# make setup  the workspace alone                      make clean  back to the state of a clone
+#
+# Each works as the first command after a clone: what it needs is installed into .venv and built
+# once. See CONTRIBUTING.md.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint bench clean lock
+
+# Small matrices: a second BLAS thread costs more than it brings.
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+
+WORKSPACE := tools/workspace.sh
+PYTHON_IN_VENV := .venv/bin/python
+SOURCED := source tools/environment.bash &&
+TEST_PROCESSES ?= 2
+
+help:
+	@sed -n 's/^# \{0,1\}//p; /^$$/q' Makefile
+
+setup:
+	@$(WORKSPACE) ros test lint build
+
+demo:
+	@$(WORKSPACE) ros build
+	@$(SOURCED) python -m hmt_ros demo
+
+test:
+	@$(WORKSPACE) ros test build
+	@$(SOURCED) python -m pytest -n $(TEST_PROCESSES) --dist loadgroup --cov $(ARGS)
+
+lint:
+	@$(WORKSPACE) ros lint
+	@$(PYTHON_IN_VENV) -m ruff check .
+	@$(PYTHON_IN_VENV) -m ruff format --check .
+	@$(PYTHON_IN_VENV) -m mypy
+
+bench:
+	@$(WORKSPACE) ros test build
+	@$(SOURCED) for benchmark in benchmarks/*.py; do echo "== $$benchmark"; python "$$benchmark"; done
+
+clean:
+	rm -rf .venv build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Newest versions that fit each other on every supported Python; without it nothing ever changes.
+lock:
+	@$(WORKSPACE) ros
+	@$(PYTHON_IN_VENV) -m pip install -qq uv
+	@: >requirements/lock.txt
+	@.venv/bin/uv pip compile --quiet --universal --python-version 3.10 --annotation-style line \
+	  --custom-compile-command 'make lock' requirements/{runtime,ros,test,lint}.txt -o requirements/lock.txt
+	@sed -i "/sys_platform == 'win32'/d" requirements/lock.txt

@@ -1,0 +1,95 @@
+"""Iterative inverse kinematics: poses that put joints where they should be (KJS 3.2).
+
+Bounded damped Newton on the squared distances of the joints to their targets, with the hard limits and
+the soft prior. The fall-back where the closed form of `interpretation_tree` does not reach: a ray that
+misses its sphere, a violated limit, joints without a closed form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.kinematics import assemble, forward, segment_sums
+from hmt_ros.inference.bounded_newton import Minimum, minimise
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+def solve_joint_positions(
+    body: Body,
+    poses: ArrayLike,
+    targets: ArrayLike,
+    joint_names: Sequence[str] | None = None,
+    *,
+    sigma: ArrayLike = 0.01,
+    prior_weight: float = 1e-3,
+    free_dofs: Sequence[str] | None = None,
+    max_iterations: int = 60,
+) -> Minimum:
+    """Poses nearest to given joint positions, for a batch of N problems.
+
+    Minimises 1/2 sum |joint - target|^2 / sigma^2 + prior_weight / 2 sum ((x - mean) / prior sigma)^2.
+
+    Args:
+        body: the body.
+        poses: (N, d) starts.
+        targets: (N, J', 3) camera frame, m; NaN: this joint does not matter.
+        joint_names: (J',) names of the targets; all joints when None.
+        sigma: standard deviation of the targets, scalar, (J',) or (N, J'), m.
+        prior_weight: weight of the body's soft prior.
+        free_dofs: degrees of freedom that may change; all when None.
+    """
+    skeleton = body.skeleton
+    names = skeleton.joint_names if joint_names is None else tuple(joint_names)
+    which = skeleton.joint_index(names)
+    start = np.array(poses, dtype=np.float64, ndmin=2)
+    goal = np.asarray(targets, dtype=np.float64)
+    if goal.shape != (len(start), len(names), 3):
+        raise ValueError(f'targets have shape {goal.shape}, wanted {(len(start), len(names), 3)}')
+    known = np.isfinite(goal).all(2)
+    weight = np.where(known, np.broadcast_to(np.asarray(sigma) ** -2.0, known.shape), 0.0)
+    goal = np.where(known[..., None], goal, 0.0)
+    precision = prior_weight * np.where(np.isfinite(body.prior_sigma), body.prior_sigma, np.inf) ** -2
+    lower, upper = np.array(body.lower), np.array(body.upper)
+    limits_low, limits_high = np.tile(lower, (len(start), 1)), np.tile(upper, (len(start), 1))
+    if free_dofs is not None:
+        frozen = np.setdiff1d(np.arange(body.dimension), skeleton.dof_index(tuple(free_dofs)))
+        limits_low[:, frozen] = limits_high[:, frozen] = start[:, frozen]
+    segments = np.repeat(skeleton.joint_segments[which], 3)
+    offsets = skeleton.joint_offsets[which]
+    axes = np.tile(np.eye(3), (len(which), 1))
+
+    def energy(x: Array, problem: Index) -> tuple[Array, Array, Array]:
+        frames = forward(skeleton, x)
+        joints = frames.points(skeleton.joint_segments[which], offsets)
+        w = weight[problem].T
+        error = joints - goal[problem].transpose(1, 2, 0)
+        value = 0.5 * np.einsum('jn,jin,jin->n', w, error, error)
+        weights = np.repeat(w, 3, axis=0)
+        gradient, hessian = assemble(
+            frames,
+            *segment_sums(
+                segments,
+                np.repeat(joints, 3, axis=0),
+                np.broadcast_to(axes[:, :, None], (*axes.shape, len(x))),
+                weights * error.reshape(-1, len(x)),
+                weights,
+                len(skeleton.parents),
+            ),
+        )
+        offset = x - body.prior_mean
+        value += 0.5 * (offset * offset) @ precision
+        gradient += offset * precision
+        hessian += np.diag(precision)
+        return value, gradient, hessian
+
+    return minimise(
+        energy, start, limits_low, limits_high,
+        step_scale=np.where(skeleton.dof_is_rotation, 0.5, 0.3),
+        damping=1.0, max_iterations=max_iterations,
+    )  # fmt: skip

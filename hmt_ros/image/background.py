@@ -1,0 +1,109 @@
+"""The person's silhouette by background subtraction, shadows removed.
+
+The background is either a given image of the empty scene or learned from frames in which the person is
+absent or moves. OpenCV's mixture (MOG2) or nearest-neighbour (KNN) model does the per-pixel work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class BackgroundSettings:
+    """How the background is subtracted.
+
+    Attributes:
+        method: 'mog2' or 'knn'.
+        threshold: squared distance, in variances of the background, above which a pixel is foreground.
+        shadow_threshold: a pixel of the background's colour, darkened down to this factor, is shadow.
+        smallest_part: pieces with less than this fraction of the largest one are dropped.
+        largest_gap: pieces further than this from the largest one are dropped, as a fraction of its
+            height.
+    """
+
+    method: str = 'mog2'
+    threshold: float = 20.0
+    shadow_threshold: float = 0.3
+    smallest_part: float = 0.004
+    largest_gap: float = 0.2
+
+    def __post_init__(self) -> None:
+        if self.method not in ('mog2', 'knn'):
+            raise ValueError(f'background method must be mog2 or knn, saw {self.method!r}')
+
+
+class BackgroundModel:
+    """Learns an empty scene and finds what does not belong to it."""
+
+    def __init__(self, settings: BackgroundSettings | None = None) -> None:
+        self.settings = settings or BackgroundSettings()
+        s = self.settings
+        if s.method == 'mog2':
+            self._model = cv2.createBackgroundSubtractorMOG2(varThreshold=s.threshold)
+        else:
+            self._model = cv2.createBackgroundSubtractorKNN(dist2Threshold=20.0 * s.threshold)
+        self._model.setDetectShadows(True)
+        self._model.setShadowThreshold(s.shadow_threshold)
+        self.frames = 0
+
+    @classmethod
+    def from_image(
+        cls, background: Image, settings: BackgroundSettings | None = None
+    ) -> BackgroundModel:
+        """A model of one image of the empty scene, (H, W, 3) uint8."""
+        model = cls(settings)
+        for _ in range(1 if model.settings.method == 'mog2' else 20):
+            model.learn(background)
+        return model
+
+    def learn(self, image: Image) -> None:
+        """Takes one more frame (H, W, 3) of the scene into the model."""
+        self.frames += 1
+        self._model.apply(image, learningRate=1.0 / self.frames)
+
+    def silhouette(self, image: Image) -> Mask:
+        """Foreground (H, W) of an image: the largest piece and what is near it, without shadow.
+
+        Empty where nothing differs from the background. The model does not change.
+
+        Raises:
+            ValueError: no background was learned, or the image has another size.
+        """
+        if self.frames == 0:
+            raise ValueError('no background has been learned: give an image or some frames first')
+        raw = self._model.apply(image, learningRate=0)
+        mask = (raw == 255).astype(np.uint8)
+        mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+        return _pieces_of_one_person(mask, self.settings)
+
+
+def _pieces_of_one_person(mask: Image, settings: BackgroundSettings) -> Mask:
+    """The largest piece of a mask and the pieces that are large enough and near enough to it."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    if count == 1:
+        return np.zeros(mask.shape, dtype=bool)
+    area = stats[1:, cv2.CC_STAT_AREA]
+    main = 1 + int(np.argmax(area))
+    keep = np.zeros(count, dtype=bool)
+    keep[main] = True
+    left, top = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
+    right = left + stats[:, cv2.CC_STAT_WIDTH]
+    bottom = top + stats[:, cv2.CC_STAT_HEIGHT]
+    gap = settings.largest_gap * stats[main, cv2.CC_STAT_HEIGHT]
+    apart_x = np.maximum(left - right[main], left[main] - right)
+    apart_y = np.maximum(top - bottom[main], top[main] - bottom)
+    near = np.maximum(apart_x, apart_y) < gap
+    large = stats[:, cv2.CC_STAT_AREA] >= settings.smallest_part * area.max()
+    keep |= near & large
+    keep[0] = False
+    result: Mask = keep[labels]
+    return result

@@ -1,0 +1,293 @@
+"""Writing a bag that rosbag2 plays: a folder with an MCAP file and its metadata.yaml, whole or not at all.
+
+The bag is written into a hidden folder beside its place and moved there when it is complete and on the
+disk; after an error nothing is left behind. The same calls write the same bytes. Chunks, data and
+summary have checksums. Time is what the caller says, the stamp of the message: log time and publish time
+are the same.
+
+    with BagWriter('out') as bag:
+        bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
+        bag.write('body', stamp_ns, message)
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+from mcap.writer import CompressionType, Writer
+from typing_extensions import Self
+
+from msg_tools.bag_error import BagError, reason
+from msg_tools.bag_metadata import FILE_NAME, VERSION, as_yaml, quality_of_service
+from msg_tools.cdr import serialise
+from msg_tools.typestore import typestore
+
+LIBRARY = 'hmt_ros'
+CHUNK_BYTES = 2**20
+_SUFFIXES = ('.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
+
+
+@dataclass
+class _Topic:
+    name: str
+    msgtype: str
+    channel: int
+    latched: bool
+    message_count: int = 0
+
+
+class BagWriter:
+    """A bag that is open for writing; a context manager, which closes it, or drops it on an error.
+
+    Args:
+        path: folder to write, `<name>`; the file in it is `<name>.mcap`.
+        overwrite: replace a bag that is there. Anything else that is there is never touched.
+
+    Raises:
+        BagError: the folder exists, can not be created or written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        self.path = Path(os.path.abspath(path))
+        self._overwrite = overwrite
+        self._check_target()
+        self._topics: dict[str, _Topic] = {}
+        self._schemas: dict[str, int] = {}
+        self._start: int | None = None
+        self._end = 0
+        self._folder: Path | None = self.path.with_name(
+            f'.{self.path.name}.{secrets.token_hex(4)}.partial'
+        )
+        self._file: BinaryIO | None = None
+        with self._dropping_on_error():
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._folder.mkdir()
+            self._file = (self._folder / self._file_name).open('xb')
+            self._writer = Writer(
+                self._file,
+                chunk_size=CHUNK_BYTES,
+                compression=CompressionType.ZSTD,
+                enable_crcs=True,
+                enable_data_crcs=True,
+            )
+            self._writer.start(profile='ros2', library=LIBRARY)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abort()
+
+    def add_topic(self, name: str, msgtype: str, *, latched: bool = False) -> None:
+        """Announces a topic; one that is written without is not latched.
+
+        Args:
+            name: of the topic.
+            msgtype: for example 'hmt_msgs/msg/PoseMixture'.
+            latched: offered as transient local, so that late subscribers get the last message.
+
+        Raises:
+            BagError: an unknown type, or the topic is there already.
+        """
+        store = typestore()
+        if msgtype not in store.fielddefs:
+            raise BagError(f'{self.path}: topic {name} can not have the unknown type {msgtype!r}')
+        if name in self._topics:
+            raise BagError(f'{self.path}: topic {name} is there already')
+        with self._dropping_on_error():
+            schema = self._schemas.get(msgtype)
+            if schema is None:
+                definition, _ = store.generate_msgdef(msgtype, ros_version=2)
+                schema = self._writer.register_schema(msgtype, 'ros2msg', definition.encode())
+                self._schemas[msgtype] = schema
+            channel = self._writer.register_channel(
+                name,
+                'cdr',
+                schema,
+                {
+                    'offered_qos_profiles': as_yaml(quality_of_service(latched)),
+                    'topic_type_hash': store.hash_rihs01(msgtype),
+                },
+            )
+        self._topics[name] = _Topic(name, msgtype, channel, latched)
+
+    def write(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """Writes a message of `typestore()`; announces its topic where that has not been done.
+
+        Raises:
+            BagError: the topic has another type, a field does not fit the type, the disk is full.
+        """
+        msgtype = message.__msgtype__
+        if topic not in self._topics:
+            self.add_topic(topic, msgtype)
+        if self._topics[topic].msgtype != msgtype:
+            raise BagError(
+                f'{self.path}: topic {topic} has type {self._topics[topic].msgtype}, not {msgtype}'
+            )
+        try:
+            data = serialise(message)
+        except Exception as error:
+            # Generated code of the library, which does not say what it may raise for a wrong field.
+            raise BagError(
+                f'{self.path}: message of {topic} does not fit {msgtype}: {reason(error)}'
+            ) from error
+        self.write_serialised(topic, stamp_ns, data)
+
+    def write_serialised(self, topic: str, stamp_ns: int, data: bytes) -> None:
+        """Writes a message that is CDR bytes already, of a topic that has been announced.
+
+        Raises:
+            BagError: no such topic, a stamp before 1970, the disk is full.
+        """
+        known = self._topics.get(topic)
+        if known is None:
+            raise BagError(f'{self.path}: topic {topic} has not been added')
+        if not 0 <= stamp_ns < 2**63:
+            raise BagError(f'{self.path}: stamp {stamp_ns} ns of a message of {topic} is not a time')
+        with self._dropping_on_error():
+            self._writer.add_message(known.channel, stamp_ns, data, stamp_ns)
+        known.message_count += 1
+        self._start = stamp_ns if self._start is None else min(self._start, stamp_ns)
+        self._end = max(self._end, stamp_ns)
+
+    def close(self) -> None:
+        """Completes the bag and moves it to its place; does nothing when that has been done.
+
+        Raises:
+            BagError: the disk is full, or the place is taken meanwhile; nothing is left behind.
+        """
+        if self._folder is None or self._file is None:
+            return
+        with self._dropping_on_error():
+            information = self._information()
+            self._writer.add_metadata('rosbag2', {'serialized_metadata': as_yaml(information)})
+            self._writer.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            with (self._folder / FILE_NAME).open('x', encoding='utf-8') as file:
+                file.write(as_yaml({'rosbag2_bagfile_information': information}))
+                file.flush()
+                os.fsync(file.fileno())
+            _sync_folder(self._folder)
+            self._move_into_place(self._folder)
+        self._folder = None
+
+    def abort(self) -> None:
+        """Drops everything that was written."""
+        folder, self._folder = self._folder, None
+        if folder is None:
+            return
+        if self._file is not None:
+            # Closing writes what is buffered, and fails again on a full disk: nothing is to be saved.
+            with suppress(OSError):
+                self._file.close()
+        shutil.rmtree(folder, ignore_errors=True)
+
+    @property
+    def _file_name(self) -> str:
+        return f'{self.path.name}.mcap'
+
+    @contextmanager
+    def _dropping_on_error(self) -> Iterator[None]:
+        if self._folder is None:
+            raise BagError(f'{self.path} is closed')
+        try:
+            yield
+        except OSError as error:
+            self.abort()
+            raise BagError(f'{self.path} can not be written: {reason(error)}') from error
+        except BaseException:
+            self.abort()
+            raise
+
+    def _check_target(self) -> None:
+        """The place must be free, or hold a bag that may be replaced."""
+        if not self.path.name:
+            raise BagError(f'{self.path} is not the name of a folder')
+        if not os.path.lexists(self.path):
+            return
+        if not self._overwrite:
+            raise BagError(f'{self.path} exists; give another name, or ask to overwrite it')
+        try:
+            names = sorted(os.listdir(self.path))
+        except OSError as error:
+            raise BagError(f'{self.path} can not be replaced: {reason(error)}') from error
+        foreign = [name for name in names if name != FILE_NAME and not name.endswith(_SUFFIXES)]
+        if self.path.is_symlink() or (names and FILE_NAME not in names) or foreign:
+            what = f'it has {foreign[0]}' if foreign else 'it is not the folder of a bag'
+            raise BagError(f'{self.path} is not replaced: {what}; give another name')
+
+    def _move_into_place(self, folder: Path) -> None:
+        self._check_target()
+        aside = folder.with_suffix('.replaced')
+        replaces = self.path.exists()
+        if replaces:
+            self.path.rename(aside)
+        try:
+            folder.rename(self.path)
+        except BaseException:
+            if replaces:
+                aside.rename(self.path)
+            raise
+        _sync_folder(self.path.parent)
+        if replaces:
+            shutil.rmtree(aside, ignore_errors=True)
+
+    def _information(self) -> dict[str, Any]:
+        """Content of metadata.yaml, as rosbag2 of Jazzy writes it."""
+        start = 2**63 - 1 if self._start is None else self._start
+        span = {
+            'duration': {'nanoseconds': max(0, self._end - start)},
+            'starting_time': {'nanoseconds_since_epoch': start},
+            'message_count': sum(topic.message_count for topic in self._topics.values()),
+        }
+        store = typestore()
+        return {
+            'version': VERSION,
+            'storage_identifier': 'mcap',
+            **span,
+            'topics_with_message_count': [
+                {
+                    'topic_metadata': {
+                        'name': topic.name,
+                        'type': topic.msgtype,
+                        'serialization_format': 'cdr',
+                        'offered_qos_profiles': quality_of_service(topic.latched),
+                        'type_description_hash': store.hash_rihs01(topic.msgtype),
+                    },
+                    'message_count': topic.message_count,
+                }
+                for topic in self._topics.values()
+            ],
+            'compression_format': '',
+            'compression_mode': '',
+            'relative_file_paths': [self._file_name],
+            'files': [{'path': self._file_name, **span}],
+            'custom_data': None,
+            'ros_distro': 'jazzy',
+        }
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,63 @@
+"""Settings that all tests share: a ROS domain of their own, reproducible hypothesis runs."""
+
+from __future__ import annotations
+
+import os
+import socket
+import zlib
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+# Speed is no property of a result: a busy machine must not fail a test.
+settings.register_profile('hmt_ros', deadline=None, derandomize=True)
+settings.load_profile('hmt_ros')
+
+_domain_reservation = pytest.StashKey[socket.socket]()
+
+
+def _reserve_ros_domain() -> tuple[int, socket.socket]:
+    """Number of a ROS domain that no other test run on this machine uses, and what reserves it.
+
+    A domain is taken while port 32768 + domain is bound, as ament's domain_coordinator does it. The
+    search starts at a number derived from the path of the checkout.
+    """
+    start = zlib.crc32(str(Path(__file__).resolve()).encode())
+    for offset in range(100):
+        domain = 1 + (start + offset) % 100
+        reservation = socket.socket()
+        try:
+            reservation.bind(('', 32768 + domain))
+        except OSError:
+            reservation.close()
+        else:
+            return domain, reservation
+    raise RuntimeError('all ROS domains from 1 to 100 are in use by other test runs')
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if hasattr(config, 'workerinput'):
+        return  # of pytest-xdist: it has the environment of the main process
+    domain, config.stash[_domain_reservation] = _reserve_ros_domain()
+    os.environ['ROS_DOMAIN_ID'] = str(domain)
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    reservation = config.stash.get(_domain_reservation, None)
+    if reservation is not None:
+        reservation.close()
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    sourced = 'AMENT_PREFIX_PATH' in os.environ
+    for item in items:
+        if item.get_closest_marker('ros') is None:
+            continue
+        # In one domain every node sees every other: one process runs all these tests, in turn.
+        item.add_marker(pytest.mark.xdist_group('ros'))
+        if not sourced:
+            reason = 'no ROS environment: "make test" or "source tools/environment.bash" first'
+            item.add_marker(pytest.mark.skip(reason=reason))

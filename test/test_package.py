@@ -1,0 +1,229 @@
+"""The shape of the two packages: layers, metadata, and what is installed."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import os
+import runpy
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import pytest
+import setuptools
+
+import hmt_ros
+
+ROOT = Path(__file__).resolve().parents[1]
+HMT_MSGS = ROOT / 'msg_tools' / 'hmt_msgs'
+INTERFACES = sorted([*HMT_MSGS.glob('msg/*.msg'), *HMT_MSGS.glob('srv/*.srv')])
+
+# An import points to the right, never to the left.
+LAYERS = [
+    'hmt_ros.app',
+    'hmt_ros.nodes',
+    'msg_tools',
+    'hmt_ros.tracking',
+    'hmt_ros.smoothing',
+    'hmt_ros.experts',
+    'hmt_ros.image',
+    'hmt_ros.body',
+    'hmt_ros.inference',
+]
+
+
+def modules() -> dict[str, Path]:
+    """Every module of the two Python packages, by name."""
+    found = {}
+    for package in ('hmt_ros', 'msg_tools'):
+        for path in sorted((ROOT / package).rglob('*.py')):
+            parts = path.relative_to(ROOT).with_suffix('').parts
+            found['.'.join(parts).removesuffix('.__init__')] = path
+    return found
+
+
+MODULES = modules()
+
+
+def layer_of(module: str) -> str | None:
+    return next((layer for layer in LAYERS if f'{module}.'.startswith(f'{layer}.')), None)
+
+
+def imported_names(module: str) -> set[str]:
+    """Full names of the modules that a module's text imports, at its top or anywhere in it."""
+    path = MODULES[module]
+    package = module if path.name == '__init__.py' else module.rpartition('.')[0]
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text('utf-8'))):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ''
+            if node.level:
+                above = package.split('.')[: len(package.split('.')) - node.level + 1]
+                base = '.'.join([*above, *filter(None, [base])])
+            names.add(base)
+            names.update(f'{base}.{alias.name}' for alias in node.names)
+    return names
+
+
+@pytest.mark.parametrize('module', [name for name in MODULES if layer_of(name)])
+def test_layers_import_downwards_only(module: str) -> None:
+    own = LAYERS.index(str(layer_of(module)))
+    upwards = {
+        name
+        for name in imported_names(module)
+        if (layer := layer_of(name)) is not None and LAYERS.index(layer) < own
+    }
+    assert upwards == set()
+
+
+def test_every_module_belongs_to_a_layer() -> None:
+    outside = {name for name in MODULES if layer_of(name) is None}
+    assert outside <= {'hmt_ros', 'hmt_ros.__main__'}
+
+
+def test_only_nodes_and_commands_name_rclpy() -> None:
+    users = {
+        layer_of(name)
+        for name in MODULES
+        if any(imported.split('.')[0] == 'rclpy' for imported in imported_names(name))
+    }
+    assert users <= {'hmt_ros.nodes', 'hmt_ros.app'}
+
+
+def test_everything_but_the_nodes_imports_without_ros() -> None:
+    names = [
+        name for name in MODULES if layer_of(name) != 'hmt_ros.nodes' and '__main__' not in name
+    ]
+    program = (
+        'import importlib, sys\n'
+        'for missing in ("rclpy", "hmt_msgs", "std_msgs", "sensor_msgs", "geometry_msgs"):\n'
+        '    sys.modules[missing] = None\n'
+        'for name in sys.argv[1:]:\n'
+        '    importlib.import_module(name)\n'
+        'print(len(sys.argv) - 1)\n'
+    )
+    result = subprocess.run(
+        [sys.executable, '-c', program, *names],
+        cwd=ROOT,
+        env={'PATH': os.environ['PATH']},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert int(result.stdout) == len(names)
+
+
+def test_every_folder_of_modules_is_a_package() -> None:
+    folders = {path.parent for path in MODULES.values()}
+    assert [folder for folder in folders if not (folder / '__init__.py').is_file()] == []
+
+
+@pytest.fixture(scope='module')
+def setup_arguments() -> dict[str, Any]:
+    """What setup.py hands to setuptools."""
+    arguments: dict[str, Any] = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(setuptools, 'setup', lambda **given: arguments.update(given))
+        patch.chdir(ROOT)
+        runpy.run_path('setup.py', run_name='__main__')
+    return arguments
+
+
+def xml(path: Path) -> ElementTree.Element:
+    return ElementTree.parse(path).getroot()
+
+
+def test_versions_agree(setup_arguments: dict[str, Any]) -> None:
+    assert setup_arguments['version'] == hmt_ros.__version__
+    assert xml(ROOT / 'package.xml').findtext('version') == hmt_ros.__version__
+    assert xml(HMT_MSGS / 'package.xml').findtext('version') == hmt_ros.__version__
+
+
+def test_tests_are_found_by_colcon(setup_arguments: dict[str, Any]) -> None:
+    # colcon runs pytest where it sees it among the extras; with tests_require it runs nothing.
+    assert 'pytest' in setup_arguments['extras_require']['test']
+    assert 'tests_require' not in setup_arguments
+
+
+def test_dependencies_of_package_xml_cover_the_message_packages_used() -> None:
+    root = xml(ROOT / 'package.xml')
+    declared = {element.text for element in root.iter() if element.tag.endswith('depend')}
+    used = {
+        name.split('.')[0]
+        for module in MODULES
+        for name in imported_names(module)
+        if name.split('.')[0].endswith('_msgs') or name.split('.')[0] == 'rclpy'
+    }
+    assert used <= declared
+
+
+def test_every_interface_is_generated() -> None:
+    text = (HMT_MSGS / 'CMakeLists.txt').read_text('utf-8')
+    listed = {word for word in text.split() if word.endswith(('.msg', '.srv'))}
+    assert listed == {str(path.relative_to(HMT_MSGS)) for path in INTERFACES}
+
+
+def test_package_data_covers_every_data_file(setup_arguments: dict[str, Any]) -> None:
+    for package, patterns in setup_arguments['package_data'].items():
+        for path in (ROOT / package).rglob('*'):
+            name = str(path.relative_to(ROOT / package))
+            if path.suffix in {'.yaml', '.msg', '.srv', '.npz', '.html', '.js', '.css'}:
+                assert any(fnmatch(name, pattern) for pattern in patterns), name
+
+
+def test_entry_points_exist(setup_arguments: dict[str, Any]) -> None:
+    for line in setup_arguments['entry_points']['console_scripts']:
+        module, _, function = line.split('=')[1].strip().partition(':')
+        tree = ast.parse(MODULES[module].read_text('utf-8'))
+        assert function in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+
+
+def test_changelog_can_be_released() -> None:
+    changelog = pytest.importorskip('catkin_pkg.changelog')
+    parsed = changelog.get_changelog_from_path(str(ROOT / 'CHANGELOG.rst'), 'hmt_ros')
+    versions = [version for version, _, _ in parsed.foreach_version()]
+    assert str(versions[0]) in {'Forthcoming', hmt_ros.__version__}
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('path', INTERFACES, ids=lambda path: path.stem)
+def test_generated_interface_imports(path: Path) -> None:
+    kind = path.parent.name
+    generated = getattr(importlib.import_module(f'hmt_msgs.{kind}'), path.stem)
+    definition = path.read_text('utf-8')
+    if kind == 'srv':
+        generated, definition = generated.Request, definition.partition('---')[0]
+    lines = [line.split('#')[0].split() for line in definition.splitlines()]
+    fields = [words[1] for words in lines if len(words) == 2 and '=' not in words[1]]
+    assert list(generated.get_fields_and_field_types()) == fields
+
+
+@pytest.mark.ros
+def test_executables_are_installed(setup_arguments: dict[str, Any]) -> None:
+    index = importlib.import_module('ament_index_python')
+    folder = Path(index.get_package_prefix('hmt_ros')) / 'lib' / 'hmt_ros'
+    for line in setup_arguments['entry_points']['console_scripts']:
+        executable = folder / line.split('=')[0].strip()
+        assert os.access(executable, os.X_OK), executable
+
+
+@pytest.mark.ros
+def test_data_files_are_installed() -> None:
+    index = importlib.import_module('ament_index_python')
+    prefix = Path(index.get_package_prefix('hmt_ros'))
+    assert (prefix / 'share' / 'hmt_ros' / 'package.xml').is_file()
+    site = next(prefix.rglob('msg_tools/__init__.py')).parents[1]
+    for package in ('hmt_ros', 'msg_tools'):
+        sources = {
+            path.relative_to(ROOT)
+            for suffix in ('yaml', 'msg', 'srv')
+            for path in (ROOT / package).rglob(f'*.{suffix}')
+        }
+        assert {path for path in sources if not (site / path).is_file()} == set()

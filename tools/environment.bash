@@ -1,0 +1,17 @@
+# The environment in which the built packages run; to be sourced, after "make setup":
+#
+#     source tools/environment.bash
+#
+# It does for .venv what /opt/ros/jazzy/setup.bash does for a ROS installation, and then sources
+# install/. What another ROS installation has put into this shell is set aside.
+
+_root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+unset PYTHONPATH LD_LIBRARY_PATH COLCON_PREFIX_PATH
+export VIRTUAL_ENV=$_root/.venv
+export AMENT_PREFIX_PATH=$VIRTUAL_ENV CMAKE_PREFIX_PATH=$VIRTUAL_ENV
+export PATH=$VIRTUAL_ENV/bin:$PATH
+export ROS_DISTRO=jazzy ROS_VERSION=2 ROS_PYTHON_VERSION=3
+source "$_root/install/local_setup.bash"
+# Nothing leaves this machine unless it is wanted.
+export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
+unset _root

