@@ -1,4 +1,4 @@
-# make demo   renders, tracks and reports one clip     make lint   ruff and mypy
+# make demo   tracks the person of a bag in bags/      make lint   ruff and mypy
 # make test   all tests                                make bench  the benchmarks
 # make setup  the workspace alone                      make clean  back to the state of a clone
 #
@@ -6,7 +6,7 @@
 # once. See CONTRIBUTING.md.
 
 SHELL := /bin/bash
-.SHELLFLAGS := -eu -o pipefail -c
+.SHELLFLAGS := -e -o pipefail -c
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test lint bench clean lock
 
@@ -18,6 +18,7 @@ WORKSPACE := tools/workspace.sh
 PYTHON_IN_VENV := .venv/bin/python
 SOURCED := source tools/environment.bash &&
 TEST_PROCESSES ?= 2
+DEMO_BAG ?= $(patsubst %/metadata.yaml,%,$(firstword $(wildcard bags/*/metadata.yaml)))
 
 help:
 	@sed -n 's/^# \{0,1\}//p; /^$$/q' Makefile
@@ -27,11 +28,14 @@ setup:
 
 demo:
 	@$(WORKSPACE) ros build
-	@$(SOURCED) python -m hmt_ros demo
+	@rm -rf build/demo && mkdir -p build/demo
+	@$(SOURCED) python -m hmt_ros replay $(DEMO_BAG) -o build/demo/$(notdir $(DEMO_BAG)) \
+	  $(addprefix --subject ,$(wildcard $(DEMO_BAG)/subject.yaml)) \
+	  $(addprefix --background ,$(wildcard $(DEMO_BAG)/background.png))
 
 test:
 	@$(WORKSPACE) ros test build
-	@$(SOURCED) python -m pytest -n $(TEST_PROCESSES) --dist loadgroup --cov $(ARGS)
+	@$(SOURCED) python -m pytest -n $(TEST_PROCESSES) --dist loadgroup --cov --cov-report term $(ARGS)
 
 lint:
 	@$(WORKSPACE) ros lint
@@ -41,7 +45,7 @@ lint:
 
 bench:
 	@$(WORKSPACE) ros test build
-	@$(SOURCED) for benchmark in benchmarks/*.py; do echo "== $$benchmark"; python "$$benchmark"; done
+	@shopt -s nullglob; $(SOURCED) for benchmark in benchmarks/*.py; do echo "== $$benchmark"; python "$$benchmark"; done
 
 clean:
 	rm -rf .venv build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info

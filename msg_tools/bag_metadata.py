@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -40,8 +39,10 @@ def read_file_names(folder: Path) -> list[str]:
         if isinstance(error, BagError):
             raise
         raise BagError(f'{path} is not YAML: {reason(error)}') from error
-    information = document.get('rosbag2_bagfile_information') if _is_map(document) else None
-    if not _is_map(information):
+    information = None
+    if isinstance(document, dict):
+        information = document.get('rosbag2_bagfile_information')
+    if not isinstance(information, dict):
         raise BagError(f'{path} has no rosbag2_bagfile_information: it is not that of a bag')
     names = information.get('relative_file_paths')
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -50,10 +51,6 @@ def read_file_names(folder: Path) -> list[str]:
         raise BagError(f'{path} names no file: the bag is empty')
     # The first versions wrote the paths relative to the parent of the folder.
     return [PurePosixPath(name).name for name in names]
-
-
-def _is_map(value: object) -> bool:
-    return isinstance(value, Mapping)
 
 
 def quality_of_service(latched: bool) -> list[dict[str, Any]]:

@@ -1,8 +1,8 @@
 """Reading a bag: a folder of rosbag2, a single .mcap or .db3 file, also compressed with zstd.
 
-Messages come in the order of their log times, whatever the order in the files, the same every time; of
-equal times in the order of the files. Memory holds the chunks of the present time, never a whole file.
-Everything that is wrong with a bag is a `BagError` of one line.
+Messages come in the order of their log times, whatever the order in the files, the same every time;
+of equal times in the order of the files. Memory holds the chunks of the present time, never a whole
+file. Everything that is wrong with a bag is a `BagError` of one line.
 
     with BagReader('walk') as bag:
         topic = bag.find_topic(['sensor_msgs/msg/CompressedImage'])
@@ -23,11 +23,11 @@ from types import TracebackType
 from typing import Any
 
 from rosbags.typesys.store import Typestore
-from typing_extensions import Self
 
 from msg_tools import sqlite_file
 from msg_tools.bag_error import BagError, reason
 from msg_tools.bag_metadata import read_file_names
+from msg_tools.cdr import deserialise
 from msg_tools.decompression import (
     ZSTD_MAGIC,
     DecompressionError,
@@ -133,7 +133,7 @@ class BagReader:
             self._scratch.cleanup()
             self._scratch = None
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> BagReader:
         return self
 
     def __exit__(
@@ -208,8 +208,8 @@ class BagReader:
             topics: names, with or without leading slash; None for all.
 
         Raises:
-            BagError: no such topic, a topic that is not CDR or of two types; where the bag is damaged,
-                after the messages before the damage.
+            BagError: no such topic, a topic that is not CDR or of two types; where the bag is
+                damaged, after the messages before the damage.
         """
         if topics is None:
             return self._merged(lambda channel: True)
@@ -230,7 +230,9 @@ class BagReader:
     def _merged(self, wanted: Callable[[Channel], bool]) -> Iterator[BagMessage]:
         sources = [
             # A file without messages comes last: all it can do is to report its damage.
-            Source(_NEVER if file.start is None else file.start, order, partial(file.messages, wanted))
+            Source(
+                _NEVER if file.start is None else file.start, order, partial(file.messages, wanted)
+            )
             for order, file in enumerate(self._files)
         ]
         for time, stored in merge(sources):
@@ -261,7 +263,7 @@ class BagReader:
             # Bags with the compression mode "message". No CDR message starts like this.
             if data[:4] == ZSTD_MAGIC:
                 data = memoryview(decompress_zstd(data))
-            return store.deserialize_cdr(data, stored.msgtype)
+            return deserialise(data, stored.msgtype, store)
         except Exception as error:
             # Bytes from outside meet generated code here, which does not say what it may raise.
             raise BagError(
@@ -327,7 +329,8 @@ class BagReader:
         """The content of a zstd file, as a file that lives as long as the reader."""
         if self._scratch is None:
             self._scratch = tempfile.TemporaryDirectory(prefix='bag_reader.')
-        target = Path(self._scratch.name) / f'{len(os.listdir(self._scratch.name))}'
+        folder = Path(self._scratch.name)
+        target = folder / str(sum(1 for _ in folder.iterdir()))
         with path.open('rb') as compressed, target.open('wb') as plain:
             for piece in decompress_file(compressed):
                 plain.write(piece)
@@ -338,5 +341,3 @@ def _full_name(msgtype: str) -> str:
     """Name of a type with its middle part, which older recorders left out."""
     package, slash, name = msgtype.partition('/')
     return f'{package}/msg/{name}' if slash and '/' not in name else msgtype
-
-

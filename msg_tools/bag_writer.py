@@ -1,9 +1,9 @@
-"""Writing a bag that rosbag2 plays: a folder with an MCAP file and its metadata.yaml, whole or not at all.
+"""Writing a bag that rosbag2 plays: a folder with an MCAP file and its metadata, or nothing at all.
 
-The bag is written into a hidden folder beside its place and moved there when it is complete and on the
-disk; after an error nothing is left behind. The same calls write the same bytes. Chunks, data and
-summary have checksums. Time is what the caller says, the stamp of the message: log time and publish time
-are the same.
+The bag is written into a hidden folder beside its place and moved there when it is complete and on
+the disk; after an error nothing is left behind. The same calls write the same bytes. Chunks, data
+and summary have checksums. Time is what the caller says, the stamp of the message: log time and
+publish time are the same.
 
     with BagWriter('out') as bag:
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
@@ -23,7 +23,6 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
-from typing_extensions import Self
 
 from msg_tools.bag_error import BagError, reason
 from msg_tools.bag_metadata import FILE_NAME, VERSION, as_yaml, quality_of_service
@@ -56,7 +55,7 @@ class BagWriter:
     """
 
     def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        self.path = Path(os.path.abspath(path))
+        self.path = Path(path).absolute()
         self._overwrite = overwrite
         self._check_target()
         self._topics: dict[str, _Topic] = {}
@@ -80,7 +79,7 @@ class BagWriter:
             )
             self._writer.start(profile='ros2', library=LIBRARY)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> BagWriter:
         return self
 
     def __exit__(
@@ -159,7 +158,9 @@ class BagWriter:
         if known is None:
             raise BagError(f'{self.path}: topic {topic} has not been added')
         if not 0 <= stamp_ns < 2**63:
-            raise BagError(f'{self.path}: stamp {stamp_ns} ns of a message of {topic} is not a time')
+            raise BagError(
+                f'{self.path}: stamp {stamp_ns} ns of a message of {topic} is not a time'
+            )
         with self._dropping_on_error():
             self._writer.add_message(known.channel, stamp_ns, data, stamp_ns)
         known.message_count += 1
@@ -177,7 +178,7 @@ class BagWriter:
         with self._dropping_on_error():
             information = self._information()
             self._writer.add_metadata('rosbag2', {'serialized_metadata': as_yaml(information)})
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call]
             self._file.flush()
             os.fsync(self._file.fileno())
             self._file.close()
@@ -195,7 +196,8 @@ class BagWriter:
         if folder is None:
             return
         if self._file is not None:
-            # Closing writes what is buffered, and fails again on a full disk: nothing is to be saved.
+            # Closing writes what is buffered, and fails again on a full disk: nothing is to be
+            # saved.
             with suppress(OSError):
                 self._file.close()
         shutil.rmtree(folder, ignore_errors=True)
@@ -219,14 +221,14 @@ class BagWriter:
 
     def _check_target(self) -> None:
         """The place must be free, or hold a bag that may be replaced."""
-        if not self.path.name:
+        if self.path.name in ('', '..'):
             raise BagError(f'{self.path} is not the name of a folder')
         if not os.path.lexists(self.path):
             return
         if not self._overwrite:
             raise BagError(f'{self.path} exists; give another name, or ask to overwrite it')
         try:
-            names = sorted(os.listdir(self.path))
+            names = sorted(path.name for path in self.path.iterdir())
         except OSError as error:
             raise BagError(f'{self.path} can not be replaced: {reason(error)}') from error
         foreign = [name for name in names if name != FILE_NAME and not name.endswith(_SUFFIXES)]

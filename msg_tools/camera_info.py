@@ -1,8 +1,8 @@
 """sensor_msgs/CameraInfo to a camera and back.
 
-The calibration in the message is that of the full sensor. The picture may be a part of it (roi), and that
-part may be binned: a pixel u of the sensor lies at (u - roi.x_offset) / binning_x in the picture, the
-convention of image_geometry.
+The calibration in the message is that of the full sensor. The picture may be a part of it (roi),
+and that part may be binned: a pixel u of the sensor lies at (u - roi.x_offset) / binning_x in the
+picture, the convention of image_geometry.
 """
 
 from __future__ import annotations
@@ -10,9 +10,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from hmt_ros.body import Camera
 from msg_tools.headers import header_message
 from msg_tools.message_factory import MessageFactory
+
+# Number of coefficients that stand for no distortion.
+_COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 
 
 class CameraInfoError(ValueError):
@@ -27,8 +32,8 @@ def camera_from_info(message: Any, image_size: tuple[int, int] | None = None) ->
         image_size: (width, height) of a picture that it has to fit, px.
 
     Raises:
-        CameraInfoError: not calibrated, values that are not finite or do not fit each other, an unknown
-            distortion model.
+        CameraInfoError: not calibrated, values that are not finite or do not fit each other, an
+            unknown distortion model.
     """
     k = [float(value) for value in message.k]
     d = [float(value) for value in message.d]
@@ -75,8 +80,10 @@ def _distortion(model: str, coefficients: list[float]) -> tuple[str, tuple[float
     if not any(coefficients):
         if model not in ('', 'plumb_bob', 'rational_polynomial', 'equidistant'):
             raise CameraInfoError(f'camera info: unknown distortion model {model!r}')
-        # An equidistant lens without coefficients is still no pinhole.
-        return ('equidistant', (0.0,) * 4) if model == 'equidistant' else ('plumb_bob', ())
+        if model == 'equidistant':
+            # Without coefficients it is a perfect fisheye, not a pinhole.
+            raise CameraInfoError('camera info: equidistant without coefficients is not supported')
+        return 'plumb_bob', ()
     if model == '':
         raise CameraInfoError(
             f'camera info: D has {len(coefficients)} coefficients, but no distortion model'

@@ -1,12 +1,13 @@
 """Pictures of sensor_msgs/Image and sensor_msgs/CompressedImage as arrays, and back.
 
-A decoded picture is always BGR, uint8, (H, W, 3), contiguous and writable. Messages of `rosbags` and of
-ROS will both do: the data may be any buffer of bytes.
+A decoded picture is always BGR, uint8, (H, W, 3), contiguous and writable. Messages of `rosbags`
+and of ROS will both do: the data may be any buffer of bytes.
 """
 
 from __future__ import annotations
 
 import struct
+import zlib
 from typing import Any
 
 import cv2
@@ -21,13 +22,20 @@ Picture = NDArray[np.uint8]
 # Larger pictures are taken for damage, before memory is spent on them.
 MAX_PIXELS = 2**26
 
+_PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
+
+# What compression can do at its best: JPEG spends one bit on each block of 8x8 pixels, deflate one
+# byte on 1032, which in PNG may be 8 pixels each.
+_JPEG_PIXELS_PER_BYTE = 512
+_PNG_PIXELS_PER_BYTE = 8 * 1032
+
 
 class ImageError(ValueError):
     """A picture that can not be decoded, in one line: what was seen and what was wanted."""
 
 
-# Encoding: (dtype, channels, conversion to BGR or None). The names of OpenCV for Bayer patterns are those
-# of the second row, second column: its BG is rggb.
+# Encoding: (dtype, channels, conversion to BGR or None). The names of OpenCV for Bayer patterns are
+# those of the second row, second column: its BG is rggb.
 _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     'mono8': ('u1', 1, cv2.COLOR_GRAY2BGR),
     '8UC1': ('u1', 1, cv2.COLOR_GRAY2BGR),
@@ -87,24 +95,24 @@ def _decode_raw(message: Any) -> Picture:
         )
     dtype, channels, conversion = _ENCODINGS[encoding]
     _check_size(width, height)
-    if encoding in _EVEN_WIDTH and width % 2 or encoding in _PLANAR and height % 2:
+    if (encoding in _EVEN_WIDTH and width % 2) or (encoding in _PLANAR and height % 2):
         raise ImageError(f'image of {width}x{height} can not be {encoding}, wanted even sizes')
     row_bytes = width * channels * np.dtype(dtype).itemsize
     if step < row_bytes:
-        raise ImageError(f'image step is {step}, wanted at least {row_bytes} for {width} {encoding}')
+        raise ImageError(
+            f'image step is {step}, wanted at least {row_bytes} for {width} {encoding}'
+        )
     rows = height * 3 // 2 if encoding in _PLANAR else height
     data = _bytes_of(message.data)
     if len(data) != rows * step:
         raise ImageError(
             f'image has {len(data)} bytes, wanted {rows * step}: {rows} rows with a step of {step}'
         )
-    pixels = np.ascontiguousarray(data.reshape(rows, step)[:, :row_bytes])
+    image: NDArray[Any]
+    image = pixels = np.ascontiguousarray(data.reshape(rows, step)[:, :row_bytes])
     if dtype == 'u2':
-        words = pixels.view('>u2' if message.is_bigendian else '<u2')
-        shape = (height, width, channels) if channels > 1 else (height, width)
-        image = words.astype(np.uint16).reshape(shape)
-    else:
-        image = pixels.reshape((rows, width, channels) if channels > 1 else (rows, width))
+        image = pixels.view('>u2' if message.is_bigendian else '<u2').astype(np.uint16)
+    image = image.reshape((rows, width, channels) if channels > 1 else (rows, width))
     try:
         if conversion is not None:
             image = cv2.cvtColor(image, conversion)
@@ -123,13 +131,19 @@ def _decode_compressed(message: Any) -> Picture:
         raise ImageError(f'compressed image has format {form!r}: depth, wanted a picture')
     if content.startswith(b'\xff\xd8\xff'):
         width, height = _jpeg_size(content)
-    elif content.startswith(b'\x89PNG\r\n\x1a\n'):
+        densest = _JPEG_PIXELS_PER_BYTE
+    elif content.startswith(_PNG_SIGNATURE):
         width, height = _png_size(content)
+        densest = _PNG_PIXELS_PER_BYTE
     else:
         raise ImageError(
             f'compressed image of format {form!r} starts with {content[:4]!r}, wanted jpeg or png'
         )
     _check_size(width, height)
+    if width * height > densest * len(content):
+        raise ImageError(
+            f'compressed image of {len(content)} bytes can not have a size of {width}x{height}'
+        )
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(data, flags)
@@ -149,19 +163,27 @@ def _check_size(width: int, height: int) -> None:
 
 def _bytes_of(data: Any) -> Picture:
     try:
-        return np.frombuffer(data, dtype=np.uint8)
+        # numpy takes no empty buffer.
+        return np.frombuffer(data, dtype=np.uint8) if len(data) else np.zeros(0, dtype=np.uint8)
     except (TypeError, ValueError) as error:
-        if isinstance(data, bytes | bytearray | memoryview) or hasattr(data, '__len__'):
-            if len(data) == 0:
-                return np.zeros(0, dtype=np.uint8)
         raise ImageError(f'image data is a {type(data).__name__}, wanted bytes') from error
 
 
 def _png_size(content: bytes) -> tuple[int, int]:
-    # Signature, then the header as first chunk: length, "IHDR", width, height.
-    if len(content) < 24 or content[12:16] != b'IHDR' or b'IEND' not in content[-1024:]:
-        raise ImageError(f'png of {len(content)} bytes breaks off')
-    width, height = struct.unpack('>II', content[16:24])
+    """Width and height of a file whose chunks are whole; OpenCV believes any length of a chunk."""
+    at = len(_PNG_SIGNATURE)
+    kind = b''
+    while kind != b'IEND':
+        length = int.from_bytes(content[at : at + 4], 'big')
+        kind = content[at + 4 : at + 8]
+        end = at + 12 + length
+        first = at == len(_PNG_SIGNATURE)
+        if end > len(content) or (first and (kind, length) != (b'IHDR', 13)):
+            raise ImageError(f'png of {len(content)} bytes breaks off or is damaged')
+        if zlib.crc32(content[at + 4 : end - 4]) != int.from_bytes(content[end - 4 : end], 'big'):
+            raise ImageError(f'png of {len(content)} bytes is damaged: a checksum differs')
+        at = end
+    width, height = struct.unpack_from('>II', content, len(_PNG_SIGNATURE) + 8)
     return int(width), int(height)
 
 
@@ -170,7 +192,7 @@ _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int]:
-    """Width and height, once it is sure that the file has its end: a decoder fills up what is missing."""
+    """Width and height of a file that has its end; a decoder would make up what is missing."""
     size: tuple[int, int] | None = None
     at = 2
     while at + 4 <= len(content) and content[at] == 0xFF:

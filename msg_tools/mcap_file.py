@@ -1,21 +1,22 @@
 """One MCAP file, read in log-time order, believing nothing that has not been checked.
 
-Written against the MCAP specification, version 0 (https://mcap.dev/spec). The reader of `rosbags` wants
-the profile `ros2` and an index or sorted messages; the one of `mcap` allocates whatever a length field
-says, takes short reads for data and loads a file without index whole. So the framing is done here:
+Written against the MCAP specification, version 0 (https://mcap.dev/spec). The reader of `rosbags`
+wants the profile `ros2` and an index or sorted messages, and passes some damage by; the one of
+`mcap` wants all channels in the summary, takes short reads for data and loads a file without index
+whole. So the framing is done here:
 
-- A pass over the record headers finds the chunks and the bare messages. The index at the end of the file
-  is not needed, so a recording that was cut off reads like any other, up to where it breaks.
-- No length is believed beyond the file or `MAX_BYTES`. Memory holds the chunks that overlap in time.
-- Checksums of chunks, of the data section and of the summary are compared where the file has them, and
-  the number of messages with the file's own statistics.
+- A pass over the record headers finds the chunks and the bare messages. The index at the end of the
+  file is not needed, so a recording that was cut off reads like any other, up to where it breaks.
+- No length is believed beyond the file or `MAX_BYTES`. Memory holds the chunks that overlap in
+  time.
+- Checksums of chunks, of the data section and of the summary are compared where the file has them,
+  and the number of messages with the file's own statistics.
 - Damage is raised as `BagError` once the messages before it are out.
 """
 
 from __future__ import annotations
 
 import os
-import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -24,38 +25,33 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from msg_tools.bag_error import BagError, reason
-from msg_tools.decompression import MAX_BYTES, PIECE_BYTES, DecompressionError, decompress
+from msg_tools.decompression import DecompressionError, decompress
+from msg_tools.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_HEAD,
+    DATA_END,
+    FOOTER,
+    HEADER,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    RECORD,
+    SCHEMA,
+    STATISTICS,
+    DamageError,
+    Fields,
+    checksum_of,
+    read_exactly,
+    record_head,
+)
 from msg_tools.stored_message import Channel, StoredMessage
 from msg_tools.time_order import Source, merge
 
-MAGIC = b'\x89MCAP0\r\n'
-
 # Bare messages, outside of chunks, are read together up to this size.
 RUN_BYTES = 2**20
-# Records other than chunks and messages are small; a larger one is damage.
-SMALL_RECORD_BYTES = 2**24
 # Chunks that overlap in time have to be in memory together.
 MAX_OPEN_BYTES = 2**30
-
-_RECORD = struct.Struct('<BQ')
-_MESSAGE_HEAD = struct.Struct('<HIQQ')
-_CHUNK_HEAD = struct.Struct('<QQQI')
-_U16 = struct.Struct('<H')
-_U32 = struct.Struct('<I')
-_U64 = struct.Struct('<Q')
-
-_HEADER = 1
-_FOOTER = 2
-_SCHEMA = 3
-_CHANNEL = 4
-_MESSAGE = 5
-_CHUNK = 6
-_STATISTICS = 11
-_DATA_END = 15
-
-
-class _Damage(Exception):
-    """What is wrong; the public methods add which bag, and raise BagError."""
 
 
 class _Block(NamedTuple):
@@ -138,7 +134,7 @@ class McapFile:
                 self._check_whole(progress)
         except OSError as error:
             raise BagError(f'{self._name} can not be read: {reason(error)}') from error
-        except _Damage as damage:
+        except DamageError as damage:
             raise BagError(
                 f'{self._name} {damage}; `mcap recover` makes a bag of what is whole'
             ) from None
@@ -154,17 +150,17 @@ class McapFile:
             known = dict(self._schemas), dict(self._channels)
             try:
                 self._statistics = self._scan_summary(file, offset, size)
-            except _Damage:
+            except DamageError:
                 self._schemas, self._channels = known
                 raise
-        except _Damage as damage:
+        except DamageError as damage:
             self.damage = str(damage)
 
     def _check_magic(self, magic: bytes, size: int) -> None:
         if magic == MAGIC:
             return
         if size == 0:
-            raise BagError(f'{self._name} is an empty file, wanted an MCAP recording')
+            raise BagError(f'{self._name} is empty, wanted an MCAP recording')
         if magic == MAGIC[:size]:
             raise BagError(f'{self._name} breaks off after {size} bytes, nothing can be read')
         raise BagError(
@@ -176,14 +172,14 @@ class McapFile:
         offset = len(MAGIC)
         run: _Block | None = None
         while True:
-            opcode, length = _record_head(file, offset, size)
-            body = offset + _RECORD.size
-            if (opcode == _HEADER) != (offset == len(MAGIC)):
-                raise _Damage(f'is damaged at byte {offset}: record of type {opcode}')
-            if opcode == _MESSAGE:
-                key, _, time, _ = _MESSAGE_HEAD.unpack(_exactly(file, _MESSAGE_HEAD.size))
+            opcode, length = record_head(file, offset, size)
+            body = offset + RECORD.size
+            if (opcode == HEADER) != (offset == len(MAGIC)):
+                raise DamageError(f'is damaged at byte {offset}: record of type {opcode}')
+            if opcode == MESSAGE:
+                key, _, time, _ = MESSAGE_HEAD.unpack(read_exactly(file, MESSAGE_HEAD.size))
                 self._bare_counts[key] += 1
-                bytes_here = _RECORD.size + length
+                bytes_here = RECORD.size + length
                 if run and run.offset + run.size == offset and run.size < RUN_BYTES:
                     run = _Block(
                         min(run.start, time), max(run.end, time), run.offset, run.size + bytes_here,
@@ -193,16 +189,16 @@ class McapFile:
                 else:
                     run = _Block(time, time, offset, bytes_here, is_chunk=False)
                     self._blocks.append(run)
-            elif opcode == _CHUNK:
-                start, end, _, _ = _CHUNK_HEAD.unpack(_exactly(file, _CHUNK_HEAD.size))
+            elif opcode == CHUNK:
+                start, end, _, _ = CHUNK_HEAD.unpack(read_exactly(file, CHUNK_HEAD.size))
                 self._blocks.append(_Block(start, end, body, length, is_chunk=True))
-            elif opcode in (_SCHEMA, _CHANNEL):
-                self._register(opcode, _exactly(file, length), offset)
-            elif opcode == _DATA_END:
-                fields = _Fields(_exactly(file, length), offset)
+            elif opcode in (SCHEMA, CHANNEL):
+                self._register(opcode, read_exactly(file, length), offset)
+            elif opcode == DATA_END:
+                fields = Fields(read_exactly(file, length), offset)
                 self._data_checksum = offset, fields.u32()
                 return body + length
-            elif opcode == _FOOTER:
+            elif opcode == FOOTER:
                 return offset
             offset = file.seek(body + length)
 
@@ -211,23 +207,23 @@ class McapFile:
         statistics: Counter[int] | None = None
         offset = file.seek(start)
         while True:
-            opcode, length = _record_head(file, offset, size)
-            end = offset + _RECORD.size + length
-            if opcode in (_SCHEMA, _CHANNEL):
-                self._register(opcode, _exactly(file, length), offset)
-            elif opcode == _STATISTICS:
-                statistics = _Fields(_exactly(file, length), offset).statistics()
-            elif opcode == _FOOTER:
-                fields = _Fields(_exactly(file, length), offset)
+            opcode, length = record_head(file, offset, size)
+            end = offset + RECORD.size + length
+            if opcode in (SCHEMA, CHANNEL):
+                self._register(opcode, read_exactly(file, length), offset)
+            elif opcode == STATISTICS:
+                statistics = Fields(read_exactly(file, length), offset).statistics()
+            elif opcode == FOOTER:
+                fields = Fields(read_exactly(file, length), offset)
                 fields.skip(16)
                 checksum = fields.u32()
                 if file.read(len(MAGIC)) != MAGIC:
-                    raise _Damage(f'is damaged at byte {end}: the mark of its end is missing')
+                    raise DamageError(f'is damaged at byte {end}: the mark of its end is missing')
                 if end + len(MAGIC) != size:
-                    raise _Damage(f'has {size - end - len(MAGIC)} bytes after its end')
-                checked = offset + _RECORD.size + 16
-                if checksum and _checksum(file, start, checked) != checksum:
-                    raise _Damage('is damaged: the checksum of its summary differs')
+                    raise DamageError(f'has {size - end - len(MAGIC)} bytes after its end')
+                checked = offset + RECORD.size + 16
+                if checksum and checksum_of(file, start, checked) != checksum:
+                    raise DamageError('is damaged: the checksum of its summary differs')
                 return statistics
             offset = file.seek(end)
 
@@ -242,7 +238,7 @@ class McapFile:
                 try:
                     records = self._load(block, file)
                     counts.update(key for _, key, _ in self._messages_in(records, block))
-                except _Damage as damage:
+                except DamageError as damage:
                     self._blocks = self._blocks[:index]
                     self.damage = str(damage)
                     break
@@ -266,13 +262,13 @@ class McapFile:
             progress.seen[key] += 1
             channel = channels.get(key) or self._channel(key)
             if channel is None:
-                raise _Damage(
+                raise DamageError(
                     f'is damaged in the chunk at byte {block.offset}: message of channel {key}, '
                     'which is not described'
                 )
             channels[key] = channel
             if time < block.start:
-                raise _Damage(
+                raise DamageError(
                     f'is damaged in the chunk at byte {block.offset}: it starts at {block.start} '
                     f'ns, but has a message of {time} ns'
                 )
@@ -285,18 +281,18 @@ class McapFile:
     def _load(self, block: _Block, file: BinaryIO) -> memoryview:
         """Records of a block, decompressed and compared with the checksum of the chunk."""
         file.seek(block.offset)
-        data = _exactly(file, block.size)
+        data = read_exactly(file, block.size)
         if not block.is_chunk:
             return memoryview(data)
-        fields = _Fields(data, block.offset)
-        _, _, size, checksum = _CHUNK_HEAD.unpack(fields.take(_CHUNK_HEAD.size))
+        fields = Fields(data, block.offset)
+        _, _, size, checksum = CHUNK_HEAD.unpack(fields.take(CHUNK_HEAD.size))
         compression = fields.text()
         try:
             data = decompress(fields.take(fields.u64()), compression, size)
         except DecompressionError as error:
-            raise _Damage(f'is damaged in the chunk at byte {block.offset}: {error}') from None
+            raise DamageError(f'is damaged in the chunk at byte {block.offset}: {error}') from None
         if checksum and zlib.crc32(data) != checksum:
-            raise _Damage(
+            raise DamageError(
                 f'is damaged in the chunk at byte {block.offset}: its checksum differs'
             )
         return memoryview(data)
@@ -308,32 +304,32 @@ class McapFile:
         place = f'the chunk at byte {block.offset}'
         offset = 0
         while offset < len(data):
-            body = offset + _RECORD.size
+            body = offset + RECORD.size
             if body > len(data):
-                raise _Damage(f'is damaged in {place}: a record breaks off')
-            opcode, length = _RECORD.unpack_from(data, offset)
+                raise DamageError(f'is damaged in {place}: a record breaks off')
+            opcode, length = RECORD.unpack_from(data, offset)
             offset = body + length
             if offset > len(data):
-                raise _Damage(f'is damaged in {place}: a record breaks off')
-            if opcode == _MESSAGE:
-                if length < _MESSAGE_HEAD.size:
-                    raise _Damage(f'is damaged in {place}: a message has {length} bytes')
-                key, _, time, _ = _MESSAGE_HEAD.unpack_from(data, body)
-                yield time, key, data[body + _MESSAGE_HEAD.size : offset]
-            elif opcode in (_SCHEMA, _CHANNEL):
+                raise DamageError(f'is damaged in {place}: a record breaks off')
+            if opcode == MESSAGE:
+                if length < MESSAGE_HEAD.size:
+                    raise DamageError(f'is damaged in {place}: a message has {length} bytes')
+                key, _, time, _ = MESSAGE_HEAD.unpack_from(data, body)
+                yield time, key, data[body + MESSAGE_HEAD.size : offset]
+            elif opcode in (SCHEMA, CHANNEL):
                 self._register(opcode, data[body:offset], block.offset)
 
     def _register(self, opcode: int, body: bytes | memoryview, offset: int) -> None:
-        fields = _Fields(body, offset)
+        fields = Fields(body, offset)
         key = fields.u16()
-        if opcode == _SCHEMA:
+        if opcode == SCHEMA:
             schema = fields.text(), fields.text(), fields.block()
             if self._schemas.setdefault(key, schema) != schema:
-                raise _Damage(f'is damaged at byte {offset}: schema {key} is given twice')
+                raise DamageError(f'is damaged at byte {offset}: schema {key} is given twice')
             return
         channel = fields.u16(), fields.text(), fields.text()
         if self._channels.setdefault(key, channel) != channel:
-            raise _Damage(f'is damaged at byte {offset}: channel {key} is given twice')
+            raise DamageError(f'is damaged at byte {offset}: channel {key} is given twice')
 
     def _channel(self, key: int) -> Channel | None:
         """A channel, None as long as it or its schema has not been met."""
@@ -346,110 +342,13 @@ class McapFile:
 
     def _check_whole(self, progress: _Pass) -> None:
         if self.damage is not None:
-            raise _Damage(self.damage)
+            raise DamageError(self.damage)
         if self._statistics is not None and +self._statistics != progress.seen:
-            raise _Damage(
+            raise DamageError(
                 f'is damaged: {progress.seen.total()} messages were found, '
                 f'its statistics say {self._statistics.total()}'
             )
         if self._data_checksum is not None:
             end, checksum = self._data_checksum
-            if checksum and _checksum(progress.file, 0, end) != checksum:
-                raise _Damage('is damaged: the checksum of its data differs')
-
-
-class _Fields:
-    """Fields of a record, in turn; nothing is read beyond its end."""
-
-    def __init__(self, body: bytes | memoryview, offset: int) -> None:
-        self._body = memoryview(body)
-        self._at = 0
-        self._offset = offset
-
-    def take(self, count: int) -> memoryview:
-        result = self._body[self._at : self._at + count]
-        if len(result) != count:
-            raise _Damage(f'is damaged at byte {self._offset}: a record breaks off')
-        self._at += count
-        return result
-
-    def skip(self, count: int) -> None:
-        self.take(count)
-
-    def u16(self) -> int:
-        value: int = _U16.unpack(self.take(2))[0]
-        return value
-
-    def u32(self) -> int:
-        value: int = _U32.unpack(self.take(4))[0]
-        return value
-
-    def u64(self) -> int:
-        value: int = _U64.unpack(self.take(8))[0]
-        return value
-
-    def block(self) -> bytes:
-        return bytes(self.take(self.u32()))
-
-    def text(self) -> str:
-        try:
-            return self.block().decode()
-        except UnicodeDecodeError:
-            raise _Damage(f'is damaged at byte {self._offset}: a name is not UTF-8') from None
-
-    def statistics(self) -> Counter[int]:
-        self.skip(42)
-        entries = _Fields(self.block(), self._offset)
-        counts: Counter[int] = Counter()
-        while entries._at < len(entries._body):
-            key = entries.u16()
-            counts[key] += entries.u64()
-        return counts
-
-
-def _record_head(file: BinaryIO, offset: int, size: int) -> tuple[int, int]:
-    """Type and length of the record at `offset`, which lies in the file whole."""
-    if offset == size:
-        raise _Damage(f'breaks off after {size} bytes: its end is missing')
-    if offset + _RECORD.size > size:
-        raise _Damage(f'breaks off after {size} bytes, inside a record')
-    opcode: int
-    length: int
-    opcode, length = _RECORD.unpack(_exactly(file, _RECORD.size))
-    if opcode == 0:
-        raise _Damage(f'is damaged at byte {offset}: record of type 0')
-    if opcode in (_MESSAGE, _CHUNK):
-        smallest = _MESSAGE_HEAD.size if opcode == _MESSAGE else _CHUNK_HEAD.size
-        largest = MAX_BYTES
-    else:
-        smallest = 0
-        largest = SMALL_RECORD_BYTES if opcode in _READ_WHOLE else size
-    if not smallest <= length <= largest:
-        raise _Damage(
-            f'is damaged at byte {offset}: record of type {opcode} with {length} bytes'
-        )
-    if offset + _RECORD.size + length > size:
-        raise _Damage(
-            f'breaks off after {size} bytes: the record at byte {offset} has {length} bytes'
-        )
-    return opcode, length
-
-
-_READ_WHOLE = (_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _STATISTICS, _DATA_END)
-
-
-def _exactly(file: BinaryIO, count: int) -> bytes:
-    data = file.read(count)
-    if len(data) != count:
-        raise _Damage('became shorter while it was read')
-    return data
-
-
-def _checksum(file: BinaryIO, start: int, end: int) -> int:
-    file.seek(start)
-    checksum = 0
-    while start < end:
-        piece = _exactly(file, min(PIECE_BYTES, end - start))
-        checksum = zlib.crc32(piece, checksum)
-        start += len(piece)
-    return checksum
+            if checksum and checksum_of(progress.file, 0, end) != checksum:
+                raise DamageError('is damaged: the checksum of its data differs')

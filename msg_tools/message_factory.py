@@ -1,8 +1,8 @@
 """One way to make messages, for the two families of message classes.
 
-Offline work has the classes of `rosbags`, whose arrays are numpy arrays and whose fields all have to be
-given; a node has the classes that ROS generates, whose sequences are `array.array`. The functions that
-turn arrays into messages take a `MessageFactory` and work for both.
+Offline work has the classes of `rosbags`, whose arrays are numpy arrays and whose fields all have
+to be given; a node has the classes that ROS generates, whose sequences are `array.array`. The
+functions that turn arrays into messages take a `MessageFactory` and work for both.
 """
 
 from __future__ import annotations
@@ -33,6 +33,11 @@ class RosbagsMessages:
     """Messages of `typestore()`, for bags and everything else without ROS."""
 
     def create(self, msgtype: str, **fields: Any) -> Any:
+        """See `MessageFactory.create`.
+
+        Raises:
+            TypeError: a field that the type does not have.
+        """
         defaults = _defaults(msgtype)
         unknown = fields.keys() - defaults.keys()
         if unknown:
@@ -65,10 +70,18 @@ class GeneratedMessages:
         }
 
     def create(self, msgtype: str, **fields: Any) -> Any:
+        """See `MessageFactory.create`.
+
+        Raises:
+            KeyError: a type whose class was not handed over.
+        """
         kinds = self._kinds[msgtype]
         for name, value in fields.items():
-            if isinstance(value, np.ndarray) and kinds[name].startswith('sequence<'):
-                fields[name] = _sequence(value, kinds[name])
+            kind = kinds.get(name, '')
+            if isinstance(value, np.ndarray) and kind.startswith('sequence<'):
+                fields[name] = _sequence(value, kind)
+            elif kind == 'octet' and isinstance(value, int):
+                fields[name] = bytes([value])
         return self._classes[msgtype](**fields)
 
 
@@ -105,7 +118,7 @@ def _defaults(msgtype: str) -> dict[str, tuple[Callable[[], Any], str | None]]:
         elif kind == Nodetype.BASE:
             result[name] = _ZEROS.get(str(detail[0]), int), None
         else:
-            (element_kind, element), length = detail  # type: ignore[misc]
+            element_kind, element, length = _element(detail)
             count = length if kind == Nodetype.ARRAY else 0
             if element_kind == Nodetype.NAME:
                 result[name] = _list_default(_message_default(str(element)), count), None
@@ -117,6 +130,12 @@ def _defaults(msgtype: str) -> dict[str, tuple[Callable[[], Any], str | None]]:
     if msgtype == 'geometry_msgs/msg/Quaternion':
         result['w'] = (lambda: 1.0), None
     return result
+
+
+def _element(detail: Any) -> tuple[Any, Any, int]:
+    """Kind and type of the elements of an array, and its length."""
+    (kind, element), length = detail
+    return kind, element, int(length)
 
 
 def _message_default(msgtype: str) -> Callable[[], Any]:

@@ -75,7 +75,9 @@ class SqliteFile:
             with closing(self._connect()) as database:
                 for key, time, data in database.execute(query, keys):
                     if not isinstance(time, int) or not isinstance(data, bytes):
-                        raise BagError(f'{self._name} is damaged: a message at {time!r} has no data')
+                        raise BagError(
+                            f'{self._name} is damaged: a message at {time!r} has no data'
+                        )
                     yield time, StoredMessage(self._channels[key], memoryview(data))
         except sqlite3.Error as error:
             raise BagError(f'{self._name} is damaged: {reason(error)}') from error

@@ -32,7 +32,7 @@ def merge(sources: Iterable[Source]) -> Iterator[Timed]:
     waiting = deque(sorted(sources, key=lambda source: (source.start, source.order)))
     heads: list[tuple[int, int, Timed, Iterator[Timed]]] = []
     while waiting or heads:
-        while waiting and (not heads or waiting[0].start <= heads[0][0]):
+        while waiting and (not heads or waiting[0][:2] < heads[0][:2]):
             source = waiting.popleft()
             stream = source.open()
             for head in stream:

@@ -6,6 +6,7 @@ them, and this module the classes that `rosbags` serialises.
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING
@@ -16,6 +17,9 @@ from rosbags.typesys.store import Typestore
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import Typesdict
 
+# Stands before each of the IDL files that a bag strings together.
+_IDL_HEADER = re.compile(r'^={80}\nIDL: .*\n', re.MULTILINE)
+
 # What ROS 2 makes of a message without fields.
 _NO_FIELDS = 'uint8 structure_needs_at_least_one_member'
 
@@ -25,7 +29,8 @@ def typestore() -> Typestore:
     """All types that the project reads and writes; the same object every time."""
     store = get_typestore(Stores.ROS2_JAZZY)
     types: Typesdict = {}
-    for file in (resources.files('msg_tools') / 'hmt_msgs' / 'msg').iterdir():
+    folder = resources.files('msg_tools') / 'hmt_msgs' / 'msg'
+    for file in sorted(folder.iterdir(), key=lambda file: file.name):
         if file.name.endswith('.msg'):
             name = f'hmt_msgs/msg/{file.name.removesuffix(".msg")}'
             types.update(get_types_from_msg(file.read_text('utf-8'), name))
@@ -50,6 +55,8 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
     Raises:
         ValueError: the type is not known and the definition can not be understood.
     """
+    if not msgtype:
+        raise ValueError('the bag does not tell the type')
     known = typestore()
     types: Typesdict = {}
     if encoding == 'ros2msg' and not definition.strip() and msgtype not in known.fielddefs:
@@ -59,7 +66,9 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
             if encoding == 'ros2msg':
                 types = get_types_from_msg(definition, msgtype)
             elif encoding == 'ros2idl':
-                types = get_types_from_idl(definition)
+                for part in _IDL_HEADER.split(definition):
+                    if part.strip():
+                        types.update(get_types_from_idl(part))
         except Exception as error:
             # The parser meets any text here, and does not say what it may raise.
             if msgtype not in known.fielddefs:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import subprocess
@@ -135,13 +136,16 @@ def test_rclpy_reads_what_rosbags_writes() -> None:
     assert_same(mixture, deserialize_message(bytes(through_rosbags), PoseMixture))
 
 
-def test_type_hash_of_tf_is_that_of_ros() -> None:
-    # Jazzy's tf2_msgs/msg/TFMessage: whoever listens to /tf refuses another hash.
-    from tf2_msgs.msg import TFMessage
+def test_tf_message_has_the_type_hash_of_a_ros_installation() -> None:
+    # A listener to /tf elsewhere takes no message of another hash.
+    import ament_index_python
 
-    assert TFMessage.get_fields_and_field_types() == {
-        'transforms': 'sequence<geometry_msgs/TransformStamped>'
-    }
+    share = Path(ament_index_python.get_package_share_directory('tf2_msgs'))
+    description = json.loads((share / 'msg' / 'TFMessage.json').read_text('utf-8'))
+    hashes = {entry['type_name']: entry['hash_string'] for entry in description['type_hashes']}
+    assert hashes['tf2_msgs/msg/TFMessage'] == (
+        'RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087'
+    )
 
 
 if __name__ == '__main__':

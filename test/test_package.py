@@ -8,7 +8,7 @@ import os
 import runpy
 import subprocess
 import sys
-import xml.etree.ElementTree as ElementTree
+import xml.etree.ElementTree as ET
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -136,8 +136,8 @@ def setup_arguments() -> dict[str, Any]:
     return arguments
 
 
-def xml(path: Path) -> ElementTree.Element:
-    return ElementTree.parse(path).getroot()
+def xml(path: Path) -> ET.Element:
+    return ET.parse(path).getroot()
 
 
 def test_versions_agree(setup_arguments: dict[str, Any]) -> None:
@@ -152,15 +152,11 @@ def test_tests_are_found_by_colcon(setup_arguments: dict[str, Any]) -> None:
     assert 'tests_require' not in setup_arguments
 
 
-def test_dependencies_of_package_xml_cover_the_message_packages_used() -> None:
+def test_dependencies_of_package_xml_cover_the_ros_packages_used() -> None:
     root = xml(ROOT / 'package.xml')
     declared = {element.text for element in root.iter() if element.tag.endswith('depend')}
-    used = {
-        name.split('.')[0]
-        for module in MODULES
-        for name in imported_names(module)
-        if name.split('.')[0].endswith('_msgs') or name.split('.')[0] == 'rclpy'
-    }
+    imported = {name.split('.')[0] for module in MODULES for name in imported_names(module)}
+    used = {name for name in imported if name.endswith(('_msgs', '_interfaces')) or name == 'rclpy'}
     assert used <= declared
 
 
@@ -185,11 +181,19 @@ def test_entry_points_exist(setup_arguments: dict[str, Any]) -> None:
         assert function in {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
 
 
-def test_changelog_can_be_released() -> None:
+@pytest.mark.filterwarnings('ignore:.*traverse:DeprecationWarning')
+def test_changelog_can_be_released(tmp_path: Path) -> None:
     changelog = pytest.importorskip('catkin_pkg.changelog')
-    parsed = changelog.get_changelog_from_path(str(ROOT / 'CHANGELOG.rst'), 'hmt_ros')
-    versions = [version for version, _, _ in parsed.foreach_version()]
-    assert str(versions[0]) in {'Forthcoming', hmt_ros.__version__}
+    version = hmt_ros.__version__
+    text = (ROOT / 'CHANGELOG.rst').read_text('utf-8')
+    # What catkin_prepare_release does with the section of the changes to come.
+    released = text.replace(
+        'Forthcoming\n-----------\n', f'{version} (2000-01-01)\n------------------\n'
+    )
+    path = tmp_path / 'CHANGELOG.rst'
+    path.write_text(released, 'utf-8')
+    parsed = changelog.get_changelog_from_path(str(path), 'hmt_ros')
+    assert len(parsed.get_content_of_version(version)) > 0
 
 
 @pytest.mark.ros

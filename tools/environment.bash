@@ -6,7 +6,7 @@
 # install/. What another ROS installation has put into this shell is set aside.
 
 _root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
-unset PYTHONPATH LD_LIBRARY_PATH COLCON_PREFIX_PATH
+unset PYTHONPATH PYTHONHOME LD_LIBRARY_PATH COLCON_PREFIX_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
 export VIRTUAL_ENV=$_root/.venv
 export AMENT_PREFIX_PATH=$VIRTUAL_ENV CMAKE_PREFIX_PATH=$VIRTUAL_ENV
 export PATH=$VIRTUAL_ENV/bin:$PATH

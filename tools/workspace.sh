@@ -21,13 +21,25 @@ stamps=$venv/stamps
 unfinished=$venv/unfinished
 headers=$venv/python-headers
 
+# What another ROS installation or virtual environment has put into this shell has no say here.
+unset PYTHONPATH PYTHONHOME LD_LIBRARY_PATH COLCON_PREFIX_PATH ROS_DISTRO
+unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
 say() { printf 'hmt_ros: %s\n' "$*" >&2; }
+
+# Ends with one line that says what is wrong; its exit code marks the fault as explained.
+explained=78
 fail() {
   say "$*"
-  exit 1
+  exit $explained
 }
 
-trap 'say "the set-up stopped (tools/workspace.sh, line $LINENO); the next call takes it up again"' ERR
+explain_exit() {
+  local code=$?
+  [ $code -eq 0 ] || [ $code -eq $explained ] ||
+    say 'the set-up stopped before its end; the next call takes it up again'
+}
+trap explain_exit EXIT
 
 # ---- What has to be there already: each is asked for before anything long starts ----
 
@@ -41,9 +53,12 @@ choose_python() {
       return
     fi
   done
-  local seen
+  local seen version package='python3 python3-venv'
   seen=$("${PYTHON:-python3}" --version 2>&1 | tail -n 1) || seen="no working ${PYTHON:-python3}"
-  fail "CPython 3.10 to 3.13 is needed, found: $seen. Try: sudo apt install python3 python3-venv" \
+  for version in 3.10 3.11 3.13 3.12; do
+    apt-cache show "python$version-venv" >/dev/null 2>&1 && package=python$version-venv
+  done
+  fail "CPython 3.10 to 3.13 is needed, found: $seen. Try: sudo apt install $package" \
     "(or name one: make PYTHON=/path/to/python3.12)"
 }
 
@@ -96,19 +111,27 @@ checksum() { { printf '%s\n' "$@" && xargs -r -d '\n' sha256sum; } | sha256sum |
 
 done_already() { [ "$(cat "$stamps/$1" 2>/dev/null)" = "$2" ] && [ ! -e "$unfinished" ]; }
 
+# Without byte-compiling what is never imported: a third of the time.
 install() {
-  "$venv/bin/python" -m pip -qq --disable-pip-version-check --no-input install "$@"
+  "$venv/bin/python" -m pip -qq --disable-pip-version-check --no-input install --no-compile "$@"
+}
+
+# Whether .venv works and, where PYTHON names an interpreter, was made with that one.
+venv_is_usable() {
+  local identity='import sys; print(sys.version, sys.base_prefix)' own
+  own=$("$venv/bin/python" -c "$identity" 2>/dev/null) || return
+  [ -z "${PYTHON:-}" ] || [ "$("$PYTHON" -c "$identity" 2>/dev/null)" = "$own" ]
 }
 
 stage_ros() {
   local key
   key=$(printf '%s\n' requirements/{lock,ros,runtime}.txt tools/workspace.sh \
-    tools/tf2_msgs/{package.xml,CMakeLists.txt,msg/*} | checksum "$root" "${PYTHON:-}")
-  done_already ros "$key" && "$venv/bin/python" -c '' 2>/dev/null && return
+    tools/tf2_msgs/{package.xml,CMakeLists.txt,msg/*} | checksum "$root")
+  done_already ros "$key" && venv_is_usable && return
   check_prerequisites
   # From scratch: a package that was half installed, or is not asked for any more, can not stay.
   rm -rf "$venv" build install log
-  say "making .venv with $("$python" --version), ROS 2 Jazzy and all it needs, once (minutes, 1.4 GB)"
+  say "making .venv with $("$python" --version), ROS 2 Jazzy and all it needs, once (minutes, 1 GB)"
   "$python" -m venv "$venv"
   touch "$unfinished"
   unpack_python_headers
@@ -133,7 +156,8 @@ repair_exported_include_paths() {
 
 # The wheels have no tf2_msgs, which every ROS installation has: it becomes part of .venv.
 build_tf2_msgs() {
-  colcon_build .venv/tf2_msgs --base-paths tools/tf2_msgs --merge-install --install-base "$venv"
+  colcon_build .venv/build --base-paths tools/tf2_msgs --merge-install --install-base "$venv"
+  rm -r .venv/build .venv/log
 }
 
 stage_test() { stage_requirements test; }
@@ -172,7 +196,6 @@ colcon_build() {
   fi
   output=$(
     export VIRTUAL_ENV=$venv PATH=$venv/bin:$PATH AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv
-    unset PYTHONPATH LD_LIBRARY_PATH COLCON_PREFIX_PATH ROS_DISTRO
     colcon --log-base "$(dirname "$build_base")/log" build --build-base "$build_base" "$@" \
       --event-handlers console_cohesion+ console_start_end- console_stderr- status- \
       desktop_notification- --cmake-args "${cmake_args[@]}" 2>&1

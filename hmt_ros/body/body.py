@@ -84,7 +84,7 @@ class Body:
     widths: tuple[float, ...] = field(default=())
 
     def __post_init__(self) -> None:
-        if not self.widths:
+        if not self.widths and self.shapes:
             object.__setattr__(self, 'widths', (1.0,) * len(self.shapes))
         if len(self.widths) != len(self.shapes):
             raise ValueError(f'{len(self.widths)} widths for {len(self.shapes)} parts')
@@ -127,9 +127,7 @@ class Body:
     @property
     def segment_lengths(self) -> dict[str, float]:
         """Lengths by name, m."""
-        return dict(
-            zip(self.skeleton.length_names, map(float, self.skeleton.lengths), strict=True)
-        )
+        return dict(zip(self.skeleton.length_names, map(float, self.skeleton.lengths), strict=True))
 
     @property
     def stature(self) -> float:
@@ -182,6 +180,15 @@ class Body:
     def with_widths(self, widths: Sequence[float]) -> Body:
         """The same body with other factors on the x and y radii of its parts."""
         return replace(self, widths=tuple(float(x) for x in widths))
+
+    def only_parts(self, parts: Sequence[int]) -> Body:
+        """The same skeleton with some parts of the flesh only."""
+        kept = list(parts)
+        return replace(
+            self,
+            shapes=tuple(self.shapes[i] for i in kept),
+            widths=tuple(self.widths[i] for i in kept),
+        )
 
     def _sum_of(self, lengths: Array) -> float:
         names = self.skeleton.length_names

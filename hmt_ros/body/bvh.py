@@ -76,7 +76,7 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
                 started, words = True, words[1:]
             elif key in {'ROOT', 'JOINT', 'END'} and pending is None:
                 pending = _opened(path, i + 1, words, joints, stack)
-                words = ['{'] if '{' in words else []
+                words = words[words.index('{') :] if '{' in words else []
             elif word == '{' and pending is not None:
                 stack.append(len(joints))
                 joints.append(pending)
@@ -85,9 +85,8 @@ def _hierarchy(path: Path, lines: list[str]) -> tuple[list[_Joint], int]:
                 _closed(path, i + 1, joints[stack.pop()])
                 words = words[1:]
             elif key == 'OFFSET' and stack and pending is None:
-                cut = words.index('}') if '}' in words else len(words)
-                joints[stack[-1]].offset = numbers(path, i + 1, words[1:cut], 3, 'OFFSET')
-                words = words[cut:]
+                joints[stack[-1]].offset = numbers(path, i + 1, words[1:4], 3, 'OFFSET')
+                words = words[4:]
             elif key == 'CHANNELS' and stack and pending is None:
                 words = _channels(path, i + 1, words, joints[stack[-1]])
             elif key == 'MOTION' and joints and not stack and pending is None:
@@ -157,7 +156,7 @@ def _motion(path: Path, lines: list[str], at: int, count: int) -> tuple[Array, f
         label, _, value = seen.partition(':')
         if ' '.join(label.lower().split()) != key.lower()[:-1]:
             raise MotionFileError(path, line, f'saw {seen.strip()[:60]!r}, wanted {key}')
-        number = float(numbers(path, line, value.split(), 1, key)[0])
+        number = float(numbers(path, line, value.split(), 1, key[:-1])[0])
         if key == 'Frames:':
             frames = int(number)
             if frames != number or frames < 1:
@@ -200,7 +199,7 @@ def _rig(path: Path, joints: list[_Joint], values: Array) -> tuple[Rig, Array]:
     at = 0
     names: set[str] = set()
     for i, joint in enumerate(joints):
-        if joint.name in names:
+        if joint.name in names and not joint.is_tip:
             raise MotionFileError(path, joint.line, f'a second joint {joint.name!r}, wanted one')
         names.add(joint.name)
         parent = place.get(joint.parent, -1)

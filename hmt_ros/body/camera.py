@@ -66,7 +66,11 @@ class Camera:
             raise ValueError(f'focal lengths must be positive, saw {self.fx} and {self.fy}')
         if self.width < 1 or self.height < 1:
             raise ValueError(f'image size must be positive, saw {self.width} x {self.height}')
-        object.__setattr__(self, 'distortion', coefficients if any(coefficients) else ())
+        # Only the fisheye lens bends rays with all of its coefficients at zero.
+        bends = any(coefficients) or self.distortion_model == 'equidistant'
+        if bends and not coefficients:
+            coefficients = (0.0,) * max(counts)
+        object.__setattr__(self, 'distortion', coefficients if bends else ())
 
     @property
     def matrix(self) -> Array:

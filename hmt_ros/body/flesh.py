@@ -72,9 +72,9 @@ class Superquadric:
             ],
             axis=1,
         )
-        lateral = np.stack(
-            [_signed_power(cos, 2 - e2), _signed_power(sin, 2 - e2)], axis=1
-        ) / ring.radius
+        lateral = (
+            np.stack([_signed_power(cos, 2 - e2), _signed_power(sin, 2 - e2)], axis=1) / ring.radius
+        )
         along = -(ring.slope * np.stack([cos * cos, sin * sin], axis=1)).sum(1) - (
             lateral * ring.lean
         ).sum(1)
@@ -223,7 +223,7 @@ def occluding_contour(flesh: Flesh, frames: Frames) -> Contour:
         g(w) = 1 + U_x C'(w) + U_y S'(w) - u_z (k_x cos^2 w + k_y sin^2 w) = 0,
 
     with U = (u - u_z lean) / radius, k the slopes, C' and S' the signed powers 2 - e2. With one slope
-    and e2 = 1 it is solved in closed form; elsewhere three Newton steps follow.
+    and e2 = 1 it is solved in closed form, elsewhere by bracketing.
     """
     ring, segments = flesh.rings, flesh.ring_segments
     columns, origins = frames.columns[segments], frames.origins[segments]
@@ -233,16 +233,15 @@ def occluding_contour(flesh: Flesh, frames: Frames) -> Contour:
     radius, slope, lean = ring.radius[:, :, None], ring.slope[:, :, None], ring.lean[:, :, None]
     big_u = (u[:, :2] - uz[:, None] * lean) / radius
     length = np.hypot(big_u[:, 0], big_u[:, 1])
-    k = 1.0 - uz * 0.5 * (slope[:, 0] + slope[:, 1])
-    cosine = -k / np.maximum(length, 1e-12)
+    cosine = -(1.0 - uz * slope[:, 0]) / np.maximum(length, 1e-12)
     exists = np.abs(cosine) < 1.0
     middle = np.arctan2(big_u[:, 1], big_u[:, 0])
     half = np.arccos(np.clip(cosine, -1.0, 1.0))
     w = np.stack([middle + half, middle - half])  # (2, R, N)
     general = np.flatnonzero((ring.exponent != 1.0) | (ring.slope[:, 0] != ring.slope[:, 1]))
     if len(general):
-        w[:, general] = _refine_angles(
-            w[:, general], big_u[general], uz[general], ring, general
+        w[:, general], exists[general] = _bracketed_angles(
+            big_u[general], uz[general], ring.slope[general], ring.exponent[general]
         )
     cos, sin = np.cos(w), np.sin(w)
     e2 = ring.exponent[:, None]
@@ -271,21 +270,39 @@ def occluding_contour(flesh: Flesh, frames: Frames) -> Contour:
     )
 
 
-def _refine_angles(w: Array, big_u: Array, uz: Array, ring: Rings, rows: Index) -> Array:
-    """Newton steps on g(w) = 0, kept within a quarter of a radian each."""
-    e = 2.0 - ring.exponent[rows][:, None]
-    kx, ky = ring.slope[rows].T[:, :, None]
-    for _ in range(3):
+def _bracketed_angles(
+    big_u: Array, uz: Array, slopes: Array, exponent: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """The two roots w (2, R, N) of g, and where there are two, by bracketing and false position."""
+    power = (2.0 - exponent)[:, None]
+    kx, ky = slopes.T[:, :, None]
+
+    def g(w: Array) -> Array:
         cos, sin = np.cos(w), np.sin(w)
-        ax, ay = np.abs(cos), np.abs(sin)
-        px, py = ax ** (e - 1.0), ay ** (e - 1.0)
-        value = 1 + big_u[:, 0] * cos * px + big_u[:, 1] * sin * py
-        value -= uz * (kx * cos * cos + ky * sin * sin)
-        slope = e * (-big_u[:, 0] * px * sin + big_u[:, 1] * py * cos)
-        slope -= uz * 2 * (ky - kx) * sin * cos
-        slope = np.where(np.abs(slope) > 1e-9, slope, 1e-9)
-        w = w - np.clip(value / slope, -0.25, 0.25)
-    return w
+        result: Array = 1 + big_u[:, 0] * _signed_power(cos, power)
+        result += big_u[:, 1] * _signed_power(sin, power)
+        return result - uz * (kx * cos * cos + ky * sin * sin)
+
+    steps = 48
+    grid = np.linspace(-np.pi, np.pi, steps + 1)
+    values = np.stack([g(np.full_like(uz, w)) for w in grid])
+    positive = values > 0
+    roots = []
+    exists = np.ones(uz.shape, dtype=bool)
+    for change in (~positive[:-1] & positive[1:], positive[:-1] & ~positive[1:]):
+        exists &= change.any(0)
+        k = change.argmax(0)
+        low, high = grid[k], grid[k + 1]
+        at_low = np.take_along_axis(values, k[None], 0)[0]
+        at_high = np.take_along_axis(values, k[None] + 1, 0)[0]
+        for _ in range(16):  # Illinois: false position that never stalls at one end
+            w = low - at_low * (high - low) / np.where(at_high != at_low, at_high - at_low, 1.0)
+            at = g(w)
+            same = (at > 0) == (at_high > 0)
+            low, at_low = np.where(same, low, high), np.where(same, 0.5 * at_low, at_high)
+            high, at_high = w, at
+        roots.append(w)
+    return np.stack(roots), exists
 
 
 def _signed_power(x: Array, exponent: Array | float) -> Array:
@@ -309,8 +326,6 @@ def _mesh(parts: Sequence[Superquadric], stacks: int, slices: int) -> Mesh:
         k = (j + 1) % slices
         body += [(first, j, k), (last, last - 2 - slices + 1 + k, last - 2 - slices + 1 + j)]
     triangles = np.array(body)
-    # s runs against z: counter-clockwise in (s, w) is clockwise from outside.
-    triangles = triangles[:, ::-1]
     vertices, normals, segments, part_of, faces = [], [], [], [], []
     for i, part in enumerate(parts):
         point, normal = part.surface(grid_s, grid_w)

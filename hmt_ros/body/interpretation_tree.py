@@ -137,8 +137,13 @@ def _links(skeleton: Skeleton, name: str) -> tuple[_Link, ...]:
         own = list(dofs)
         result.append(
             _Link(
-                s, skeleton.parents[s], skeleton.mounts[s], float(-end[2]), dofs,
-                skeleton.lower[own], skeleton.upper[own],
+                s,
+                skeleton.parents[s],
+                skeleton.mounts[s],
+                float(-end[2]),
+                dofs,
+                skeleton.lower[own],
+                skeleton.upper[own],
             )  # fmt: skip
         )
     return tuple(result)
@@ -157,9 +162,7 @@ def _leaves(
     return angles, valid
 
 
-def _positions(
-    frames: Frames, links: tuple[_Link, ...]
-) -> tuple[list[Array], NDArray[np.bool_]]:
+def _positions(frames: Frames, links: tuple[_Link, ...]) -> tuple[list[Array], NDArray[np.bool_]]:
     """Joint positions after 0, 1, ... links, (2^k, 3, N) each, and which of the last exist."""
     start = frames.origins[links[0].segment]
     result = [start[None]]
@@ -235,9 +238,7 @@ def _joint_angles(
     return angles, valid
 
 
-def _two_angles(
-    v: Array, given: Array, link: _Link
-) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _two_angles(v: Array, given: Array, link: _Link) -> tuple[Array, Array, NDArray[np.bool_]]:
     """a and b of v = (sin b, -sin a cos b, cos a cos b), within the limits and nearest the given."""
     b_first = np.arcsin(np.clip(v[:, 0], -1.0, 1.0))
     best: tuple[Array, Array, NDArray[np.bool_]] | None = None

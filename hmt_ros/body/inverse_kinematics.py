@@ -54,7 +54,9 @@ def solve_joint_positions(
     known = np.isfinite(goal).all(2)
     weight = np.where(known, np.broadcast_to(np.asarray(sigma) ** -2.0, known.shape), 0.0)
     goal = np.where(known[..., None], goal, 0.0)
-    precision = prior_weight * np.where(np.isfinite(body.prior_sigma), body.prior_sigma, np.inf) ** -2
+    precision = (
+        prior_weight * np.where(np.isfinite(body.prior_sigma), body.prior_sigma, np.inf) ** -2
+    )
     lower, upper = np.array(body.lower), np.array(body.upper)
     limits_low, limits_high = np.tile(lower, (len(start), 1)), np.tile(upper, (len(start), 1))
     if free_dofs is not None:

@@ -135,9 +135,11 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
                 columns[where, i] = cq * a + sq * b
                 columns[where, j] = cq * b - sq * a
             else:
-                along = np.eye(3)[axis][None, :, None] if parents is None else columns[
-                    step.parents, axis
-                ]
+                along = (
+                    np.eye(3)[axis][None, :, None]
+                    if parents is None
+                    else columns[step.parents, axis]
+                )
                 axes[dofs] = along
                 origins[where] += along * q[dofs][:, None]
     rotational = skeleton.dof_is_rotation

@@ -24,7 +24,9 @@ LARGEST_FILE = 1_000_000  # bytes; a body is a few kB
 def model_names() -> list[str]:
     """Names of the bodies that ship with the package."""
     folder = resources.files('hmt_ros.body') / 'models'
-    return sorted(f.name.removesuffix('.yaml') for f in folder.iterdir() if f.name.endswith('.yaml'))
+    return sorted(
+        f.name.removesuffix('.yaml') for f in folder.iterdir() if f.name.endswith('.yaml')
+    )
 
 
 def read_body(source: str | Path) -> Body:
@@ -42,10 +44,13 @@ def read_body(source: str | Path) -> Body:
         ) from fault
     except (ValueError, yaml.YAMLError) as fault:
         text = ' '.join(str(fault).split())
-        raise ValueError(f'{source}: not a body model ({text}); compare with human37.yaml') from fault
+        raise ValueError(
+            f'{source}: not a body model ({text}); compare with human37.yaml'
+        ) from fault
 
 
 def _read(source: str | Path) -> dict[str, Any]:
+    """The content of a model file, with what it extends."""
     if str(source) in model_names():
         text = (resources.files('hmt_ros.body') / 'models' / f'{source}.yaml').read_text('utf-8')
     else:
@@ -62,7 +67,10 @@ def _read(source: str | Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f'wanted a mapping, saw {type(content).__name__}')
     if 'extends' in content:
-        base = _read(str(content['extends']))
+        try:
+            base = _read(str(content['extends']))
+        except FileNotFoundError as fault:
+            raise ValueError(f'it extends what is not there: {fault}') from fault
         fixed = [*base.get('fixed', []), *content.pop('fixed', [])]
         content.pop('extends')
         return {**base, **content, 'fixed': fixed}
@@ -100,14 +108,38 @@ def _mount(entry: dict[str, Any]) -> Array:
     down = np.array(entry.get('points', [0, 0, -1]), dtype=float)
     x /= np.linalg.norm(x)
     down = down - x * (x @ down)
+    if not np.linalg.norm(down) > 1e-6:
+        raise ValueError(f'segment {entry["name"]}: `points` and `x_axis` must differ in direction')
     z = -down / np.linalg.norm(down)
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
+KEYS = {'name', 'lengths', 'stature', 'stature_extra', 'segments', 'joints', 'chains', 'fixed'}
+SEGMENT_KEYS = {'name', 'parent', 'offset', 'points', 'x_axis', 'length', 'dofs', 'flesh'}
+FLESH_KEYS = {'centre', 'radii', 'exponents', 'taper', 'bend', 'extend', 'rings'}
+
+
+def _check_keys(entry: dict[str, Any], known: set[str], what: str) -> None:
+    unknown = sorted(str(key) for key in entry if key not in known)
+    if unknown:
+        raise ValueError(f'{what} has unknown entries {unknown}; known are {sorted(known)}')
+
+
+def _named(name: str, names: tuple[str, ...], what: str) -> int:
+    if name not in names:
+        raise ValueError(f'{what} {name!r} is not one of {list(names)}')
+    return names.index(name)
+
+
 def _build(content: dict[str, Any]) -> Body:
+    _check_keys(content, KEYS, 'the model')
     length_names = tuple(content['lengths'])
     lengths = np.array([float(v[0]) for v in content['lengths'].values()])
     relative = np.array([float(v[1]) for v in content['lengths'].values()])
+    if not (np.isfinite(lengths).all() and np.isfinite(relative).all()):
+        raise ValueError(f'lengths must be finite, saw {content["lengths"]}')
+    for name in content['stature']:
+        _named(name, length_names, 'stature:')
     fixed_dofs = {name for entry in content.get('fixed', []) for name, _ in _sides(entry)}
     left_over = set(fixed_dofs)
 
@@ -117,6 +149,7 @@ def _build(content: dict[str, Any]) -> Body:
     shapes: list[PartShape] = []
     own_length: list[int | None] = []
     for entry, name, mirrored in _expand(content['segments']):
+        _check_keys(entry, SEGMENT_KEYS, f'segment {name}')
         parent_name = entry.get('parent')
         if parent_name is not None:
             parent_name = parent_name.format(side='left' if mirrored else 'right')
@@ -136,7 +169,9 @@ def _build(content: dict[str, Any]) -> Body:
         fixed.append(sign * constant)
         basis.append(sign[:, None] * coefficients)
         span = entry.get('length')
-        own_length.append(None if span is None else length_names.index(span))
+        own_length.append(
+            None if span is None else _named(span, length_names, f'segment {name}: length')
+        )
         for dof in entry.get('dofs', []):
             dof_name = dof[0].format(side='left' if mirrored else 'right')
             if dof_name in fixed_dofs:
@@ -215,7 +250,10 @@ def _dof(entry: list[Any], mirrored: bool) -> tuple[int, bool, float, float, flo
 
 
 def _shape(flesh: dict[str, Any], segment: int, length: int | None, mirrored: bool) -> PartShape:
+    _check_keys(flesh, FLESH_KEYS, 'flesh')
     radii = tuple(float(x) for x in flesh['radii'])
+    if len(radii) not in (2, 3) or not all(r > 0 for r in radii):
+        raise ValueError(f'radii must be two or three positive numbers, saw {list(radii)}')
     spans = len(radii) == 2
     if spans and length is None:
         raise ValueError('flesh with two radii needs a segment with a length')

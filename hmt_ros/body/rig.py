@@ -1,8 +1,8 @@
 """The skeleton of a motion file before it is a body: segments, channels and tips, in file units.
 
-What BVH and ASF/AMC have in common. Each segment starts at a joint of the same name, sits at an
-offset in its parent's frame, and is turned by its channels; a tip is a named point at the far end of
-a segment that carries no other. `rig_body` turns this into a `Body` with lengths in metres, whose
+What BVH and ASF/AMC share. Each segment starts at a joint of the same name, sits at an offset in
+its parent's frame, and is turned by its channels; a tip is a named point at the far end of a
+segment that carries no other. `rig_body` turns this into a `Body` with lengths in metres, whose
 joints bear the standard names of a human body where the file's names are known (`rig_names.py`).
 """
 
@@ -41,7 +41,7 @@ class MotionFileError(ValueError):
 
 @dataclass(frozen=True)
 class Channel:
-    """One number a frame: a shift along or a turn about axis 0 to 2; limits in rad or file units."""
+    """One number a frame: shift along or turn about axis 0 to 2; limits in rad or file units."""
 
     axis: int
     is_rotation: bool
@@ -141,7 +141,7 @@ def numbers(path: Path, line: int, words: Sequence[str], count: int, what: str) 
 
 def rig_body(rig: Rig, name: str, unit_to_m: float) -> Body:
     """Body of a rig without flesh and without beliefs; one length a bone, in metres."""
-    names = rig.standard_names()
+    names = _unique(rig.standard_names())
     bones = [(x.length_name, x.offset * unit_to_m) for x in rig.joints]
     lengths: dict[str, float] = {}
     for bone, offset in bones:
@@ -164,7 +164,7 @@ def rig_body(rig: Rig, name: str, unit_to_m: float) -> Body:
         mounts=np.array([s.mount for s in rig.segments]),
         fixed_offsets=np.zeros((s_count, 3)),
         offset_basis=basis[:s_count],
-        dof_names=tuple(_dof_name(rig, s, c) for s, c in channels),
+        dof_names=tuple(_unique([_dof_name(rig, s, c) for s, c in channels])),
         dof_segments=np.array([s for s, _ in channels], dtype=np.intp),
         dof_axes=np.array([c.axis for _, c in channels], dtype=np.intp),
         dof_is_rotation=np.array([c.is_rotation for _, c in channels], dtype=bool),
@@ -189,6 +189,16 @@ def rig_body(rig: Rig, name: str, unit_to_m: float) -> Body:
         stature_extra=SKULL_AND_HEEL * sum(lengths[k] for k in upright),
         default_lengths=values,
     )
+
+
+def _unique(names: Sequence[str]) -> list[str]:
+    """The names, with an underscore behind those that stand before."""
+    result: dict[str, None] = {}
+    for name in names:
+        while name in result:
+            name += '_'
+        result[name] = None
+    return list(result)
 
 
 def _upright_bones(rig: Rig, names: Sequence[str]) -> list[str]:

@@ -55,7 +55,7 @@ def standard_names(names: Sequence[str], parents: Sequence[int]) -> list[str]:
     result = []
     for joint, name in enumerate(names):
         own = by_joint.get(joint, name)
-        while joint not in by_joint and own in found:  # a standard name that means another joint
+        if joint not in by_joint and own in found:  # a standard name that means another joint
             own += '_'
         result.append(own)
     return result

@@ -99,9 +99,7 @@ def _pairs(body: Body) -> tuple[Index, Index]:
     return first[apart], second[apart]
 
 
-def _nearest_points(
-    middle: Array, axis: Array, first: Index, second: Index
-) -> tuple[Array, Array]:
+def _nearest_points(middle: Array, axis: Array, first: Index, second: Index) -> tuple[Array, Array]:
     """Nearest points (X, 3, N) of the axes middle + s axis, s in [-1, 1], of pairs of parts."""
     c1, c2, u, v = middle[first], middle[second], axis[first], axis[second]
     w = c1 - c2

@@ -87,7 +87,9 @@ class Skeleton:
         for own in self.segment_dofs:
             kinds = [bool(self.dof_is_rotation[i]) for i in own]
             if kinds != sorted(kinds):
-                raise ValueError(f'{self.name}: translations of a segment come before its rotations')
+                raise ValueError(
+                    f'{self.name}: translations of a segment come before its rotations'
+                )
         for kind in ('segment_names', 'dof_names', 'joint_names', 'length_names'):
             names = getattr(self, kind)
             twice = sorted({x for x in names if names.count(x) > 1})

@@ -1,7 +1,7 @@
 """Where a still camera stands over a level floor, and the world frame of rendered motions.
 
-The world has its origin on the floor, straight in front of the camera. A person at rest there faces the
-camera: x to the person's right (left in the image), y towards the camera, z up.
+The world has its origin on the floor, straight in front of the camera. A person at rest there faces
+the camera: x to the person's right (left in the image), y towards the camera, z up.
 """
 
 from __future__ import annotations

@@ -79,7 +79,9 @@ def motion_energy(
         weight: total weight of all points.
     """
     segments, points, pixels, projection, each = _project(frames, camera, textures, which, weight)
-    at = np.broadcast_to(textures.pixels.transpose(1, 0, 2)[:, None], (2, 2, *textures.weights.shape))
+    at = np.broadcast_to(
+        textures.pixels.transpose(1, 0, 2)[:, None], (2, 2, *textures.weights.shape)
+    )
     moved, _ = flow.sample(at, np.arange(2)[:, None, None])  # (2, K, Q)
     spread = sigma + 0.15 * np.hypot(moved[0], moved[1])
     target = textures.pixels.transpose(1, 0, 2) + moved

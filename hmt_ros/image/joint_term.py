@@ -14,7 +14,12 @@ Array = NDArray[np.float64]
 
 
 def joint_energy(
-    frames: Frames, camera: Camera, keypoints: Keypoints, *, scale: float = np.inf, weight: float = 1.0
+    frames: Frames,
+    camera: Camera,
+    keypoints: Keypoints,
+    *,
+    scale: float = np.inf,
+    weight: float = 1.0,
 ) -> Energy:
     """Energy of keypoints: residuals whitened by their covariances, one robust kernel a keypoint axis.
 

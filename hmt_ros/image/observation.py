@@ -166,7 +166,12 @@ def _grown(
         return 0, 0, width, height
     left, top, right, bottom = box
     left, top = max(0, min(left - margin, width - 2)), max(0, min(top - margin, height - 2))
-    return left, top, min(width, max(right + margin, left + 2)), min(height, max(bottom + margin, top + 2))
+    return (
+        left,
+        top,
+        min(width, max(right + margin, left + 2)),
+        min(height, max(bottom + margin, top + 2)),
+    )
 
 
 def _signed_distance(mask: Image) -> NDArray[np.float32]:

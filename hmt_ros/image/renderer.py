@@ -1,14 +1,14 @@
 """Pictures of a body: image, silhouette, part labels and depth of its flesh at given poses.
 
-Triangles of the flesh's mesh are cut into spans of pixels and the spans meet in a depth buffer, all in
-numpy over whole arrays. A pixel belongs to a triangle when its centre lies inside; neighbouring triangles
-share no pixel and leave none out. Colours are taken at a finer raster and averaged.
+Triangles of the flesh's mesh are cut into spans of pixels and the spans meet in a depth buffer, all
+in numpy over whole arrays. A pixel belongs to a triangle when its centre lies inside; neighbouring
+triangles share no pixel and leave none out. Colours are taken at a finer raster and averaged.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -24,10 +24,12 @@ from hmt_ros.image.scene import Scene
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+Picture = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 STACKS, SLICES = 13, 18  # of the mesh of a part: its outline is right to 2 % of its radius
 SUPERSAMPLING = 2
+SMALLEST_AREA = 1e-6  # px^2, of twice a triangle: a smaller one covers the centre of no pixel
 SHADOW_BLUR = 0.004  # standard deviation of the shadow's edge as a share of the image's width
 CHUNK = 16  # poses whose silhouettes are drawn together
 
@@ -46,7 +48,7 @@ class Rendered:
     image: NDArray[np.uint8]
     mask: Mask
     parts: NDArray[np.int8]
-    depth: NDArray[np.float32]
+    depth: Picture
 
 
 def render(body: Body, pose: ArrayLike, camera: Camera, scene: Scene, frame: int = 0) -> Rendered:
@@ -65,10 +67,8 @@ def render(body: Body, pose: ArrayLike, camera: Camera, scene: Scene, frame: int
     return _renderer(body, camera, scene).render(pose, frame)
 
 
-def render_frames(
-    body: Body, poses: ArrayLike, camera: Camera, scene: Scene
-) -> Iterator[Rendered]:
-    """Pictures of a body at poses (T, d), one after the other; picture t has the noise of frame t."""
+def render_frames(body: Body, poses: ArrayLike, camera: Camera, scene: Scene) -> Iterator[Rendered]:
+    """Pictures of a body at poses (T, d), one after the other, numbered from 0."""
     renderer = _renderer(body, camera, scene)
     for frame, pose in enumerate(np.asarray(poses, dtype=np.float64)):
         yield renderer.render(pose, frame)
@@ -85,8 +85,7 @@ def render_silhouettes(body: Body, poses: ArrayLike, camera: Camera) -> Mask:
     result = np.zeros((len(poses), camera.height, camera.width), dtype=bool)
     for start in range(0, len(poses), CHUNK):
         points = _vertices(mesh, forward(body.skeleton, poses[start : start + CHUNK]))
-        triangles, _ = _project(mesh, points, camera)
-        pixels = _fill(triangles, camera.width, camera.height).pixels
+        pixels = _fill(_project(mesh, points, camera), camera.height, camera.width).pixels
         result[start : start + CHUNK].reshape(-1)[pixels] = True
     return result
 
@@ -118,81 +117,68 @@ class Renderer:
 
     def render(self, pose: ArrayLike, frame: int = 0) -> Rendered:
         """Picture number `frame`, of a pose (d,)."""
-        camera = self.camera
+        camera, scene = self.camera, self.scene
         shape = (camera.height, camera.width)
         frames = forward(self.body.skeleton, np.asarray(pose, dtype=np.float64)[None])
         points = _vertices(self.mesh, frames)
-        triangles, corners = _project(self.mesh, points, camera)
-        image = self.scene.background(camera)
-        if self.scene.shadow > 0:
-            image = self._with_shadow(image, points)
-
-        front = _front(_fill(triangles, *shape[::-1]), shape[0] * shape[1])
+        triangles = _project(self.mesh, points, camera)
+        image = scene.background(camera).copy()
+        if scene.shadow > 0:
+            self._darken(image, points)
+        front = _front(triangles, _fill(triangles, *shape), shape)
         parts = np.full(shape, -1, dtype=np.int8)
-        parts.reshape(-1)[front.pixels] = self.mesh.parts[corners[front.triangles, 0]]
+        parts.reshape(-1)[front.pixels] = self.mesh.parts[triangles.corners[0, front.triangles]]
         depth = np.full(shape, np.inf, dtype=np.float32)
         depth.reshape(-1)[front.pixels] = 1.0 / front.inverse_depth
         if len(front.pixels):
-            image = self._with_person(image, triangles, corners, frames)
-        return Rendered(self.scene.add_noise(image, frame), parts >= 0, parts, depth)
+            self._draw(image, triangles, frames)
+        return Rendered(scene.add_noise(image, frame), parts >= 0, parts, depth)
 
-    def _with_person(
-        self, image: NDArray[np.float32], triangles: _Triangles, corners: Index, frames: Frames
-    ) -> NDArray[np.float32]:
-        camera, k = self.camera, SUPERSAMPLING
-        # The part of the image with the person, and a margin.
-        low = np.floor(triangles.pixels.min((0, 1))).astype(int)
-        high = np.ceil(triangles.pixels.max((0, 1))).astype(int) + 1
-        left, top = np.clip(low, 0, [camera.width, camera.height])
-        right, bottom = np.clip(high, 0, [camera.width, camera.height])
-        if right <= left or bottom <= top:
-            return image
-        width, height = k * (right - left), k * (bottom - top)
-        fine = triangles.scaled(k, left, top)
-        front = _front(_fill(fine, width, height), width * height)
-        share = fine.shares(front)
-        of = corners[front.triangles]
-        places = np.einsum('mc,mcx->mx', share, self.places[of])
+    def _draw(self, image: Picture, triangles: _Triangles, frames: Frames) -> None:
+        """The person into the image."""
+        k = SUPERSAMPLING
+        height, width = image.shape[:2]
+        left, right = _extent(triangles.u, width)
+        top, bottom = _extent(triangles.v, height)
+        fine = triangles.magnified(k, left, top)
+        shape = (k * (bottom - top), k * (right - left))
+        front = _front(fine, _fill(fine, *shape), shape)
         normals = frames.directions(self.mesh.segments, self.mesh.normals)[:, :, 0]
-        normal = np.einsum('mc,mcx->mx', share, normals[of])
-        cosine = normal @ self.scene.light_direction
+        values = np.concatenate([self.places, normals], axis=1).astype(np.float32)
+        surface = fine.interpolated(values, front)
+        normal = surface[:, 4:]
+        cosine = normal @ self.scene.light_direction.astype(np.float32)
         cosine /= np.sqrt(np.einsum('mx,mx->m', normal, normal))
-        colour = self.clothes.colours(self.mesh.parts[of[:, 0]], places)
-        colour *= 255.0 * self.scene.lambert(cosine)[:, None]
-        layer = np.zeros((height * width, 4), dtype=np.float32)
+        parts = self.mesh.parts[fine.corners[0, front.triangles]]
+        layer = np.zeros((shape[0] * shape[1], 4), dtype=np.float32)
+        colour = self.clothes.colours(parts, surface[:, :4])
+        colour *= (255.0 * self.scene.lambert(cosine))[:, None]
         layer[front.pixels, :3] = np.minimum(colour, 255.0)
         layer[front.pixels, 3] = 1.0
         size = (right - left, bottom - top)
-        layer = cv2.resize(layer.reshape(height, width, 4), size, interpolation=cv2.INTER_AREA)
-        result = image.copy()
-        window = result[top:bottom, left:right]
-        window *= 1.0 - layer[:, :, 3:]
-        window += layer[:, :, :3]
-        return result
+        seen = cv2.resize(layer.reshape(*shape, 4), size, interpolation=cv2.INTER_AREA)
+        window = image[top:bottom, left:right]
+        window *= 1.0 - seen[:, :, 3:]
+        window += seen[:, :, :3]
 
-    def _with_shadow(self, image: NDArray[np.float32], points: Array) -> NDArray[np.float32]:
+    def _darken(self, image: Picture, points: Array) -> None:
+        """The shadow of the person's vertices (V, 3, 1) into the image."""
         camera, scene = self.camera, self.scene
-        fallen = scene.shadow_points(points[:, :, 0])
-        triangles, _ = _project(self.mesh, fallen[:, :, None], camera)
+        fallen = scene.shadow_points(points[:, :, 0])[:, :, None]
+        triangles = _project(self.mesh, fallen, camera)
         dark = np.zeros((camera.height, camera.width), dtype=np.float32)
-        dark.reshape(-1)[_fill(triangles, camera.width, camera.height).pixels] = 1.0
-        rows, columns = np.flatnonzero(dark.any(1)), np.flatnonzero(dark.any(0))
-        if not len(rows):
-            return image
+        dark.reshape(-1)[_fill(triangles, camera.height, camera.width).pixels] = 1.0
+        if not dark.any():
+            return
         sigma = max(SHADOW_BLUR * camera.width, 0.5)
         margin = int(3 * sigma) + 1
-        window = (
-            slice(max(rows[0] - margin, 0), rows[-1] + margin + 1),
-            slice(max(columns[0] - margin, 0), columns[-1] + margin + 1),
-        )
-        soft = cv2.GaussianBlur(dark[window], (0, 0), sigma)
-        light = np.array(scene.light)
-        cosine = light[2] / np.linalg.norm(light)
+        left, right = _extent(triangles.u, camera.width, margin)
+        top, bottom = _extent(triangles.v, camera.height, margin)
+        soft = cv2.GaussianBlur(dark[top:bottom, left:right], (0, 0), sigma)
+        cosine = scene.light[2] / float(np.linalg.norm(scene.light))
         lit, shaded = scene.lambert(np.array([1.0, 1.0 - scene.shadow]) * cosine)
-        result = image.copy()
-        weakened = 1.0 - (1.0 - shaded / lit) * soft * scene.floor(camera)[window]
-        result[window] *= weakened[:, :, None].astype(np.float32)
-        return result
+        soft *= (1.0 - shaded / lit) * scene.floor(camera)[top:bottom, left:right]
+        image[top:bottom, left:right] *= 1.0 - soft[:, :, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,47 +187,71 @@ class _Triangles:
 
     Attributes:
         images: (F,) index of the image.
-        pixels: (F, 3, 2) corners, px.
-        inverse_depth: (F, 3) 1 / z of the corners, 1/m: linear over an image without distortion.
+        corners: (3, F) vertices.
+        u, v: (3, F) corners, px.
+        inverse_depth: (3, F) 1 / z of the corners, 1/m.
     """
 
     images: Index
-    pixels: Array
+    corners: Index
+    u: Array
+    v: Array
     inverse_depth: Array
 
-    def scaled(self, factor: int, left: int, top: int) -> _Triangles:
-        """The triangles in a finer raster of a window of the image."""
-        pixels = (self.pixels + 0.5 - [left, top]) * factor - 0.5
-        return _Triangles(self.images, pixels, self.inverse_depth)
+    def magnified(self, factor: int, left: int, top: int) -> _Triangles:
+        """The triangles in a finer raster over a window of the image."""
+        u = (self.u + (0.5 - left)) * factor - 0.5
+        v = (self.v + (0.5 - top)) * factor - 0.5
+        return _Triangles(self.images, self.corners, u, v, self.inverse_depth)
 
-    def shares(self, front: _Front) -> Array:
-        """Shares (M, 3) of the corners in what is seen at M pixels, right in perspective."""
-        p = self.pixels[front.triangles]
-        edges = p[:, 1:] - p[:, :1]
-        offset = np.stack([front.columns, front.rows], axis=1) - p[:, 0]
-        area = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
-        b = (offset[:, 0] * edges[:, 1, 1] - offset[:, 1] * edges[:, 1, 0]) / area
-        c = (edges[:, 0, 0] * offset[:, 1] - edges[:, 0, 1] * offset[:, 0]) / area
-        share = np.stack([1.0 - b - c, b, c], axis=1) * self.inverse_depth[front.triangles]
-        result: Array = share / share.sum(1, keepdims=True)
-        return result
+    def planes(self, values: NDArray[np.floating]) -> tuple[Array, Array, Array]:
+        """Value at the first corner, and slopes along u and v, of values (3, F, ...)."""
+        tail = (slice(None),) + (None,) * (values.ndim - 2)
+        u, v = self.u[1:] - self.u[0], self.v[1:] - self.v[0]
+        area = u[0] * v[1] - v[0] * u[1]
+        one, two = values[1] - values[0], values[2] - values[0]
+        along_u = one * (v[1] / area)[tail] - two * (v[0] / area)[tail]
+        along_v = two * (u[0] / area)[tail] - one * (u[1] / area)[tail]
+        return values[0], along_u, along_v
+
+    def interpolated(self, values: Picture, front: _Front) -> Picture:
+        """Values (M, k) at what is seen, of values (V, k) at the vertices; right in perspective."""
+        # Divided by the depth they are linear over the image.
+        weighted = values[self.corners] * self.inverse_depth[:, :, None].astype(np.float32)
+        which = front.triangles
+        base, along_u, along_v = (x.astype(np.float32)[which] for x in self.planes(weighted))
+        along_u *= (front.columns - self.u[0][which]).astype(np.float32)[:, None]
+        along_v *= (front.rows - self.v[0][which]).astype(np.float32)[:, None]
+        base += along_u
+        base += along_v
+        base *= (1.0 / front.inverse_depth).astype(np.float32)[:, None]
+        return base
 
 
 @dataclass(frozen=True, eq=False)
-class _Front:
-    """M pixels and the triangle that each shows (or, before the depth buffer, may show).
+class _Filled:
+    """M times a pixel whose centre lies in a triangle.
 
     Attributes:
         pixels: (M,) index into all images, row by row.
         rows, columns: (M,).
         triangles: (M,).
-        inverse_depth: (M,) 1/m.
     """
 
     pixels: Index
     rows: Index
     columns: Index
     triangles: Index
+
+
+@dataclass(frozen=True, eq=False)
+class _Front(_Filled):
+    """Every pixel that shows something, once.
+
+    Attributes:
+        inverse_depth: (M,) 1 / z, 1/m.
+    """
+
     inverse_depth: Array
 
 
@@ -253,7 +263,12 @@ def _mesh(body: Body) -> Mesh:
 
 @lru_cache(maxsize=8)
 def _mesh_of_flesh(body: Body) -> Mesh:
-    return body.flesh.mesh(STACKS, SLICES)
+    mesh = body.flesh.mesh(STACKS, SLICES)
+    # What faces the camera is told from the order of the corners: make it that of the normals.
+    a, b, c = mesh.vertices[mesh.triangles.T]
+    inwards = np.einsum('fx,fx->f', np.cross(b - a, c - a), mesh.normals[mesh.triangles[:, 0]]) < 0
+    triangles = np.where(inwards[:, None], mesh.triangles[:, ::-1], mesh.triangles)
+    return replace(mesh, triangles=triangles)
 
 
 @lru_cache(maxsize=4)
@@ -267,105 +282,90 @@ def _vertices(mesh: Mesh, frames: Frames) -> Array:
 
 
 @lru_cache(maxsize=8)
-def _field_of_view(camera: Camera) -> tuple[float, float, float, float]:
-    """Bounds of x / z and y / z of what the image may show: lower, lower, upper, upper."""
+def _field_of_view(camera: Camera) -> Array:
+    """Bounds [[low, high], [low, high]] of x / z and of y / z of what the image may show."""
     u, v = np.linspace(-0.5, camera.width - 0.5, 33), np.linspace(-0.5, camera.height - 0.5, 33)
-    grid = np.stack(np.meshgrid(u, v), axis=-1)
-    rays = camera.rays(grid)
+    rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1))
     slopes = (rays[..., :2] / rays[..., 2:]).reshape(-1, 2)
     low, high = slopes.min(0), slopes.max(0)
     margin = 0.05 * (high - low)
-    return (*(low - margin), *(high + margin))
+    return np.stack([low - margin, high + margin], axis=1)
 
 
-def _project(mesh: Mesh, points: Array, camera: Camera) -> tuple[_Triangles, Index]:
-    """Triangles of N images that face the camera and may be seen; corners (F, 3) as vertices."""
-    n = points.shape[2]
-    p = points.transpose(2, 0, 1)
-    z = p[..., 2]
-    pixels = camera.project(p)
+def _project(mesh: Mesh, points: Array, camera: Camera) -> _Triangles:
+    """Triangles that face the camera and may be seen, of vertices (V, 3, N) of N images."""
+    p = np.ascontiguousarray(points.transpose(1, 0, 2))
+    (u, v), _ = camera.project_with_derivative(p, derivative=False)
+    a, b, c = mesh.triangles.T
+    # Counter-clockwise from outside is clockwise where the v axis points down. A corner behind the
+    # camera is NaN, and the triangle is left out.
+    area = (u[b] - u[a]) * (v[c] - v[a]) - (v[b] - v[a]) * (u[c] - u[a])
+    visible = area < -SMALLEST_AREA
     # Far outside the image a distortion model may fold back into it.
-    low_x, low_y, high_x, high_y = _field_of_view(camera)
-    x, y = p[..., 0], p[..., 1]
-    outside = np.stack([x < low_x * z, x > high_x * z, y < low_y * z, y > high_y * z], axis=-1)
-    ahead = np.isfinite(pixels).all(-1)
-    corners = mesh.triangles
-    visible = ahead[:, corners].all(2) & ~outside[:, corners].all(2).any(2)
-    t = pixels[:, corners]
-    one, two = t[:, :, 1] - t[:, :, 0], t[:, :, 2] - t[:, :, 0]
-    with np.errstate(invalid='ignore'):
-        # Counter-clockwise from outside is clockwise for a v axis that points down.
-        visible &= one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0] < 0.0
-    image, triangle = np.nonzero(visible)
-    chosen = corners[triangle]
-    del n
-    return (
-        _Triangles(image, pixels[image[:, None], chosen], 1.0 / z[image[:, None], chosen]),
-        chosen,
-    )
+    (left, right), (top, bottom) = _field_of_view(camera)
+    x, y, z = p
+    sides = (x < left * z, x > right * z, y < top * z, y > bottom * z)
+    for side in sides:
+        if side.any():
+            visible &= ~(side[a] & side[b] & side[c])
+    triangle, image = np.nonzero(visible)
+    corners = np.ascontiguousarray(mesh.triangles[triangle].T)
+    return _Triangles(image, corners, u[corners, image], v[corners, image], 1.0 / z[corners, image])
 
 
-def _fill(triangles: _Triangles, width: int, height: int) -> _Front:
+def _fill(triangles: _Triangles, height: int, width: int) -> _Filled:
     """All pixels whose centres lie in triangles, without regard to what hides what."""
-    # Corners from top to bottom, so that both triangles at an edge compute it alike.
-    order = np.argsort(triangles.pixels[:, :, 1], axis=1, kind='stable')
-    p = np.take_along_axis(triangles.pixels, order[:, :, None], axis=1)
-    first = np.clip(np.ceil(p[:, 0, 1]), 0, height).astype(np.intp)
-    last = np.clip(np.ceil(p[:, 2, 1]), 0, height).astype(np.intp)
-    rows, which = _ranges(first, last)
-    q = p[which]
-    lower = rows >= q[:, 1, 1]
-    a = np.where(lower[:, None], q[:, 1], q[:, 0])
-    b = np.where(lower[:, None], q[:, 2], q[:, 1])
-    long = _crossing(q[:, 0], q[:, 2], rows)
-    short = _crossing(a, b, rows)
-    start = np.clip(np.ceil(np.minimum(long, short)), 0, width).astype(np.intp)
-    stop = np.clip(np.ceil(np.maximum(long, short)), 0, width).astype(np.intp)
+    # Corners from top to bottom. Both triangles at an edge then compute its places alike, and every
+    # pixel goes to one of them.
+    order = np.argsort(triangles.v, axis=0, kind='stable')
+    u0, u1, u2 = np.take_along_axis(triangles.u, order, axis=0)
+    v0, v1, v2 = np.take_along_axis(triangles.v, order, axis=0)
+    rows, which = _ranges(_first(v0, height), _first(v2, height))
+    with np.errstate(divide='ignore', invalid='ignore'):  # an edge along a row is never asked
+        upper, lower, long = (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1), (u2 - u0) / (v2 - v0)
+    below = rows >= v1[which]
+    one = u0[which] + long[which] * (rows - v0[which])
+    two = np.where(below, u1[which], u0[which])
+    two += np.where(below, lower[which], upper[which]) * (
+        rows - np.where(below, v1[which], v0[which])
+    )
+    start, stop = _first(np.minimum(one, two), width), _first(np.maximum(one, two), width)
     columns, span = _ranges(start, stop)
-    which, rows = which[span], rows[span]
-
-    w, p = triangles.inverse_depth, triangles.pixels
-    one, two = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
-    dw, ew = w[:, 1] - w[:, 0], w[:, 2] - w[:, 0]
-    area = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
-    along_u = (dw * two[:, 1] - ew * one[:, 1]) / area
-    along_v = (ew * one[:, 0] - dw * two[:, 0]) / area
-    base = w[:, 0] - along_u * p[:, 0, 0] - along_v * p[:, 0, 1]
-    depth = base[which] + along_u[which] * columns + along_v[which] * rows
-    # The plane of a triangle seen from its edge is not known well: never beyond its corners.
-    depth = np.clip(depth, w.min(1)[which], w.max(1)[which])
-    pixels = (triangles.images[which] * height + rows) * width + columns
-    return _Front(pixels, rows, columns, which, depth)
+    first = (triangles.images[which] * height + rows) * width
+    return _Filled(first[span] + columns, rows[span], columns, which[span])
 
 
-def _front(filled: _Front, count: int) -> _Front:
-    """Of all that pixels may show, what is nearest to the camera; each pixel once."""
-    buffer = np.zeros(count)
-    np.maximum.at(buffer, filled.pixels, filled.inverse_depth)
-    nearest = np.flatnonzero(filled.inverse_depth == buffer[filled.pixels])
-    winner = np.full(count, -1, dtype=np.intp)
+def _front(triangles: _Triangles, filled: _Filled, shape: tuple[int, int]) -> _Front:
+    """Of all that the pixels of one image may show, what is nearest to the camera."""
+    base, along_u, along_v = triangles.planes(triangles.inverse_depth)
+    base = base - along_u * triangles.u[0] - along_v * triangles.v[0]
+    which = filled.triangles
+    inverse = base[which] + along_u[which] * filled.columns + along_v[which] * filled.rows
+    buffer = np.zeros(shape[0] * shape[1])
+    np.maximum.at(buffer, filled.pixels, inverse)
+    nearest = np.flatnonzero(inverse == buffer[filled.pixels])
+    winner = np.full(len(buffer), -1, dtype=np.intp)
     winner[filled.pixels[nearest]] = nearest  # of equals the last
     seen = winner[winner >= 0]
     return _Front(
-        filled.pixels[seen],
-        filled.rows[seen],
-        filled.columns[seen],
-        filled.triangles[seen],
-        filled.inverse_depth[seen],
-    )
+        filled.pixels[seen], filled.rows[seen], filled.columns[seen], which[seen], inverse[seen]
+    )  # fmt: skip
 
 
-def _crossing(a: Array, b: Array, rows: Index) -> Array:
-    """Column where the line from a to b (M, 2) crosses a row (M,); within the two ends."""
-    height = b[:, 1] - a[:, 1]
-    share = (rows - a[:, 1]) / np.where(height > 0, height, 1.0)
-    result: Array = a[:, 0] + np.clip(share, 0.0, 1.0) * (b[:, 0] - a[:, 0])
-    return result
+def _extent(places: Array, size: int, margin: int = 0) -> tuple[int, int]:
+    """First pixel and the one after the last that places (px) touch, within an image."""
+    low, high = np.floor(places.min() + 0.5) - margin, np.floor(places.max() + 0.5) + 1 + margin
+    return int(np.clip(low, 0, size)), int(np.clip(high, 0, size))
+
+
+def _first(places: Array, size: int) -> Index:
+    """First whole number from each place on, within an image."""
+    return np.clip(np.ceil(places), 0, size).astype(np.intp)
 
 
 def _ranges(start: Index, stop: Index) -> tuple[Index, Index]:
     """All whole numbers of the ranges [start, stop), and the range that each belongs to."""
     count = np.maximum(stop - start, 0)
     which = np.repeat(np.arange(len(start)), count)
-    first = np.cumsum(count) - count
-    return np.arange(len(which)) - first[which] + start[which], which
+    first = start - (np.cumsum(count) - count)
+    return np.arange(len(which)) + first[which], which

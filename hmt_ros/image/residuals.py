@@ -30,6 +30,7 @@ class Energy:
         directions: (M, 3, N) derivative of the residual with respect to its point.
         pull: (M, N) derivative of the energy with respect to the residual.
         curvature: (M, N) its second derivative, Gauss-Newton, not negative.
+        each: (M', N) what every measurement costs, where the term knows.
     """
 
     value: Array
@@ -38,9 +39,12 @@ class Energy:
     directions: Array
     pull: Array
     curvature: Array
+    each: Array | None = None
 
 
-def robust(residual: Array, scale: float, weight: Array | float = 1.0) -> tuple[Array, Array, Array]:
+def robust(
+    residual: Array, scale: float, weight: Array | float = 1.0
+) -> tuple[Array, Array, Array]:
     """Geman-McClure kernel: values, derivatives and Gauss-Newton curvatures.
 
         rho(r) = 1/2 r^2 / (1 + r^2 / c^2)

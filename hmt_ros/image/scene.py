@@ -1,13 +1,14 @@
 """The still scene around a rendered person: light, floor, wall and things, and the camera's noise.
 
-A scene is a seed and a few numbers. The picture of the empty place follows from them by casting rays
-through every pixel, so that it is right for every distortion of the camera.
+A scene is a seed and a few numbers. The picture of the empty place follows from them by casting
+rays through every pixel, so that it is right for every distortion of the camera.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from hmt_ros.body.viewpoint import Viewpoint
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.float32]
+Real = TypeVar('Real', np.float32, np.float64)
 
 SUPERSAMPLING = 2
 NOISE_LEVELS = 256
@@ -43,10 +45,10 @@ class Scene:
         ValueError: a number outside its range.
     """
 
-    viewpoint: Viewpoint = Viewpoint()
+    viewpoint: Viewpoint = field(default_factory=Viewpoint)
     seed: int = 0
     light: tuple[float, float, float] = (-0.5, 0.75, 1.0)
-    ambient: float = 0.45
+    ambient: float = 0.5
     shadow: float = 0.8
     noise: float = 2.5
     clear: float = 1.5
@@ -69,10 +71,10 @@ class Scene:
         result: Array = self.viewpoint.rotation @ _unit(np.array(self.light))
         return result
 
-    def lambert(self, cosine: Array) -> Array:
+    def lambert(self, cosine: NDArray[Real]) -> NDArray[Real]:
         """Light that a surface sends back, by the cosine of its normal to the light; 1 at most."""
-        result: Array = self.ambient + (1.0 - self.ambient) * np.maximum(cosine, 0.0)
-        return result
+        lit = self.ambient + (1.0 - self.ambient) * np.maximum(cosine, 0.0)
+        return lit.astype(cosine.dtype, copy=False)
 
     def background(self, camera: Camera) -> Picture:
         """The empty place, BGR (H, W, 3) in grey levels 0 to 255, without noise."""
@@ -103,7 +105,7 @@ class Scene:
 
 @lru_cache(maxsize=1)
 def _normal_quantiles() -> Picture:
-    """NOISE_LEVELS equally likely values with the mean and variance of a standard normal variable."""
+    """NOISE_LEVELS equally likely values, with mean and variance of a standard normal variable."""
     grid = np.linspace(-4.0, 4.0, 8001)
     cumulative = np.cumsum(np.exp(-0.5 * grid * grid))
     p = (np.arange(NOISE_LEVELS) + 0.5) / NOISE_LEVELS
@@ -138,7 +140,7 @@ class _Things:
     stripes: Array  # (B,) per metre, 0: plain
 
     def hit(self, origins: Array, rays: Array) -> tuple[Array, NDArray[np.intp], Array, Array]:
-        """First box on each ray (N, 3): distance (inf: none), box, normal (N, 3), place in the box."""
+        """First box on each ray (N, 3): distance (inf: none), box, normal, place in the box."""
         best = np.full(len(rays), np.inf)
         which = np.zeros(len(rays), dtype=np.intp)
         normal, place = np.zeros((len(rays), 3)), np.zeros((len(rays), 3))
@@ -200,12 +202,13 @@ def _empty_place(scene: Scene, camera: Camera) -> tuple[Picture, Picture]:
     on_box = t_box < np.minimum(t_wall, t_floor)
     on_floor = (t_floor < t_wall) & ~on_box
 
-    # The wall has stains and a skirting. Behind the camera's back it is one grey.
-    at = eye + rays * np.where(np.isfinite(t_wall), t_wall, 0.0)[:, None]
-    colour = base[0] * scene.lambert(light[1:2]) * np.ones((len(rays), 1))
-    colour *= 1.0 + 0.25 * smooth_noise(at[:, [0, 2]] * 0.6, rng)[:, None]
-    colour *= 1.0 + 0.10 * smooth_noise(at[:, [0, 2]] * 3.0, rng)[:, None]
-    colour[at[:, 2] < 0.18] *= 0.45
+    # The wall has stains and a skirting. What no ray meets has its plain colour.
+    colour = np.tile(base[0] * scene.lambert(light[1:2]), (len(rays), 1))
+    on_wall = np.flatnonzero(np.isfinite(t_wall) & ~on_floor & ~on_box)
+    at = eye + rays[on_wall] * t_wall[on_wall, None]
+    stains = 1.0 + 0.25 * smooth_noise(at[:, [0, 2]] * 0.6, rng)
+    stains *= 1.0 + 0.10 * smooth_noise(at[:, [0, 2]] * 3.0, rng)
+    colour[on_wall] *= (stains * np.where(at[:, 2] < 0.18, 0.45, 1.0))[:, None]
 
     # The floor has tiles, stains and the shadows of the things; its colours fade with distance.
     points = eye + rays[on_floor] * t_floor[on_floor, None]
@@ -228,10 +231,13 @@ def _empty_place(scene: Scene, camera: Camera) -> tuple[Picture, Picture]:
     image = (255.0 * np.clip(colour, 0.0, 1.0)).astype(np.float32).reshape(*shape, 3)
     floor = on_floor.astype(np.float32).reshape(shape)
     size = (camera.width, camera.height)
-    image, floor = (cv2.resize(x, size, interpolation=cv2.INTER_AREA) for x in (image, floor))
-    image.setflags(write=False)
-    floor.setflags(write=False)
-    return image, floor
+    result = [
+        np.asarray(cv2.resize(x, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+        for x in (image, floor)
+    ]
+    for picture in result:
+        picture.setflags(write=False)
+    return result[0], result[1]
 
 
 def _unit(vector: Array) -> Array:

@@ -19,7 +19,13 @@ Array = NDArray[np.float64]
 
 
 def containment_energy(
-    surface: Surface, distance: ImageMap, *, sigma: float, scale: float, weight: float
+    surface: Surface,
+    distance: ImageMap,
+    *,
+    sigma: float,
+    scale: float,
+    weight: float,
+    count: int | None = None,
 ) -> Energy:
     """Contour points outside the silhouette pay their distance to it.
 
@@ -29,12 +35,13 @@ def containment_energy(
         sigma: standard deviation of the outline, px.
         scale: of the robust kernel, in sigmas.
         weight: total weight of all points.
+        count: number of points that the weight is for; all of the surface when None.
     """
     value, gradient = distance.sample(surface.pixels)
     out = surface.valid & (value > 0)
     residual = np.where(out, value / sigma, 0.0)
     directions = np.einsum('apn,aipn->pin', gradient / sigma, _safe(surface.projection))
-    each = weight / len(residual)
+    each = weight / (count or len(residual))
     rho, pull, curvature = robust(residual, scale, each)
     return Energy(
         rho.sum(0),
@@ -43,6 +50,7 @@ def containment_energy(
         directions,
         pull,
         np.where(out, curvature, 0.0),
+        rho,
     )
 
 
@@ -54,6 +62,7 @@ def coverage_energy(
     scale: float,
     weight: float,
     spacing: float = 8.0,
+    explained: Array | None = None,
 ) -> Energy:
     """Points on the outline pay their distance to the nearest contour of the model.
 
@@ -67,6 +76,7 @@ def coverage_energy(
         scale: of the robust kernel, in sigmas.
         weight: total weight of all samples.
         spacing: of neighbouring contour points, px.
+        explained: (M, N) what each sample costs at most, because other parts explain it.
     """
     n = surface.pixels.shape[2]
     match = _nearest_contour_points(surface, outline)  # (M, N)
@@ -80,6 +90,9 @@ def coverage_energy(
     square = (across * across + beyond * beyond) / (sigma * sigma)
     # One kernel on the length of the two residuals together.
     rho, _, curvature = robust(np.sqrt(square), scale, weight / max(len(match), 1))
+    if explained is not None:
+        curvature = np.where(rho < explained, curvature, 0.0)
+        rho = np.minimum(rho, explained)
     projection = surface.projection[:, :, match, batch]  # (2, 3, M, N)
     toward = nx * projection[0] + ny * projection[1]
     sideways = nx * projection[1] - ny * projection[0]
@@ -94,6 +107,7 @@ def coverage_energy(
         directions,
         both * residual,
         both * used,
+        rho,
     )
 
 
@@ -105,7 +119,11 @@ def _nearest_contour_points(surface: Surface, outline: Outline) -> NDArray[np.in
     turn = 12.0  # px that opposite directions count like, per unit of difference
     c = outline.pixels.mean(1, keepdims=True) if outline.pixels.size else np.zeros((2, 1))
     samples = np.concatenate(
-        [-2.0 * (outline.pixels - c), np.ones((1, outline.pixels.shape[1])), -2 * turn**2 * outline.normals]
+        [
+            -2.0 * (outline.pixels - c),
+            np.ones((1, outline.pixels.shape[1])),
+            -2 * turn**2 * outline.normals,
+        ]
     ).astype(np.float32)
     use = surface.valid & ~surface.covered
     # A pose whose contour is hidden everywhere keeps all that exists.

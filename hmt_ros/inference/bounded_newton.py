@@ -110,6 +110,9 @@ def minimise(
             break
 
         trial = np.clip(x[active] + step, lower[active], upper[active])
+        # Rounding must not leave a variable a hair away from the limit it was put on.
+        trial = np.where(step <= lower[active] - x[active], lower[active], trial)
+        trial = np.where(step >= upper[active] - x[active], upper[active], trial)
         new_value, new_gradient, new_hessian = objective(trial, active)
         iterations[active] += 1
         decrease = value[active] - new_value
@@ -145,35 +148,71 @@ def _steps(
     x: Array, gradient: Array, hessian: Array, lower: Array, upper: Array, lam: Array, metric: Array
 ) -> tuple[Array, Array]:
     """Damped Newton steps, projected onto the box, and the decrease that the model predicts."""
-    fixed = _resting(x, gradient, lower, upper)
     step = np.empty_like(x)
-    diagonal = np.arange(x.shape[1])
-    right = np.where(fixed, 0.0, -gradient)
     for i in range(len(x)):
-        system = hessian[i].copy()
-        if fixed[i].any():
-            system[fixed[i]] = 0.0
-            system[:, fixed[i]] = 0.0
-            system[diagonal[fixed[i]], diagonal[fixed[i]]] = 1.0
-        shift = lam[i]
+        step[i], lam[i] = _box_step(
+            gradient[i], hessian[i], lower[i] - x[i], upper[i] - x[i], lam[i], metric
+        )
+    curvature = np.einsum('ni,nij,nj->n', step, hessian, step)
+    predicted = -(np.einsum('ni,ni->n', gradient, step) + 0.5 * curvature)
+    resting = _resting(x, gradient, lower, upper)
+    for i in np.flatnonzero(predicted <= 0):
+        downhill = np.where(resting[i], 0.0, -gradient[i])
+        step[i], predicted[i] = _gradient_step(
+            x[i], downhill, hessian[i], lower[i], upper[i], metric
+        )
+    return step, predicted
+
+
+def _box_step(
+    gradient: Array, hessian: Array, low: Array, high: Array, shift: float, metric: Array
+) -> tuple[Array, float]:
+    """Minimiser of the damped quadratic model in the box low <= step <= high, and the damping used.
+
+    An active set: what the step on the free variables drives across a limit is put on it, the others
+    are solved again, and what pulls away from its limit is set free.
+    """
+    bound = ((low >= 0) & (gradient > 0)) | ((high <= 0) & (gradient < 0))
+    step = np.where(bound, np.clip(0.0, low, high), 0.0)
+    diagonal = np.arange(len(gradient))
+    best, best_gain = np.zeros_like(step), -np.inf
+    for _ in range(3 * len(gradient) + 3):
+        free, held = ~bound, bool(bound.any())
         while True:
-            damped = system.copy()
+            damped = hessian.copy()
             damped[diagonal, diagonal] += shift * metric
-            _, solution, info = dposv(damped, right[i], overwrite_a=True)
+            right = -gradient
+            if held:
+                right = right - damped[:, bound] @ step[bound]
+                right[bound] = 0.0
+                damped[bound] = 0.0
+                damped[:, bound] = 0.0
+                damped[diagonal[bound], diagonal[bound]] = 1.0
+            _, solution, info = dposv(damped, right, overwrite_a=True)
             if info == 0 or shift > DAMPING_LIMIT:
                 break
             # Not positive definite: the least shift that Gershgorin asks for is far too careful.
-            shift = max(4.0 * shift, 1e-3 * float(np.abs(system).max() / metric.min()))
-        lam[i] = shift
-        step[i] = solution
-    step = np.clip(x + step, lower, upper) - x
-    curvature = np.einsum('ni,nij,nj->n', step, hessian, step)
-    predicted = -(np.einsum('ni,ni->n', gradient, step) + 0.5 * curvature)
-    for i in np.flatnonzero(predicted <= 0):
-        step[i], predicted[i] = _gradient_step(
-            x[i], right[i], hessian[i], lower[i], upper[i], metric
-        )
-    return step, predicted
+            shift = max(4.0 * shift, 1e-3 * float(np.abs(hessian).max() / metric.min()))
+        step = np.where(free, solution, step)
+        across = free & ((step < low) | (step > high))
+        if not held and not across.any():
+            return step, shift
+        step = np.clip(step, low, high)
+        slope = gradient + hessian @ step
+        gain = -float(gradient @ step + 0.5 * step @ (slope - gradient))
+        if gain > best_gain:
+            best, best_gain = step, gain
+        if across.any():
+            bound = bound | across
+            continue
+        slope = slope + shift * metric * step
+        away = bound & (low < high)
+        away &= ((step <= low) & (slope < 0)) | ((step >= high) & (slope > 0))
+        if not away.any():
+            return step, shift
+        bound = bound.copy()
+        bound[np.argmax(np.where(away, np.abs(slope), -1.0))] = False
+    return best, shift
 
 
 def _gradient_step(

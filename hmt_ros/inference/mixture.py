@@ -63,8 +63,7 @@ class GaussianMixture:
         if not isinstance(other, GaussianMixture):
             return NotImplemented
         return all(
-            np.array_equal(a, b)
-            for a, b in zip(self._arrays(), other._arrays(), strict=True)
+            np.array_equal(a, b) for a, b in zip(self._arrays(), other._arrays(), strict=True)
         )
 
     def _arrays(self) -> tuple[Array, Array, Array]:
@@ -204,9 +203,7 @@ def bhattacharyya_distances(
     log_det = 2.0 * np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(-1)
     log_a = np.linalg.slogdet(covariances_a)[1]
     log_b = np.linalg.slogdet(covariances_b)[1]
-    result: Array = 0.125 * (z * z).sum(-1) + 0.5 * (
-        log_det - 0.5 * (log_a[:, None] + log_b[None])
-    )
+    result: Array = 0.125 * (z * z).sum(-1) + 0.5 * (log_det - 0.5 * (log_a[:, None] + log_b[None]))
     return result
 
 
@@ -222,7 +219,9 @@ def _solve_lower(factor: Array, right: Array) -> Array:
     return result
 
 
-def _merged(w: Array, m: Array, s: Array, i: int, j: NDArray[np.int_]) -> tuple[Array, Array, Array]:
+def _merged(
+    w: Array, m: Array, s: Array, i: int, j: NDArray[np.int_]
+) -> tuple[Array, Array, Array]:
     """Moment-preserving merges of component i with each of the components j."""
     total = w[i] + w[j]
     a, b = w[i] / total, w[j] / total
@@ -233,9 +232,7 @@ def _merged(w: Array, m: Array, s: Array, i: int, j: NDArray[np.int_]) -> tuple[
     return total, mean, cov
 
 
-def _merge_cost(
-    w: Array, m: Array, s: Array, log_det: Array, i: int, j: NDArray[np.int_]
-) -> Array:
+def _merge_cost(w: Array, m: Array, s: Array, log_det: Array, i: int, j: NDArray[np.int_]) -> Array:
     total, _, cov = _merged(w, m, s, i, j)
     result: Array = 0.5 * (
         total * np.linalg.slogdet(cov)[1] - w[i] * log_det[i] - w[j] * log_det[j]

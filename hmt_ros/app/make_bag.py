@@ -1,0 +1,274 @@
+"""make-bag: renders a motion, procedural or recorded, into a bag with ground truth.
+
+What is written is described in `hmt_ros.app.rendered_bag`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.app.rendered_bag import MEASURED, Take, new_bag_folder, write_bag
+from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body.footsteps import sole
+from hmt_ros.body.motion_file import Motion, read_motion
+from hmt_ros.body.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
+from hmt_ros.body.retarget import body_from_motion, retarget
+from hmt_ros.body.viewpoint import Viewpoint
+from hmt_ros.image.scene import Scene
+
+Array = NDArray[np.float64]
+
+DURATION, HEADING = 4.0, 30.0  # s, and deg of recorded motions
+LARGEST = 10_000  # px, of a side of the image
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command; 0: the bag is there, 1: bad input, and one line on stderr says which."""
+    try:
+        options = _parser().parse_args(argv)
+        viewpoint = Viewpoint(options.distance, options.camera_height, math.radians(options.pitch))
+        scene = Scene(
+            viewpoint=viewpoint,
+            seed=options.seed,
+            noise=options.noise,
+            shadow=Scene.shadow if options.shadow else 0.0,
+        )
+        camera = _camera(options.size, options.fov)
+        with new_bag_folder(options.output, overwrite=options.overwrite) as folder:
+            take = _take(options, viewpoint)
+            write_bag(
+                folder,
+                take,
+                camera,
+                scene,
+                quality=options.jpeg_quality,
+                progress=not options.quiet,
+            )
+    except (ValueError, OSError) as error:
+        text = ' '.join(str(error).split()) or type(error).__name__
+        print(f'make-bag: {text}', file=sys.stderr)
+        return 1
+    return 0
+
+
+class _Parser(argparse.ArgumentParser):
+    """Bad input is one line and exit code 1, as everywhere else."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f'{message}; --help tells more')
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog='make-bag',
+        description='Renders a motion into a bag with ground truth.',
+    )
+    parser.add_argument(
+        'name',
+        help=f'a procedural motion ({", ".join(PROCEDURAL_MOTIONS)}), or with --mocap any name',
+    )
+    parser.add_argument(
+        '-o', '--output', type=Path, required=True, metavar='DIR', help='folder of the bag'
+    )
+    parser.add_argument('--overwrite', action='store_true', help='replace the bag that is there')
+    parser.add_argument('--quiet', action='store_true', help='no progress bar')
+    parser.add_argument('--seed', type=_whole(0), default=0, help='of all that is random (0)')
+
+    motion = parser.add_argument_group('motion')
+    motion.add_argument(
+        '--mocap', type=Path, metavar='FILE', help='recorded motion (.bvh, or .amc beside its .asf)'
+    )
+    motion.add_argument(
+        '--body', default='human37', help='body model: a name or a YAML file (human37)'
+    )
+    motion.add_argument(
+        '--stature',
+        type=_number(0.3, 3),
+        help="of the person, m; not with --mocap (the model's)",
+    )
+    motion.add_argument(
+        '--duration', type=_number(0.001, 1e5), help=f's ({DURATION:g}, or all of --mocap)'
+    )
+    motion.add_argument(
+        '--start', type=_number(0, 1e6), default=0.0, help='where in --mocap to begin, s (0)'
+    )
+    motion.add_argument(
+        '--fps',
+        type=_number(0.01, 1000),
+        default=30.0,
+        help='images per second; with --mocap the nearest that every n-th frame gives (30)',
+    )
+    motion.add_argument(
+        '--heading',
+        type=_number(-3600, 3600),
+        help='of the person at first, degrees; 0: to the camera, 90: to the right of the image '
+        f'(one that suits the motion; {HEADING:g} with --mocap)',
+    )
+
+    camera = parser.add_argument_group('camera and scene')
+    camera.add_argument(
+        '--size', type=_size, default=(640, 480), metavar='WxH', help='of the images, px (640x480)'
+    )
+    camera.add_argument(
+        '--fov', type=_number(1, 150), default=51.7, help='horizontal field of view, degrees (51.7)'
+    )
+    camera.add_argument(
+        '--distance',
+        type=_number(0.3, 1000),
+        default=5.6,
+        help='of the camera to the middle of the motion, m (5.6)',
+    )
+    camera.add_argument(
+        '--camera-height', type=_number(0.01, 100), default=1.2, help='over the floor, m (1.2)'
+    )
+    camera.add_argument(
+        '--pitch',
+        type=_number(-80, 80),
+        default=0.0,
+        help='by which the camera looks down, degrees (0)',
+    )
+    camera.add_argument(
+        '--noise', type=_number(0, 100), default=2.5, help='of a pixel, grey levels of 255 (2.5)'
+    )
+    camera.add_argument(
+        '--shadow',
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help='of the person, on the floor (yes)',
+    )
+    camera.add_argument(
+        '--jpeg-quality', type=_whole(1, 100), default=90, metavar='Q', help='1 to 100 (90)'
+    )
+    return parser
+
+
+def _number(low: float, high: float) -> Any:
+    """Reader of a number in a range."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(
+                f'wanted a number from {low:g} to {high:g}, saw {text!r}'
+            )
+        return value
+
+    return read
+
+
+def _whole(low: int, high: int = 2**63 - 1) -> Any:
+    """Reader of a whole number in a range."""
+
+    def read(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = low - 1
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(
+                f'wanted a whole number from {low} to {high}, saw {text!r}'
+            )
+        return value
+
+    return read
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.lower().partition('x')
+    if not (width.isdecimal() and height.isdecimal()):
+        raise argparse.ArgumentTypeError(f'wanted a size such as 640x480, saw {text!r}')
+    if not (8 <= int(width) <= LARGEST and 8 <= int(height) <= LARGEST):
+        raise argparse.ArgumentTypeError(f'wanted sides of 8 to {LARGEST} px, saw {text!r}')
+    return int(width), int(height)
+
+
+def _camera(size: tuple[int, int], fov: float) -> Camera:
+    width, height = size
+    focal = 0.5 * width / math.tan(math.radians(fov) / 2)
+    return Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+
+
+def _take(options: argparse.Namespace, viewpoint: Viewpoint) -> Take:
+    body = load_body(options.body)
+    missing = sorted(set(MEASURED) - set(body.segment_lengths))
+    if missing or not body.shapes:
+        what = f'no lengths {missing}' if missing else 'no flesh'
+        raise ValueError(f'body {options.body} has {what}: wanted one such as human37')
+    heading = None if options.heading is None else math.radians(options.heading)
+    if options.mocap is not None:
+        if options.stature is not None:
+            raise ValueError('--stature does not go with --mocap: the file says how tall one is')
+        return _recorded(options, body, heading, viewpoint)
+    if options.start:
+        raise ValueError('--start goes with --mocap only')
+    if options.stature is not None:
+        body = body.with_stature(options.stature)
+    duration = DURATION if options.duration is None else options.duration
+    poses = procedural_motion(
+        options.name,
+        body,
+        duration,
+        options.fps,
+        options.seed,
+        heading=heading,
+        viewpoint=viewpoint,
+    )
+    return Take(f'{options.name}, seed {options.seed}', body, poses, options.fps)
+
+
+def _recorded(
+    options: argparse.Namespace, body: Body, heading: float | None, viewpoint: Viewpoint
+) -> Take:
+    motion = read_motion(options.mocap)
+    step = max(round(motion.fps / options.fps), 1)
+    first = round(options.start * motion.fps)
+    if first >= len(motion):
+        raise ValueError(
+            f'--start {options.start:g} is after the end of {options.mocap}, which has '
+            f'{len(motion) / motion.fps:.2f} s'
+        )
+    stop = (
+        None if options.duration is None else first + max(round(options.duration * motion.fps), 1)
+    )
+    part = motion.part(first, stop, step)
+    body = body_from_motion(part, body)
+    if heading is None:
+        heading = math.radians(HEADING)
+    poses = retarget(part, body, _placed(part, heading, sole(body), viewpoint))
+    return Take(options.mocap.name, body, poses, part.fps)
+
+
+def _placed(
+    motion: Motion, heading: float, ankle_height: float, viewpoint: Viewpoint
+) -> tuple[Array, Array]:
+    """Rotation and translation from the world of a motion to the camera.
+
+    The middle of the motion comes to the origin of the viewpoint; at first the person faces
+    `heading`.
+    """
+    hips = motion.joint_positions(['left_hip', 'right_hip'])[0]
+    x, y = (hips[1] - hips[0])[:2]  # to the right of the person, who looks to (-y, x)
+    turn = heading - math.atan2(y, x)
+    c, s = math.cos(turn), math.sin(turn)
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    pelvis = motion.joint_positions(['pelvis'])[:, 0] @ rotation.T
+    names = motion.body.joint_names
+    feet = [f'{a}_{b}' for a in ('left', 'right') for b in ('ankle', 'toe') if f'{a}_{b}' in names]
+    lowest = motion.joint_positions(feet)[..., 2].min(1)
+    centre = 0.5 * (pelvis.min(0) + pelvis.max(0))
+    centre[2] = np.percentile(lowest, 10) - ankle_height
+    return viewpoint.rotation @ rotation, viewpoint.translation - viewpoint.rotation @ centre
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,263 @@
+"""Rendered bags: images of a moving person, with ground truth, as a bag and files beside it.
+
+The bag has the topics `image/compressed`, `camera_info`, `ground_truth` (hmt_msgs/PoseMixture) and
+`body` (hmt_msgs/Body, latched). Beside it, in its folder, lies what replaying and evaluating it
+need: `background.png` (the empty scene), `subject.yaml` (joints as clicked in the first image) and
+`truth.npz` (joints, pixels and silhouettes).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from hmt_ros.body import Body, Camera
+from hmt_ros.image.renderer import render_frames
+from hmt_ros.image.scene import Scene
+from msg_tools import BagWriter, RosbagsMessages
+from msg_tools.bodies import body_message
+from msg_tools.camera_info import camera_info_message
+from msg_tools.headers import SECOND_NS, header_message
+from msg_tools.images import compressed_image_message
+from msg_tools.pose_mixtures import MixtureKind
+from msg_tools.urdf import Freedom, Segment, body_urdf
+
+Array = NDArray[np.float64]
+
+FRAME_ID = 'camera_optical_frame'
+START_NS = 1_700_000_000 * SECOND_NS  # stamp of the first image
+FILES_BESIDE = ('background.png', 'subject.yaml', 'truth.npz')
+CLICK_SIGMA = 2.0  # px
+OF_CLICKS = 5  # stream of random numbers of a seed; `hmt_ros.image` has others
+TAPE = 0.005  # m, to which a subject is measured
+MEASURED = (
+    'thigh', 'shin', 'foot', 'upper_arm', 'forearm', 'hand', 'hip_width', 'shoulder_width', 'trunk',
+    'neck_to_head',
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """What is to be seen.
+
+    Attributes:
+        source: where the motion comes from.
+        body: whose poses they are.
+        poses: (T, d) camera optical frame.
+        fps: poses per second.
+    """
+
+    source: str
+    body: Body
+    poses: Array
+    fps: float
+
+    def stamp_ns(self, frame: int) -> int:
+        """Stamp of an image."""
+        return START_NS + round(frame * SECOND_NS / self.fps)
+
+
+def write_bag(
+    folder: Path,
+    take: Take,
+    camera: Camera,
+    scene: Scene,
+    *,
+    quality: int = 90,
+    progress: bool = False,
+) -> None:
+    """Renders a motion into a new bag folder, with its files beside.
+
+    Args:
+        folder: to be created; its name is that of the bag.
+        take: the motion.
+        camera: that sees it.
+        scene: around it; its seed is that of the clicks, too.
+        quality: of the JPEG images, 1 to 100.
+        progress: whether a bar is shown on stderr, where that is a terminal.
+
+    Raises:
+        ValueError: the first image does not show the person.
+        BagError: the folder exists or can not be written.
+    """
+    joints = take.body.joint_positions(take.poses)
+    pixels = camera.project(joints)
+    subject = subject_text(take, camera, pixels[0], scene.seed)
+    messages = RosbagsMessages()
+    masks = np.empty((len(take.poses), camera.height, (camera.width + 7) // 8), dtype=np.uint8)
+    hidden = not progress or not sys.stderr.isatty()
+    with (
+        BagWriter(folder) as bag,
+        tqdm(total=len(take.poses), unit='image', desc=folder.name, disable=hidden) as bar,
+    ):
+        bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
+        bag.write('body', START_NS, body_content(messages, take.body, START_NS))
+        for frame, shown in enumerate(render_frames(take.body, take.poses, camera, scene)):
+            stamp = take.stamp_ns(frame)
+            image = compressed_image_message(messages, shown.image, stamp, FRAME_ID, quality)
+            bag.write('image/compressed', stamp, image)
+            info = camera_info_message(messages, camera, stamp, FRAME_ID)
+            bag.write('camera_info', stamp, info)
+            truth = ground_truth(messages, take.body, take.poses[frame], joints[frame], stamp)
+            bag.write('ground_truth', stamp, truth)
+            masks[frame] = np.packbits(shown.mask, axis=1)
+            bar.update()
+    (folder / 'subject.yaml').write_text(subject, encoding='utf-8')
+    empty = np.rint(scene.background(camera)).astype(np.uint8)
+    if not cv2.imwrite(str(folder / 'background.png'), empty):
+        raise OSError(f'{folder / "background.png"} can not be written')
+    np.savez_compressed(
+        folder / 'truth.npz',
+        stamps=np.array([take.stamp_ns(frame) for frame in range(len(take.poses))]),
+        joint_names=np.array(take.body.joint_names),
+        joints=joints,
+        pixels=pixels,
+        masks=masks,
+        K=camera.matrix,
+        fps=np.array(take.fps),
+        source=np.array(take.source),
+        dof_names=np.array(take.body.dof_names),
+        poses=take.poses,
+    )
+
+
+def ground_truth(
+    messages: RosbagsMessages, body: Body, pose: Array, joints: Array, stamp_ns: int
+) -> Any:
+    """hmt_msgs/PoseMixture of a known pose: one component, whose covariance is empty."""
+    component = messages.create(
+        'hmt_msgs/msg/PoseComponent',
+        weight=1.0,
+        mean=pose,
+        covariance=np.empty(0),
+        log_likelihood=math.nan,
+        joint_positions=[
+            messages.create('geometry_msgs/msg/Point', x=x, y=y, z=z) for x, y, z in joints.tolist()
+        ],
+    )
+    return messages.create(
+        'hmt_msgs/msg/PoseMixture',
+        header=header_message(messages, stamp_ns, FRAME_ID),
+        body_model=body.name,
+        dof_names=list(body.dof_names),
+        joint_names=list(body.joint_names),
+        kind=int(MixtureKind.GROUND_TRUTH),
+        components=[component],
+    )
+
+
+def body_content(messages: RosbagsMessages, body: Body, stamp_ns: int) -> Any:
+    """hmt_msgs/Body of a body."""
+    skeleton = body.skeleton
+    axes: tuple[Literal['x', 'y', 'z'], ...] = ('x', 'y', 'z')
+    segments = []
+    for index, name in enumerate(skeleton.segment_names):
+        ends = [
+            *skeleton.joint_offsets[skeleton.joint_segments == index],
+            *skeleton.offsets[np.array(skeleton.parents) == index],
+        ]
+        freedoms = [
+            Freedom(
+                skeleton.dof_names[dof],
+                axes[skeleton.dof_axes[dof]],
+                'revolute' if skeleton.dof_is_rotation[dof] else 'prismatic',
+                float(skeleton.lower[dof]),
+                float(skeleton.upper[dof]),
+            )
+            for dof in skeleton.segment_dofs[index]
+        ]
+        segments.append(
+            Segment(
+                name=name,
+                parent=skeleton.parents[index],
+                offset=skeleton.offsets[index],
+                mount=skeleton.mounts[index],
+                freedoms=freedoms,
+                points=np.array([end for end in ends if np.any(end)]).reshape(-1, 3),
+            )
+        )
+    return body_message(
+        messages,
+        name=body.name,
+        dof_names=body.dof_names,
+        lower=body.lower,
+        upper=body.upper,
+        joint_names=body.joint_names,
+        segment_lengths=body.segment_lengths,
+        urdf=body_urdf(body.name, segments, FRAME_ID),
+        stamp_ns=stamp_ns,
+        frame_id=FRAME_ID,
+    )
+
+
+def subject_text(take: Take, camera: Camera, pixels: Array, seed: int) -> str:
+    """Subject file: the joints (J, 2) of the first image as one would click them, and the lengths.
+
+    Raises:
+        ValueError: fewer than four joints lie in the image.
+    """
+    clicks = pixels + np.random.default_rng([seed, OF_CLICKS]).normal(0, CLICK_SIGMA, pixels.shape)
+    lowest, highest = np.zeros(2), np.array([camera.width - 1, camera.height - 1])
+    inside = np.all((clicks >= lowest) & (clicks <= highest), axis=1)
+    if inside.sum() < 4:
+        raise ValueError(
+            f'the first image shows {inside.sum()} joints of the person, wanted 4 at least: '
+            f'change --distance, --heading or --fov'
+        )
+    lines = [
+        '# joint centres in the first image, as a person would click them, and the subject',
+        f'stamp_ns: {take.stamp_ns(0)}',
+        f'sigma_px: {CLICK_SIGMA}',
+        "keypoints:  # name: [u, v] in pixels; left and right are the person's own",
+    ]
+    for name, click, seen in zip(take.body.joint_names, clicks, inside):
+        if seen:
+            lines.append(f'  {name}: [{click[0]:.1f}, {click[1]:.1f}]')
+    lines.append(f'segment_lengths_m:  # as measured with a tape, to {1000 * TAPE:.0f} mm')
+    for name in MEASURED:
+        rounded = max(round(take.body.segment_lengths[name] / TAPE), 1) * TAPE
+        lines.append(f'  {name}: {rounded:.3f}')
+    return '\n'.join(lines) + '\n'
+
+
+@contextmanager
+def new_bag_folder(target: Path, *, overwrite: bool) -> Iterator[Path]:
+    """A folder to write the bag to, which comes to its place when all is written, or not at all."""
+    target = target.absolute()
+    _check_target(target, overwrite)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    around = Path(tempfile.mkdtemp(prefix=f'.{target.name}.', suffix='.partial', dir=target.parent))
+    try:
+        yield around / target.name
+        _check_target(target, overwrite)
+        if target.exists():
+            target.rename(around / 'replaced')
+        (around / target.name).rename(target)
+    finally:
+        shutil.rmtree(around, ignore_errors=True)
+
+
+def _check_target(target: Path, overwrite: bool) -> None:
+    if not os.path.lexists(target):
+        return
+    if not overwrite:
+        raise ValueError(f'{target} exists; give another name, or --overwrite')
+    names = sorted(path.name for path in target.iterdir()) if target.is_dir() else []
+    own = ('metadata.yaml', f'{target.name}.mcap', *FILES_BESIDE)
+    foreign = [name for name in names if name not in own]
+    if target.is_symlink() or 'metadata.yaml' not in names or foreign:
+        what = f'it has {foreign[0]}' if foreign else 'it is not the folder of a bag'
+        raise ValueError(f'{target} is not replaced: {what}; give another name')

@@ -1,0 +1,246 @@
+"""The start of a track: poses, depth, lengths and widths from joints seen in one image (KJS 2, 5.2).
+
+From several headings the pose is fitted to the joints together with the lengths, each length held by
+what was measured or by its spread over people. The lengths are then fixed, the flips of all limbs that
+the image and the limits allow are enumerated and fitted again, and the best stand as the first mixture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.interpretation_tree import enumerate_flips
+from hmt_ros.body.kinematics import forward, joint_length_jacobians, point_jacobians
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
+from hmt_ros.image.observation import Keypoints, Observation
+from hmt_ros.inference.bounded_newton import Minimum, minimise
+from hmt_ros.tracking.subject import Subject
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# Standard deviation of a length that was measured on the person, m.
+MEASURED = 0.01
+# Relative standard deviation of all lengths together when the stature is unknown.
+STATURE_SPREAD = 0.06
+HEADINGS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What a track starts from.
+
+    Attributes:
+        body: with the person's lengths.
+        poses: (M, d) distinct poses, best first.
+        energies: (M,) of joints and soft prior.
+        hessians: (M, d, d).
+    """
+
+    body: Body
+    poses: Array
+    energies: Array
+    hessians: Array
+
+
+def start_from_keypoints(
+    body: Body, camera: Camera, subject: Subject, *, prior_weight: float = 1.0
+) -> Start:
+    """All poses that explain the joints of a subject, and the body with the subject's lengths.
+
+    Raises:
+        ValueError: joints from which no pose can be fitted.
+    """
+    body = _sized(body, subject)
+    keypoints = subject.keypoints
+    measured = np.array([x in subject.segment_lengths for x in body.skeleton.length_names])
+    fits = _fit_with_lengths(body, camera, keypoints, measured, subject.stature is not None)
+    best = np.argsort(fits.value, kind='stable')[:3]
+    if not np.isfinite(fits.value[best[0]]):
+        raise ValueError('no pose of the body explains the keypoints: are they in the image?')
+    weights = np.exp(-(fits.value[best] - fits.value[best[0]]))
+    d = body.dimension
+    lengths = (weights / weights.sum()) @ fits.x[best, d:]
+    body = body.with_segment_lengths(dict(zip(body.skeleton.length_names, lengths, strict=True)))
+
+    likelihood = ImageLikelihood(
+        body,
+        camera,
+        LikelihoodSettings(joints=TermSettings(1.0, 1.0, np.inf), prior_weight=prior_weight),
+    )
+    observation = Observation(keypoints=keypoints)
+
+    def energy(x: Array, _: Index) -> tuple[Array, Array, Array]:
+        return likelihood.energy(x, observation)
+
+    heads = _distinct(_solve(energy, fits.x[:, :d], body), body, 4)
+    chains = [
+        c for c in ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck') if c in body.chains
+    ]
+    flips = np.concatenate(
+        [heads.x] + [enumerate_flips(body, camera, heads.x, c)[0] for c in chains]
+    )
+    flips = np.concatenate([flips, *_pairs_of_flips(body, camera, heads.x, chains)])
+    raw = likelihood.energy(flips, observation)[0]
+    keep = np.argsort(raw, kind='stable')[:192]
+    solved = _distinct(_solve(energy, flips[keep], body), body, 96)
+    order = np.argsort(solved.value, kind='stable')
+    return Start(body, solved.x[order], solved.value[order], solved.hessian[order])
+
+
+def _sized(body: Body, subject: Subject) -> Body:
+    if subject.stature is not None:
+        body = body.with_stature(subject.stature)
+    known = subject.segment_lengths
+    if not known:
+        return body
+    # What was not measured scales with what was.
+    names = body.skeleton.length_names
+    factor = sum(known.values()) / sum(body.segment_lengths[x] for x in known)
+    scaled = {x: body.segment_lengths[x] * factor for x in names if x not in known}
+    return body.with_segment_lengths({**scaled, **known})
+
+
+def _fit_with_lengths(
+    body: Body, camera: Camera, keypoints: Keypoints, measured: NDArray[np.bool_], sized: bool
+) -> Minimum:
+    """Fits (pose, lengths) to the joints from several headings; x is (HEADINGS, d + L)."""
+    skeleton = body.skeleton
+    d, count = body.dimension, len(skeleton.length_names)
+    which = skeleton.joint_index(keypoints.names)
+    seen = np.isfinite(keypoints.pixels).all(1)
+    precision = np.linalg.inv(keypoints.covariances) * seen[:, None, None]
+    target = np.where(seen[:, None], keypoints.pixels, 0.0)
+    sigma = np.where(measured, MEASURED, body.length_sigma)
+    length_precision = np.diag(sigma**-2.0)
+    if not sized and not measured.any():
+        # People differ in size first and in proportions second.
+        common = STATURE_SPREAD * skeleton.lengths
+        covariance = np.diag(sigma**2) + np.outer(common, common)
+        length_precision = np.linalg.inv(covariance)
+    prior_precision = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, np.inf) ** -2.0
+    default = skeleton.lengths
+
+    def energy(x: Array, _: Index) -> tuple[Array, Array, Array]:
+        poses, lengths = x[:, :d], x[:, d:]
+        value = np.empty(len(x))
+        gradient = np.empty_like(x)
+        hessian = np.empty((len(x), d + count, d + count))
+        for i in range(len(x)):
+            own = skeleton.with_lengths(dict(zip(skeleton.length_names, lengths[i], strict=True)))
+            frames = forward(own, poses[i : i + 1])
+            points = frames.joints()[which]
+            by_pose = point_jacobians(frames, skeleton.joint_segments[which], points)[..., 0]
+            by_length = joint_length_jacobians(own, poses[i : i + 1])[0][which]
+            pixels, projection = camera.project_with_derivative(points[..., 0].T)
+            if not np.isfinite(pixels).all():
+                value[i], gradient[i], hessian[i] = np.inf, 0.0, np.eye(d + count)
+                continue
+            error = pixels.T - target
+            jacobian = np.concatenate(
+                [
+                    np.einsum('aij,jdi->jad', projection, by_pose),
+                    np.einsum('aij,jil->jal', projection, by_length),
+                ],
+                axis=2,
+            )
+            weighted = np.einsum('jab,jbd->jad', precision, jacobian)
+            value[i] = 0.5 * np.einsum('ja,jab,jb->', error, precision, error)
+            gradient[i] = np.einsum('jad,ja->d', weighted, error)
+            hessian[i] = np.einsum('jad,jae->de', weighted, jacobian)
+        offset = poses - body.prior_mean
+        change = lengths - default
+        value += 0.5 * (offset * offset) @ prior_precision
+        value += 0.5 * np.einsum('nl,lm,nm->n', change, length_precision, change)
+        gradient[:, :d] += offset * prior_precision
+        gradient[:, d:] += change @ length_precision
+        hessian[:, :d, :d] += np.diag(prior_precision)
+        hessian[:, d:, d:] += length_precision
+        return value, gradient, hessian
+
+    starts = np.concatenate(
+        [_first_guesses(body, camera, keypoints), np.tile(default, (HEADINGS, 1))], axis=1
+    )
+    lower = np.concatenate([body.lower, np.minimum(default - 5 * sigma, 0.5 * default)])
+    upper = np.concatenate([body.upper, np.maximum(default + 5 * sigma, 2.0 * default)])
+    positive = (
+        skeleton.length_names.index('shoulder_rise')
+        if 'shoulder_rise' in skeleton.length_names
+        else None
+    )
+    lower[d:] = np.where(
+        np.arange(count) == positive, default - 5 * sigma, np.maximum(lower[d:], 0.02)
+    )
+    scale = np.concatenate([np.where(skeleton.dof_is_rotation, 0.4, 0.3), np.full(count, 0.05)])
+    return minimise(
+        energy, starts, lower, upper, step_scale=scale, damping=10.0, max_iterations=80,
+        tolerance=1e-3,
+    )  # fmt: skip
+
+
+def _first_guesses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
+    """Mean poses at several headings, where the joints are and as far as their spread says."""
+    seen = np.isfinite(keypoints.pixels).all(1)
+    pixels = keypoints.pixels[seen]
+    names = [x for x, ok in zip(keypoints.names, seen, strict=True) if ok]
+    rays = camera.rays(pixels)
+    rays = rays / rays[:, 2:]
+    pose = body.prior_mean.copy()
+    pose[~body.skeleton.dof_is_rotation] = 0.0
+    joints = body.joint_positions(pose[None])[0][body.skeleton.joint_index(names)]
+    # Size in space over size in the image; arms and heading blur it, the fit mends it.
+    extent = np.linalg.norm(rays - rays.mean(0), axis=1).mean()
+    spread = np.linalg.norm((joints - joints.mean(0))[:, :2], axis=1).mean()
+    if not extent > 0:
+        raise ValueError('the keypoints all lie on one point')
+    depth = float(np.clip(spread / extent, 0.5, 40.0))
+    middle = rays.mean(0) * depth
+    result = np.tile(pose, (HEADINGS, 1))
+    turn = body.dof_names.index('root_z')
+    result[:, turn] = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
+    turned = body.joint_positions(result)[:, body.skeleton.joint_index(names)]
+    result[:, :3] = middle - turned.mean(1)
+    return result
+
+
+def _pairs_of_flips(body: Body, camera: Camera, poses: Array, chains: list[str]) -> list[Array]:
+    """Products of the trees of both arms and of both legs."""
+    pairs = [('left_arm', 'right_arm'), ('left_leg', 'right_leg')]
+    return [
+        enumerate_flips(body, camera, poses, pair)[0]
+        for pair in pairs
+        if all(c in chains for c in pair)
+    ]
+
+
+def _solve(energy: object, poses: Array, body: Body) -> Minimum:
+    return minimise(
+        energy,  # type: ignore[arg-type]
+        poses, body.lower, body.upper,
+        step_scale=np.where(body.skeleton.dof_is_rotation, 0.4, 0.3),
+        damping=1.0, max_iterations=40, tolerance=1e-3,
+    )  # fmt: skip
+
+
+def _distinct(solved: Minimum, body: Body, count: int) -> Minimum:
+    """The best minima whose joints differ by more than 3 cm somewhere."""
+    order = np.argsort(solved.value, kind='stable')
+    order = order[np.isfinite(solved.value[order])]
+    joints = body.joint_positions(solved.x)
+    kept: list[int] = []
+    for i in order:
+        gaps = [np.linalg.norm(joints[i] - joints[j], axis=1).max() for j in kept]
+        if not gaps or min(gaps) > 0.03:
+            kept.append(int(i))
+        if len(kept) == count:
+            break
+    k = np.array(kept, dtype=np.intp)
+    return Minimum(
+        solved.x[k], solved.value[k], solved.gradient[k], solved.hessian[k], solved.free[k],
+        solved.status[k], solved.iterations[k],
+    )  # fmt: skip

@@ -1,0 +1,124 @@
+"""Subject files: where a person's joints are in one image, and what is known of the person's size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.image.observation import Keypoints
+
+Array = NDArray[np.float64]
+
+LARGEST_FILE = 1_000_000  # bytes
+KEYS = ('stamp_ns', 'sigma_px', 'keypoints', 'segment_lengths_m', 'stature_m')
+
+
+class SubjectError(ValueError):
+    """A subject file that can not be used; one line that says what was seen and what was wanted."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What starts a track.
+
+    Attributes:
+        stamp_ns: of the image in which the joints were seen.
+        keypoints: the joints.
+        segment_lengths: m, where measured.
+        stature: m, or None.
+    """
+
+    stamp_ns: int
+    keypoints: Keypoints
+    segment_lengths: dict[str, float]
+    stature: float | None = None
+
+
+def read_subject(path: str | Path, body: Body) -> Subject:
+    """Reads a subject file and checks its names against a body.
+
+    The file is YAML: `stamp_ns`, `sigma_px`, `keypoints` (name: [u, v], px), and optionally
+    `segment_lengths_m` (name: length) and `stature_m`.
+
+    Raises:
+        SubjectError: a file that is missing, is not YAML, lacks an entry, or names a joint or a length
+            that the body does not have.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise SubjectError(
+                f'{path}: {path.stat().st_size} bytes, a subject file is far smaller'
+            )
+        content = yaml.safe_load(path.read_text('utf-8'))
+    except OSError as fault:
+        raise SubjectError(f'{path}: can not be read ({fault.strerror})') from fault
+    except (yaml.YAMLError, UnicodeDecodeError) as fault:
+        raise SubjectError(f'{path}: not YAML ({" ".join(str(fault).split())})') from fault
+    try:
+        return parse_subject(content, body)
+    except SubjectError as fault:
+        raise SubjectError(f'{path}: {fault}') from None
+
+
+def parse_subject(content: Any, body: Body) -> Subject:
+    """The subject that the content of a subject file describes.
+
+    Raises:
+        SubjectError: as `read_subject`.
+    """
+    if not isinstance(content, dict):
+        raise SubjectError(f'wanted entries {list(KEYS)}, saw {type(content).__name__}')
+    unknown = sorted(str(k) for k in content if k not in KEYS)
+    if unknown:
+        raise SubjectError(f'unknown entries {unknown}, known are {list(KEYS)}')
+    for key in ('stamp_ns', 'keypoints'):
+        if key not in content:
+            raise SubjectError(f'no entry {key!r}')
+    stamp = content['stamp_ns']
+    if not isinstance(stamp, int) or isinstance(stamp, bool) or stamp < 0:
+        raise SubjectError(f'stamp_ns must be a whole number of nanoseconds, saw {stamp!r}')
+    sigma = _positive(content.get('sigma_px', 3.0), 'sigma_px')
+    clicked = content['keypoints']
+    if not isinstance(clicked, dict) or len(clicked) < 4:
+        raise SubjectError('keypoints must name at least four joints')
+    _check_names(clicked, body.joint_names, 'joint', body.name)
+    pixels = np.array([_pixel(name, value) for name, value in clicked.items()])
+    n = len(clicked)
+    keypoints = Keypoints(
+        tuple(clicked), pixels, np.tile(sigma**2 * np.eye(2), (n, 1, 1)), np.ones(n)
+    )
+    lengths = content.get('segment_lengths_m') or {}
+    if not isinstance(lengths, dict):
+        raise SubjectError(f'segment_lengths_m must map names to metres, saw {lengths!r}')
+    _check_names(lengths, body.skeleton.length_names, 'length', body.name)
+    checked = {name: _positive(value, f'length {name}', 3.0) for name, value in lengths.items()}
+    stature = content.get('stature_m')
+    if stature is not None:
+        stature = _positive(stature, 'stature_m', 3.0)
+    return Subject(stamp, keypoints, checked, stature)
+
+
+def _check_names(given: dict[Any, Any], known: tuple[str, ...], kind: str, body: str) -> None:
+    wrong = sorted(str(name) for name in given if name not in known)
+    if wrong:
+        raise SubjectError(f'{body} has no {kind} {wrong}; it has {sorted(known)}')
+
+
+def _positive(value: Any, name: str, largest: float = 1e4) -> float:
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value <= largest:
+        return float(value)
+    raise SubjectError(f'{name} must be a number above 0 and at most {largest:g}, saw {value!r}')
+
+
+def _pixel(name: str, value: Any) -> tuple[float, float]:
+    if isinstance(value, (list, tuple)) and len(value) == 2:
+        if all(isinstance(x, (int, float)) and np.isfinite(x) for x in value):
+            return float(value[0]), float(value[1])
+    raise SubjectError(f'keypoint {name} must be [u, v] in pixels, saw {value!r}')

@@ -1,0 +1,25 @@
+"""Numpy arrays to ROS messages and back, bags in and out, markers and URDF for viewers.
+
+Nothing here needs ROS: the message types come from `rosbags` and from the .msg files in
+`hmt_msgs/`. The same functions serve nodes, which hand over the classes that ROS generates.
+"""
+
+from msg_tools.bag_error import BagError
+from msg_tools.bag_reader import BagMessage, BagReader, Topic
+from msg_tools.bag_writer import BagWriter
+from msg_tools.message_error import MessageError
+from msg_tools.message_factory import GeneratedMessages, MessageFactory, RosbagsMessages
+from msg_tools.typestore import typestore
+
+__all__ = [
+    'BagError',
+    'BagMessage',
+    'BagReader',
+    'BagWriter',
+    'GeneratedMessages',
+    'MessageError',
+    'MessageFactory',
+    'RosbagsMessages',
+    'Topic',
+    'typestore',
+]

@@ -1,0 +1,90 @@
+"""The error of messages that contradict themselves, and the checks that the conversions share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Weights sum to 1 up to this.
+WEIGHT_TOLERANCE = 1e-6
+# Covariances are symmetric up to this, relative to their largest entry.
+SYMMETRY_TOLERANCE = 1e-9
+
+
+class MessageError(ValueError):
+    """A message that can not be understood, in one line: what was seen and what was wanted."""
+
+
+def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
+    """Floats of a flat field of a message, in a shape.
+
+    Raises:
+        MessageError: another number of values.
+    """
+    array = np.array(values, dtype=np.float64)
+    count = int(np.prod(shape))
+    if array.shape != (count,):
+        raise MessageError(f'{what} has {array.size} values, wanted {count}')
+    return array.reshape(shape)
+
+
+def check_finite(values: Array, what: str) -> None:
+    """Raises MessageError where a value is NaN or infinite."""
+    if not np.isfinite(values).all():
+        raise MessageError(f'{what} has values that are not finite')
+
+
+def check_weights(weights: Array, what: str) -> None:
+    """Raises MessageError where weights are no probabilities."""
+    if not np.isfinite(weights).all() or (weights < 0).any():
+        worst = weights[~(weights >= 0) | ~np.isfinite(weights)][0]
+        raise MessageError(f'{what} has the weight {worst}, wanted numbers from 0 to 1')
+    total = float(weights.sum())
+    if abs(total - 1.0) > WEIGHT_TOLERANCE:
+        raise MessageError(f'{what} has weights that sum to {total:.9g}, wanted 1')
+
+
+def check_covariances(covariances: Array, what: str) -> None:
+    """Raises MessageError where a covariance (..., d, d) is not symmetric and positive definite."""
+    check_finite(covariances, f'covariance of {what}')
+    if covariances.size == 0:
+        return
+    transposed = np.swapaxes(covariances, -1, -2)
+    scale = np.abs(covariances).max(axis=(-1, -2), keepdims=True)
+    if (np.abs(covariances - transposed) > SYMMETRY_TOLERANCE * scale).any():
+        raise MessageError(f'covariance of {what} is not symmetric')
+    try:
+        np.linalg.cholesky(covariances)
+    except np.linalg.LinAlgError:
+        smallest = float(np.linalg.eigvalsh(covariances).min())
+        raise MessageError(
+            f'covariance of {what} is not positive definite: smallest eigenvalue {smallest:.3g}'
+        ) from None
+
+
+def names_of(values: Sequence[str], what: str) -> tuple[str, ...]:
+    """Names, each once.
+
+    Raises:
+        MessageError: a name that is there twice.
+    """
+    names = tuple(str(value) for value in values)
+    for name in names:
+        if names.count(name) > 1:
+            raise MessageError(f'{what} has the name {name!r} twice')
+    return names
+
+
+def check_names(names: tuple[str, ...], wanted: Sequence[str] | None, what: str) -> None:
+    """Raises MessageError where names are not those wanted, in their order; None: any will do."""
+    if wanted is None or names == tuple(wanted):
+        return
+    if len(names) != len(wanted):
+        raise MessageError(f'{what} has {len(names)} names, wanted {len(wanted)}')
+    index = next(i for i, (a, b) in enumerate(zip(names, wanted, strict=True)) if a != b)
+    raise MessageError(f'{what} has {names[index]!r} at {index}, wanted {wanted[index]!r}')

@@ -1,0 +1,141 @@
+"""The camera against OpenCV and finite differences."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hmt_ros.body import Camera
+
+LENSES = {
+    'none': ('plumb_bob', ()),
+    'plumb_bob with four': ('plumb_bob', (-0.28, 0.09, 1e-3, -2e-3)),
+    'plumb_bob with five': ('plumb_bob', (-0.28, 0.09, 1e-3, -2e-3, 0.01)),
+    'rational_polynomial': (
+        'rational_polynomial', (0.4, -0.2, 1e-3, -2e-3, 0.05, 0.7, -0.1, 0.02),
+    ),
+    'equidistant': ('equidistant', (-0.02, 0.01, -0.004, 0.001)),
+}  # fmt: skip
+
+
+@pytest.fixture(params=LENSES)
+def camera(request) -> Camera:
+    model, coefficients = LENSES[request.param]
+    return Camera(610.0, 590.0, 322.5, 238.0, 640, 480, coefficients, model)
+
+
+def points_in_view(n: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(0.5, 8, n)
+    return np.stack([z * rng.uniform(-0.5, 0.5, n), z * rng.uniform(-0.4, 0.4, n), z], axis=1)
+
+
+def test_projection_equals_opencv(camera):
+    points = points_in_view(200, 0)
+    none = np.zeros((3, 1))
+    if camera.distortion_model == 'equidistant':
+        expected, _ = cv2.fisheye.projectPoints(
+            points[:, None], none, none, camera.matrix, np.array(camera.distortion)
+        )
+    else:
+        distortion = np.array(camera.distortion) if camera.distortion else None
+        expected, _ = cv2.projectPoints(points, none, none, camera.matrix, distortion)
+    np.testing.assert_allclose(camera.project(points), expected[:, 0], atol=1e-6)
+
+
+def test_derivative_equals_central_differences(camera):
+    points = np.concatenate([points_in_view(40, 1), [[0.0, 0.0, 2.0], [1e-7, 0.0, 2.0]]]).T
+    pixels, derivative = camera.project_with_derivative(points)
+    np.testing.assert_allclose(pixels.T, camera.project(points.T), atol=1e-12)
+    for k in range(3):
+        step = np.zeros((3, 1))
+        step[k] = 1e-6
+        ahead, _ = camera.project_with_derivative(points + step)
+        behind, _ = camera.project_with_derivative(points - step)
+        np.testing.assert_allclose(derivative[:, k], (ahead - behind) / 2e-6, atol=2e-5)
+
+
+def test_rays_undo_the_projection(camera):
+    points = points_in_view(200, 2)
+    rays = camera.rays(camera.project(points))
+    expected = points / np.linalg.norm(points, axis=1, keepdims=True)
+    np.testing.assert_allclose(rays, expected, atol=1e-10)
+    back = camera.project(3.0 * rays)
+    np.testing.assert_allclose(back, camera.project(points), atol=1e-6)
+
+
+def test_shapes_of_points_are_kept():
+    camera = Camera(600, 600, 320, 240, 640, 480)
+    points = points_in_view(24, 3).reshape(2, 3, 4, 3)
+    assert camera.project(points).shape == (2, 3, 4, 2)
+    assert camera.rays(camera.project(points)).shape == (2, 3, 4, 3)
+    assert camera.project(points[0, 0, 0]).shape == (2,)
+
+
+@pytest.mark.parametrize('z', [0.01, 0.0, -1.0])
+def test_a_point_behind_the_camera_has_no_image(camera, z):
+    points = np.array([[0.1, 0.2, z], [0.1, 0.2, 1.0]])
+    pixels = camera.project(points)
+    assert np.isnan(pixels[0]).all()
+    assert np.isfinite(pixels[1]).all()
+
+
+@given(
+    u=st.floats(0, 639),
+    v=st.floats(0, 479),
+    depth=st.floats(0.1, 50),
+    lens=st.sampled_from(sorted(LENSES)),
+)
+def test_every_pixel_has_a_ray_that_projects_to_it(u, v, depth, lens):
+    model, coefficients = LENSES[lens]
+    camera = Camera(610.0, 590.0, 322.5, 238.0, 640, 480, coefficients, model)
+    ray = camera.rays([u, v])
+    assert np.linalg.norm(ray) == pytest.approx(1.0)
+    np.testing.assert_allclose(camera.project(depth * ray), [u, v], atol=1e-5)
+
+
+@given(factor=st.sampled_from([0.25, 0.5, 2.0]), seed=st.integers(0, 1000))
+def test_a_resized_image_has_the_scaled_camera(factor, seed):
+    """The corner of the first pixel, not its centre, stays where it is."""
+    camera = Camera(610.0, 590.0, 322.5, 238.0, 640, 480, (-0.2, 0.05, 0.001, 0.0))
+    small = camera.scaled(factor)
+    points = points_in_view(5, seed)
+    expected = (camera.project(points) + 0.5) * factor - 0.5
+    np.testing.assert_allclose(small.project(points), expected, atol=1e-9)
+    assert (small.width, small.height) == (640 * factor, 480 * factor)
+
+
+def test_zero_coefficients_are_no_distortion():
+    assert Camera(600, 600, 320, 240, 640, 480, (0.0,) * 5).distortion == ()
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'fx': 0.0}, 'focal lengths must be positive, saw 0.0 and 600'),
+        ({'fy': -1.0}, 'focal lengths must be positive'),
+        ({'cx': float('nan')}, 'must be finite'),
+        ({'fx': float('inf')}, 'must be finite'),
+        ({'width': 0}, 'image size must be positive, saw 0 x 480'),
+        ({'distortion': (0.1, 0.2, 0.3)}, 'coefficients, saw 3'),
+        ({'distortion': (0.1,) * 5, 'distortion_model': 'equidistant'}, 'coefficients, saw 5'),
+        ({'distortion_model': 'fisheye624'}, "unknown distortion model 'fisheye624'"),
+    ],
+)
+def test_an_impossible_camera_is_refused(change, message):
+    values = {'fx': 600.0, 'fy': 600.0, 'cx': 320.0, 'cy': 240.0, 'width': 640, 'height': 480}
+    with pytest.raises(ValueError, match=message):
+        Camera(**{**values, **change})
+
+
+def test_equidistant_with_zero_coefficients_is_still_a_fisheye():
+    """All coefficients zero means an ideal equidistant lens, not a pinhole."""
+    camera = Camera(600, 600, 320, 240, 640, 480, (0.0,) * 4, 'equidistant')
+    points = points_in_view(20, 4)
+    expected, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros((3, 1)), np.zeros((3, 1)), camera.matrix, np.zeros(4)
+    )
+    np.testing.assert_allclose(camera.project(points), expected[:, 0], atol=1e-6)

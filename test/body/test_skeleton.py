@@ -1,0 +1,88 @@
+"""What a skeleton checks when it is made, and how its parts are found by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import load_body
+
+SKELETON = load_body('human37').skeleton
+
+
+def two_segments() -> dict:
+    """Arguments for a rod that slides and turns, with a second rod hinged to it."""
+    return {
+        'name': 'rods', 'segment_names': ('first', 'second'), 'parents': (-1, 0),
+        'mounts': np.tile(np.eye(3), (2, 1, 1)), 'fixed_offsets': np.zeros((2, 3)),
+        'offset_basis': np.zeros((2, 3, 1)), 'dof_names': ('slide', 'turn', 'hinge'),
+        'dof_segments': np.array([0, 0, 1]), 'dof_axes': np.array([2, 0, 0]),
+        'dof_is_rotation': np.array([False, True, True]), 'lower': -np.ones(3), 'upper': np.ones(3),
+        'joint_names': ('start', 'end'), 'joint_segments': np.array([0, 1]),
+        'joint_fixed': np.zeros((2, 3)), 'joint_basis': np.zeros((2, 3, 1)),
+        'length_names': ('rod',), 'lengths': np.array([0.5]),
+    }  # fmt: skip
+
+
+def test_the_example_is_a_skeleton():
+    skeleton = type(SKELETON)(**two_segments())
+    assert skeleton.dimension == 3
+    assert skeleton.segment_dofs == ((0, 1), (2,))
+    np.testing.assert_array_equal(skeleton.moves, [[True, True, False], [True, True, True]])
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'mounts': np.eye(3)}, r'rods: mounts has shape \(3, 3\), wanted \(2, 3, 3\)'),
+        ({'lower': -np.ones(2)}, r'lower has shape \(2,\), wanted \(3,\)'),
+        ({'lengths': np.ones(2)}, r'lengths has shape \(2,\), wanted \(1,\)'),
+        ({'joint_basis': np.zeros((2, 3, 2))}, 'joint_basis has shape'),
+        ({'parents': (-1, 1)}, 'segment second has parent 1, wanted one that stands before'),
+        ({'parents': (-2, 0)}, 'segment first has parent -2'),
+        ({'dof_segments': np.array([0, 1, 0])}, 'in the order of segments'),
+        ({'dof_is_rotation': np.array([True, False, True])}, 'translations .* before'),
+        ({'dof_names': ('slide', 'slide', 'hinge')}, r"dof_names has \['slide'\] more than once"),
+        ({'joint_names': ('end', 'end')}, r"joint_names has \['end'\] more than once"),
+        ({'segment_names': ('rod', 'rod')}, r"segment_names has \['rod'\] more than once"),
+        ({'lower': np.array([-1, 1, -1.0])}, r"lower limit not below upper limit for \['turn'\]"),
+        ({'upper': np.array([1, np.nan, 1])}, 'lower limit not below upper'),
+    ],
+)
+def test_a_skeleton_that_contradicts_itself_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        type(SKELETON)(**{**two_segments(), **change})
+
+
+def test_arrays_of_a_skeleton_can_not_be_written():
+    with pytest.raises(ValueError, match='read-only'):
+        SKELETON.lower[0] = 0.0
+    with pytest.raises(ValueError, match='read-only'):
+        SKELETON.lengths[0] = 0.0
+
+
+def test_a_skeleton_keeps_its_own_copy_of_arrays():
+    arguments = two_segments()
+    skeleton = type(SKELETON)(**arguments)
+    arguments['lengths'][0] = 9.0
+    assert skeleton.lengths[0] == 0.5
+
+
+def test_names_are_found_and_unknown_ones_are_named():
+    names = ('left_knee', 'root_tx')
+    where = SKELETON.dof_index(names)
+    assert tuple(SKELETON.dof_names[i] for i in where) == names
+    with pytest.raises(KeyError, match=r"no joint \['nose'\]; it has"):
+        SKELETON.joint_index(('head', 'nose'))
+    with pytest.raises(KeyError, match=r"no degree of freedom \['elbow'\]"):
+        SKELETON.dof_index(['elbow'])
+
+
+def test_offsets_follow_the_lengths():
+    longer = SKELETON.with_lengths({'thigh': 0.6})
+    knee = SKELETON.segment_names.index('left_shin')
+    np.testing.assert_allclose(longer.offsets[knee], [0, 0, -0.6])
+    np.testing.assert_allclose(SKELETON.offsets[knee], [0, 0, -SKELETON.lengths[0]])
+    assert replace(longer, name='tall').offsets[knee][2] == -0.6

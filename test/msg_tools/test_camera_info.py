@@ -1,0 +1,144 @@
+"""CameraInfo to a camera: what real drivers send, and what gives no camera."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from hmt_ros.body import Camera
+from msg_tools import BagReader, RosbagsMessages
+from msg_tools.camera_info import CameraInfoError, camera_from_info, camera_info_message
+
+K = [600.0, 0.0, 321.5, 0.0, 590.0, 243.25, 0.0, 0.0, 1.0]
+PLUMB_BOB = [-0.25, 0.08, 0.001, -0.002, 0.01]
+RATIONAL = [0.5, -0.3, 0.001, 0.0005, 0.05, 0.9, -0.2, 0.01]
+EQUIDISTANT = [0.05, -0.01, 0.003, -0.0005]
+
+
+def info(**changes: Any) -> SimpleNamespace:
+    roi = {'x_offset': 0, 'y_offset': 0, 'width': 0, 'height': 0, 'do_rectify': False}
+    roi.update(changes.pop('roi', {}))
+    fields: dict[str, Any] = {
+        'width': 640,
+        'height': 480,
+        'distortion_model': 'plumb_bob',
+        'd': PLUMB_BOB,
+        'k': K,
+        'binning_x': 0,
+        'binning_y': 0,
+        'roi': SimpleNamespace(**roi),
+    }
+    return SimpleNamespace(**{**fields, **changes})
+
+
+@pytest.mark.parametrize(
+    ('model', 'coefficients'),
+    [
+        ('plumb_bob', []),
+        ('plumb_bob', PLUMB_BOB),
+        ('plumb_bob', PLUMB_BOB[:4]),
+        ('plumb_bob', [0.0] * 5),
+        ('', []),
+        ('', [0.0] * 5),
+        ('rational_polynomial', RATIONAL),
+        ('rational_polynomial', [*RATIONAL, 0.0, 0.0, 0.0, 0.0]),
+        ('rational_polynomial', [0.0] * 14),
+    ],
+)
+def test_projects_as_opencv(model: str, coefficients: list[float]) -> None:
+    camera = camera_from_info(info(distortion_model=model, d=np.array(coefficients)))
+    points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 5], (50, 3))
+    matrix = np.reshape(K, (3, 3))
+    wanted, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(coefficients))
+    np.testing.assert_allclose(camera.project(points), wanted[:, 0], atol=1e-8)
+    assert (camera.width, camera.height) == (640, 480)
+
+
+def test_fisheye_projects_as_opencv() -> None:
+    camera = camera_from_info(info(distortion_model='equidistant', d=EQUIDISTANT))
+    points = np.random.default_rng(0).uniform([-3, -3, 1], [3, 3, 3], (50, 3))
+    matrix = np.reshape(K, (3, 3))
+    wanted, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), matrix, np.array(EQUIDISTANT)
+    )
+    np.testing.assert_allclose(camera.project(points), wanted[:, 0], atol=1e-8)
+
+
+def test_region_and_binning() -> None:
+    roi = {'x_offset': 100, 'y_offset': 50, 'width': 400, 'height': 300}
+    whole = camera_from_info(info())
+    part = camera_from_info(info(roi=roi, binning_x=2, binning_y=4))
+    assert (part.width, part.height) == (200, 75)
+    points = np.random.default_rng(0).uniform([-0.5, -0.5, 2], [0.5, 0.5, 5], (50, 3))
+    wanted = (whole.project(points) - [100, 50]) / [2, 4]
+    np.testing.assert_allclose(part.project(points), wanted, atol=1e-9)
+    same = camera_from_info(info(roi={'width': 640, 'height': 480}, binning_x=1, binning_y=1))
+    assert same == whole
+
+
+def test_size_of_the_picture() -> None:
+    assert camera_from_info(info(), (640, 480)).width == 640
+    with pytest.raises(CameraInfoError, match='is for pictures of 640x480, saw 320x240'):
+        camera_from_info(info(), (320, 240))
+    assert camera_from_info(info(binning_x=2, binning_y=2), (320, 240)).fx == 300.0
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error'),
+    [
+        ({'k': [0.0] * 9}, r'the camera is not calibrated \(K is zero\)'),
+        ({'k': K[:8]}, r'K has 8 values, wanted 9'),
+        ({'k': [np.nan, *K[1:]]}, r'values that are not finite'),
+        ({'d': [np.inf, 0, 0, 0, 0]}, r'values that are not finite'),
+        ({'k': [-600.0, *K[1:]]}, r'focal lengths are -600.0 and 590.0, wanted positive'),
+        ({'k': [*K[:4], 0.0, *K[5:]]}, r'focal lengths are 600.0 and 0.0'),
+        ({'k': [600.0, 0.5, *K[2:]]}, r'without skew'),
+        ({'k': [*K[:8], 0.0]}, r'wanted \[fx, 0, cx, 0, fy, cy, 0, 0, 1\]'),
+        ({'width': 0}, r'size is 0x480'),
+        ({'height': 0, 'width': 0}, r'size is 0x0'),
+        ({'distortion_model': 'omni'}, r"unknown distortion model 'omni'"),
+        ({'distortion_model': 'omni', 'd': []}, r"unknown distortion model 'omni'"),
+        ({'distortion_model': ''}, r'D has 5 coefficients, but no distortion model'),
+        ({'d': PLUMB_BOB[:3]}, r'plumb_bob has \(0, 4, 5\) coefficients, saw 3'),
+        ({'distortion_model': 'equidistant', 'd': []}, r'equidistant without coefficients'),
+        ({'distortion_model': 'rational_polynomial', 'd': RATIONAL + [0.1] * 4}, r'saw 12'),
+        ({'roi': {'x_offset': 600, 'width': 100, 'height': 100}}, r'roi of 100x100 at \(600, 0\)'),
+        ({'roi': {'x_offset': 10}}, r'roi of 0x0 at \(10, 0\) does not lie in the 640x480'),
+        ({'binning_x': 1000}, r'binning of 1000 and 1 leaves 0x480 pixels'),
+    ],
+)
+def test_what_gives_no_camera(changes: dict[str, Any], error: str) -> None:
+    with pytest.raises(CameraInfoError, match=error) as caught:
+        camera_from_info(info(**changes))
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('model', 'coefficients'),
+    [
+        ('plumb_bob', ()),
+        ('plumb_bob', tuple(PLUMB_BOB)),
+        ('rational_polynomial', tuple(RATIONAL)),
+        ('equidistant', tuple(EQUIDISTANT)),
+    ],
+)
+def test_round_trip(messages: RosbagsMessages, model: str, coefficients: tuple[float, ...]) -> None:
+    camera = Camera(600.0, 590.0, 321.5, 243.25, 640, 480, coefficients, model)
+    message = camera_info_message(messages, camera, 5, 'camera')
+    assert camera_from_info(message) == camera
+    assert message.p.tolist() == [600.0, 0, 321.5, 0, 0, 590.0, 243.25, 0, 0, 0, 1, 0]
+    assert message.r.tolist() == np.eye(3).ravel().tolist()
+    assert message.header.frame_id == 'camera'
+
+
+@pytest.mark.parametrize('name', ['walk', 'exercise', 'charleston', 'park_walk', 'leaflet'])
+def test_cameras_of_the_videos(shared: Any, name: str) -> None:
+    with BagReader(shared / 'video' / name) as bag:
+        topic = bag.find_topic(['sensor_msgs/msg/CameraInfo'])
+        camera = camera_from_info(next(bag.messages([topic.name])).message)
+    assert camera.width in (640, 1061, 576)
+    assert 0.5 < camera.fx / camera.width < 3

@@ -1,0 +1,349 @@
+"""Pictures in messages: every encoding against OpenCV, every defect as one line."""
+
+from __future__ import annotations
+
+import array
+import struct
+import zlib
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from msg_tools import RosbagsMessages
+from msg_tools.images import (
+    ImageError,
+    compressed_image_message,
+    decode_image,
+    encode_jpeg,
+    image_message,
+)
+
+HEIGHT, WIDTH = 30, 44
+RNG = np.random.default_rng(2)
+
+
+def scene() -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """A smooth picture with colours, BGR."""
+    v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
+    planes = [128 + 100 * np.sin(u / 7), 128 + 100 * np.cos(v / 9), 255 * u / WIDTH]
+    return np.stack(planes, axis=-1).round().astype(np.uint8)
+
+
+def raw(
+    pixels: np.ndarray[Any, Any],
+    encoding: str,
+    /,
+    *,
+    padding: int = 0,
+    big: bool = False,
+    **changes: Any,
+) -> SimpleNamespace:
+    """An Image of rows of pixels."""
+    kind = pixels.dtype.newbyteorder('>' if big else '<')
+    rows = np.ascontiguousarray(pixels.astype(kind)).view(np.uint8).reshape(len(pixels), -1)
+    padded = np.hstack([rows, np.full((len(rows), padding), 171, dtype=np.uint8)])
+    fields = {
+        'height': HEIGHT,
+        'width': WIDTH,
+        'encoding': encoding,
+        'is_bigendian': int(big),
+        'step': padded.shape[1],
+        'data': padded.tobytes(),
+    }
+    return SimpleNamespace(**{**fields, **changes})
+
+
+BGR = scene()
+GREY = cv2.cvtColor(BGR, cv2.COLOR_BGR2GRAY)
+WORDS = RNG.integers(0, 65536, (HEIGHT, WIDTH), dtype=np.uint16)
+MOSAIC = RNG.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
+PAIRS = RNG.integers(0, 256, (HEIGHT, WIDTH, 2), dtype=np.uint8)
+PLANES = RNG.integers(0, 256, (HEIGHT * 3 // 2, WIDTH), dtype=np.uint8)
+ALPHA = np.dstack([BGR, MOSAIC])
+
+
+def eight_bits(words: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    return np.rint(words.astype(np.float64) / 257.0).astype(np.uint8)
+
+
+# Encoding, pixels as sent, picture wanted.
+CASES: list[tuple[str, Any, Any]] = [
+    ('mono8', GREY, cv2.cvtColor(GREY, cv2.COLOR_GRAY2BGR)),
+    ('8UC1', GREY, cv2.cvtColor(GREY, cv2.COLOR_GRAY2BGR)),
+    ('mono16', WORDS, np.dstack([eight_bits(WORDS)] * 3)),
+    ('16UC1', WORDS, np.dstack([eight_bits(WORDS)] * 3)),
+    ('bgr8', BGR, BGR),
+    ('8UC3', BGR, BGR),
+    ('rgb8', BGR[..., ::-1], BGR),
+    ('bgra8', ALPHA, BGR),
+    ('8UC4', ALPHA, BGR),
+    ('rgba8', ALPHA[..., [2, 1, 0, 3]], BGR),
+    ('bgr16', BGR.astype(np.uint16) * 257, BGR),
+    ('rgb16', BGR[..., ::-1].astype(np.uint16) * 257, BGR),
+    ('bgra16', ALPHA.astype(np.uint16) * 257, BGR),
+    ('rgba16', ALPHA[..., [2, 1, 0, 3]].astype(np.uint16) * 257, BGR),
+    ('bayer_rggb8', MOSAIC, cv2.cvtColor(MOSAIC, cv2.COLOR_BayerRGGB2BGR)),
+    ('bayer_bggr8', MOSAIC, cv2.cvtColor(MOSAIC, cv2.COLOR_BayerBGGR2BGR)),
+    ('bayer_gbrg8', MOSAIC, cv2.cvtColor(MOSAIC, cv2.COLOR_BayerGBRG2BGR)),
+    ('bayer_grbg8', MOSAIC, cv2.cvtColor(MOSAIC, cv2.COLOR_BayerGRBG2BGR)),
+    ('bayer_rggb16', WORDS, eight_bits(cv2.cvtColor(WORDS, cv2.COLOR_BayerRGGB2BGR))),
+    ('bayer_bggr16', WORDS, eight_bits(cv2.cvtColor(WORDS, cv2.COLOR_BayerBGGR2BGR))),
+    ('bayer_gbrg16', WORDS, eight_bits(cv2.cvtColor(WORDS, cv2.COLOR_BayerGBRG2BGR))),
+    ('bayer_grbg16', WORDS, eight_bits(cv2.cvtColor(WORDS, cv2.COLOR_BayerGRBG2BGR))),
+    ('yuv422', PAIRS, cv2.cvtColor(PAIRS, cv2.COLOR_YUV2BGR_UYVY)),
+    ('uyvy', PAIRS, cv2.cvtColor(PAIRS, cv2.COLOR_YUV2BGR_UYVY)),
+    ('yuv422_yuy2', PAIRS, cv2.cvtColor(PAIRS, cv2.COLOR_YUV2BGR_YUY2)),
+    ('yuyv', PAIRS, cv2.cvtColor(PAIRS, cv2.COLOR_YUV2BGR_YUY2)),
+    ('nv12', PLANES, cv2.cvtColor(PLANES, cv2.COLOR_YUV2BGR_NV12)),
+    ('nv21', PLANES, cv2.cvtColor(PLANES, cv2.COLOR_YUV2BGR_NV21)),
+]
+
+
+@pytest.mark.parametrize('padding', [0, 1, 6])
+@pytest.mark.parametrize(('encoding', 'pixels', 'wanted'), CASES, ids=[case[0] for case in CASES])
+def test_every_encoding(encoding: str, pixels: Any, wanted: Any, padding: int) -> None:
+    for big in (False, True) if pixels.dtype == np.uint16 else (False,):
+        picture = decode_image(raw(pixels, encoding, padding=padding, big=big))
+        np.testing.assert_array_equal(picture, wanted)
+        assert picture.dtype == np.uint8
+        assert picture.flags.c_contiguous
+        assert picture.flags.writeable
+
+
+@pytest.mark.parametrize('pattern', ['rggb', 'bggr', 'gbrg', 'grbg'])
+def test_bayer_patterns_give_back_a_plain_colour(pattern: str) -> None:
+    colour = {'b': 200, 'g': 90, 'r': 30}
+    tile = np.array([colour[letter] for letter in pattern], dtype=np.uint8).reshape(2, 2)
+    mosaic = np.tile(tile, (HEIGHT // 2, WIDTH // 2))
+    picture = decode_image(raw(mosaic, f'bayer_{pattern}8'))
+    assert (picture == [200, 90, 30]).all()
+
+
+@pytest.mark.parametrize('encoding', ['yuv422', 'yuv422_yuy2', 'nv12', 'nv21'])
+def test_luma_without_chroma_is_grey(encoding: str) -> None:
+    luma, none = 126, 128
+    pixels = {
+        'yuv422': np.tile(np.array([none, luma], dtype=np.uint8), (HEIGHT, WIDTH, 1)),
+        'yuv422_yuy2': np.tile(np.array([luma, none], dtype=np.uint8), (HEIGHT, WIDTH, 1)),
+    }.get(encoding, np.full((HEIGHT * 3 // 2, WIDTH), luma, dtype=np.uint8))
+    if encoding in ('nv12', 'nv21'):
+        pixels[HEIGHT:] = none
+    picture = decode_image(raw(pixels, encoding))
+    assert (picture == picture[0, 0, 0]).all()
+    assert abs(int(picture[0, 0, 0]) - 128) <= 1
+
+
+@pytest.mark.parametrize(
+    'kind',
+    [bytes, bytearray, memoryview, lambda d: array.array('B', d), lambda d: np.frombuffer(d, 'u1')],
+)
+def test_data_of_any_kind(kind: Any) -> None:
+    message = raw(BGR, 'bgr8')
+    message.data = kind(message.data)
+    np.testing.assert_array_equal(decode_image(message), BGR)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error'),
+    [
+        ({'encoding': 'rgb9'}, r"image encoding 'rgb9' is not known, wanted one of mono8, "),
+        ({'width': 0}, r'image has size 0x30, wanted at least one pixel'),
+        ({'height': 0}, r'image has size 44x0'),
+        ({'step': 131}, r'image step is 131, wanted at least 132 for 44 bgr8'),
+        ({'step': 0}, r'image step is 0'),
+        ({'height': 31}, r'image has 3960 bytes, wanted 4092: 31 rows with a step of 132'),
+        ({'height': 29}, r'image has 3960 bytes, wanted 3828'),
+        ({'data': b''}, r'image has 0 bytes'),
+        ({'data': None}, r'image data is a NoneType, wanted bytes'),
+        ({'width': 2**31, 'height': 2**31, 'step': 2**33}, r'the limit is 67108864 pixels'),
+        (
+            {'encoding': 'yuv422', 'width': 43},
+            r'image of 43x30 can not be yuv422, wanted even sizes',
+        ),
+        ({'encoding': 'nv12', 'height': 31}, r'image of 44x31 can not be nv12, wanted even sizes'),
+    ],
+)
+def test_defects_of_raw_images(changes: dict[str, Any], error: str) -> None:
+    with pytest.raises(ImageError, match=error):
+        decode_image(raw(BGR, 'bgr8', **changes))
+
+
+# Compressed
+
+
+def compressed(data: bytes, form: str = 'jpeg') -> SimpleNamespace:
+    return SimpleNamespace(format=form, data=data)
+
+
+def encoded(suffix: str, image: Any) -> bytes:
+    done, data = cv2.imencode(suffix, image)
+    assert done
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ('form', 'suffix'),
+    [
+        ('jpeg', '.jpg'),
+        ('jpg', '.jpg'),
+        ('', '.jpg'),
+        ('bgr8; jpeg compressed bgr8', '.jpg'),
+        ('rgb8; jpeg compressed bgr8', '.jpg'),
+        ('png', '.png'),
+        ('rgb8; png compressed bgr8', '.png'),
+    ],
+)
+def test_compressed_formats(form: str, suffix: str) -> None:
+    data = encoded(suffix, BGR)
+    wanted = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    picture = decode_image(compressed(data, form))
+    np.testing.assert_array_equal(picture, wanted)
+    assert picture.flags.writeable
+    if suffix == '.png':
+        np.testing.assert_array_equal(picture, BGR)
+
+
+def test_compressed_grey_alpha_and_16_bits() -> None:
+    for image, wanted in (
+        (GREY, np.dstack([GREY] * 3)),
+        (ALPHA, BGR),
+        (BGR.astype(np.uint16) * 257, BGR),
+    ):
+        np.testing.assert_array_equal(
+            decode_image(compressed(encoded('.png', image), 'png')), wanted
+        )
+    grey = decode_image(compressed(encoded('.jpg', GREY)))
+    assert grey.shape == (HEIGHT, WIDTH, 3)
+    assert np.abs(grey[..., 1].astype(int) - GREY).mean() < 3
+
+
+def with_orientation(jpeg: bytes) -> bytes:
+    """The picture with the note of the camera that it stands upside down."""
+    tiff = (
+        b'II*\x00\x08\x00\x00\x00\x01\x00\x12\x01\x03\x00\x01\x00\x00\x00\x03\x00\x00\x00'
+        + bytes(4)
+    )
+    segment = b'Exif\x00\x00' + tiff
+    return jpeg[:2] + b'\xff\xe1' + (len(segment) + 2).to_bytes(2, 'big') + segment + jpeg[2:]
+
+
+def test_plain_pictures_are_not_taken_for_damage() -> None:
+    plain = np.full((2048, 2048), 77, dtype=np.uint8)
+    for suffix in ('.jpg', '.png'):
+        assert (decode_image(compressed(encoded(suffix, plain), suffix)) == 77).all()
+    progressive = cv2.imencode(
+        '.jpg',
+        plain,
+        [
+            cv2.IMWRITE_JPEG_PROGRESSIVE,
+            1,
+            cv2.IMWRITE_JPEG_OPTIMIZE,
+            1,
+            cv2.IMWRITE_JPEG_QUALITY,
+            1,
+        ],
+    )[1]
+    assert decode_image(compressed(bytes(progressive))).shape == (2048, 2048, 3)
+    done, packed = cv2.imencode('.png', plain // 255, [cv2.IMWRITE_PNG_BILEVEL, 1])
+    assert done
+    assert decode_image(compressed(bytes(packed), 'png')).shape == (2048, 2048, 3)
+
+
+def test_orientation_of_the_camera_is_ignored() -> None:
+    data = encoded('.jpg', BGR)
+    turned = with_orientation(data)
+    assert (
+        cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR)[0, 0] != BGR[0, 0]
+    ).any()
+    np.testing.assert_array_equal(decode_image(compressed(turned)), decode_image(compressed(data)))
+
+
+def test_jpeg_that_was_cut_anywhere_is_no_picture() -> None:
+    data = encoded('.jpg', BGR)
+    for length in range(len(data) - 1):
+        with pytest.raises(ImageError):
+            decode_image(compressed(data[:length]))
+    # Cameras pad their pictures.
+    assert decode_image(compressed(data + bytes(7))).shape == BGR.shape
+
+
+def test_png_that_was_cut_anywhere_is_no_picture() -> None:
+    data = encoded('.png', BGR)
+    for length in [*range(60), *range(60, len(data) - 8, 37)]:
+        with pytest.raises(ImageError):
+            decode_image(compressed(data[:length], 'png'))
+
+
+def test_damaged_pictures_never_crash() -> None:
+    for suffix in ('.jpg', '.png'):
+        data = encoded(suffix, BGR)
+        for seed in range(300):
+            rng = np.random.default_rng(seed)
+            damaged = bytearray(data)
+            for offset in rng.integers(0, len(data), 4):
+                damaged[offset] = rng.integers(256)
+            try:
+                picture = decode_image(compressed(bytes(damaged)))
+            except ImageError:
+                continue
+            assert picture.size <= 3 * 2**26
+
+
+def with_size(png: bytes, width: int, height: int) -> bytes:
+    header = b'IHDR' + struct.pack('>II', width, height) + png[24:29]
+    return png[:12] + header + struct.pack('>I', zlib.crc32(header)) + png[33:]
+
+
+def test_defects_of_compressed_images() -> None:
+    jpeg = encoded('.jpg', BGR)
+    frame = jpeg.index(b'\xff\xc0')
+    huge = jpeg[: frame + 5] + b'\xff\xff\xff\xff' + jpeg[frame + 9 :]
+    large = jpeg[: frame + 5] + b'\x10\x00\x10\x00' + jpeg[frame + 9 :]
+    png = encoded('.png', BGR)
+    for message, error in (
+        (compressed(b''), r"of format 'jpeg' starts with b'', wanted jpeg or png"),
+        (compressed(b'\x00\x00\x00\x01h264', 'h264'), r"of format 'h264' starts with"),
+        (compressed(png, '16UC1; compressedDepth png'), r'depth, wanted a picture'),
+        (compressed(huge), r'image has size 65535x65535, the limit is'),
+        (compressed(large), rf'of {len(large)} bytes can not have a size of 4096x4096'),
+        (compressed(with_size(png, 2**30, 2**30), 'png'), r'the limit is'),
+        (compressed(with_size(png, 0, 0), 'png'), r'image has size 0x0'),
+        (compressed(with_size(png, 8000, 8000), 'png'), r'can not have a size of 8000x8000'),
+        (compressed(png[:40] + b'?' + png[41:], 'png'), r'is damaged: a checksum differs'),
+        (compressed(png[:33] + b'\x7f' + png[34:], 'png'), r'breaks off or is damaged'),
+    ):
+        with pytest.raises(ImageError, match=error):
+            decode_image(message)
+
+
+# Encoding
+
+
+def test_encoding_is_repeatable_and_near(messages: RosbagsMessages) -> None:
+    assert encode_jpeg(BGR, 90) == encode_jpeg(BGR.copy(), 90)
+    assert len(encode_jpeg(BGR, 95)) > len(encode_jpeg(BGR, 50))
+    message = compressed_image_message(messages, BGR, 1_500_000_000, 'camera', quality=95)
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1, 500_000_000)
+    assert message.format == 'jpeg'
+    assert np.abs(decode_image(message).astype(int) - BGR).mean() < 3
+
+
+def test_image_message_round_trip(messages: RosbagsMessages) -> None:
+    view = np.dstack([BGR, BGR])[:, ::2, 1:4]
+    message = image_message(messages, view, 5, 'camera')
+    assert (message.encoding, message.step) == ('bgr8', WIDTH // 2 * 3)
+    np.testing.assert_array_equal(decode_image(message), view)
+    message = image_message(messages, GREY, 5, 'camera')
+    assert message.encoding == 'mono8'
+    np.testing.assert_array_equal(decode_image(message)[..., 0], GREY)
+
+
+@pytest.mark.parametrize('image', [BGR.astype(float), BGR[..., :2], BGR[0, 0], BGR[:0]])
+def test_what_is_no_picture_is_not_encoded(messages: RosbagsMessages, image: Any) -> None:
+    with pytest.raises(ImageError):
+        encode_jpeg(image)
+    with pytest.raises(ImageError):
+        image_message(messages, image, 0, 'camera')

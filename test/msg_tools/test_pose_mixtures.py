@@ -1,0 +1,156 @@
+"""PoseMixture to arrays and back, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hmt_ros.inference import GaussianMixture
+from msg_tools import MessageError, RosbagsMessages, typestore
+from msg_tools.cdr import deserialise, serialise
+from msg_tools.pose_mixtures import (
+    MixtureKind,
+    PoseMixture,
+    pose_mixture_message,
+    pose_mixture_of,
+)
+
+
+def test_kinds_are_those_of_the_message() -> None:
+    constants = typestore().fielddefs['hmt_msgs/msg/PoseMixture'][0]
+    assert {name: value for name, _, value in constants} == {
+        kind.name: kind.value for kind in MixtureKind
+    }
+
+
+def test_round_trip_sorts_by_weight(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
+    data = serialise(pose_mixture_message(messages, pose_mixture))
+    back = pose_mixture_of(
+        deserialise(data, 'hmt_msgs/msg/PoseMixture'),
+        pose_mixture.dof_names,
+        pose_mixture.joint_names,
+    )
+    order = [2, 1, 0]
+    np.testing.assert_array_equal(back.mixture.weights, [0.5, 0.3, 0.2])
+    np.testing.assert_array_equal(back.mixture.means, pose_mixture.mixture.means[order])
+    np.testing.assert_array_equal(back.mixture.covariances, pose_mixture.mixture.covariances[order])
+    np.testing.assert_array_equal(back.joint_positions, pose_mixture.joint_positions[order])
+    np.testing.assert_array_equal(back.log_likelihoods, [-1.0, -2.0, -3.0])
+    np.testing.assert_array_equal(back.degrees_of_freedom, [0.0, 5.0, 0.0])
+    for name in ('body_model', 'dof_names', 'joint_names', 'kind', 'stamp_ns', 'frame_id'):
+        assert getattr(back, name) == getattr(pose_mixture, name)
+    # Sorted it is the same message again.
+    assert serialise(pose_mixture_message(messages, back)) == data
+
+
+def test_what_is_unknown(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
+    content = replace(pose_mixture, log_likelihoods=None, degrees_of_freedom=None)
+    back = pose_mixture_of(pose_mixture_message(messages, content))
+    assert np.isnan(back.log_likelihoods).all()
+    assert (back.degrees_of_freedom == 0).all()
+
+
+def test_equal_weights_keep_their_order(
+    pose_mixture: PoseMixture, messages: RosbagsMessages
+) -> None:
+    mixture = pose_mixture.mixture
+    even = GaussianMixture(np.full(3, 1 / 3), mixture.means, mixture.covariances)
+    back = pose_mixture_of(pose_mixture_message(messages, replace(pose_mixture, mixture=even)))
+    np.testing.assert_array_equal(back.mixture.means, mixture.means)
+
+
+def bend(path: str, value: Any) -> Callable[[Any], None]:
+    """Sets a field of a message, or of a component as '0.mean'."""
+
+    def change(message: Any) -> None:
+        index, _, name = path.rpartition('.')
+        setattr(message.components[int(index)] if index else message, name, value)
+
+    return change
+
+
+def asymmetric() -> Any:
+    result = np.eye(4)
+    result[0, 1] = 0.1
+    return result.ravel()
+
+
+@pytest.mark.parametrize(
+    ('change', 'error'),
+    [
+        (bend('components', []), r'mixture has no components'),
+        (bend('1.mean', np.zeros(3)), r'mixture: component 1: mean has 3 values, wanted 4'),
+        (bend('1.mean', np.array([0, 0, np.nan, 0])), r'mean has values that are not finite'),
+        (bend('1.covariance', np.zeros(0)), r'mixture: component 1 has no covariance'),
+        (bend('2.covariance', np.zeros(15)), r'component 2: covariance has 15 values, wanted 16'),
+        (bend('2.covariance', np.zeros(16)), r'covariance of mixture is not positive definite: sm'),
+        (
+            bend('2.covariance', -np.eye(4).ravel()),
+            r'not positive definite: smallest eigenvalue -1',
+        ),
+        (bend('2.covariance', asymmetric()), r'covariance of mixture is not symmetric'),
+        (bend('2.covariance', np.full(16, np.inf)), r'covariance has values that are not finite'),
+        (bend('0.weight', -0.5), r'mixture has the weight -0.5, wanted numbers from 0 to 1'),
+        (bend('0.weight', np.nan), r'mixture has the weight nan'),
+        (bend('0.weight', 0.51), r'mixture has weights that sum to 1.01, wanted 1'),
+        (bend('0.joint_positions', []), r'component 0 has 0 joint_positions, wanted 2'),
+        (bend('joint_names', ['pelvis']), r'component 0 has 2 joint_positions, wanted 1'),
+        (bend('joint_names', ['a', 'a']), r"joint_names has the name 'a' twice"),
+        (bend('dof_names', ['a', 'b', 'c', 'a']), r"dof_names has the name 'a' twice"),
+        (bend('dof_names', ['a', 'b', 'c']), r'component 0: mean has 4 values, wanted 3'),
+        (bend('kind', 9), r'mixture has the kind 9'),
+    ],
+)
+def test_messages_that_contradict_themselves(
+    pose_mixture: PoseMixture,
+    messages: RosbagsMessages,
+    change: Callable[[Any], None],
+    error: str,
+) -> None:
+    message = pose_mixture_message(messages, pose_mixture)
+    change(message)
+    with pytest.raises(MessageError, match=error) as caught:
+        pose_mixture_of(message)
+    assert '\n' not in str(caught.value)
+
+
+def test_another_body(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
+    message = pose_mixture_message(messages, pose_mixture)
+    with pytest.raises(MessageError, match=r'dof_names has 4 names, wanted 2'):
+        pose_mixture_of(message, ['root_x', 'bend'])
+    with pytest.raises(MessageError, match=r"dof_names has 'root_yy' at 1, wanted 'root_y'"):
+        pose_mixture_of(message, ['root_x', 'root_y', 'root_zzz', 'bend'])
+    with pytest.raises(MessageError, match=r"joint_names has 'pelvis' at 0, wanted 'head'"):
+        pose_mixture_of(message, None, ['head', 'pelvis'])
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error'),
+    [
+        ({'dof_names': ('a', 'b')}, r'mixture has 4 variables, but 2 dof_names'),
+        ({'joint_names': ('a',)}, r'joint_positions has shape \(3, 2, 3\), wanted \(3, 1, 3\)'),
+        ({'joint_positions': np.full((3, 2, 3), np.nan)}, r'joint_positions has values'),
+        ({'log_likelihoods': np.zeros(2)}, r'log_likelihoods has shape \(2,\), wanted \(3,\)'),
+        (
+            {
+                'mixture': GaussianMixture(
+                    np.ones(3), np.zeros((3, 4)), np.tile(np.eye(4), (3, 1, 1))
+                )
+            },
+            r'weights that sum to 3, wanted 1',
+        ),
+        (
+            {'mixture': GaussianMixture(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4, 4)))},
+            r'no components',
+        ),
+    ],
+)
+def test_content_that_no_message_may_have(
+    pose_mixture: PoseMixture, changes: dict[str, Any], error: str
+) -> None:
+    with pytest.raises(MessageError, match=error):
+        replace(pose_mixture, **changes)
