@@ -3,46 +3,48 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-from hmt_ros.image.observation import orientation_bins
-from hmt_ros.image.residuals import Energy, robust
-from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import Surface
+from hmt_ros.image.accumulation import add_residual
+from hmt_ros.image.robust import geman_mcclure
+from hmt_ros.image.sampling import sample_distance
+
+# Fewer visible points than this do not make each of them count more.
+FEWEST = 20
 
 
-def edge_energy(
-    surface: Surface,
-    edges: ImageMap,
-    *,
-    sigma: float,
-    scale: float,
-    weight: float,
-    count: int | None = None,
-) -> Energy:
-    """Energy of the distances from visible contour points to the nearest edge, normalised along it.
+@njit(cache=True, nogil=True)
+def add_edges(edges, contour, part_segments, term, count, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
+    """Distances from visible contour points to the nearest edge, normalised; returns the energy.
 
     Args:
-        surface: contours of N poses.
-        edges: distance to the nearest edge of each orientation, px.
-        sigma: standard deviation of an edge, px.
-        scale: of the robust kernel, in sigmas; truncates edges that were not found.
-        weight: total weight of all points.
-        count: number of points that the weight is for; the visible ones when None.
+        edges: distance to the nearest edge of each orientation bin, px.
+        contour: of one pose.
+        part_segments: (B,) segment of each part.
+        term: weight, sigma (px) and scale (sigmas) of the term; the scale truncates edges that were
+            not found.
+        count: number of points that the weight is for; 0: those that are visible.
+        wrenches, stiffnesses: sums of the segments, added to.
     """
-    bins = orientation_bins(np.arctan2(surface.normals[1], surface.normals[0]))
-    value, gradient = edges.sample(surface.pixels, bins)
-    seen = surface.valid & ~surface.hidden
-    residual = np.where(seen, value / sigma, 0.0)
-    projection = np.nan_to_num(surface.projection, nan=0.0)
-    directions = np.einsum('apn,aipn->pin', gradient / sigma, projection)
-    each = np.where(seen, weight / (count or np.maximum(seen.sum(0), 20)), 0.0)
-    rho, pull, curvature = robust(residual, scale, each)
-    return Energy(
-        rho.sum(0),
-        surface.contour.segments,
-        surface.contour.points,
-        directions,
-        pull,
-        curvature,
-        rho,
-    )
+    bins = edges.values.shape[0]
+    if count == 0:
+        for i in range(len(contour.parts)):
+            if contour.valid[i] and not contour.hidden[i]:
+                count += 1
+    each = term.weight / max(count, FEWEST)
+    energy = 0.0
+    for i in range(len(contour.parts)):
+        if not contour.valid[i] or contour.hidden[i]:
+            continue
+        angle = np.arctan2(contour.normals[i, 1], contour.normals[i, 0])
+        channel = int(np.round(angle * (bins / np.pi))) % bins
+        value, gu, gv = sample_distance(edges, channel, contour.pixels[i, 0], contour.pixels[i, 1])
+        rho, pull, curvature = geman_mcclure(value / term.sigma, term.scale, each)
+        energy += rho
+        j = contour.projections[i]
+        a0 = (gu * j[0, 0] + gv * j[1, 0]) / term.sigma
+        a1 = (gu * j[0, 1] + gv * j[1, 1]) / term.sigma
+        a2 = (gu * j[0, 2] + gv * j[1, 2]) / term.sigma
+        segment = part_segments[contour.parts[i]]
+        add_residual(wrenches, stiffnesses, segment, contour.points[i], a0, a1, a2, pull, curvature)
+    return energy

@@ -8,134 +8,135 @@ the same to first order but reaches further.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 
-from hmt_ros.body.camera import Camera
-from hmt_ros.body.kinematics import Frames
-from hmt_ros.image.residuals import Energy, robust
-from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.texture import Textures
+from hmt_ros.image.accumulation import add_residual
+from hmt_ros.image.robust import geman_mcclure
+from hmt_ros.image.sampling import sample
+from hmt_ros.image.surface import project
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+# Fewer texture points than this do not make each of them count more.
+FEWEST = 20
+# Optical flow errs by this share of the displacement on top of the term's sigma.
+FLOW_ERROR = 0.15
 
 
-def intensity_energy(
-    frames: Frames,
-    camera: Camera,
-    textures: Textures,
-    which: Index,
-    intensity: ImageMap,
-    *,
-    sigma: float,
-    scale: float,
-    weight: float,
-) -> Energy:
-    """Energy of the difference in colour between the texture and the image under it.
+@njit(cache=True, nogil=True)
+def add_intensity(  # type: ignore[no-untyped-def]
+    intensity, texture, t, wanted, lens, columns, origins, term, wrenches, stiffnesses
+):
+    """Differences in colour between the texture and the image under it; returns the energy.
 
     Args:
-        frames: of N poses.
-        camera: that looks.
-        textures: of the poses that the N descend from.
-        which: (N,) the texture that each pose carries.
         intensity: the blurred image, three channels.
-        sigma: standard deviation of a difference in colour, grey levels.
-        scale: of the robust kernel, in sigmas.
-        weight: total weight of all points.
+        texture: of several poses.
+        t: which of them this pose carries.
+        wanted: (S,) segments whose texture counts.
+        lens: the camera.
+        columns, origins: frames of the segments.
+        term: weight, sigma (grey levels) and scale (sigmas) of the term.
+        wrenches, stiffnesses: sums of the segments, added to.
     """
-    segments, points, pixels, projection, each = _project(frames, camera, textures, which, weight)
-    at = np.broadcast_to(pixels[:, None], (2, 3, *pixels.shape[1:]))
-    value, slope = intensity.sample(at, np.arange(3)[:, None, None])  # (3, Q, N), (2, 3, Q, N)
-    error = (value - textures.colours[which].transpose(1, 2, 0)) / sigma
-    length = np.sqrt((error * error).sum(0))
-    rho, _, curvature = robust(length, scale, each)
-    slope = slope / sigma
-    gradient = np.einsum('cqn,acqn->aqn', error, slope)
-    hessian = np.einsum('acqn,bcqn->abqn', slope, slope)
-    return _from_pixels(rho, segments, points, projection, gradient, hessian, curvature)
+    count = texture.counts[t]
+    each = term.weight / max(count, FEWEST)
+    pixel, projection, point = np.empty(2), np.empty((2, 3)), np.empty(3)
+    errors, slopes = np.empty(3), np.empty((3, 2))
+    energy = 0.0
+    for q in range(count):
+        s = texture.segments[t, q]
+        if not wanted[s]:
+            continue
+        if not _place(texture.local[t, q], columns[s], origins[s], lens, point, pixel, projection):
+            continue
+        square = 0.0
+        for c in range(3):
+            value, gu, gv = sample(intensity, c, pixel[0], pixel[1])
+            errors[c] = (value - texture.colours[t, q, c]) / term.sigma
+            slopes[c, 0], slopes[c, 1] = gu / term.sigma, gv / term.sigma
+            square += errors[c] * errors[c]
+        rho, _, curvature = geman_mcclure(np.sqrt(square), term.scale, each)
+        energy += rho
+        g0, g1, h00, h01, h11 = 0.0, 0.0, 1e-9, 0.0, 1e-9
+        for c in range(3):
+            g0 += errors[c] * slopes[c, 0]
+            g1 += errors[c] * slopes[c, 1]
+            h00 += slopes[c, 0] * slopes[c, 0]
+            h01 += slopes[c, 0] * slopes[c, 1]
+            h11 += slopes[c, 1] * slopes[c, 1]
+        _add_pixel_energy(
+            g0, g1, h00, h01, h11, curvature, s, point, projection, wrenches, stiffnesses
+        )
+    return energy
 
 
-def motion_energy(
-    frames: Frames,
-    camera: Camera,
-    textures: Textures,
-    which: Index,
-    flow: ImageMap,
-    *,
-    sigma: float,
-    scale: float,
-    weight: float,
-) -> Energy:
-    """Energy of the difference between the motion of the texture in the image and the optical flow.
+@njit(cache=True, nogil=True)
+def add_motion(  # type: ignore[no-untyped-def]
+    flow, texture, t, wanted, lens, columns, origins, term, wrenches, stiffnesses
+):
+    """Differences between the motion of the texture and the optical flow; returns the energy.
 
     Args:
-        frames: of N poses.
-        camera: that looks.
-        textures: of the poses that the N descend from.
-        which: (N,) the texture that each pose carries.
         flow: from the last image to this one, two channels, px.
-        sigma: standard deviation of the flow, px; larger displacements have a larger one.
-        scale: of the robust kernel, in sigmas.
-        weight: total weight of all points.
+        texture, t, wanted, lens, columns, origins, wrenches, stiffnesses: as for `add_intensity`.
+        term: weight, sigma (px) and scale (sigmas) of the term.
     """
-    segments, points, pixels, projection, each = _project(frames, camera, textures, which, weight)
-    at = np.broadcast_to(
-        textures.pixels.transpose(1, 0, 2)[:, None], (2, 2, *textures.weights.shape)
-    )
-    moved, _ = flow.sample(at, np.arange(2)[:, None, None])  # (2, K, Q)
-    spread = sigma + 0.15 * np.hypot(moved[0], moved[1])
-    target = textures.pixels.transpose(1, 0, 2) + moved
-    error = (pixels - target[:, which].transpose(0, 2, 1)) / spread[which].T
-    length = np.sqrt((error * error).sum(0))
-    rho, _, curvature = robust(length, scale, each)
-    per_pixel = 1.0 / spread[which].T
-    hessian = np.zeros((2, 2, *length.shape))
-    hessian[0, 0] = hessian[1, 1] = per_pixel**2
-    return _from_pixels(rho, segments, points, projection, error * per_pixel, hessian, curvature)
+    count = texture.counts[t]
+    each = term.weight / max(count, FEWEST)
+    pixel, projection, point = np.empty(2), np.empty((2, 3)), np.empty(3)
+    energy = 0.0
+    for q in range(count):
+        s = texture.segments[t, q]
+        if not wanted[s]:
+            continue
+        if not _place(texture.local[t, q], columns[s], origins[s], lens, point, pixel, projection):
+            continue
+        u, v = texture.pixels[t, q, 0], texture.pixels[t, q, 1]
+        fu, _, _ = sample(flow, 0, u, v)
+        fv, _, _ = sample(flow, 1, u, v)
+        inverse = 1.0 / (term.sigma + FLOW_ERROR * np.sqrt(fu * fu + fv * fv))
+        e0, e1 = (pixel[0] - u - fu) * inverse, (pixel[1] - v - fv) * inverse
+        rho, _, curvature = geman_mcclure(np.sqrt(e0 * e0 + e1 * e1), term.scale, each)
+        energy += rho
+        for a in range(2):
+            j = projection[a]
+            error = e0 if a == 0 else e1
+            add_residual(
+                wrenches, stiffnesses, s, point,
+                j[0] * inverse, j[1] * inverse, j[2] * inverse, curvature * error, curvature,
+            )  # fmt: skip
+    return energy
 
 
-def _project(
-    frames: Frames, camera: Camera, textures: Textures, which: Index, weight: float
-) -> tuple[Index, Array, Array, Array, Array]:
-    segments = textures.segments[which].T  # (Q, N)
-    local = textures.local[which].transpose(1, 2, 0)
-    batch = np.arange(frames.count)
-    columns = frames.columns[segments, :, :, batch]  # (Q, N, 3, 3)
-    points = np.einsum('qnix,qin->qxn', columns, local)
-    points += frames.origins[segments, :, batch].transpose(0, 2, 1)
-    pixels, projection = camera.project_with_derivative(points.transpose(1, 0, 2))
-    present = textures.weights[which].T * np.isfinite(pixels[0])
-    each = weight * present / np.maximum(present.sum(0), 20.0)
-    return segments, points, np.nan_to_num(pixels), np.nan_to_num(projection), each
+@njit(cache=True, nogil=True, inline='always')
+def _place(local, columns, origin, lens, point, pixel, projection):  # type: ignore[no-untyped-def]
+    for a in range(3):
+        point[a] = (
+            origin[a]
+            + columns[0, a] * local[0] + columns[1, a] * local[1] + columns[2, a] * local[2]
+        )  # fmt: skip
+    return project(lens, point, pixel, projection)
 
 
-def _from_pixels(
-    rho: Array,
-    segments: Index,
-    points: Array,
-    projection: Array,
-    gradient: Array,
-    hessian: Array,
-    curvature: Array,
-) -> Energy:
-    """An energy given by its gradient and Hessian over pixel positions, as two residuals a point.
+@njit(cache=True, nogil=True, inline='always')
+def _add_pixel_energy(  # type: ignore[no-untyped-def]
+    g0, g1, h00, h01, h11, curvature, segment, point, projection, wrenches, stiffnesses
+):
+    """Adds an energy with gradient g and Hessian G over the pixel, as two residuals.
 
-    With the Hessian G = L L^T the residuals have the directions of the rows of L^T and the pulls
-    L^-1 g, so that both are met exactly.
+    With G = L L^T they have the directions of the rows of L^T and the pulls L^-1 g: both are met.
     """
-    eps = 1e-9
-    l11 = np.sqrt(hessian[0, 0] + eps)
-    l21 = hessian[0, 1] / l11
-    l22 = np.sqrt(np.maximum(hessian[1, 1] - l21 * l21, 0.0) + eps)
-    first = gradient[0] / l11
-    second = (gradient[1] - l21 * first) / l22
-    along = l11 * projection[0] + l21 * projection[1]  # (3, Q, N)
-    across = l22 * projection[1]
-    return Energy(
-        rho.sum(0),
-        np.tile(segments, (2, 1)),
-        np.tile(points, (2, 1, 1)),
-        np.concatenate([along.transpose(1, 0, 2), across.transpose(1, 0, 2)]),
-        np.concatenate([curvature * first, curvature * second]),
-        np.concatenate([curvature, curvature]),
-    )
+    l00 = np.sqrt(h00)
+    l10 = h01 / l00
+    l11 = np.sqrt(max(h11 - l10 * l10, 1e-12))
+    first = g0 / l00
+    second = (g1 - l10 * first) / l11
+    j = projection
+    add_residual(
+        wrenches, stiffnesses, segment, point,
+        l00 * j[0, 0] + l10 * j[1, 0], l00 * j[0, 1] + l10 * j[1, 1], l00 * j[0, 2] + l10 * j[1, 2],
+        curvature * first, curvature,
+    )  # fmt: skip
+    add_residual(
+        wrenches, stiffnesses, segment, point,
+        l11 * j[1, 0], l11 * j[1, 1], l11 * j[1, 2], curvature * second, curvature,
+    )  # fmt: skip

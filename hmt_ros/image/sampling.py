@@ -1,58 +1,65 @@
-"""Bilinear values and gradients of image maps at many points."""
+"""Bilinear values and gradients of image maps."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Map = NDArray[np.float32]
-Index = NDArray[np.intp]
 
-
-@dataclass(frozen=True, eq=False)
-class ImageMap:
+class ImageMap(NamedTuple):
     """Values on a window of the pixel grid, of one or several channels.
 
     Attributes:
-        values: (C, h, w) float32.
+        values: (C, h, w) float32, h and w at least 2.
         left, top: column and row of the window's first pixel in the whole image.
     """
 
-    values: Map
+    values: NDArray[np.float32]
     left: int = 0
     top: int = 0
 
-    def sample(self, pixels: Array, channels: Index | int = 0) -> tuple[Array, Array]:
-        """Values and gradients at pixels.
 
-        Args:
-            pixels: (2, ...) column and row in the whole image; NaN gives the value of the corner.
-            channels: which channel at each pixel.
+@njit(cache=True, nogil=True, inline='always')
+def sample(image_map, channel, u, v):  # type: ignore[no-untyped-def]
+    """Value and its derivatives by u and v at a pixel of the whole image.
 
-        Returns:
-            values (...) and gradients (2, ...). Outside the window the nearest value is continued and
-            its gradient is zero.
-        """
-        c, h, w = self.values.shape
-        u = pixels[0] - self.left
-        v = pixels[1] - self.top
-        inside_u = (u >= 0) & (u <= w - 1)
-        inside_v = (v >= 0) & (v <= h - 1)
-        u = np.clip(np.nan_to_num(u, nan=0.0), 0.0, w - 1.001)
-        v = np.clip(np.nan_to_num(v, nan=0.0), 0.0, h - 1.001)
-        column = u.astype(np.intp)
-        row = v.astype(np.intp)
-        du, dv = u - column, v - row
-        flat = self.values.reshape(-1)
-        index = (np.asarray(channels) * h + row) * w + column
-        a, b = flat[index], flat[index + 1]
-        p, q = flat[index + w], flat[index + w + 1]
-        top = a + (b - a) * du
-        bottom = p + (q - p) * du
-        gradient = np.empty((2, *u.shape))
-        gradient[0] = ((b - a) * (1 - dv) + (q - p) * dv) * inside_u
-        gradient[1] = (bottom - top) * inside_v
-        return top + (bottom - top) * dv, gradient
+    Outside the window the nearest value is continued.
+    """
+    values = image_map.values
+    h, w = values.shape[1], values.shape[2]
+    x, y = u - image_map.left, v - image_map.top
+    cx, cy = min(max(x, 0.0), w - 1.001), min(max(y, 0.0), h - 1.001)
+    i, j = int(cy), int(cx)
+    dv, du = cy - i, cx - j
+    a, b = values[channel, i, j], values[channel, i, j + 1]
+    p, q = values[channel, i + 1, j], values[channel, i + 1, j + 1]
+    top = a + (b - a) * du
+    bottom = p + (q - p) * du
+    value = top + (bottom - top) * dv
+    slope_u = (b - a) * (1.0 - dv) + (q - p) * dv
+    slope_v = bottom - top
+    if x < 0.0 or x > w - 1.0:
+        slope_u = 0.0
+    if y < 0.0 or y > h - 1.0:
+        slope_v = 0.0
+    return value, slope_u, slope_v
+
+
+@njit(cache=True, nogil=True, inline='always')
+def sample_distance(image_map, channel, u, v):  # type: ignore[no-untyped-def]
+    """`sample` of a map of distances, continued outside its window by the way to the window."""
+    value, slope_u, slope_v = sample(image_map, channel, u, v)
+    h, w = image_map.values.shape[1], image_map.values.shape[2]
+    x, y = u - image_map.left, v - image_map.top
+    if x < 0.0:
+        value, slope_u = value - x, -1.0
+    elif x > w - 1.0:
+        value, slope_u = value + (x - w + 1.0), 1.0
+    if y < 0.0:
+        value, slope_v = value - y, -1.0
+    elif y > h - 1.0:
+        value, slope_v = value + (y - h + 1.0), 1.0
+    return value, slope_u, slope_v

@@ -1,4 +1,4 @@
-"""Likelihood of a silhouette, both ways (method of Sminchisescu and Triggs).
+"""Likelihood of a silhouette, both ways (KJS 2; Sminchisescu and Triggs, IJRR 2003).
 
 The model explains the silhouette when its contour lies inside, and when the outline of the silhouette
 lies on the contour of the model: the first alone would let the model shrink, the second alone would let
@@ -8,132 +8,126 @@ limbs stick out.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 
-from hmt_ros.image.observation import Outline
-from hmt_ros.image.residuals import Energy, robust
-from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import Surface
+from hmt_ros.image.accumulation import add_residual
+from hmt_ros.image.robust import geman_mcclure
+from hmt_ros.image.sampling import sample_distance
 
-Array = NDArray[np.float64]
+# Pixels that opposite directions count like when outline and contour are matched, per unit.
+TURN = 12.0
+# Along the outline distances up to this cost nothing: the contour's points stand that far apart, px.
+SPACING = 8.0
 
 
-def containment_energy(
-    surface: Surface,
-    distance: ImageMap,
-    *,
-    sigma: float,
-    scale: float,
-    weight: float,
-    count: int | None = None,
-) -> Energy:
-    """Contour points outside the silhouette pay their distance to it.
+@njit(cache=True, nogil=True)
+def add_containment(distance, contour, part_segments, term, each, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
+    """Contour points outside the silhouette pay their distance to it; returns the energy.
 
     Args:
-        surface: contours of N poses.
-        distance: signed distance to the outline, px.
-        sigma: standard deviation of the outline, px.
-        scale: of the robust kernel, in sigmas.
-        weight: total weight of all points.
-        count: number of points that the weight is for; all of the surface when None.
+        distance: signed distance to the outline, px, positive outside.
+        contour: of one pose.
+        part_segments: (B,) segment of each part.
+        term: weight, sigma (px) and scale (sigmas) of the term.
+        each: weight of one point.
+        wrenches, stiffnesses: sums of the segments, added to.
     """
-    value, gradient = distance.sample(surface.pixels)
-    out = surface.valid & (value > 0)
-    residual = np.where(out, value / sigma, 0.0)
-    directions = np.einsum('apn,aipn->pin', gradient / sigma, _safe(surface.projection))
-    each = weight / (count or len(residual))
-    rho, pull, curvature = robust(residual, scale, each)
-    return Energy(
-        rho.sum(0),
-        surface.contour.segments,
-        surface.contour.points,
-        directions,
-        pull,
-        np.where(out, curvature, 0.0),
-        rho,
-    )
+    energy = 0.0
+    for i in range(len(contour.parts)):
+        if not contour.valid[i]:
+            continue
+        value, gu, gv = sample_distance(distance, 0, contour.pixels[i, 0], contour.pixels[i, 1])
+        if value <= 0.0:
+            continue
+        rho, pull, curvature = geman_mcclure(value / term.sigma, term.scale, each)
+        energy += rho
+        j = contour.projections[i]
+        a0 = (gu * j[0, 0] + gv * j[1, 0]) / term.sigma
+        a1 = (gu * j[0, 1] + gv * j[1, 1]) / term.sigma
+        a2 = (gu * j[0, 2] + gv * j[1, 2]) / term.sigma
+        segment = part_segments[contour.parts[i]]
+        add_residual(wrenches, stiffnesses, segment, contour.points[i], a0, a1, a2, pull, curvature)
+    return energy
 
 
-def coverage_energy(
-    surface: Surface,
-    outline: Outline,
-    *,
-    sigma: float,
-    scale: float,
-    weight: float,
-    spacing: float = 8.0,
-    explained: Array | None = None,
-) -> Energy:
+@njit(cache=True, nogil=True)
+def add_coverage(  # type: ignore[no-untyped-def]
+    pixels, normals, contour, part_segments, term, each, explained, costs, wrenches, stiffnesses
+):
     """Points on the outline pay their distance to the nearest contour of the model.
 
-    Nearest by position and direction. Along the outline distances up to the spacing of the contour's
-    points cost nothing.
+    Nearest by position and direction, among contour points that no other part covers.
 
     Args:
-        surface: contours of N poses.
-        outline: M samples on the outline of the silhouette.
-        sigma: standard deviation of the outline, px.
-        scale: of the robust kernel, in sigmas.
-        weight: total weight of all samples.
-        spacing: of neighbouring contour points, px.
-        explained: (M, N) what each sample costs at most, because other parts explain it.
+        pixels, normals: (M, 2) samples on the outline of the silhouette.
+        contour: of one pose.
+        part_segments: (B,) segment of each part.
+        term: weight, sigma (px) and scale (sigmas) of the term.
+        each: weight of one sample.
+        explained: (M,) what each sample costs at most, because something else explains it.
+        costs: (M,) what each sample costs, result.
+        wrenches, stiffnesses: sums of the segments, added to.
     """
-    n = surface.pixels.shape[2]
-    match = _nearest_contour_points(surface, outline)  # (M, N)
-    batch = np.arange(n)
-    u = surface.pixels[:, match, batch]
-    offset = u - outline.pixels[:, :, None]
-    nx, ny = outline.normals[:, :, None]
-    across = nx * offset[0] + ny * offset[1]
-    along = nx * offset[1] - ny * offset[0]
-    beyond = np.sign(along) * np.maximum(np.abs(along) - spacing, 0.0)
-    square = (across * across + beyond * beyond) / (sigma * sigma)
-    # One kernel on the length of the two residuals together.
-    rho, _, curvature = robust(np.sqrt(square), scale, weight / max(len(match), 1))
-    if explained is not None:
-        curvature = np.where(rho < explained, curvature, 0.0)
-        rho = np.minimum(rho, explained)
-    projection = surface.projection[:, :, match, batch]  # (2, 3, M, N)
-    toward = nx * projection[0] + ny * projection[1]
-    sideways = nx * projection[1] - ny * projection[0]
-    directions = np.concatenate([toward.transpose(1, 0, 2), sideways.transpose(1, 0, 2)]) / sigma
-    residual = np.concatenate([across, beyond]) / sigma
-    both = np.concatenate([curvature, curvature])
-    used = np.concatenate([np.ones_like(beyond), (beyond != 0).astype(float)])
-    return Energy(
-        rho.sum(0),
-        np.tile(surface.contour.segments[match], (2, 1)),
-        np.tile(surface.contour.points[match, :, batch].transpose(0, 2, 1), (2, 1, 1)),
-        directions,
-        both * residual,
-        both * used,
-        rho,
-    )
-
-
-def _nearest_contour_points(surface: Surface, outline: Outline) -> NDArray[np.intp]:
-    """Index (M, N) of the contour point nearest to each sample of the outline.
-
-    The distance |c - u|^2 + t^2 |n_c - n_u|^2, up to what does not depend on u, is one matrix product.
-    """
-    turn = 12.0  # px that opposite directions count like, per unit of difference
-    c = outline.pixels.mean(1, keepdims=True) if outline.pixels.size else np.zeros((2, 1))
-    samples = np.concatenate(
-        [
-            -2.0 * (outline.pixels - c),
-            np.ones((1, outline.pixels.shape[1])),
-            -2 * turn**2 * outline.normals,
-        ]
-    ).astype(np.float32)
-    use = surface.valid & ~surface.covered
-    # A pose whose contour is hidden everywhere keeps all that exists.
-    use |= surface.valid & ~use.any(0)
-    u = np.where(use, surface.pixels - c[:, :, None], 0.0)
-    square = np.where(use, u[0] * u[0] + u[1] * u[1], 1e9)
-    features = np.stack([u[0], u[1], square, surface.normals[0], surface.normals[1]])
-    features = np.ascontiguousarray(features.transpose(2, 0, 1), dtype=np.float32)  # (N, 5, P)
-    return np.ascontiguousarray((samples.T @ features).argmin(2).T)
-
-
-def _safe(projection: Array) -> Array:
-    return np.nan_to_num(projection, nan=0.0)
+    count = len(contour.parts)
+    use = np.empty(count, np.int64)
+    used = 0
+    for i in range(count):
+        if contour.valid[i] and not contour.covered[i]:
+            use[used] = i
+            used += 1
+    if used == 0:  # a pose whose contour is covered everywhere keeps all that exists
+        for i in range(count):
+            if contour.valid[i]:
+                use[used] = i
+                used += 1
+    us, vs = np.empty(used, np.float32), np.empty(used, np.float32)
+    nus, nvs = np.empty(used, np.float32), np.empty(used, np.float32)
+    turn = np.float32(TURN)
+    for k in range(used):
+        i = use[k]
+        us[k], vs[k] = contour.pixels[i, 0], contour.pixels[i, 1]
+        nus[k], nvs[k] = turn * contour.normals[i, 0], turn * contour.normals[i, 1]
+    energy = 0.0
+    gaps = np.empty(used, np.float32)
+    for m in range(len(pixels)):
+        if used == 0:
+            costs[m] = min(explained[m], 0.5 * each * term.scale * term.scale)
+            energy += costs[m]
+            continue
+        u, v = np.float32(pixels[m, 0]), np.float32(pixels[m, 1])
+        nu, nv = turn * np.float32(normals[m, 0]), turn * np.float32(normals[m, 1])
+        for k in range(used):
+            du, dv, dnu, dnv = us[k] - u, vs[k] - v, nus[k] - nu, nvs[k] - nv
+            gaps[k] = du * du + dv * dv + dnu * dnu + dnv * dnv
+        i = use[np.argmin(gaps)]
+        du, dv = contour.pixels[i, 0] - pixels[m, 0], contour.pixels[i, 1] - pixels[m, 1]
+        nx, ny = normals[m, 0], normals[m, 1]
+        across = (nx * du + ny * dv) / term.sigma
+        along = nx * dv - ny * du
+        beyond = 0.0
+        if along > SPACING:
+            beyond = (along - SPACING) / term.sigma
+        elif along < -SPACING:
+            beyond = (along + SPACING) / term.sigma
+        length = np.sqrt(across * across + beyond * beyond)
+        rho, _, curvature = geman_mcclure(length, term.scale, each)
+        if rho >= explained[m]:
+            costs[m] = explained[m]
+            energy += costs[m]
+            continue
+        costs[m] = rho
+        energy += rho
+        segment = part_segments[contour.parts[i]]
+        point, j = contour.points[i], contour.projections[i]
+        a0 = (nx * j[0, 0] + ny * j[1, 0]) / term.sigma
+        a1 = (nx * j[0, 1] + ny * j[1, 1]) / term.sigma
+        a2 = (nx * j[0, 2] + ny * j[1, 2]) / term.sigma
+        add_residual(wrenches, stiffnesses, segment, point, a0, a1, a2, curvature * across, curvature)
+        if beyond != 0.0:
+            a0 = (nx * j[1, 0] - ny * j[0, 0]) / term.sigma
+            a1 = (nx * j[1, 1] - ny * j[0, 1]) / term.sigma
+            a2 = (nx * j[1, 2] - ny * j[0, 2]) / term.sigma
+            add_residual(
+                wrenches, stiffnesses, segment, point, a0, a1, a2, curvature * beyond, curvature
+            )
+    return energy

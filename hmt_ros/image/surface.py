@@ -1,98 +1,344 @@
-"""The body's occluding contour in the image, and which parts of it can be seen."""
+"""The body's occluding contour in the image, and which parts of it can be seen; compiled, pose by pose.
+
+The counterpart of `body.flesh.occluding_contour` and `Camera.project` for the inner loop of the
+likelihood: on every ring of the flesh the two points whose normal is perpendicular to the ray.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera
-from hmt_ros.body.flesh import Contour, occluding_contour
-from hmt_ros.body.kinematics import Frames
+from hmt_ros.body.camera import NEAR, Camera
 
 Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 # Parts are grown by this factor when they hide others: superquadrics are fatter than ellipsoids.
 COVER = 1.04
 # A point this much behind the front of another part, relative to its distance, is hidden by it.
 HIDDEN = 0.004
+LENSES = {'plumb_bob': 0, 'rational_polynomial': 0, 'equidistant': 1}
 
 
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Occluding contours of N poses in the image.
+class Lens(NamedTuple):
+    """A camera as the compiled code reads it: fx fy cx cy, model (-1: no distortion), coefficients."""
+
+    focal: Array
+    centre: Array
+    model: int
+    coefficients: Array
+
+
+class FleshTable(NamedTuple):
+    """The flesh as the compiled code reads it: parts (B,), and rings (R,) of `flesh.Rings`."""
+
+    part_segments: Ints
+    part_centres: Array
+    part_radii: Array
+    ring_parts: Ints
+    ring_centres: Array
+    ring_radii: Array
+    ring_slopes: Array
+    ring_leans: Array
+    ring_exponents: Array
+
+
+class Contour(NamedTuple):
+    """Contour of one pose, P = 2R points.
 
     Attributes:
-        contour: in space.
-        pixels: (2, P, N); NaN behind the camera.
-        projection: (2, 3, P, N) derivative of the pixels with respect to the points.
-        normals: (2, P, N) unit vectors out of the body, in the image.
-        valid: (P, N) the contour exists there and lies in front of the camera.
-        covered: (P, N) another part lies on the same ray, before or behind.
-        hidden: (P, N) another part lies on the same ray, before.
+        parts: (P,).
+        points: (P, 3) camera frame, m.
+        pixels: (P, 2).
+        projections: (P, 2, 3) derivative of the pixels with respect to the points.
+        normals: (P, 2) out of the body, in the image.
+        valid: (P,) the point exists and lies before the camera.
+        covered: (P,) another part lies on the same ray, before or behind.
+        hidden: (P,) another part lies on the same ray, before.
     """
 
-    contour: Contour
+    parts: Ints
+    points: Array
     pixels: Array
-    projection: Array
+    projections: Array
     normals: Array
     valid: Mask
     covered: Mask
     hidden: Mask
 
 
-def project_surface(body: Body, camera: Camera, frames: Frames) -> Surface:
-    """Contours of the body's flesh at the frames of N poses."""
-    contour = occluding_contour(body.flesh, frames)
-    pixels, projection = camera.project_with_derivative(contour.points.transpose(1, 0, 2))
-    valid = contour.exists & np.isfinite(pixels[0])
-    # The normal of the contour is perpendicular to the ray: only its image part matters.
-    normals = np.stack([contour.normals[:, 0] / camera.fx, contour.normals[:, 1] / camera.fy])
-    normals /= np.maximum(np.hypot(normals[0], normals[1]), 1e-12)
-    covered, hidden = visibility(body, frames, contour.points, contour.parts)
-    return Surface(contour, pixels, projection, normals, valid, covered, hidden)
+def lens_of(camera: Camera) -> Lens:
+    """The compiled code's view of a camera."""
+    coefficients = np.zeros(8)
+    coefficients[: len(camera.distortion)] = camera.distortion
+    model = LENSES[camera.distortion_model] if camera.distortion else -1
+    focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    return Lens(focal, centre, model, coefficients)
 
 
-def visibility(body: Body, frames: Frames, points: Array, parts: Index) -> tuple[Mask, Mask]:
-    """Whether other parts lie on the rays to points, and whether before them.
+def flesh_table_of(body: Body) -> FleshTable:
+    """The compiled code's view of a body's flesh."""
+    flesh, ring = body.flesh, body.flesh.rings
+    return FleshTable(
+        np.array([p.segment for p in flesh.parts], dtype=np.int64),
+        np.array([p.centre for p in flesh.parts]).reshape(-1, 3),
+        np.array([p.radii for p in flesh.parts]).reshape(-1, 3),
+        flesh.ring_parts.astype(np.int64),
+        ring.centre,
+        ring.radius,
+        ring.slope,
+        ring.lean,
+        ring.exponent,
+    )
+
+
+@njit(cache=True, nogil=True)
+def empty_contour(rings):  # type: ignore[no-untyped-def]
+    """Room for the contour of one pose."""
+    count = 2 * rings
+    return Contour(
+        np.empty(count, np.int64), np.empty((count, 3)), np.empty((count, 2)),
+        np.empty((count, 2, 3)), np.empty((count, 2)), np.empty(count, np.bool_),
+        np.empty(count, np.bool_), np.empty(count, np.bool_),
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, inline='always')
+def project(lens, p, pixel, projection):  # type: ignore[no-untyped-def]
+    """Pixel (2,) of a point (3,) and its derivative (2, 3); False behind the camera."""
+    z = p[2]
+    if not z > NEAR:
+        return False
+    a, b = p[0] / z, p[1] / z
+    if lens.model < 0:
+        da, db, ea, eb = 1.0, 0.0, 0.0, 1.0
+        u, v = a, b
+    elif lens.model == 0:
+        k = lens.coefficients
+        p1, p2 = k[2], k[3]
+        s = a * a + b * b
+        top = 1.0 + s * (k[0] + s * (k[1] + s * k[4]))
+        bottom = 1.0 + s * (k[5] + s * (k[6] + s * k[7]))
+        radial = top / bottom
+        slope = (
+            k[0] + s * (2.0 * k[1] + s * 3.0 * k[4])
+            - radial * (k[5] + s * (2.0 * k[6] + s * 3.0 * k[7]))
+        ) / bottom  # fmt: skip
+        u = a * radial + 2.0 * p1 * a * b + p2 * (s + 2.0 * a * a)
+        v = b * radial + p1 * (s + 2.0 * b * b) + 2.0 * p2 * a * b
+        da = radial + 2.0 * a * a * slope + 2.0 * p1 * b + 6.0 * p2 * a
+        db = 2.0 * a * b * slope + 2.0 * p1 * a + 2.0 * p2 * b
+        ea = db
+        eb = radial + 2.0 * b * b * slope + 6.0 * p1 * b + 2.0 * p2 * a
+    else:
+        k = lens.coefficients
+        r = np.sqrt(a * a + b * b)
+        theta = np.arctan(r)
+        t = theta * theta
+        bent = theta * (1.0 + t * (k[0] + t * (k[1] + t * (k[2] + t * k[3]))))
+        d_bent = 1.0 + t * (3.0 * k[0] + t * (5.0 * k[1] + t * (7.0 * k[2] + t * 9.0 * k[3])))
+        scale = bent / r if r > 1e-8 else 1.0
+        slope = (
+            (d_bent / (1.0 + r * r) - scale) / (r * r) if r > 1e-4 else 2.0 * (k[0] - 1.0 / 3.0)
+        )
+        u, v = a * scale, b * scale
+        da = scale + a * a * slope
+        db = a * b * slope
+        ea = db
+        eb = scale + b * b * slope
+    fx, fy = lens.focal[0], lens.focal[1]
+    pixel[0] = fx * u + lens.centre[0]
+    pixel[1] = fy * v + lens.centre[1]
+    projection[0, 0] = fx * da / z
+    projection[0, 1] = fx * db / z
+    projection[0, 2] = -(projection[0, 0] * a + projection[0, 1] * b)
+    projection[1, 0] = fy * ea / z
+    projection[1, 1] = fy * eb / z
+    projection[1, 2] = -(projection[1, 0] * a + projection[1, 1] * b)
+    return True
+
+
+@njit(cache=True, nogil=True)
+def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: ignore[no-untyped-def]
+    """Fills the contour of one pose: points, pixels, normals.
+
+    Args:
+        flesh: the flesh.
+        wanted: (B,) parts whose contour is traced; the others have no valid points.
+        lens: the camera.
+        columns, origins: (S, 3, 3), (S, 3) frames of the segments; columns[s, i] is axis i.
+        contour: filled.
+    """
+    rings = len(flesh.ring_parts)
+    cosines, sines = np.empty(2), np.empty(2)
+    normal = np.empty(3)
+    for r in range(rings):
+        part = flesh.ring_parts[r]
+        s = flesh.part_segments[part]
+        contour.parts[r] = part
+        contour.parts[r + rings] = part
+        contour.valid[r] = False
+        contour.valid[r + rings] = False
+        if not wanted[part]:
+            continue
+        x, y, z = columns[s, 0], columns[s, 1], columns[s, 2]
+        o, centre = origins[s], flesh.ring_centres[r]
+        ux = x[0] * o[0] + x[1] * o[1] + x[2] * o[2] + centre[0]
+        uy = y[0] * o[0] + y[1] * o[1] + y[2] * o[2] + centre[1]
+        uz = z[0] * o[0] + z[1] * o[1] + z[2] * o[2] + centre[2]
+        rx, ry = flesh.ring_radii[r, 0], flesh.ring_radii[r, 1]
+        kx, ky = flesh.ring_slopes[r, 0], flesh.ring_slopes[r, 1]
+        lx, ly = flesh.ring_leans[r, 0], flesh.ring_leans[r, 1]
+        e = flesh.ring_exponents[r]
+        bx, by = (ux - uz * lx) / rx, (uy - uz * ly) / ry
+        if e == 1.0 and kx == ky:
+            length = np.sqrt(bx * bx + by * by)
+            cosine = -(1.0 - uz * kx) / max(length, 1e-12)
+            if not abs(cosine) < 1.0:
+                continue
+            sine = np.sqrt(1.0 - cosine * cosine)
+            cm, sm = bx / length, by / length
+            cosines[0], sines[0] = cm * cosine - sm * sine, sm * cosine + cm * sine
+            cosines[1], sines[1] = cm * cosine + sm * sine, sm * cosine - cm * sine
+        elif not _bracketed_roots(bx, by, uz, kx, ky, 2.0 - e, cosines, sines):
+            continue
+        for side in range(2):
+            c, sn = cosines[side], sines[side]
+            if e == 1.0:
+                outline_x, outline_y, lateral_x, lateral_y = c, sn, c, sn
+            else:
+                outline_x, outline_y = _signed_power(c, e), _signed_power(sn, e)
+                lateral_x, lateral_y = _signed_power(c, 2.0 - e), _signed_power(sn, 2.0 - e)
+            px, py, pz = centre[0] + rx * outline_x, centre[1] + ry * outline_y, centre[2]
+            nx, ny = lateral_x / rx, lateral_y / ry
+            nz = -(kx * c * c + ky * sn * sn) - (nx * lx + ny * ly)
+            i = r + side * rings
+            point = contour.points[i]
+            for a in range(3):
+                point[a] = o[a] + x[a] * px + y[a] * py + z[a] * pz
+                normal[a] = x[a] * nx + y[a] * ny + z[a] * nz
+            if not project(lens, point, contour.pixels[i], contour.projections[i]):
+                continue
+            nu, nv = normal[0] / lens.focal[0], normal[1] / lens.focal[1]
+            size = np.sqrt(nu * nu + nv * nv)
+            if not size > 0.0:
+                continue
+            contour.normals[i, 0], contour.normals[i, 1] = nu / size, nv / size
+            contour.valid[i] = True
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _signed_power(x, exponent):  # type: ignore[no-untyped-def]
+    return np.sign(x) * np.abs(x) ** exponent
+
+
+@njit(cache=True, nogil=True)
+def _bracketed_roots(bx, by, uz, kx, ky, power, cosines, sines):  # type: ignore[no-untyped-def]
+    """Cosine and sine of the two roots of g(w), of `flesh.occluding_contour`; False if there are none."""
+    steps = 48
+    found_up, found_down = False, False
+    before = 0.0
+    for k in range(steps + 1):
+        w = -np.pi + k * (2.0 * np.pi / steps)
+        at = _condition(w, bx, by, uz, kx, ky, power)
+        if k > 0 and (before > 0) != (at > 0):
+            up = at > 0
+            if (up and not found_up) or (not up and not found_down):
+                low, high, at_low, at_high = w - 2.0 * np.pi / steps, w, before, at
+                root = high
+                for _ in range(16):  # Illinois: false position that never stalls at one end
+                    if at_high == at_low:
+                        break
+                    root = low - at_low * (high - low) / (at_high - at_low)
+                    value = _condition(root, bx, by, uz, kx, ky, power)
+                    if (value > 0) == (at_high > 0):
+                        at_low *= 0.5
+                    else:
+                        low, at_low = high, at_high
+                    high, at_high = root, value
+                side = 0 if up else 1
+                cosines[side], sines[side] = np.cos(root), np.sin(root)
+                if up:
+                    found_up = True
+                else:
+                    found_down = True
+        before = at
+    return found_up and found_down
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _condition(w, bx, by, uz, kx, ky, power):  # type: ignore[no-untyped-def]
+    c, s = np.cos(w), np.sin(w)
+    turned = bx * _signed_power(c, power) + by * _signed_power(s, power)
+    return 1.0 + turned - uz * (kx * c * c + ky * s * s)
+
+
+@njit(cache=True, nogil=True)
+def mark_visibility(flesh, occluders, columns, origins, parts, points, valid, covered, hidden):  # type: ignore[no-untyped-def]
+    """Which points (P, 3) have other parts on their rays, and which before them.
 
     Every part counts as its ellipsoid |A (x - c)| = 1. On the ray t p it is entered at
     t = (m.k - sqrt((m.k)^2 - m.m (k.k - 1))) / m.m with m = A p, k = A c.
 
     Args:
-        body: the body.
-        frames: of N poses.
-        points: (P, 3, N) camera frame, m.
-        parts: (P,) part that each point belongs to, which does not hide it.
-
-    Returns:
-        covered (P, N) and hidden (P, N).
+        flesh: the flesh.
+        occluders: (B,) parts that can hide.
+        columns, origins: frames of the segments.
+        parts: (P,) part of each point, which does not hide it.
+        points: (P, 3) camera frame, m.
+        valid: (P,) points that matter.
+        covered, hidden: (P,) results.
     """
-    flesh = body.flesh
-    segments = np.array([p.segment for p in flesh.parts])
-    radii = COVER * np.array([p.radii for p in flesh.parts])
-    centres = np.array([p.centre for p in flesh.parts])
-    n = frames.count
-    where = frames.points(segments, centres)  # (S, 3, N)
-    scaled = frames.columns[segments] / radii[:, :, None, None]  # (S, 3 axes, 3, N)
-    k = np.einsum('sixn,sxn->nsi', scaled, where)
-    shape = np.ascontiguousarray(scaled.reshape(-1, 3, n).transpose(2, 0, 1))
-    m = shape @ np.ascontiguousarray(points.transpose(2, 1, 0))  # (N, 3S, P)
-    m = m.reshape(n, len(segments), 3, -1)
-    mm = m[:, :, 0] ** 2
-    mm += m[:, :, 1] ** 2
-    mm += m[:, :, 2] ** 2
-    mk = m[:, :, 0] * k[:, :, 0, None]
-    mk += m[:, :, 1] * k[:, :, 1, None]
-    mk += m[:, :, 2] * k[:, :, 2, None]
-    outside = (k * k).sum(2)[:, :, None] - 1.0
-    discriminant = mk * mk - mm * outside
-    own = np.arange(len(segments))[:, None] == parts
-    through = (discriminant > 0) & ~own
-    root = np.sqrt(np.maximum(discriminant, 0.0))
-    before = through & (mk - root < (1.0 - HIDDEN) * mm)
-    return through.any(1).T, before.any(1).T
+    count = len(flesh.part_segments)
+    shapes = np.empty((count, 3, 3))
+    centres, k = np.empty((count, 3)), np.empty((count, 3))
+    reach, outside = np.empty(count), np.empty(count)
+    for b in range(count):
+        s = flesh.part_segments[b]
+        far = 0.0
+        for i in range(3):
+            centres[b, i] = origins[s, i]
+            for j in range(3):
+                centres[b, i] += columns[s, j, i] * flesh.part_centres[b, j]
+        outside[b] = -1.0
+        for i in range(3):
+            radius = COVER * flesh.part_radii[b, i]
+            far = max(far, radius)
+            k[b, i] = 0.0
+            for j in range(3):
+                shapes[b, i, j] = columns[s, i, j] / radius
+                k[b, i] += shapes[b, i, j] * centres[b, j]
+            outside[b] += k[b, i] * k[b, i]
+        reach[b] = far * far
+    for n in range(len(points)):
+        covered[n] = False
+        hidden[n] = False
+        if not valid[n]:
+            continue
+        p = points[n]
+        square = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
+        for b in range(count):
+            if b == parts[n] or not occluders[b]:
+                continue
+            c = centres[b]
+            along = c[0] * p[0] + c[1] * p[1] + c[2] * p[2]
+            away = c[0] * c[0] + c[1] * c[1] + c[2] * c[2] - along * along / square
+            if away > reach[b]:
+                continue
+            mm, mk = 0.0, 0.0
+            for i in range(3):
+                m = shapes[b, i, 0] * p[0] + shapes[b, i, 1] * p[1] + shapes[b, i, 2] * p[2]
+                mm += m * m
+                mk += m * k[b, i]
+            discriminant = mk * mk - mm * outside[b]
+            if discriminant > 0.0:
+                covered[n] = True
+                if mk - np.sqrt(discriminant) < (1.0 - HIDDEN) * mm:
+                    hidden[n] = True
+                    break

@@ -1,0 +1,121 @@
+"""From residuals at points of the body to a gradient and a Gauss-Newton Hessian over the pose.
+
+The compiled counterpart of `body.kinematics.segment_sums` and `assemble`, one pose at a time: a residual
+at the point p with derivative a adds `g b` and `k b b^T` to its segment, b = (a, p x a); sums over what
+a degree of freedom moves give its row of the gradient and of the Hessian.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from hmt_ros.body.skeleton import Skeleton
+
+Array = NDArray[np.float64]
+
+
+class Tree(NamedTuple):
+    """The skeleton as the compiled code reads it.
+
+    Attributes:
+        parents: (S,) segment above; -1: none.
+        dof_segments: (d,) segment of each degree of freedom.
+        dof_parents: (d,) the degree of freedom before it on the path from the root; -1: none.
+        dof_is_rotation: (d,).
+    """
+
+    parents: NDArray[np.int64]
+    dof_segments: NDArray[np.int64]
+    dof_parents: NDArray[np.int64]
+    dof_is_rotation: NDArray[np.bool_]
+
+
+def tree_of(skeleton: Skeleton) -> Tree:
+    """The compiled code's view of a skeleton."""
+    last_of: list[int] = []  # the last degree of freedom on the path to each segment
+    before = np.full(skeleton.dimension, -1)
+    for segment, parent in enumerate(skeleton.parents):
+        last = last_of[parent] if parent >= 0 else -1
+        for dof in skeleton.segment_dofs[segment]:
+            before[dof] = last
+            last = dof
+        last_of.append(last)
+    return Tree(
+        np.array(skeleton.parents, dtype=np.int64),
+        np.array(skeleton.dof_segments, dtype=np.int64),
+        before.astype(np.int64),
+        np.array(skeleton.dof_is_rotation),
+    )
+
+
+@njit(cache=True, nogil=True, inline='always')
+def add_residual(wrenches, stiffnesses, segment, p, a0, a1, a2, pull, curvature):  # type: ignore[no-untyped-def]
+    """Adds a residual at the point p (3,) with derivative (a0, a1, a2) to its segment."""
+    b = np.empty(6)
+    b[0], b[1], b[2] = a0, a1, a2
+    b[3] = p[1] * a2 - p[2] * a1
+    b[4] = p[2] * a0 - p[0] * a2
+    b[5] = p[0] * a1 - p[1] * a0
+    for i in range(6):
+        wrenches[segment, i] += pull * b[i]
+        scaled = curvature * b[i]
+        for j in range(i, 6):
+            stiffnesses[segment, i, j] += scaled * b[j]
+
+
+@njit(cache=True, nogil=True)
+def assemble_pose(tree, axes, dof_origins, wrenches, stiffnesses, gradient, hessian):  # type: ignore[no-untyped-def]
+    """Gradient (d,) and Hessian (d, d) of one pose; overwrites the sums of the segments.
+
+    Args:
+        tree: the skeleton.
+        axes, dof_origins: (d, 3) of the degrees of freedom, camera frame.
+        wrenches: (S, 6) sums of g b.
+        stiffnesses: (S, 6, 6) sums of k b b^T, upper triangle.
+        gradient, hessian: results, added to.
+    """
+    count = len(tree.parents)
+    d = len(tree.dof_segments)
+    for s in range(count - 1, 0, -1):
+        parent = tree.parents[s]
+        if parent >= 0:
+            for i in range(6):
+                wrenches[parent, i] += wrenches[s, i]
+                for j in range(i, 6):
+                    stiffnesses[parent, i, j] += stiffnesses[s, i, j]
+    for s in range(count):
+        for i in range(6):
+            for j in range(i):
+                stiffnesses[s, i, j] = stiffnesses[s, j, i]
+    twists = np.zeros((d, 6))
+    for j in range(d):
+        if tree.dof_is_rotation[j]:
+            o, w = dof_origins[j], axes[j]
+            twists[j, 0] = o[1] * w[2] - o[2] * w[1]
+            twists[j, 1] = o[2] * w[0] - o[0] * w[2]
+            twists[j, 2] = o[0] * w[1] - o[1] * w[0]
+            twists[j, 3:] = w
+        else:
+            twists[j, :3] = axes[j]
+    pushed = np.empty(6)
+    for j in range(d):
+        s = tree.dof_segments[j]
+        for i in range(6):
+            total = 0.0
+            for k in range(6):
+                total += stiffnesses[s, i, k] * twists[j, k]
+            pushed[i] = total
+            gradient[j] += wrenches[s, i] * twists[j, i]
+        i = j
+        while i >= 0:
+            total = 0.0
+            for k in range(6):
+                total += twists[i, k] * pushed[k]
+            hessian[i, j] += total
+            if i != j:
+                hessian[j, i] += total
+            i = tree.dof_parents[i]
