@@ -86,6 +86,20 @@ class Frames:
         result[:, 3:] = np.where(rotation, self.axes, 0.0)
         return result
 
+    def by_pose(self) -> tuple[Array, Array]:
+        """Columns (N, S, 3, 3) and origins (N, S, 3), pose by pose in memory."""
+        return (
+            np.ascontiguousarray(self.columns.transpose(3, 0, 1, 2)),
+            np.ascontiguousarray(self.origins.transpose(2, 0, 1)),
+        )
+
+    def dofs_by_pose(self) -> tuple[Array, Array]:
+        """Axes and points on the axes (N, d, 3) of the degrees of freedom, pose by pose in memory."""
+        return (
+            np.ascontiguousarray(self.axes.transpose(2, 0, 1)),
+            np.ascontiguousarray(self.dof_origins.transpose(2, 0, 1)),
+        )
+
     def rotations(self) -> Array:
         """Rotation matrices (N, S, 3, 3) from the segments' frames to the camera frame."""
         return np.ascontiguousarray(self.columns.transpose(3, 0, 2, 1))
@@ -201,7 +215,7 @@ def segment_sums(
     """Sums of g b and k b b^T per segment, for residuals at points that stay on their segments.
 
     Args:
-        segments: (M,) the segment of each residual, or (M, N) where it differs from pose to pose.
+        segments: (M,) the segment of each residual.
         points: (M, 3, N) where it acts, camera frame, m.
         directions: (M, 3, N) derivative a of the residual with respect to its point.
         pull: (M, N) derivative g of the energy with respect to the residual.
@@ -213,8 +227,6 @@ def segment_sums(
     """
     n = points.shape[-1]
     b = np.concatenate([directions, _cross(points, directions)], axis=1)
-    if segments.ndim == 2:
-        return _scattered_sums(segments, b, pull, curvature, count)
     wrenches = np.zeros((count, 6, n))
     stiffnesses = np.zeros((count, 6, 6, n))
     weighted = curvature[:, None] * b
@@ -224,26 +236,6 @@ def segment_sums(
         wrenches[s] = np.einsum('mn,man->an', pull[rows], b[rows])
         stiffnesses[s] = np.einsum('man,mbn->abn', weighted[rows], b[rows])
     return wrenches, stiffnesses
-
-
-def _scattered_sums(
-    segments: Index, b: Array, pull: Array, curvature: Array, count: int
-) -> tuple[Array, Array]:
-    """`segment_sums` where every pose has its own segments (M, N)."""
-    m, n = segments.shape
-    rows, cols = np.triu_indices(6)
-    terms = np.empty((n, m, 6 + len(rows)))
-    batch_first = np.ascontiguousarray(b.transpose(2, 0, 1))
-    terms[:, :, :6] = batch_first * pull.T[:, :, None]
-    weighted = batch_first * curvature.T[:, :, None]
-    terms[:, :, 6:] = weighted[:, :, rows] * batch_first[:, :, cols]
-    membership = (np.arange(count)[:, None] == segments.T[:, None, :]).astype(np.float64)
-    sums = membership @ terms  # (N, S, 27)
-    stiffnesses = np.empty((count, 6, 6, n))
-    upper = sums[:, :, 6:].transpose(1, 2, 0)
-    stiffnesses[:, rows, cols] = upper
-    stiffnesses[:, cols, rows] = upper
-    return np.ascontiguousarray(sums[:, :, :6].transpose(1, 2, 0)), stiffnesses
 
 
 def assemble(frames: Frames, wrenches: Array, stiffnesses: Array) -> tuple[Array, Array]:

@@ -53,18 +53,46 @@ def tree_of(skeleton: Skeleton) -> Tree:
 
 
 @njit(cache=True, nogil=True, inline='always')
-def add_residual(wrenches, stiffnesses, segment, p, a0, a1, a2, pull, curvature):  # type: ignore[no-untyped-def]
-    """Adds a residual at the point p (3,) with derivative (a0, a1, a2) to its segment."""
-    b = np.empty(6)
-    b[0], b[1], b[2] = a0, a1, a2
-    b[3] = p[1] * a2 - p[2] * a1
-    b[4] = p[2] * a0 - p[0] * a2
-    b[5] = p[0] * a1 - p[1] * a0
-    for i in range(6):
-        wrenches[segment, i] += pull * b[i]
-        scaled = curvature * b[i]
-        for j in range(i, 6):
-            stiffnesses[segment, i, j] += scaled * b[j]
+def add_residual(wrenches, stiffnesses, s, p0, p1, p2, a0, a1, a2, pull, curvature):  # type: ignore[no-untyped-def]
+    """Adds a residual at the point p with derivative a to segment s.
+
+    Everything is a scalar: a small array a call would cost more than the arithmetic.
+    """
+    a3 = p1 * a2 - p2 * a1
+    a4 = p2 * a0 - p0 * a2
+    a5 = p0 * a1 - p1 * a0
+    wrenches[s, 0] += pull * a0
+    wrenches[s, 1] += pull * a1
+    wrenches[s, 2] += pull * a2
+    wrenches[s, 3] += pull * a3
+    wrenches[s, 4] += pull * a4
+    wrenches[s, 5] += pull * a5
+    c = curvature * a0
+    stiffnesses[s, 0, 0] += c * a0
+    stiffnesses[s, 0, 1] += c * a1
+    stiffnesses[s, 0, 2] += c * a2
+    stiffnesses[s, 0, 3] += c * a3
+    stiffnesses[s, 0, 4] += c * a4
+    stiffnesses[s, 0, 5] += c * a5
+    c = curvature * a1
+    stiffnesses[s, 1, 1] += c * a1
+    stiffnesses[s, 1, 2] += c * a2
+    stiffnesses[s, 1, 3] += c * a3
+    stiffnesses[s, 1, 4] += c * a4
+    stiffnesses[s, 1, 5] += c * a5
+    c = curvature * a2
+    stiffnesses[s, 2, 2] += c * a2
+    stiffnesses[s, 2, 3] += c * a3
+    stiffnesses[s, 2, 4] += c * a4
+    stiffnesses[s, 2, 5] += c * a5
+    c = curvature * a3
+    stiffnesses[s, 3, 3] += c * a3
+    stiffnesses[s, 3, 4] += c * a4
+    stiffnesses[s, 3, 5] += c * a5
+    c = curvature * a4
+    stiffnesses[s, 4, 4] += c * a4
+    stiffnesses[s, 4, 5] += c * a5
+    stiffnesses[s, 5, 5] += curvature * a5 * a5
 
 
 @njit(cache=True, nogil=True)
@@ -94,13 +122,15 @@ def assemble_pose(tree, axes, dof_origins, wrenches, stiffnesses, gradient, hess
     twists = np.zeros((d, 6))
     for j in range(d):
         if tree.dof_is_rotation[j]:
-            o, w = dof_origins[j], axes[j]
-            twists[j, 0] = o[1] * w[2] - o[2] * w[1]
-            twists[j, 1] = o[2] * w[0] - o[0] * w[2]
-            twists[j, 2] = o[0] * w[1] - o[1] * w[0]
-            twists[j, 3:] = w
+            o0, o1, o2 = dof_origins[j, 0], dof_origins[j, 1], dof_origins[j, 2]
+            w0, w1, w2 = axes[j, 0], axes[j, 1], axes[j, 2]
+            twists[j, 0] = o1 * w2 - o2 * w1
+            twists[j, 1] = o2 * w0 - o0 * w2
+            twists[j, 2] = o0 * w1 - o1 * w0
+            twists[j, 3], twists[j, 4], twists[j, 5] = w0, w1, w2
         else:
-            twists[j, :3] = axes[j]
+            for i in range(3):
+                twists[j, i] = axes[j, i]
     pushed = np.empty(6)
     for j in range(d):
         s = tree.dof_segments[j]

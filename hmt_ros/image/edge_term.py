@@ -41,10 +41,11 @@ def add_edges(edges, contour, part_segments, term, count, wrenches, stiffnesses)
         value, gu, gv = sample_distance(edges, channel, contour.pixels[i, 0], contour.pixels[i, 1])
         rho, pull, curvature = geman_mcclure(value / term.sigma, term.scale, each)
         energy += rho
-        j = contour.projections[i]
-        a0 = (gu * j[0, 0] + gv * j[1, 0]) / term.sigma
-        a1 = (gu * j[0, 1] + gv * j[1, 1]) / term.sigma
-        a2 = (gu * j[0, 2] + gv * j[1, 2]) / term.sigma
-        segment = part_segments[contour.parts[i]]
-        add_residual(wrenches, stiffnesses, segment, contour.points[i], a0, a1, a2, pull, curvature)
+        j, p = contour.projections, contour.points
+        gu, gv = gu / term.sigma, gv / term.sigma
+        add_residual(
+            wrenches, stiffnesses, part_segments[contour.parts[i]], p[i, 0], p[i, 1], p[i, 2],
+            gu * j[i, 0, 0] + gv * j[i, 1, 0], gu * j[i, 0, 1] + gv * j[i, 1, 1],
+            gu * j[i, 0, 2] + gv * j[i, 1, 2], pull, curvature,
+        )  # fmt: skip
     return energy

@@ -39,18 +39,19 @@ def add_intensity(  # type: ignore[no-untyped-def]
     """
     count = texture.counts[t]
     each = term.weight / max(count, FEWEST)
-    pixel, projection, point = np.empty(2), np.empty((2, 3)), np.empty(3)
+    pixel, projection = np.empty((1, 2)), np.empty((1, 2, 3))
     errors, slopes = np.empty(3), np.empty((3, 2))
     energy = 0.0
     for q in range(count):
         s = texture.segments[t, q]
         if not wanted[s]:
             continue
-        if not _place(texture.local[t, q], columns[s], origins[s], lens, point, pixel, projection):
+        p0, p1, p2 = _place(texture.local, t, q, columns, origins, s)
+        if not project(lens, p0, p1, p2, 0, pixel, projection):
             continue
         square = 0.0
         for c in range(3):
-            value, gu, gv = sample(intensity, c, pixel[0], pixel[1])
+            value, gu, gv = sample(intensity, c, pixel[0, 0], pixel[0, 1])
             errors[c] = (value - texture.colours[t, q, c]) / term.sigma
             slopes[c, 0], slopes[c, 1] = gu / term.sigma, gv / term.sigma
             square += errors[c] * errors[c]
@@ -64,7 +65,7 @@ def add_intensity(  # type: ignore[no-untyped-def]
             h01 += slopes[c, 0] * slopes[c, 1]
             h11 += slopes[c, 1] * slopes[c, 1]
         _add_pixel_energy(
-            g0, g1, h00, h01, h11, curvature, s, point, projection, wrenches, stiffnesses
+            g0, g1, h00, h01, h11, curvature, s, p0, p1, p2, projection, wrenches, stiffnesses
         )
     return energy
 
@@ -82,44 +83,46 @@ def add_motion(  # type: ignore[no-untyped-def]
     """
     count = texture.counts[t]
     each = term.weight / max(count, FEWEST)
-    pixel, projection, point = np.empty(2), np.empty((2, 3)), np.empty(3)
+    pixel, projection = np.empty((1, 2)), np.empty((1, 2, 3))
     energy = 0.0
     for q in range(count):
         s = texture.segments[t, q]
         if not wanted[s]:
             continue
-        if not _place(texture.local[t, q], columns[s], origins[s], lens, point, pixel, projection):
+        p0, p1, p2 = _place(texture.local, t, q, columns, origins, s)
+        if not project(lens, p0, p1, p2, 0, pixel, projection):
             continue
         u, v = texture.pixels[t, q, 0], texture.pixels[t, q, 1]
         fu, _, _ = sample(flow, 0, u, v)
         fv, _, _ = sample(flow, 1, u, v)
         inverse = 1.0 / (term.sigma + FLOW_ERROR * np.sqrt(fu * fu + fv * fv))
-        e0, e1 = (pixel[0] - u - fu) * inverse, (pixel[1] - v - fv) * inverse
+        e0, e1 = (pixel[0, 0] - u - fu) * inverse, (pixel[0, 1] - v - fv) * inverse
         rho, _, curvature = geman_mcclure(np.sqrt(e0 * e0 + e1 * e1), term.scale, each)
         energy += rho
         for a in range(2):
-            j = projection[a]
             error = e0 if a == 0 else e1
             add_residual(
-                wrenches, stiffnesses, s, point,
-                j[0] * inverse, j[1] * inverse, j[2] * inverse, curvature * error, curvature,
+                wrenches, stiffnesses, s, p0, p1, p2, projection[0, a, 0] * inverse,
+                projection[0, a, 1] * inverse, projection[0, a, 2] * inverse,
+                curvature * error, curvature,
             )  # fmt: skip
     return energy
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _place(local, columns, origin, lens, point, pixel, projection):  # type: ignore[no-untyped-def]
-    for a in range(3):
-        point[a] = (
-            origin[a]
-            + columns[0, a] * local[0] + columns[1, a] * local[1] + columns[2, a] * local[2]
-        )  # fmt: skip
-    return project(lens, point, pixel, projection)
+def _place(local, t, q, columns, origins, s):  # type: ignore[no-untyped-def]
+    """Point q of texture t in the camera frame."""
+    x, y, z = local[t, q, 0], local[t, q, 1], local[t, q, 2]
+    return (
+        origins[s, 0] + columns[s, 0, 0] * x + columns[s, 1, 0] * y + columns[s, 2, 0] * z,
+        origins[s, 1] + columns[s, 0, 1] * x + columns[s, 1, 1] * y + columns[s, 2, 1] * z,
+        origins[s, 2] + columns[s, 0, 2] * x + columns[s, 1, 2] * y + columns[s, 2, 2] * z,
+    )
 
 
 @njit(cache=True, nogil=True, inline='always')
 def _add_pixel_energy(  # type: ignore[no-untyped-def]
-    g0, g1, h00, h01, h11, curvature, segment, point, projection, wrenches, stiffnesses
+    g0, g1, h00, h01, h11, curvature, segment, p0, p1, p2, projection, wrenches, stiffnesses
 ):
     """Adds an energy with gradient g and Hessian G over the pixel, as two residuals.
 
@@ -132,11 +135,11 @@ def _add_pixel_energy(  # type: ignore[no-untyped-def]
     second = (g1 - l10 * first) / l11
     j = projection
     add_residual(
-        wrenches, stiffnesses, segment, point,
-        l00 * j[0, 0] + l10 * j[1, 0], l00 * j[0, 1] + l10 * j[1, 1], l00 * j[0, 2] + l10 * j[1, 2],
-        curvature * first, curvature,
+        wrenches, stiffnesses, segment, p0, p1, p2,
+        l00 * j[0, 0, 0] + l10 * j[0, 1, 0], l00 * j[0, 0, 1] + l10 * j[0, 1, 1],
+        l00 * j[0, 0, 2] + l10 * j[0, 1, 2], curvature * first, curvature,
     )  # fmt: skip
     add_residual(
-        wrenches, stiffnesses, segment, point,
-        l11 * j[1, 0], l11 * j[1, 1], l11 * j[1, 2], curvature * second, curvature,
+        wrenches, stiffnesses, segment, p0, p1, p2,
+        l11 * j[0, 1, 0], l11 * j[0, 1, 1], l11 * j[0, 1, 2], curvature * second, curvature,
     )  # fmt: skip

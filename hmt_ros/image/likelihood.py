@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,17 +15,27 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.body.self_intersection import self_intersection_energy
-from hmt_ros.image.edge_term import edge_energy
-from hmt_ros.image.intensity_term import intensity_energy, motion_energy
+from hmt_ros.image.accumulation import tree_of
+from hmt_ros.image.energy_kernel import (
+    TERM_COUNT,
+    Evidence,
+    Model,
+    Placement,
+    Term,
+    Terms,
+    add_energies,
+)
 from hmt_ros.image.joint_term import joint_energy
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.residuals import Energy, assemble_energies
-from hmt_ros.image.silhouette_term import containment_energy, coverage_energy
-from hmt_ros.image.surface import project_surface
-from hmt_ros.image.texture import Textures
+from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.surface import flesh_table_of, lens_of
+from hmt_ros.image.texture import Textures, no_textures
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+TERMS = Terms._fields
+NO_MAP = ImageMap(np.zeros((2, 2, 2), np.float32))
 
 
 @dataclass(frozen=True)
@@ -31,7 +45,8 @@ class TermSettings:
     Attributes:
         weight: how many independent measurements the term counts for; 0 switches it off. For joints:
             a factor.
-        sigma: standard deviation of one measurement, px.
+        sigma: standard deviation of one measurement, px (intensity: grey levels; joints: a factor on
+            the keypoints' own).
         scale: of the Geman-McClure kernel, in sigmas.
     """
 
@@ -49,11 +64,11 @@ class LikelihoodSettings:
     """The terms of the likelihood and of the prior.
 
     Attributes:
-        joints: keypoints; sigma multiplies their own standard deviations.
+        joints: keypoints.
         containment: the model's contour lies inside the silhouette.
         coverage: the silhouette's outline lies on the model's contour.
         edges: visible contours lie on edges.
-        intensity: the texture of the last image is found again; sigma in grey levels.
+        intensity: the texture of the last image is found again.
         motion: the texture moves with the optical flow.
         prior_weight: factor on the soft prior of the joint angles.
         self_intersection_sigma: overlap of body parts that costs 1/2, m; inf switches it off.
@@ -70,12 +85,42 @@ class LikelihoodSettings:
 
 
 @dataclass(frozen=True, eq=False)
+class ImageEnergy:
+    """Terms of an image at N poses.
+
+    Attributes:
+        terms: name -> (N,) energy.
+        costs: (N, M) what each sample of the silhouette's outline costs.
+        gradient, hessian: (N, d), (N, d, d) of the sum; None: not asked for.
+    """
+
+    terms: dict[str, Array]
+    costs: Array
+    gradient: Array | None
+    hessian: Array | None
+
+    @property
+    def value(self) -> Array:
+        """The sum of the terms, (N,)."""
+        return np.sum(list(self.terms.values()), axis=0)
+
+
+@dataclass(frozen=True, eq=False)
 class ImageLikelihood:
-    """-log p(image | pose) - log prior(pose) of a body before a camera."""
+    """-log p(image | pose) - log prior(pose) of a body before a camera.
+
+    Attributes:
+        body, camera: who is seen by what.
+        settings: the terms.
+        parts: the parts of the flesh that are compared with the image; None: all.
+        occluders: the parts that hide others; None: all.
+    """
 
     body: Body
     camera: Camera
     settings: LikelihoodSettings = field(default_factory=LikelihoodSettings)
+    parts: tuple[int, ...] | None = None
+    occluders: tuple[int, ...] | None = None
 
     def energy(
         self,
@@ -93,76 +138,78 @@ class ImageLikelihood:
             which: (N,) the texture that each pose carries.
         """
         frames = forward(self.body.skeleton, poses)
-        terms = self.terms(frames, observation, textures, which)
-        value, gradient, hessian = assemble_energies(frames, list(terms.values()))
+        image = self.image_energy(frames, observation, textures, which)
+        assert image.gradient is not None
+        assert image.hessian is not None
+        value, gradient, hessian = image.value, image.gradient, image.hessian
         for part in (self.prior(poses), self.intersection(frames)):
             value += part[0]
             gradient += part[1]
             hessian += part[2]
         return value, gradient, hessian
 
-    def terms(
+    def image_energy(
         self,
         frames: Frames,
         observation: Observation,
         textures: Textures | None = None,
         which: Index | None = None,
-    ) -> dict[str, Energy]:
-        """The terms that the observation and the settings allow, by name."""
-        s = self.settings
-        result: dict[str, Energy] = {}
-        if observation.keypoints is not None and s.joints.weight > 0:
-            result['joints'] = joint_energy(
-                frames, self.camera, observation.keypoints,
-                scale=s.joints.scale, weight=s.joints.weight / s.joints.sigma**2,
-            )  # fmt: skip
-        if textures is not None and which is not None:
-            result |= self._texture_terms(frames, observation, textures, which)
-        silhouette = observation.distance is not None
-        wanted = silhouette and (s.containment.weight > 0 or s.coverage.weight > 0)
-        if not wanted and (observation.edges is None or s.edges.weight == 0):
-            return result
-        surface = project_surface(self.body, self.camera, frames)
-        if observation.distance is not None and s.containment.weight > 0:
-            t = s.containment
-            result['containment'] = containment_energy(
-                surface, observation.distance, sigma=t.sigma, scale=t.scale, weight=t.weight
-            )
-        if observation.outline is not None and s.coverage.weight > 0:
-            t = s.coverage
-            result['coverage'] = coverage_energy(
-                surface, observation.outline, sigma=t.sigma, scale=t.scale, weight=t.weight
-            )
-        if observation.edges is not None and s.edges.weight > 0:
-            t = s.edges
-            result['edges'] = edge_energy(
-                surface, observation.edges, sigma=t.sigma, scale=t.scale, weight=t.weight
-            )
-        return result
+        *,
+        explained: Array | None = None,
+        derivatives: bool = True,
+    ) -> ImageEnergy:
+        """The terms of the image at the frames of N poses.
 
-    def _texture_terms(
-        self, frames: Frames, observation: Observation, textures: Textures, which: Index
-    ) -> dict[str, Energy]:
-        result: dict[str, Energy] = {}
-        t = self.settings.intensity
-        if observation.intensity is not None and t.weight > 0:
-            result['intensity'] = intensity_energy(
-                frames, self.camera, textures, which, observation.intensity,
-                sigma=t.sigma, scale=t.scale, weight=t.weight,
+        Args:
+            frames: of the poses.
+            observation: of the image.
+            textures, which: as for `energy`.
+            explained: (N, M) or (1, M) what each sample of the outline costs at most, because
+                something else explains it.
+            derivatives: whether gradient and Hessian are wanted.
+        """
+        n, d = frames.count, self.body.dimension
+        evidence, terms = _evidence(observation), self._terms(observation, textures)
+        samples = len(evidence.outline_pixels)
+        energies, costs = np.zeros((n, TERM_COUNT)), np.zeros((n, samples))
+        gradient = np.zeros((n if derivatives else 0, d))
+        hessian = np.zeros((n if derivatives else 0, d, d))
+        if explained is None:
+            explained = np.full((1, samples), np.inf)
+        own = np.full(n, -1) if which is None else which
+        columns, origins = frames.by_pose()
+        placement = Placement(columns, origins, *frames.dofs_by_pose())
+        textures = textures or no_textures()
+
+        def work(first: int, last: int) -> None:
+            add_energies(
+                first, last, self._model, terms, evidence, textures, own, placement, explained,
+                energies, costs, gradient, hessian,
             )  # fmt: skip
-        t = self.settings.motion
-        if observation.flow is not None and t.weight > 0:
-            result['motion'] = motion_energy(
-                frames, self.camera, textures, which, observation.flow,
-                sigma=t.sigma, scale=t.scale, weight=t.weight,
+
+        _in_threads(work, n)
+        result = {
+            name: energies[:, i] for i, name in enumerate(TERMS) if getattr(terms, name).weight > 0
+        }
+        if observation.keypoints is not None and self.settings.joints.weight > 0:
+            s = self.settings.joints
+            value, g, h = joint_energy(
+                frames, self.camera, observation.keypoints,
+                scale=s.scale, weight=s.weight / s.sigma**2,
             )  # fmt: skip
-        return result
+            result['joints'] = value
+            if derivatives:
+                gradient += g
+                hessian += h
+        result = result or {'nothing': np.zeros(n)}
+        if not derivatives:
+            return ImageEnergy(result, costs, None, None)
+        return ImageEnergy(result, costs, gradient, hessian)
 
     def prior(self, poses: Array) -> tuple[Array, Array, Array]:
         """Energy, gradient and Hessian of the soft prior of the joint angles."""
         body = self.body
-        sigma = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, np.inf)
-        precision = self.settings.prior_weight * sigma**-2.0
+        precision = self.settings.prior_weight * body.prior_sigma**-2.0
         offset = poses - body.prior_mean
         value = 0.5 * (offset * offset) @ precision
         hessian = np.broadcast_to(np.diag(precision), (len(poses), body.dimension, body.dimension))
@@ -175,3 +222,84 @@ class ImageLikelihood:
             n, d = frames.count, self.body.dimension
             return np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d))
         return self_intersection_energy(self.body, frames, sigma=sigma)
+
+    def _terms(self, observation: Observation, textures: Textures | None) -> Terms:
+        s, o = self.settings, observation
+        textured = textures is not None and len(textures.counts) > 0
+        present = {
+            'containment': o.distance is not None,
+            'coverage': o.outline is not None and o.outline.pixels.size > 0,
+            'edges': o.edges is not None,
+            'intensity': o.intensity is not None and textured,
+            'motion': o.flow is not None and textured,
+        }
+        return Terms(
+            *(
+                Term(t.weight if present[name] else 0.0, t.sigma, t.scale)
+                for name in TERMS
+                for t in (getattr(s, name),)
+            )
+        )
+
+    @cached_property
+    def _model(self) -> Model:
+        body = self.body
+        flesh = flesh_table_of(body)
+        count = len(flesh.part_segments)
+        traced = _selected(self.parts, count)
+        textured = np.zeros(len(body.skeleton.parents), dtype=bool)
+        textured[flesh.part_segments[traced]] = True
+        return Model(
+            tree_of(body.skeleton),
+            flesh,
+            lens_of(self.camera),
+            traced,
+            _selected(self.occluders, count),
+            textured,
+            0 if self.parts is None else 2 * len(flesh.ring_parts),
+        )
+
+
+def _selected(parts: Sequence[int] | None, count: int) -> NDArray[np.bool_]:
+    result = np.ones(count, dtype=bool)
+    if parts is not None:
+        result[:] = False
+        result[list(parts)] = True
+    return result
+
+
+def _evidence(observation: Observation) -> Evidence:
+    o = observation
+    outline = o.outline
+    none = np.zeros((0, 2))
+    return Evidence(
+        o.distance or NO_MAP,
+        o.edges or NO_MAP,
+        o.intensity or NO_MAP,
+        o.flow or NO_MAP,
+        none if outline is None else outline.pixels,
+        none if outline is None else outline.normals,
+    )
+
+
+@lru_cache(maxsize=1)
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_thread_count(), thread_name_prefix='likelihood')
+
+
+@lru_cache(maxsize=1)
+def _thread_count() -> int:
+    return min(len(os.sched_getaffinity(0)), 8)
+
+
+def _in_threads(work: Callable[[int, int], None], count: int) -> None:
+    """Shares poses among threads; every pose is worked on alone, so the result does not depend on it."""
+    threads = min(_thread_count(), count // 4)
+    if threads < 2:
+        work(0, count)
+        return
+    ends = [count * i // threads for i in range(threads + 1)]
+    jobs = [_pool().submit(work, a, b) for a, b in zip(ends[1:-1], ends[2:])]
+    work(0, ends[1])
+    for job in jobs:
+        job.result()

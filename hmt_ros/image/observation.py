@@ -65,8 +65,8 @@ class Outline:
     """Samples on the outline of the silhouette.
 
     Attributes:
-        pixels: (2, M).
-        normals: (2, M) unit vectors out of the silhouette.
+        pixels: (M, 2).
+        normals: (M, 2) unit vectors out of the silhouette.
     """
 
     pixels: Array
@@ -139,7 +139,7 @@ def observe(
         mask = np.ascontiguousarray(silhouette[top:bottom, left:right]).view(np.uint8)
         signed = _signed_distance(mask)
         distance = ImageMap(signed[None], left, top)
-        outline = _outline(mask, distance, s.outline_points)
+        outline = _outline(mask, left, top, s.outline_points)
         near = signed <= s.edge_margin
     edges = ImageMap(_edge_distances(part, near, s), left, top)
     blurred = cv2.GaussianBlur(part, (0, 0), s.intensity_blur).astype(np.float32)
@@ -182,29 +182,37 @@ def _signed_distance(mask: Image) -> NDArray[np.float32]:
     return result
 
 
-def _outline(mask: Image, distance: ImageMap, count: int) -> Outline:
+def _outline(mask: Image, left: int, top: int, count: int) -> Outline:
     """Points spaced evenly along all outlines of the silhouette, holes included."""
     contours, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     contours = [c[:, 0].astype(float) for c in contours if len(c) >= 12]
     if not contours:
-        return Outline(np.empty((2, 0)), np.empty((2, 0)))
+        return Outline(np.empty((0, 2)), np.empty((0, 2)))
     steps = [np.linalg.norm(np.roll(c, -1, axis=0) - c, axis=1) for c in contours]
     total = sum(x.sum() for x in steps)
     points = []
     for contour, step in zip(contours, steps, strict=True):
-        n = max(int(round(count * step.sum() / total)), 3)
+        n = max(round(count * step.sum() / total), 3)
         along = np.concatenate([[0.0], np.cumsum(step)])
         closed = np.concatenate([contour, contour[:1]])
         at = (np.arange(n) + 0.5) / n * along[-1]
-        points.append(np.stack([np.interp(at, along, closed[:, i]) for i in range(2)]))
-    pixels = np.concatenate(points, axis=1) + np.array([[distance.left], [distance.top]])
-    blurred = ImageMap(
-        cv2.GaussianBlur(distance.values[0], (0, 0), 1.5)[None], distance.left, distance.top
-    )
-    _, normals = blurred.sample(pixels)
-    length = np.hypot(normals[0], normals[1])
-    good = length > 0.2
-    return Outline(pixels[:, good] + 0.5 * (normals / length)[:, good], (normals / length)[:, good])
+        points.append(np.stack([np.interp(at, along, closed[:, i]) for i in range(2)], axis=1))
+    pixels = np.concatenate(points)
+    # Out of the silhouette is against the gradient of the blurred mask.
+    blurred = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 2.0)
+    column, row = np.round(pixels).astype(int).T
+    normals = -np.stack(
+        [
+            cv2.Sobel(blurred, cv2.CV_32F, 1, 0)[row, column],
+            cv2.Sobel(blurred, cv2.CV_32F, 0, 1)[row, column],
+        ],
+        axis=1,
+    ).astype(float)
+    length = np.linalg.norm(normals, axis=1)
+    good = length > 1e-3
+    normals = normals[good] / length[good, None]
+    # The outline lies half a pixel outside the last pixels of the silhouette.
+    return Outline(pixels[good] + 0.5 * normals + np.array([left, top]), normals)
 
 
 def _edge_distances(
@@ -240,12 +248,6 @@ def _optical_flow(before: Image, after: Image) -> NDArray[np.float32]:
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     flow = method.calc(grey[0], grey[1], None)
     return np.ascontiguousarray(flow.transpose(2, 0, 1))
-
-
-def orientation_bins(angle: Array) -> NDArray[np.intp]:
-    """Orientation bin of directions given as angles, rad; opposite directions share a bin."""
-    bins = np.round(angle * (EDGE_ORIENTATIONS / np.pi)).astype(np.intp)
-    return bins % EDGE_ORIENTATIONS
 
 
 def _counts_for(angle: Array, k: int) -> Mask:

@@ -41,12 +41,13 @@ def add_containment(distance, contour, part_segments, term, each, wrenches, stif
             continue
         rho, pull, curvature = geman_mcclure(value / term.sigma, term.scale, each)
         energy += rho
-        j = contour.projections[i]
-        a0 = (gu * j[0, 0] + gv * j[1, 0]) / term.sigma
-        a1 = (gu * j[0, 1] + gv * j[1, 1]) / term.sigma
-        a2 = (gu * j[0, 2] + gv * j[1, 2]) / term.sigma
-        segment = part_segments[contour.parts[i]]
-        add_residual(wrenches, stiffnesses, segment, contour.points[i], a0, a1, a2, pull, curvature)
+        j, p = contour.projections, contour.points
+        gu, gv = gu / term.sigma, gv / term.sigma
+        add_residual(
+            wrenches, stiffnesses, part_segments[contour.parts[i]], p[i, 0], p[i, 1], p[i, 2],
+            gu * j[i, 0, 0] + gv * j[i, 1, 0], gu * j[i, 0, 1] + gv * j[i, 1, 1],
+            gu * j[i, 0, 2] + gv * j[i, 1, 2], pull, curvature,
+        )  # fmt: skip
     return energy
 
 
@@ -99,7 +100,13 @@ def add_coverage(  # type: ignore[no-untyped-def]
         for k in range(used):
             du, dv, dnu, dnv = us[k] - u, vs[k] - v, nus[k] - nu, nvs[k] - nv
             gaps[k] = du * du + dv * dv + dnu * dnu + dnv * dnv
-        i = use[np.argmin(gaps)]
+        least = gaps[0]
+        for k in range(1, used):
+            least = min(least, gaps[k])
+        nearest = 0
+        while gaps[nearest] != least:
+            nearest += 1
+        i = use[nearest]
         du, dv = contour.pixels[i, 0] - pixels[m, 0], contour.pixels[i, 1] - pixels[m, 1]
         nx, ny = normals[m, 0], normals[m, 1]
         across = (nx * du + ny * dv) / term.sigma
@@ -118,16 +125,17 @@ def add_coverage(  # type: ignore[no-untyped-def]
         costs[m] = rho
         energy += rho
         segment = part_segments[contour.parts[i]]
-        point, j = contour.points[i], contour.projections[i]
-        a0 = (nx * j[0, 0] + ny * j[1, 0]) / term.sigma
-        a1 = (nx * j[0, 1] + ny * j[1, 1]) / term.sigma
-        a2 = (nx * j[0, 2] + ny * j[1, 2]) / term.sigma
-        add_residual(wrenches, stiffnesses, segment, point, a0, a1, a2, curvature * across, curvature)
+        p, j = contour.points, contour.projections
+        nx, ny = nx / term.sigma, ny / term.sigma
+        add_residual(
+            wrenches, stiffnesses, segment, p[i, 0], p[i, 1], p[i, 2],
+            nx * j[i, 0, 0] + ny * j[i, 1, 0], nx * j[i, 0, 1] + ny * j[i, 1, 1],
+            nx * j[i, 0, 2] + ny * j[i, 1, 2], curvature * across, curvature,
+        )  # fmt: skip
         if beyond != 0.0:
-            a0 = (nx * j[1, 0] - ny * j[0, 0]) / term.sigma
-            a1 = (nx * j[1, 1] - ny * j[0, 1]) / term.sigma
-            a2 = (nx * j[1, 2] - ny * j[0, 2]) / term.sigma
             add_residual(
-                wrenches, stiffnesses, segment, point, a0, a1, a2, curvature * beyond, curvature
-            )
+                wrenches, stiffnesses, segment, p[i, 0], p[i, 1], p[i, 2],
+                nx * j[i, 1, 0] - ny * j[i, 0, 0], nx * j[i, 1, 1] - ny * j[i, 0, 1],
+                nx * j[i, 1, 2] - ny * j[i, 0, 2], curvature * beyond, curvature,
+            )  # fmt: skip
     return energy

@@ -110,12 +110,11 @@ def empty_contour(rings):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def project(lens, p, pixel, projection):  # type: ignore[no-untyped-def]
-    """Pixel (2,) of a point (3,) and its derivative (2, 3); False behind the camera."""
-    z = p[2]
+def project(lens, x, y, z, i, pixels, projections):  # type: ignore[no-untyped-def]
+    """Pixel and derivative of a point, into row i of (P, 2) and (P, 2, 3); False behind the camera."""
     if not z > NEAR:
         return False
-    a, b = p[0] / z, p[1] / z
+    a, b = x / z, y / z
     if lens.model < 0:
         da, db, ea, eb = 1.0, 0.0, 0.0, 1.0
         u, v = a, b
@@ -144,23 +143,21 @@ def project(lens, p, pixel, projection):  # type: ignore[no-untyped-def]
         bent = theta * (1.0 + t * (k[0] + t * (k[1] + t * (k[2] + t * k[3]))))
         d_bent = 1.0 + t * (3.0 * k[0] + t * (5.0 * k[1] + t * (7.0 * k[2] + t * 9.0 * k[3])))
         scale = bent / r if r > 1e-8 else 1.0
-        slope = (
-            (d_bent / (1.0 + r * r) - scale) / (r * r) if r > 1e-4 else 2.0 * (k[0] - 1.0 / 3.0)
-        )
+        slope = (d_bent / (1.0 + r * r) - scale) / (r * r) if r > 1e-4 else 2.0 * (k[0] - 1.0 / 3.0)
         u, v = a * scale, b * scale
         da = scale + a * a * slope
         db = a * b * slope
         ea = db
         eb = scale + b * b * slope
-    fx, fy = lens.focal[0], lens.focal[1]
-    pixel[0] = fx * u + lens.centre[0]
-    pixel[1] = fy * v + lens.centre[1]
-    projection[0, 0] = fx * da / z
-    projection[0, 1] = fx * db / z
-    projection[0, 2] = -(projection[0, 0] * a + projection[0, 1] * b)
-    projection[1, 0] = fy * ea / z
-    projection[1, 1] = fy * eb / z
-    projection[1, 2] = -(projection[1, 0] * a + projection[1, 1] * b)
+    fx, fy = lens.focal[0] / z, lens.focal[1] / z
+    pixels[i, 0] = lens.focal[0] * u + lens.centre[0]
+    pixels[i, 1] = lens.focal[1] * v + lens.centre[1]
+    projections[i, 0, 0] = fx * da
+    projections[i, 0, 1] = fx * db
+    projections[i, 0, 2] = -fx * (da * a + db * b)
+    projections[i, 1, 0] = fy * ea
+    projections[i, 1, 1] = fy * eb
+    projections[i, 1, 2] = -fy * (ea * a + eb * b)
     return True
 
 
@@ -177,7 +174,6 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
     """
     rings = len(flesh.ring_parts)
     cosines, sines = np.empty(2), np.empty(2)
-    normal = np.empty(3)
     for r in range(rings):
         part = flesh.ring_parts[r]
         s = flesh.part_segments[part]
@@ -187,11 +183,14 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
         contour.valid[r + rings] = False
         if not wanted[part]:
             continue
-        x, y, z = columns[s, 0], columns[s, 1], columns[s, 2]
-        o, centre = origins[s], flesh.ring_centres[r]
-        ux = x[0] * o[0] + x[1] * o[1] + x[2] * o[2] + centre[0]
-        uy = y[0] * o[0] + y[1] * o[1] + y[2] * o[2] + centre[1]
-        uz = z[0] * o[0] + z[1] * o[1] + z[2] * o[2] + centre[2]
+        x0, x1, x2 = columns[s, 0, 0], columns[s, 0, 1], columns[s, 0, 2]
+        y0, y1, y2 = columns[s, 1, 0], columns[s, 1, 1], columns[s, 1, 2]
+        z0, z1, z2 = columns[s, 2, 0], columns[s, 2, 1], columns[s, 2, 2]
+        o0, o1, o2 = origins[s, 0], origins[s, 1], origins[s, 2]
+        cx, cy, cz = flesh.ring_centres[r, 0], flesh.ring_centres[r, 1], flesh.ring_centres[r, 2]
+        ux = x0 * o0 + x1 * o1 + x2 * o2 + cx
+        uy = y0 * o0 + y1 * o1 + y2 * o2 + cy
+        uz = z0 * o0 + z1 * o1 + z2 * o2 + cz
         rx, ry = flesh.ring_radii[r, 0], flesh.ring_radii[r, 1]
         kx, ky = flesh.ring_slopes[r, 0], flesh.ring_slopes[r, 1]
         lx, ly = flesh.ring_leans[r, 0], flesh.ring_leans[r, 1]
@@ -215,17 +214,18 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
             else:
                 outline_x, outline_y = _signed_power(c, e), _signed_power(sn, e)
                 lateral_x, lateral_y = _signed_power(c, 2.0 - e), _signed_power(sn, 2.0 - e)
-            px, py, pz = centre[0] + rx * outline_x, centre[1] + ry * outline_y, centre[2]
+            px, py = cx + rx * outline_x, cy + ry * outline_y
             nx, ny = lateral_x / rx, lateral_y / ry
             nz = -(kx * c * c + ky * sn * sn) - (nx * lx + ny * ly)
             i = r + side * rings
-            point = contour.points[i]
-            for a in range(3):
-                point[a] = o[a] + x[a] * px + y[a] * py + z[a] * pz
-                normal[a] = x[a] * nx + y[a] * ny + z[a] * nz
-            if not project(lens, point, contour.pixels[i], contour.projections[i]):
+            p0 = o0 + x0 * px + y0 * py + z0 * cz
+            p1 = o1 + x1 * px + y1 * py + z1 * cz
+            p2 = o2 + x2 * px + y2 * py + z2 * cz
+            contour.points[i, 0], contour.points[i, 1], contour.points[i, 2] = p0, p1, p2
+            if not project(lens, p0, p1, p2, i, contour.pixels, contour.projections):
                 continue
-            nu, nv = normal[0] / lens.focal[0], normal[1] / lens.focal[1]
+            nu = (x0 * nx + y0 * ny + z0 * nz) / lens.focal[0]
+            nv = (x1 * nx + y1 * ny + z1 * nz) / lens.focal[1]
             size = np.sqrt(nu * nu + nv * nv)
             if not size > 0.0:
                 continue
@@ -298,10 +298,10 @@ def mark_visibility(flesh, occluders, columns, origins, parts, points, valid, co
     count = len(flesh.part_segments)
     shapes = np.empty((count, 3, 3))
     centres, k = np.empty((count, 3)), np.empty((count, 3))
-    reach, outside = np.empty(count), np.empty(count)
+    reach, far, outside = np.empty(count), np.empty(count), np.empty(count)
     for b in range(count):
         s = flesh.part_segments[b]
-        far = 0.0
+        largest = 0.0
         for i in range(3):
             centres[b, i] = origins[s, i]
             for j in range(3):
@@ -309,31 +309,30 @@ def mark_visibility(flesh, occluders, columns, origins, parts, points, valid, co
         outside[b] = -1.0
         for i in range(3):
             radius = COVER * flesh.part_radii[b, i]
-            far = max(far, radius)
+            largest = max(largest, radius)
             k[b, i] = 0.0
             for j in range(3):
                 shapes[b, i, j] = columns[s, i, j] / radius
                 k[b, i] += shapes[b, i, j] * centres[b, j]
             outside[b] += k[b, i] * k[b, i]
-        reach[b] = far * far
+        reach[b] = largest * largest
+        far[b] = centres[b, 0] ** 2 + centres[b, 1] ** 2 + centres[b, 2] ** 2
     for n in range(len(points)):
         covered[n] = False
         hidden[n] = False
         if not valid[n]:
             continue
-        p = points[n]
-        square = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
+        p0, p1, p2 = points[n, 0], points[n, 1], points[n, 2]
+        inverse = 1.0 / (p0 * p0 + p1 * p1 + p2 * p2)
         for b in range(count):
-            if b == parts[n] or not occluders[b]:
+            along = centres[b, 0] * p0 + centres[b, 1] * p1 + centres[b, 2] * p2
+            if far[b] - along * along * inverse > reach[b]:
                 continue
-            c = centres[b]
-            along = c[0] * p[0] + c[1] * p[1] + c[2] * p[2]
-            away = c[0] * c[0] + c[1] * c[1] + c[2] * c[2] - along * along / square
-            if away > reach[b]:
+            if b == parts[n] or not occluders[b]:
                 continue
             mm, mk = 0.0, 0.0
             for i in range(3):
-                m = shapes[b, i, 0] * p[0] + shapes[b, i, 1] * p[1] + shapes[b, i, 2] * p[2]
+                m = shapes[b, i, 0] * p0 + shapes[b, i, 1] * p1 + shapes[b, i, 2] * p2
                 mm += m * m
                 mk += m * k[b, i]
             discriminant = mk * mk - mm * outside[b]

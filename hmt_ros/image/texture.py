@@ -2,53 +2,50 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import Frames
-from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import visibility
+from hmt_ros.image.sampling import ImageMap, sample
+from hmt_ros.image.surface import flesh_table_of, lens_of, mark_visibility, project
 
 Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+Ints = NDArray[np.int64]
 
 # A surface that faces the camera less than this (cosine) is seen too flat to carry a texture.
 FACING = 0.3
 
 
-@dataclass(frozen=True, eq=False)
-class Textures:
-    """Q points on the visible surface of each of K poses.
+class Textures(NamedTuple):
+    """Up to Q points on the visible surface of each of K poses.
 
     Attributes:
+        counts: (K,) points of each pose; the rest of its row is not used.
         segments: (K, Q).
         local: (K, Q, 3) places in the frames of the segments, m.
-        pixels: (K, 2, Q) where they were seen.
-        colours: (K, 3, Q) what was seen there.
-        weights: (K, Q) 1, or 0 for points that are missing.
+        pixels: (K, Q, 2) where they were seen.
+        colours: (K, Q, 3) what was seen there.
     """
 
-    segments: Index
+    counts: Ints
+    segments: Ints
     local: Array
     pixels: Array
     colours: Array
-    weights: Array
 
-    def __len__(self) -> int:
-        return len(self.segments)
 
-    def __getitem__(self, index: Index) -> Textures:
-        return Textures(
-            self.segments[index],
-            self.local[index],
-            self.pixels[index],
-            self.colours[index],
-            self.weights[index],
-        )
+def no_textures() -> Textures:
+    """Textures of no pose."""
+    return Textures(
+        np.zeros(0, np.int64), np.zeros((0, 1), np.int64), np.zeros((0, 1, 3)),
+        np.zeros((0, 1, 2)), np.zeros((0, 1, 3)),
+    )  # fmt: skip
 
 
 def capture_textures(
@@ -57,28 +54,74 @@ def capture_textures(
     """Textures of the surface visible at K poses.
 
     The points are spread evenly over the visible vertices of a coarse mesh, the same way every time.
+
+    Args:
+        body: with flesh.
+        camera: that took the image.
+        frames: of the K poses.
+        intensity: the blurred image, three channels.
+        points: at most so many a pose, Q.
     """
-    mesh = body.flesh.mesh(stacks=5, slices=10)
-    places = frames.points(mesh.segments, mesh.vertices)
-    normals = frames.directions(mesh.segments, mesh.normals)
-    distance = np.sqrt((places * places).sum(1))
-    facing = -(places * normals).sum(1) > FACING * distance
-    _, hidden = visibility(body, frames, places, mesh.parts)
-    pixels = camera.project(places.transpose(0, 2, 1)).transpose(2, 0, 1)  # (2, V, K)
-    inside = (pixels[0] >= 0) & (pixels[0] < camera.width)
-    inside &= (pixels[1] >= 0) & (pixels[1] < camera.height)
-    visible = facing & ~hidden & inside
     k = frames.count
-    chosen = np.zeros((k, points), dtype=np.intp)
-    weights = np.zeros((k, points))
+    mesh = coarse_mesh(body)
+    result = Textures(
+        np.zeros(k, np.int64), np.zeros((k, points), np.int64), np.zeros((k, points, 3)),
+        np.zeros((k, points, 2)), np.zeros((k, points, 3)),
+    )  # fmt: skip
+    columns, origins = frames.by_pose()
+    flesh, lens = flesh_table_of(body), lens_of(camera)
+    size = np.array([camera.width, camera.height])
     for i in range(k):
-        seen = np.flatnonzero(visible[:, i])
-        if len(seen) > points:
-            seen = seen[(np.arange(points) * len(seen)) // points]
-        chosen[i, : len(seen)] = seen
-        weights[i, : len(seen)] = 1.0
-    rows = np.arange(k)[:, None]
-    uv = np.nan_to_num(pixels.transpose(2, 0, 1)[rows, :, chosen].transpose(0, 2, 1))
-    at = np.broadcast_to(uv[:, None], (k, 3, *uv.shape[1:])).transpose(2, 0, 1, 3)
-    colours, _ = intensity.sample(at, np.arange(3)[:, None])
-    return Textures(mesh.segments[chosen], mesh.vertices[chosen], uv, colours, weights)
+        _capture(
+            flesh, mesh.vertices, mesh.normals, mesh.segments, mesh.parts, lens, size,
+            columns[i], origins[i], intensity, i, result,
+        )  # fmt: skip
+    return result
+
+
+def coarse_mesh(body: Body) -> Mesh:
+    """The mesh whose vertices carry the texture."""
+    return body.flesh.mesh(stacks=5, slices=10)
+
+
+@njit(cache=True, nogil=True)
+def _capture(  # type: ignore[no-untyped-def]
+    flesh, vertices, normals, segments, parts, lens, size, columns, origins, intensity, k, result
+):
+    count = len(vertices)
+    points = np.empty((count, 3))
+    pixels = np.empty((count, 2))
+    visible = np.empty(count, np.bool_)
+    projections = np.empty((count, 2, 3))
+    for i in range(count):
+        s = segments[i]
+        facing, square = 0.0, 0.0
+        for a in range(3):
+            points[i, a] = origins[s, a]
+            normal = 0.0
+            for b in range(3):
+                points[i, a] += columns[s, b, a] * vertices[i, b]
+                normal += columns[s, b, a] * normals[i, b]
+            facing -= normal * points[i, a]
+            square += points[i, a] * points[i, a]
+        visible[i] = facing > FACING * np.sqrt(square)
+        if visible[i]:
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            visible[i] = project(lens, x, y, z, i, pixels, projections)
+        if visible[i]:
+            u, v = pixels[i, 0], pixels[i, 1]
+            visible[i] = 0.0 <= u < size[0] and 0.0 <= v < size[1]
+    covered, hidden = np.empty(count, np.bool_), np.empty(count, np.bool_)
+    everything = np.ones(len(flesh.part_segments), np.bool_)
+    mark_visibility(flesh, everything, columns, origins, parts, points, visible, covered, hidden)
+    seen = np.flatnonzero(visible & ~hidden)
+    room = result.segments.shape[1]
+    taken = min(len(seen), room)
+    for q in range(taken):
+        i = seen[q * len(seen) // taken]
+        result.segments[k, q] = segments[i]
+        result.local[k, q] = vertices[i]
+        result.pixels[k, q] = pixels[i]
+        for c in range(3):
+            result.colours[k, q, c] = sample(intensity, c, pixels[i, 0], pixels[i, 1])[0]
+    result.counts[k] = taken

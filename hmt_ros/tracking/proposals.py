@@ -1,0 +1,89 @@
+"""Where new hypotheses come from: spherical, covariance-scaled and kinematic jump sampling (KJS 3, 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+PROPOSALS = ('kjs', 'css', 'ss')
+VOTES = ('trace', 'eigenvalue', 'uniform')
+
+
+def spherical_samples(
+    body: Body, means: Array, covariances: Array, count: int, scale: float, rng: np.random.Generator
+) -> Array:
+    """Isotropic noise around each mean, of the volume that its covariance has; (K, count, d).
+
+    The radius is the geometric mean of the axes of the ellipsoid, |S|^(1/2d). Samples that leave the
+    limits are projected back.
+
+    Args:
+        body: with the limits.
+        means, covariances: (K, d), (K, d, d).
+        count: samples a mean.
+        scale: factor on the radius; 0: Cauchy tails of scale 1.
+        rng: source of randomness.
+    """
+    d = means.shape[1]
+    radius = np.exp(np.linalg.slogdet(covariances)[1] / (2 * d))
+    noise = _noise((len(means), count, d), scale, rng)
+    return np.clip(means[:, None] + radius[:, None, None] * noise, body.lower, body.upper)
+
+
+def covariance_scaled_samples(
+    body: Body, means: Array, covariances: Array, count: int, scale: float, rng: np.random.Generator
+) -> Array:
+    """Noise with the covariance of each mean, stretched; (K, count, d). Arguments as above."""
+    factors = np.linalg.cholesky(covariances)
+    noise = _noise((len(means), count, means.shape[1]), scale, rng)
+    return np.clip(
+        means[:, None] + np.einsum('kij,knj->kni', factors, noise), body.lower, body.upper
+    )
+
+
+def chain_votes(
+    body: Body, covariances: Array, chains: Sequence[str], vote: str = 'trace'
+) -> Array:
+    """Probabilities (K, C) with which each mode's chains are chosen, by their local uncertainty.
+
+    'trace': the trace of the block of the covariance that belongs to the rotations of the chain, which
+    equals the sum over the eigenvectors of eigenvalue times squared length inside the chain;
+    'eigenvalue': the largest eigenvalue of that block; 'uniform': all alike.
+
+    Raises:
+        ValueError: an unknown vote.
+    """
+    if vote not in VOTES:
+        raise ValueError(f'vote must be one of {VOTES}, saw {vote!r}')
+    result = np.ones((len(covariances), len(chains)))
+    if vote != 'uniform':
+        for i, chain in enumerate(chains):
+            own = chain_dofs(body, chain)
+            block = covariances[:, own[:, None], own]
+            if vote == 'trace':
+                result[:, i] = np.einsum('kii->k', block)
+            else:
+                result[:, i] = np.linalg.eigvalsh(block)[:, -1]
+    return result / result.sum(1, keepdims=True)
+
+
+def chain_dofs(body: Body, chain: str) -> Index:
+    """Degrees of freedom of a chain."""
+    skeleton = body.skeleton
+    return np.array([j for s in skeleton.chains[chain] for j in skeleton.segment_dofs[s]])
+
+
+def _noise(shape: tuple[int, ...], scale: float, rng: np.random.Generator) -> Array:
+    """Gaussian noise times a scale, or multivariate Cauchy noise where the scale is 0."""
+    noise = rng.standard_normal(shape)
+    if scale > 0:
+        return scale * noise
+    heavy = np.sqrt(rng.chisquare(1, size=(*shape[:-1], 1)))
+    return noise / np.maximum(heavy, 1e-3)

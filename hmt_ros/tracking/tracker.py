@@ -1,0 +1,660 @@
+"""Mixture density propagation with kinematic jumps and covariance-scaled sampling (KJS fig. 4 and 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.interpretation_tree import enumerate_flips
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
+from hmt_ros.image.observation import Keypoints, Observation, ObservationSettings, observe
+from hmt_ros.image.texture import Textures, capture_textures
+from hmt_ros.inference.bounded_newton import Minimum, minimise
+from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.chain_product import (
+    Alternatives,
+    best_combinations,
+    distinct_alternatives,
+)
+from hmt_ros.tracking.chain_search import ChainSearch, ChainSearchSettings
+from hmt_ros.tracking.dynamics import DynamicsSettings, predict, update_velocities
+from hmt_ros.tracking.initialisation import start_from_keypoints
+from hmt_ros.tracking.proposals import (
+    PROPOSALS,
+    VOTES,
+    chain_dofs,
+    chain_votes,
+    covariance_scaled_samples,
+    spherical_samples,
+)
+from hmt_ros.tracking.pruning import choose_hypotheses
+from hmt_ros.tracking.subject import Subject
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Image = NDArray[np.uint8]
+
+CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
+
+
+class Status(Enum):
+    """What the tracker is doing."""
+
+    WAITING = 'waiting'  # for the image that the subject's joints were seen in
+    TRACKING = 'tracking'
+    LOST = 'lost'
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """How poses are tracked.
+
+    Attributes:
+        max_hypotheses: modes that are kept, K.
+        hypothesis_merge_distance: mean distance of the joints below which two modes are one, m.
+        proposals: 'kjs' (covariance-scaled samples and kinematic jumps), 'css' or 'ss' (samples alone).
+        candidates: hypotheses that are optimised fully an image.
+        combinations: combinations of chain alternatives that are rated an image.
+        alternatives: configurations of a chain that are rated.
+        samples: samples an image of 'css' and 'ss'.
+        sample_scale: their stretch; 0: Cauchy tails.
+        vote: how chains are chosen for search: 'trace', 'eigenvalue' or 'uniform'.
+        searched_chains: chains searched in an image.
+        jump_probability: of a flip of one chain from one image to the next.
+        base_iterations, iterations: Newton steps on the predictions and on the candidates.
+        temperature: factor on the image's energy in a mode's weight; below 1 because neighbouring
+            measurements err together.
+        tails: degrees of freedom of the Student distribution around a prediction.
+        least_log_weight: no kept mode's weight falls below this.
+        lost_misfit: share of the outline, or of the keypoints, that no mode explains, above which an
+            image counts as lost.
+        lost_images: so many in a row start the track anew.
+        dynamics, likelihood, observation, search: settings of the parts.
+    """
+
+    max_hypotheses: int = 8
+    hypothesis_merge_distance: float = 0.02
+    proposals: str = 'kjs'
+    candidates: int = 16
+    combinations: int = 96
+    alternatives: int = 6
+    samples: int = 256
+    sample_scale: float = 2.0
+    vote: str = 'trace'
+    searched_chains: int = 4
+    jump_probability: float = 0.1
+    base_iterations: int = 6
+    iterations: int = 6
+    temperature: float = 0.3
+    tails: float = 8.0
+    least_log_weight: float = -10.0
+    lost_misfit: float = 0.35
+    lost_images: int = 5
+    dynamics: DynamicsSettings = field(default_factory=DynamicsSettings)
+    likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
+    observation: ObservationSettings = field(default_factory=ObservationSettings)
+    search: ChainSearchSettings = field(default_factory=ChainSearchSettings)
+
+    def __post_init__(self) -> None:
+        if self.proposals not in PROPOSALS:
+            raise ValueError(f'proposals must be one of {PROPOSALS}, saw {self.proposals!r}')
+        if self.vote not in VOTES:
+            raise ValueError(f'vote must be one of {VOTES}, saw {self.vote!r}')
+        if self.max_hypotheses < 1 or self.candidates < self.max_hypotheses:
+            raise ValueError(
+                f'wanted 1 <= max_hypotheses <= candidates, saw {self.max_hypotheses} and '
+                f'{self.candidates}'
+            )
+        if not 0 < self.jump_probability < 1:
+            raise ValueError(f'jump_probability must lie in (0, 1), saw {self.jump_probability}')
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """The mixture that is propagated: K modes, heaviest first.
+
+    Attributes:
+        poses, velocities: (K, d), velocities per second.
+        covariances: (K, d, d).
+        log_weights: (K,) normalised.
+        log_likelihoods: (K,) of the image at the poses.
+        textures: of the image at the poses, or None.
+    """
+
+    poses: Array
+    velocities: Array
+    covariances: Array
+    log_weights: Array
+    log_likelihoods: Array
+    textures: Textures | None
+
+
+class Tracker:
+    """Follows one person through images; the posterior over poses is a mixture.
+
+    Args:
+        body: model of the person; a subject's lengths replace the model's when a track starts.
+        camera: calibrated.
+        settings: how.
+        background: the empty scene; None: learned from images before the track starts, and if there
+            are none the silhouette is not used.
+        seed: of all randomness. The same images, settings and seed give the same numbers.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        camera: Camera,
+        settings: TrackerSettings | None = None,
+        background: BackgroundModel | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.settings = settings or TrackerSettings()
+        self.model = body
+        self.body = body
+        self.camera = camera
+        self.background = background or BackgroundModel()
+        self._learning = background is None
+        self._seed = seed
+        self._rng = np.random.default_rng(seed)
+        self._start: Subject | GaussianMixture | None = None
+        self._modes: Modes | None = None
+        self._last_image: Image | None = None
+        self._last_stamp: int | None = None
+        self._bad_images = 0
+        self.status = Status.WAITING
+        self.misfit = 0.0
+        self.evaluations = 0
+
+    def reset(self, start: Subject | GaussianMixture | None = None) -> None:
+        """Drops the track; the next image starts a new one.
+
+        Args:
+            start: a subject, whose track starts at the first image at or after its stamp, or a mixture
+                over poses of the present body, or None: the start that was given last.
+        """
+        if isinstance(start, GaussianMixture) and start.dimension != self.body.dimension:
+            raise ValueError(
+                f'a start for {self.body.name} has {self.body.dimension} dimensions, '
+                f'saw {start.dimension}'
+            )
+        if start is not None:
+            self._start = start
+        self._rng = np.random.default_rng(self._seed)
+        self._modes = None
+        self._last_image, self._last_stamp = None, None
+        self._bad_images = 0
+        self.status = Status.WAITING
+
+    def step(
+        self, image: Image, stamp: int, keypoints: Keypoints | None = None
+    ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
+        """Takes the next image.
+
+        Args:
+            image: (H, W, 3) BGR uint8, of the camera's size.
+            stamp: of the image, ns; later than the one before.
+            keypoints: joints seen in this image, if any.
+
+        Returns:
+            The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses, heaviest
+            first with weights that sum to 1; (None, None) while there is no track.
+
+        Raises:
+            ValueError: an image of another size, or a stamp that does not increase.
+        """
+        size = (self.camera.height, self.camera.width)
+        if image.shape[:2] != size:
+            raise ValueError(f'the camera gives images of {size}, saw {image.shape[:2]}')
+        if self._last_stamp is not None and stamp <= self._last_stamp:
+            raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
+        self.evaluations = 0
+        if self._modes is None:
+            if not self._can_start(stamp):
+                if self._learning:
+                    self.background.learn(image)
+                return None, None
+            observation = self._observe(image, keypoints)
+            self._begin(observation)
+        else:
+            assert self._last_stamp is not None
+            observation = self._observe(image, keypoints)
+            self._propagate(observation, (stamp - self._last_stamp) * 1e-9)
+        self._last_image, self._last_stamp = image, stamp
+        self._judge(observation)
+        return self.posterior, self.likelihood_mixture(observation)
+
+    @property
+    def modes(self) -> Modes:
+        """The present modes.
+
+        Raises:
+            ValueError: there is no track.
+        """
+        if self._modes is None:
+            raise ValueError('there is no track yet')
+        return self._modes
+
+    @property
+    def posterior(self) -> GaussianMixture:
+        """The present posterior."""
+        m = self.modes
+        return GaussianMixture(np.exp(m.log_weights), m.poses, m.covariances)
+
+    def likelihood_mixture(self, observation: Observation) -> GaussianMixture:
+        """The modes of the likelihood alone, without what was known from the images before.
+
+        Around each mode of the posterior the energy of the image and of the body's prior is a
+        parabola; its minimum and curvature make a component, its depth the weight.
+        """
+        m, body = self.modes, self.body
+        value, gradient, hessian = self._likelihood.energy(m.poses, observation, None, None)
+        free = ~_resting(m.poses, gradient, body)
+        covariances = _covariances(hessian, free)
+        step = -np.einsum('kij,kj->ki', covariances, np.where(free, gradient, 0.0))
+        limit = 3.0 * np.sqrt(np.einsum('kii->ki', m.covariances))
+        step = np.clip(step, -limit, limit)
+        means = np.clip(m.poses + step, body.lower, body.upper)
+        log_weights = -self.settings.temperature * value
+        weights = np.exp(log_weights - log_weights.max())
+        return GaussianMixture(weights / weights.sum(), means, covariances).sorted()
+
+    # The start of a track.
+
+    def _can_start(self, stamp: int) -> bool:
+        if isinstance(self._start, Subject):
+            return stamp >= self._start.stamp_ns
+        return self._start is not None
+
+    def _begin(self, observation: Observation) -> None:
+        s = self.settings
+        if isinstance(self._start, Subject):
+            begun = start_from_keypoints(self.model, self.camera, self._start)
+            self.body = begun.body
+            self.__dict__.pop('_likelihood', None)
+            self.__dict__.pop('_searches', None)
+            observation = replace(observation, keypoints=self._start.keypoints)
+            poses, log_weights = begun.poses, np.zeros(len(begun.poses))
+            precisions = np.zeros((len(poses), self.body.dimension, self.body.dimension))
+        else:
+            assert self._start is not None
+            poses = self._start.means
+            with np.errstate(divide='ignore'):
+                log_weights = np.log(self._start.normalised().weights)
+            precisions = np.linalg.inv(self._start.covariances)
+
+        def energy(x: Array, index: Index) -> tuple[Array, Array, Array]:
+            value, gradient, hessian = self._energy(x, observation, None, None)
+            offset = x - poses[index]
+            pulled = np.einsum('nij,nj->ni', precisions[index], offset)
+            return (
+                value + 0.5 * (offset * pulled).sum(1),
+                gradient + pulled,
+                hessian + precisions[index],
+            )
+
+        solved = self._minimise(energy, poses, 3 * s.iterations)
+        still = np.zeros_like(solved.x)
+        self._keep(solved, log_weights, still, observation)
+
+    # One image after another.
+
+    def _propagate(self, observation: Observation, dt: float) -> None:
+        s, m, body = self.settings, self.modes, self.body
+        predicted, covariances = predict(
+            s.dynamics, self._rates, m.poses, m.covariances, m.velocities, dt
+        )
+        predicted = np.clip(predicted, body.lower, body.upper)
+        precisions = np.linalg.inv(covariances)
+        everyone = np.arange(len(m.poses))
+        moved = self._follow_motion(predicted, precisions, observation)
+        base = self._minimise(
+            self._posterior_energy(observation, everyone, moved, precisions),
+            moved,
+            s.base_iterations,
+        )
+        if s.proposals == 'kjs':
+            poses, parents, log_priors, centres = self._jumps(base, moved, covariances, observation)
+        else:
+            poses, parents, log_priors, centres = self._samples(
+                base, moved, covariances, observation
+            )
+        solved = self._minimise(
+            self._posterior_energy(observation, parents, centres, precisions),
+            poses,
+            s.iterations,
+        )
+        velocities = update_velocities(
+            s.dynamics, m.velocities[parents], m.poses[parents], solved.x, dt
+        )
+        # Where a chain has jumped, its displacement is no motion.
+        jumped = np.abs(poses - base.x[parents]) > 1e-9
+        velocities = np.where(jumped, 0.0, velocities)
+        self._keep(solved, log_priors, velocities, observation)
+
+    def _follow_motion(
+        self, predicted: Array, precisions: Array, observation: Observation
+    ) -> Array:
+        """Predictions corrected by the optical flow, before shapes are compared."""
+        if observation.flow is None or self.settings.likelihood.motion.weight == 0:
+            return predicted
+        textures, everyone = self.modes.textures, np.arange(len(predicted))
+
+        def energy(x: Array, index: Index) -> tuple[Array, Array, Array]:
+            image = self._motion_likelihood.image_energy(
+                forward(self.body.skeleton, x), observation, textures, everyone[index]
+            )
+            assert image.gradient is not None
+            assert image.hessian is not None
+            offset = x - predicted[index]
+            pulled = np.einsum('nij,nj->ni', precisions[index], offset)
+            soft = self._likelihood.prior(x)
+            return (
+                image.value + soft[0] + 0.5 * (offset * pulled).sum(1),
+                image.gradient + soft[1] + pulled,
+                image.hessian + soft[2] + precisions[index],
+            )
+
+        return self._minimise(energy, predicted, 5).x
+
+    def _jumps(
+        self, base: Minimum, moved: Array, covariances: Array, observation: Observation
+    ) -> tuple[Array, Index, Array, Array]:
+        """Candidates of kinematic jump sampling: poses, parents, log priors and centres."""
+        s, m = self.settings, self.modes
+        everything: list[tuple[Array, Index, Array, Array]] = []
+        for group in self._groups(base):
+            lead = group[0]
+            found = self._search(base.x[lead], covariances[lead], observation, int(lead))
+            alternatives = [
+                self._alternatives(base.x[group], chain, found.get(chain))
+                for chain in CHAINS
+                if chain in self.body.chains
+            ]
+            changes, energy = self._rate(base.x[lead], alternatives, observation, int(lead))
+            combined = best_combinations(
+                self.body, base.x[group], m.log_weights[group], energy, alternatives, changes,
+                s.temperature, s.combinations,
+            )  # fmt: skip
+            parents = group[combined.parents]
+            everything.append((combined.poses, parents, combined.log_priors, combined.energies))
+        poses, parents, log_priors, energies = (
+            np.concatenate([part[i] for part in everything]) for i in range(4)
+        )
+        kept = choose_hypotheses(
+            self._relative_joints(poses),
+            log_priors - s.temperature * energies,
+            s.candidates,
+            same=s.hypothesis_merge_distance,
+        ).chosen
+        poses, parents = poses[kept], parents[kept]
+        # A chain that jumped is expected where it landed, the rest where it was predicted.
+        centres = np.where(np.abs(poses - base.x[parents]) > 1e-9, poses, moved[parents])
+        return poses, parents, log_priors[kept], centres
+
+    def _samples(
+        self, base: Minimum, moved: Array, covariances: Array, observation: Observation
+    ) -> tuple[Array, Index, Array, Array]:
+        """Candidates of covariance-scaled or spherical sampling."""
+        s, m = self.settings, self.modes
+        draw = covariance_scaled_samples if s.proposals == 'css' else spherical_samples
+        k = len(moved)
+        each = max(s.samples // k, 1)
+        drawn = draw(self.body, moved, covariances, each, s.sample_scale, self._rng)
+        poses = np.concatenate([base.x, drawn.reshape(-1, self.body.dimension)])
+        parents = np.concatenate([np.arange(k), np.repeat(np.arange(k), each)])
+        energies = self._value(poses, observation, m.textures, parents)
+        kept = choose_hypotheses(
+            self._relative_joints(poses),
+            m.log_weights[parents] - s.temperature * energies,
+            s.candidates,
+            same=s.hypothesis_merge_distance,
+        ).chosen
+        return poses[kept], parents[kept], m.log_weights[parents[kept]], moved[parents[kept]]
+
+    def _groups(self, base: Minimum) -> list[Index]:
+        """Modes with nearly the same trunk, each group with its best mode first."""
+        names = [
+            name
+            for name in (
+                'pelvis',
+                'neck',
+                'left_hip',
+                'right_hip',
+                'left_shoulder',
+                'right_shoulder',
+            )
+            if name in self.body.joint_names
+        ]
+        trunk = self.body.joint_positions(base.x)[:, self.body.skeleton.joint_index(names)]
+        left = list(np.argsort(base.value, kind='stable'))
+        groups = []
+        while left:
+            gaps = np.linalg.norm(trunk[left] - trunk[left[0]], axis=2).max(1)
+            near = gaps < 0.06
+            groups.append(np.array([i for i, ok in zip(left, near) if ok], dtype=np.intp))
+            left = [i for i, ok in zip(left, near) if not ok]
+        return groups
+
+    def _search(
+        self, pose: Array, covariance: Array, observation: Observation, which: int
+    ) -> dict[str, Array]:
+        """Configurations of some chains, chosen by vote, that fit the image."""
+        names = list(self._searches)
+        count = min(self.settings.searched_chains, len(names))
+        if count == 0:
+            return {}
+        votes = chain_votes(self.body, covariance[None], names, self.settings.vote)[0]
+        chosen = self._rng.choice(len(names), size=count, replace=False, p=votes)
+        result = {}
+        for i in sorted(chosen):
+            search = self._searches[names[i]]
+            result[names[i]] = search.find(
+                pose, covariance, observation, self.modes.textures, which, self._rng
+            )
+            own = self.settings.search
+            self.evaluations += own.samples + own.refined * own.iterations
+        return result
+
+    def _alternatives(self, modes: Array, chain: str, found: Array | None) -> Alternatives:
+        """Configurations of a chain in a group: the modes' own, what was found, and all flips."""
+        s = self.settings
+        own = chain_dofs(self.body, chain)
+        jump = -np.log(s.jump_probability)
+        angles, penalties = [modes[:, own]], [np.where(np.eye(len(modes)) > 0, 0.0, jump)]
+        if found is not None:
+            angles.append(found)
+            penalties.append(np.full((len(modes), len(found)), jump))
+        sources = np.concatenate(angles)
+        poses = np.repeat(modes[:1], len(sources), axis=0)
+        poses[:, own] = sources
+        flips, parents = enumerate_flips(self.body, self.camera, poses, chain)
+        first = np.concatenate([[True], parents[1:] != parents[:-1]])
+        flips, parents = flips[~first], parents[~first]
+        angles.append(flips[:, own])
+        penalties.append(np.full((len(modes), len(flips)), jump))
+        return distinct_alternatives(
+            self.body, modes[0], chain, np.concatenate(angles), np.concatenate(penalties, axis=1),
+            apart=0.08, most=s.alternatives,
+        )  # fmt: skip
+
+    def _rate(
+        self, pose: Array, alternatives: list[Alternatives], observation: Observation, which: int
+    ) -> tuple[list[Array], float]:
+        """Energy change that each alternative makes alone, and the energy of the pose itself."""
+        poses = [pose[None]]
+        for chain in alternatives:
+            block = np.repeat(pose[None], len(chain.angles), axis=0)
+            block[:, chain_dofs(self.body, chain.chain)] = chain.angles
+            poses.append(block)
+        everything = np.concatenate(poses)
+        value = self._value(
+            everything, observation, self.modes.textures, np.full(len(everything), which)
+        )
+        ends = np.cumsum([1] + [len(c.angles) for c in alternatives])
+        return [value[a:b] - value[0] for a, b in zip(ends[:-1], ends[1:])], float(value[0])
+
+    def _keep(
+        self, solved: Minimum, log_priors: Array, velocities: Array, observation: Observation
+    ) -> None:
+        """Makes the modes of the next mixture from optimised candidates."""
+        s = self.settings
+        usable = np.flatnonzero(np.isfinite(solved.value))
+        if len(usable) == 0:
+            raise ValueError('no hypothesis has a finite energy')
+        log_weights = log_priors[usable] - s.temperature * solved.value[usable]
+        kept = choose_hypotheses(
+            self._relative_joints(solved.x[usable]),
+            log_weights,
+            s.max_hypotheses,
+            same=s.hypothesis_merge_distance,
+        )
+        weights = kept.log_weights - np.logaddexp.reduce(kept.log_weights)
+        weights = np.maximum(weights, s.least_log_weight)
+        weights -= np.logaddexp.reduce(weights)
+        order = np.argsort(-weights, kind='stable')
+        rows = usable[kept.chosen[order]]
+        poses = solved.x[rows]
+        frames = forward(self.body.skeleton, poses)
+        textures = None
+        if observation.intensity is not None:
+            textures = capture_textures(self.body, self.camera, frames, observation.intensity)
+        image = self._likelihood.image_energy(frames, observation, derivatives=False)
+        self._modes = Modes(
+            poses,
+            velocities[rows],
+            _covariances(solved.hessian[rows], solved.free[rows]),
+            weights[order],
+            -image.value,
+            textures,
+        )
+        self._outline_costs = image.costs
+
+    def _judge(self, observation: Observation) -> None:
+        """Whether the track is lost: how much of the image the best mode leaves unexplained."""
+        s = self.settings
+        if self._outline_costs.size:
+            t = s.likelihood.coverage
+            most = 0.5 * t.weight / self._outline_costs.shape[1] * t.scale**2
+            self.misfit = float((self._outline_costs > 0.5 * most).mean(1).min())
+        else:
+            self.misfit = 0.0
+        self._bad_images = self._bad_images + 1 if self.misfit > s.lost_misfit else 0
+        self.status = Status.LOST if self._bad_images >= s.lost_images else Status.TRACKING
+
+    # Energies.
+
+    @cached_property
+    def _likelihood(self) -> ImageLikelihood:
+        return ImageLikelihood(self.body, self.camera, self.settings.likelihood)
+
+    @cached_property
+    def _motion_likelihood(self) -> ImageLikelihood:
+        off = TermSettings(0.0, 1.0, 1.0)
+        only_motion = replace(
+            self.settings.likelihood,
+            joints=off, containment=off, coverage=off, edges=off, intensity=off,
+        )  # fmt: skip
+        return ImageLikelihood(self.body, self.camera, only_motion)
+
+    @cached_property
+    def _searches(self) -> dict[str, ChainSearch]:
+        s = self.settings
+        return {
+            chain: ChainSearch(self.body, self.camera, s.likelihood, chain, s.search)
+            for chain in CHAINS[:4]
+            if chain in self.body.chains
+        }
+
+    @cached_property
+    def _rates(self) -> Array:
+        return self.settings.dynamics.rates(self.body.skeleton)
+
+    @cached_property
+    def _step_scale(self) -> Array:
+        return np.where(self.body.skeleton.dof_is_rotation, 0.3, 0.2)
+
+    def _observe(self, image: Image, keypoints: Keypoints | None) -> Observation:
+        silhouette = self.background.silhouette(image) if self.background.frames else None
+        return observe(
+            image, silhouette, keypoints, self.settings.observation, last_image=self._last_image
+        )
+
+    def _energy(
+        self, poses: Array, observation: Observation, textures: Textures | None, which: Index | None
+    ) -> tuple[Array, Array, Array]:
+        self.evaluations += len(poses)
+        return self._likelihood.energy(poses, observation, textures, which)
+
+    def _value(
+        self, poses: Array, observation: Observation, textures: Textures | None, which: Index
+    ) -> Array:
+        self.evaluations += len(poses)
+        frames = forward(self.body.skeleton, poses)
+        image = self._likelihood.image_energy(
+            frames, observation, textures, which, derivatives=False
+        )
+        soft, overlap = self._likelihood.prior(poses)[0], self._likelihood.intersection(frames)[0]
+        return image.value + soft + overlap
+
+    def _posterior_energy(
+        self, observation: Observation, parents: Index, centres: Array, precisions: Array
+    ) -> Callable[[Array, Index], tuple[Array, Array, Array]]:
+        """Energy of candidates: image, body, and a Student prior around where each is expected."""
+        nu, d = self.settings.tails, self.body.dimension
+        textures = self.modes.textures
+
+        def energy(x: Array, index: Index) -> tuple[Array, Array, Array]:
+            own = parents[index]
+            value, gradient, hessian = self._energy(x, observation, textures, own)
+            offset = x - centres[index]
+            pulled = np.einsum('nij,nj->ni', precisions[own], offset)
+            distance = (offset * pulled).sum(1)
+            shrink = (nu + d) / (nu + distance)
+            value = value + 0.5 * (nu + d) * np.log1p(distance / nu)
+            gradient += shrink[:, None] * pulled
+            hessian += shrink[:, None, None] * precisions[own]
+            return value, gradient, hessian
+
+        return energy
+
+    def _minimise(
+        self,
+        energy: Callable[[Array, Index], tuple[Array, Array, Array]],
+        poses: Array,
+        iterations: int,
+    ) -> Minimum:
+        return minimise(
+            energy, poses, self.body.lower, self.body.upper, step_scale=self._step_scale,
+            damping=1.0, max_iterations=iterations, tolerance=0.02,
+        )  # fmt: skip
+
+    def _relative_joints(self, poses: Array) -> Array:
+        joints = self.body.joint_positions(poses)
+        return joints - joints[:, :1]
+
+
+def _resting(poses: Array, gradient: Array, body: Body) -> NDArray[np.bool_]:
+    at_lower = (poses <= body.lower) & (gradient > 0)
+    result: NDArray[np.bool_] = at_lower | ((poses >= body.upper) & (gradient < 0))
+    return result
+
+
+def _covariances(hessians: Array, free: NDArray[np.bool_]) -> Array:
+    """Inverse Hessians on the free variables; a variable at its limit has a deviation of 3 degrees."""
+    h = hessians.copy()
+    rows, dofs = np.nonzero(~free)
+    h[rows, dofs, :] = 0.0
+    h[rows, :, dofs] = 0.0
+    h[rows, dofs, dofs] = 0.05**-2.0
+    result = np.linalg.inv(0.5 * (h + h.transpose(0, 2, 1)))
+    return 0.5 * (result + result.transpose(0, 2, 1))
