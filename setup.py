@@ -39,6 +39,7 @@ setup(
         'setuptools',
         'numpy',
         'scipy',
+        'numba',
         'PyYAML',
         'matplotlib',
         'mcap',

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hmt_ros.body import Body
 from msg_tools.headers import header_message
 from msg_tools.message_error import MessageError
 from msg_tools.message_factory import MessageFactory
+from msg_tools.urdf import body_urdf, segments_of
 
 
 def body_message(
@@ -59,4 +61,20 @@ def body_message(
         segment_names=list(segment_lengths),
         segment_lengths=np.array(list(segment_lengths.values()), dtype=np.float64),
         urdf=urdf,
+    )
+
+
+def message_of_body(messages: MessageFactory, body: Body, stamp_ns: int, frame_id: str) -> Any:
+    """hmt_msgs/Body of a body at its present lengths; the root of its URDF is `frame_id`."""
+    return body_message(
+        messages,
+        name=body.name,
+        dof_names=body.dof_names,
+        lower=body.lower,
+        upper=body.upper,
+        joint_names=body.joint_names,
+        segment_lengths=body.segment_lengths,
+        urdf=body_urdf(body.name, segments_of(body.skeleton), frame_id),
+        stamp_ns=stamp_ns,
+        frame_id=frame_id,
     )

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,12 +28,11 @@ from hmt_ros.body import Body, Camera
 from hmt_ros.image.renderer import render_frames
 from hmt_ros.image.scene import Scene
 from msg_tools import BagWriter, RosbagsMessages
-from msg_tools.bodies import body_message
+from msg_tools.bodies import message_of_body
 from msg_tools.camera_info import camera_info_message
 from msg_tools.headers import SECOND_NS, header_message
 from msg_tools.images import compressed_image_message
 from msg_tools.pose_mixtures import MixtureKind
-from msg_tools.urdf import Freedom, Segment, body_urdf
 
 Array = NDArray[np.float64]
 
@@ -104,7 +103,7 @@ def write_bag(
         tqdm(total=len(take.poses), unit='image', desc=folder.name, disable=hidden) as bar,
     ):
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
-        bag.write('body', START_NS, body_content(messages, take.body, START_NS))
+        bag.write('body', START_NS, message_of_body(messages, take.body, START_NS, FRAME_ID))
         for frame, shown in enumerate(render_frames(take.body, take.poses, camera, scene)):
             stamp = take.stamp_ns(frame)
             image = compressed_image_message(messages, shown.image, stamp, FRAME_ID, quality)
@@ -156,50 +155,6 @@ def ground_truth(
         joint_names=list(body.joint_names),
         kind=int(MixtureKind.GROUND_TRUTH),
         components=[component],
-    )
-
-
-def body_content(messages: RosbagsMessages, body: Body, stamp_ns: int) -> Any:
-    """hmt_msgs/Body of a body."""
-    skeleton = body.skeleton
-    axes: tuple[Literal['x', 'y', 'z'], ...] = ('x', 'y', 'z')
-    segments = []
-    for index, name in enumerate(skeleton.segment_names):
-        ends = [
-            *skeleton.joint_offsets[skeleton.joint_segments == index],
-            *skeleton.offsets[np.array(skeleton.parents) == index],
-        ]
-        freedoms = [
-            Freedom(
-                skeleton.dof_names[dof],
-                axes[skeleton.dof_axes[dof]],
-                'revolute' if skeleton.dof_is_rotation[dof] else 'prismatic',
-                float(skeleton.lower[dof]),
-                float(skeleton.upper[dof]),
-            )
-            for dof in skeleton.segment_dofs[index]
-        ]
-        segments.append(
-            Segment(
-                name=name,
-                parent=skeleton.parents[index],
-                offset=skeleton.offsets[index],
-                mount=skeleton.mounts[index],
-                freedoms=freedoms,
-                points=np.array([end for end in ends if np.any(end)]).reshape(-1, 3),
-            )
-        )
-    return body_message(
-        messages,
-        name=body.name,
-        dof_names=body.dof_names,
-        lower=body.lower,
-        upper=body.upper,
-        joint_names=body.joint_names,
-        segment_lengths=body.segment_lengths,
-        urdf=body_urdf(body.name, segments, FRAME_ID),
-        stamp_ns=stamp_ns,
-        frame_id=FRAME_ID,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -78,8 +78,8 @@ class LikelihoodSettings:
     containment: TermSettings = field(default=TermSettings(30.0, 3.0, 8.0))
     coverage: TermSettings = field(default=TermSettings(30.0, 3.0, 8.0))
     edges: TermSettings = field(default=TermSettings(20.0, 2.5, 3.0))
-    intensity: TermSettings = field(default=TermSettings(15.0, 20.0, 3.0))
-    motion: TermSettings = field(default=TermSettings(20.0, 1.5, 4.0))
+    intensity: TermSettings = field(default=TermSettings(4.0, 20.0, 2.0))
+    motion: TermSettings = field(default=TermSettings(5.0, 1.5, 2.0))
     prior_weight: float = 1.0
     self_intersection_sigma: float = 0.03
 
@@ -205,6 +205,21 @@ class ImageLikelihood:
         if not derivatives:
             return ImageEnergy(result, costs, None, None)
         return ImageEnergy(result, costs, gradient, hessian)
+
+    def with_scaled_widths(self, factors: Array) -> ImageLikelihood:
+        """The likelihood with the x and y radii of the parts (B,) multiplied.
+
+        Made from what is compiled for this one: much cheaper than from a body with other widths, which
+        `body` does not become.
+        """
+        flesh = self._model.flesh
+        radii = flesh.part_radii.copy()
+        radii[:, :2] *= factors[:, None]
+        rings = flesh.ring_radii * factors[flesh.ring_parts][:, None]
+        scaled = self._model._replace(flesh=flesh._replace(part_radii=radii, ring_radii=rings))
+        result = replace(self)
+        result.__dict__['_model'] = scaled
+        return result
 
     def prior(self, poses: Array) -> tuple[Array, Array, Array]:
         """Energy, gradient and Hessian of the soft prior of the joint angles."""

@@ -27,6 +27,7 @@ from hmt_ros.tracking.chain_product import (
 )
 from hmt_ros.tracking.chain_search import ChainSearch, ChainSearchSettings
 from hmt_ros.tracking.dynamics import DynamicsSettings, predict, update_velocities
+from hmt_ros.tracking.flesh_fitting import FleshFit
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from hmt_ros.tracking.proposals import (
     PROPOSALS,
@@ -75,6 +76,7 @@ class TrackerSettings:
             measurements err together.
         tails: degrees of freedom of the Student distribution around a prediction.
         least_log_weight: no kept mode's weight falls below this.
+        flesh_images: images from which the widths of the flesh are estimated; 0: the model's.
         lost_misfit: share of the outline, or of the keypoints, that no mode explains, above which an
             image counts as lost.
         lost_images: so many in a row start the track anew.
@@ -97,6 +99,7 @@ class TrackerSettings:
     temperature: float = 0.3
     tails: float = 8.0
     least_log_weight: float = -10.0
+    flesh_images: int = 15
     lost_misfit: float = 0.35
     lost_images: int = 5
     dynamics: DynamicsSettings = field(default_factory=DynamicsSettings)
@@ -171,6 +174,7 @@ class Tracker:
         self._last_image: Image | None = None
         self._last_stamp: int | None = None
         self._bad_images = 0
+        self._flesh = FleshFit(body)
         self.status = Status.WAITING
         self.misfit = 0.0
         self.evaluations = 0
@@ -193,6 +197,7 @@ class Tracker:
         self._modes = None
         self._last_image, self._last_stamp = None, None
         self._bad_images = 0
+        self._flesh = FleshFit(self.body)
         self.status = Status.WAITING
 
     def step(
@@ -279,9 +284,8 @@ class Tracker:
         s = self.settings
         if isinstance(self._start, Subject):
             begun = start_from_keypoints(self.model, self.camera, self._start)
-            self.body = begun.body
-            self.__dict__.pop('_likelihood', None)
-            self.__dict__.pop('_searches', None)
+            self._use_body(begun.body)
+            self._flesh = FleshFit(self.body)
             observation = replace(observation, keypoints=self._start.keypoints)
             poses, log_weights = begun.poses, np.zeros(len(begun.poses))
             precisions = np.zeros((len(poses), self.body.dimension, self.body.dimension))
@@ -305,6 +309,29 @@ class Tracker:
         solved = self._minimise(energy, poses, 3 * s.iterations)
         still = np.zeros_like(solved.x)
         self._keep(solved, log_weights, still, observation)
+        for _ in range(3):
+            if not self._fit_flesh(observation):
+                break
+            solved = self._minimise(energy, solved.x, s.iterations)
+            self._keep(solved, log_weights, still, observation)
+
+    def _fit_flesh(self, observation: Observation) -> bool:
+        """Moves the widths of the flesh by what an image says; False where it says nothing more."""
+        if self._flesh.images >= self.settings.flesh_images or observation.outline is None:
+            return False
+        m = self.modes
+        poses, weights = m.poses[:4], np.exp(m.log_weights[:4])
+        body = self._flesh.update(
+            self._likelihood, replace(observation, keypoints=None), poses, weights / weights.sum()
+        )
+        self.evaluations += len(poses) * (2 * len(self._flesh.widths) + 1)
+        self._use_body(body)
+        return True
+
+    def _use_body(self, body: Body) -> None:
+        self.body = body
+        for name in ('_likelihood', '_motion_likelihood', '_searches'):
+            self.__dict__.pop(name, None)
 
     # One image after another.
 
@@ -340,6 +367,7 @@ class Tracker:
         jumped = np.abs(poses - base.x[parents]) > 1e-9
         velocities = np.where(jumped, 0.0, velocities)
         self._keep(solved, log_priors, velocities, observation)
+        self._fit_flesh(observation)
 
     def _follow_motion(
         self, predicted: Array, precisions: Array, observation: Observation

@@ -1,0 +1,391 @@
+"""The command evaluate, on small bags of made-up mixtures whose truth is known."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from hmt_ros.app.evaluate import main
+from hmt_ros.app.rendered_bag import FRAME_ID, START_NS, ground_truth
+from hmt_ros.body import load_body
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.tracking.evaluation import EVALUATED_JOINTS, joint_mixtures, score
+from msg_tools import BagWriter, RosbagsMessages
+from msg_tools.bodies import message_of_body
+from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
+
+MESSAGES = RosbagsMessages()
+FRAMES = 6
+STAMPS = [START_NS + i * 33_333_333 for i in range(FRAMES)]
+
+
+@pytest.fixture(scope='module')
+def body():
+    return load_body('human37').with_stature(1.82)
+
+
+@pytest.fixture(scope='module')
+def poses(body):
+    """True poses (T, d)."""
+    rng = np.random.default_rng(0)
+    poses = np.clip(rng.normal(0, 0.2, (FRAMES, body.dimension)), body.lower, body.upper)
+    poses[:, 2] = 4.0
+    return poses
+
+
+@pytest.fixture(scope='module')
+def mixtures(body, poses):
+    """Mixtures of two components near the true poses."""
+    rng = np.random.default_rng(1)
+    return [
+        GaussianMixture(
+            [0.7, 0.3],
+            pose + 0.05 * rng.normal(size=(2, body.dimension)),
+            np.tile(0.003 * np.eye(body.dimension), (2, 1, 1)),
+        )
+        for pose in poses
+    ]
+
+
+@pytest.fixture(scope='module')
+def truth_file(tmp_path_factory, body, poses):
+    path = tmp_path_factory.mktemp('truth') / 'truth.npz'
+    np.savez(
+        path,
+        stamps=np.array(STAMPS),
+        joint_names=np.array(body.joint_names),
+        joints=body.joint_positions(poses),
+    )
+    return path
+
+
+def mixture_message(body, mixture, stamp, kind=MixtureKind.POSTERIOR, frame_id=FRAME_ID, name=None):
+    positions = body.joint_positions(mixture.means)
+    content = PoseMixture(
+        mixture, name or body.name, body.dof_names, body.joint_names, positions, kind, stamp, frame_id
+    )
+    return pose_mixture_message(MESSAGES, content)
+
+
+def write(path, body, mixtures, *, poses=None, with_body=True, change=None):
+    """A bag with the topics body, pose_mixture and, with poses, ground_truth."""
+    with BagWriter(path) as bag:
+        if with_body:
+            bag.write('body', START_NS, message_of_body(MESSAGES, body, START_NS, FRAME_ID))
+        for i, (stamp, mixture) in enumerate(zip(STAMPS, mixtures)):
+            message = mixture_message(body, mixture, stamp)
+            bag.write('pose_mixture', stamp, message if change is None else change(message))
+            if poses is not None:
+                joints = body.joint_positions(poses[i : i + 1])[0]
+                bag.write('ground_truth', stamp, ground_truth(MESSAGES, body, poses[i], joints, stamp))
+    return path
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory, body, poses, mixtures):
+    return write(tmp_path_factory.mktemp('bags') / 'out', body, mixtures, poses=poses)
+
+
+def run(capsys, *arguments):
+    """Runs the command and gives its exit code, its output and its lines on stderr."""
+    code = main([str(x) for x in arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err.splitlines()
+
+
+def report(capsys, *arguments):
+    code, out, errors = run(capsys, *arguments, '--json')
+    assert (code, errors) == (0, [])
+    return json.loads(out)
+
+
+def relative(body, joints):
+    which = body.skeleton.joint_index(EVALUATED_JOINTS)
+    return joints[:, which] - joints[:, [body.joint_names.index('pelvis')]]
+
+
+def without_names(summary):
+    return {key: value for key, value in summary.items() if not isinstance(value, (str, dict))}
+
+
+def test_numbers_are_those_of_the_library(capsys, bag, body, poses, mixtures, truth_file):
+    result = report(capsys, bag, '--truth', truth_file)
+    truth = relative(body, body.joint_positions(poses))
+    wanted = score(joint_mixtures(body, mixtures), truth, seed=0).summary()
+    assert list(result['topics']) == ['pose_mixture']
+    found = result['topics']['pose_mixture']
+    assert found['kind'] == 'posterior'
+    assert (found['frames'], found['missing'], found['without_truth']) == (FRAMES, 0, 0)
+    for key, value in without_names(wanted).items():
+        assert found[key] == pytest.approx(value, rel=1e-9), key
+    assert list(found['by_joint']) == list(EVALUATED_JOINTS)
+    for joint, values in wanted['by_joint'].items():
+        assert found['by_joint'][joint] == pytest.approx(values)
+
+
+def test_truth_from_the_bag_itself_and_from_another_bag(capsys, bag, truth_file):
+    from_file = report(capsys, bag, '--truth', truth_file)
+    from_bag = report(capsys, bag)
+    assert from_bag['topics'] == from_file['topics']
+    assert from_bag['truth'] == f'{bag} (ground_truth)'
+    assert report(capsys, bag, '--truth', bag)['topics'] == from_file['topics']
+
+
+def test_model_sigma_and_seed(capsys, bag):
+    usual, wide, seeded = (
+        report(capsys, bag, *more)['topics']['pose_mixture']
+        for more in ((), ('--model-sigma', '0.2'), ('--seed', '5'))
+    )
+    assert wide['heaviest_mm'] == usual['heaviest_mm']
+    assert wide['negative_log_likelihood'] > usual['negative_log_likelihood'] + 20
+    assert wide['coverage_50'] == 1.0
+    assert seeded['negative_log_likelihood'] == usual['negative_log_likelihood']
+
+
+def test_table_for_people(capsys, bag, truth_file):
+    code, out, errors = run(capsys, bag, '--truth', truth_file)
+    assert (code, errors) == (0, [])
+    lines = out.splitlines()
+    summary = report(capsys, bag, '--truth', truth_file)['topics']['pose_mixture']
+    (row,) = (line.split() for line in lines if line.startswith('pose_mixture'))
+    assert row[1:7] == [
+        str(FRAMES), '0', '2.0', *(f'{summary[f"{key}_mm"]:.0f}' for key in ('heaviest', 'best', 'expected'))
+    ]  # fmt: skip
+    assert max(map(len, lines)) <= 120
+    assert [line.split()[0] for line in lines[-13:]] == list(EVALUATED_JOINTS)
+
+
+def test_frames_without_mixture_and_mixtures_without_truth(capsys, tmp_path, body, poses, mixtures):
+    path = write(tmp_path / 'out', body, mixtures[:4])
+    truth = tmp_path / 'truth.npz'
+    joints = body.joint_positions(poses)
+    np.savez(truth, stamps=STAMPS[1:], joint_names=body.joint_names, joints=joints[1:])
+    found = report(capsys, path, '--truth', truth)['topics']['pose_mixture']
+    assert (found['frames'], found['missing'], found['without_truth']) == (3, 2, 1)
+
+
+def test_a_bag_without_body_has_errors_but_no_densities(capsys, tmp_path, body, mixtures, bag, truth_file):
+    path = write(tmp_path / 'out', body, mixtures, with_body=False)
+    found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+    wanted = report(capsys, bag, '--truth', truth_file)['topics']['pose_mixture']
+    assert found['best_mm'] == pytest.approx(wanted['best_mm'])
+    assert found['coverage_90'] is None
+    assert found['negative_log_likelihood'] is None
+    assert 'body' in found['note']
+    code, out, _ = run(capsys, path, '--truth', truth_file)
+    assert code == 0
+    assert out.splitlines()[-1].startswith('pose_mixture: no covariances')
+
+
+def test_unknown_covariances(capsys, tmp_path, body, mixtures, truth_file):
+    def forget(message):
+        for component in message.components:
+            component.covariance = np.empty(0)
+        return message
+
+    path = write(tmp_path / 'out', body, mixtures, change=forget)
+    found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+    assert found['coverage_90'] is None
+    assert found['best_mm'] > 0
+
+
+def test_body_of_another_person_is_noticed(capsys, tmp_path, body, mixtures, truth_file):
+    path = tmp_path / 'out'
+    with BagWriter(path) as bag:
+        other = body.with_stature(1.6)
+        bag.write('body', START_NS, message_of_body(MESSAGES, other, START_NS, FRAME_ID))
+        for stamp, mixture in zip(STAMPS, mixtures):
+            bag.write('pose_mixture', stamp, mixture_message(body, mixture, stamp))
+    found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+    assert found['note'] == 'joint positions are not those of the body human37 of the bag'
+    assert found['coverage_90'] is None
+
+
+def test_the_body_may_change_on_the_way(capsys, tmp_path, body, poses, truth_file):
+    """After a new start the lengths may be others: each mixture is measured with its own."""
+    path = tmp_path / 'out'
+    rng = np.random.default_rng(0)
+    with BagWriter(path) as bag:
+        for i, stature in enumerate((1.82, 1.70)):
+            own = body.with_stature(stature)
+            bag.write('body', STAMPS[3 * i], message_of_body(MESSAGES, own, STAMPS[3 * i], FRAME_ID))
+            for t in range(3 * i, 3 * i + 3):
+                mean = poses[t] + 0.01 * rng.normal(size=body.dimension)
+                mixture = GaussianMixture([1.0], mean[None], 0.001 * np.eye(body.dimension)[None])
+                bag.write('pose_mixture', STAMPS[t], mixture_message(own, mixture, STAMPS[t]))
+    found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+    assert found['note'] == ''
+    assert found['frames'] == FRAMES
+    assert 0 < found['coverage_90'] <= 1
+
+
+def test_model_that_only_the_option_knows(capsys, tmp_path, body, mixtures, truth_file):
+    path = tmp_path / 'out'
+    with BagWriter(path) as bag:
+        content = message_of_body(MESSAGES, body, START_NS, FRAME_ID)
+        content.name = 'my_body'
+        bag.write('body', START_NS, content)
+        for stamp, mixture in zip(STAMPS, mixtures):
+            bag.write('pose_mixture', stamp, mixture_message(body, mixture, stamp, name='my_body'))
+    unknown = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+    assert unknown['coverage_90'] is None
+    named = report(capsys, path, '--truth', truth_file, '--body', 'human37')['topics']['pose_mixture']
+    assert named['coverage_90'] is not None
+
+
+def test_every_topic_gets_a_row_and_one_can_be_chosen(capsys, tmp_path, body, poses, mixtures, truth_file):
+    path = tmp_path / 'out'
+    kinds = {
+        'p/pose_mixture': MixtureKind.POSTERIOR,
+        'p/likelihood_mixture': MixtureKind.LIKELIHOOD,
+        'p/smoothed_pose_mixture': MixtureKind.SMOOTHED,
+    }
+    with BagWriter(path) as bag:
+        bag.write('p/body', START_NS, message_of_body(MESSAGES, body, START_NS, FRAME_ID))
+        for stamp, mixture in zip(STAMPS, mixtures):
+            for topic, kind in kinds.items():
+                bag.write(topic, stamp, mixture_message(body, mixture, stamp, kind))
+    result = report(capsys, path, '--truth', truth_file)['topics']
+    assert {name: found['kind'] for name, found in result.items()} == {
+        topic: kind.name.lower() for topic, kind in kinds.items()
+    }
+    likelihood, smoothed = list(result.values())[1:]
+    assert without_names(likelihood) == without_names(smoothed)
+    one = report(capsys, path, '--truth', truth_file, '--topic', '/p/smoothed_pose_mixture')
+    assert list(one['topics']) == ['p/smoothed_pose_mixture']
+    code, out, _ = run(capsys, path, '--truth', truth_file)
+    assert code == 0
+    assert sum(line.startswith('p/') for line in out.splitlines()) == 3
+
+
+@pytest.mark.parametrize('with_covariances', [True, False])
+def test_marginals_of_trajectories(
+    capsys, tmp_path, body, mixtures, truth_file, with_covariances
+):
+    """Windows overlap; of a frame the newest one counts."""
+    path = tmp_path / 'out'
+
+    def window(first, last, shift):
+        chosen = mixtures[first:last]
+        return TrajectoryMixture(
+            weights=chosen[0].weights,
+            means=np.stack([m.means for m in chosen], axis=1) + shift,
+            marginal_covariances=np.stack([m.covariances for m in chosen], axis=1)
+            if with_covariances
+            else None,
+            log_joint=np.zeros(2),
+            inflation=np.ones(2),
+            stamps_ns=tuple(STAMPS[first:last]),
+            final_until_ns=STAMPS[first],
+            free_energy=np.zeros(0),
+            body_model=body.name,
+            dof_names=body.dof_names,
+            frame_id=FRAME_ID,
+        )
+
+    with BagWriter(path) as bag:
+        bag.write('body', START_NS, message_of_body(MESSAGES, body, START_NS, FRAME_ID))
+        for first, last, shift in ((0, 4, 0.5), (0, 5, 0.0), (3, 6, 0.0)):
+            message = trajectory_mixture_message(MESSAGES, window(first, last, shift))
+            bag.write('trajectory_mixture', STAMPS[last - 1], message)
+        for stamp, mixture in zip(STAMPS, mixtures):
+            bag.write('pose_mixture', stamp, mixture_message(body, mixture, stamp))
+    topics = report(capsys, path, '--truth', truth_file)['topics']
+    found, wanted = topics['trajectory_mixture'], topics['pose_mixture']
+    assert found['kind'] == 'trajectories'
+    assert found['frames'] == FRAMES
+    for key in ('heaviest_mm', 'best_mm', 'expected_mm'):
+        assert found[key] == pytest.approx(wanted[key])
+    if with_covariances:
+        assert found['negative_log_likelihood'] == pytest.approx(wanted['negative_log_likelihood'])
+    else:
+        assert found['coverage_90'] is None
+
+
+def save(path, **arrays):
+    np.savez(path, **arrays)
+    return path
+
+
+def test_truth_that_can_not_be_used(capsys, tmp_path, bag, body):
+    good = {
+        'stamps': np.array(STAMPS),
+        'joint_names': np.array(body.joint_names),
+        'joints': np.zeros((FRAMES, len(body.joint_names), 3)),
+    }
+    text = tmp_path / 'text.npz'
+    text.write_text('no arrays')
+    infinite = good['joints'].copy()
+    infinite[2, 3, 1] = math.nan
+    cases = {
+        'can not be read': tmp_path / 'nowhere.npz',
+        'no truth file': text,
+        "no ['joints']": save(tmp_path / 'a.npz', **{k: good[k] for k in ('stamps', 'joint_names')}),
+        '5 stamps': save(tmp_path / 'b.npz', **{**good, 'stamps': good['stamps'][:5]}),
+        'whole nanoseconds': save(tmp_path / 'c.npz', **{**good, 'stamps': good['stamps'] * 1e-9}),
+        'not finite': save(tmp_path / 'd.npz', **{**good, 'joints': infinite}),
+        'no joint pelvis': save(
+            tmp_path / 'e.npz', **{**good, 'joint_names': np.char.add(good['joint_names'], '_')}
+        ),
+        'wanted 4 at least': save(
+            tmp_path / 'f.npz',
+            stamps=good['stamps'],
+            joint_names=['pelvis', 'neck'],
+            joints=good['joints'][:, :2],
+        ),
+        'no stamp of pose_mixture': save(
+            tmp_path / 'g.npz', **{**good, 'stamps': good['stamps'] + 1}
+        ),
+        'wanted (19, 3)': save(tmp_path / 'h.npz', **{**good, 'joints': good['joints'][:, :5]}),
+    }
+    for wanted, path in cases.items():
+        code, out, errors = run(capsys, bag, '--truth', path)
+        assert (code, out, len(errors)) == (1, '', 1), wanted
+        assert errors[0].startswith('evaluate: ')
+        assert wanted in errors[0]
+
+
+def test_bags_that_can_not_be_used(capsys, tmp_path, bag, body, mixtures, truth_file):
+    empty = tmp_path / 'empty'
+    with BagWriter(empty) as out:
+        out.write('note', START_NS, MESSAGES.create('std_msgs/msg/String', data='nothing'))
+    silent = write(tmp_path / 'silent', body, mixtures)
+    broken = tmp_path / 'broken.mcap'
+    content = (bag / 'out.mcap').read_bytes()
+    broken.write_bytes(content[: len(content) // 2])
+
+    def in_map(message):
+        message.header.frame_id = 'map'
+        return message
+
+    def nameless(message):
+        message.joint_names = [f'{name}_' for name in message.joint_names]
+        return message
+
+    def heavy(message):
+        message.components[0].weight = 3.0
+        return message
+
+    cases = [
+        ('can not be read', [tmp_path / 'nowhere', '--truth', truth_file]),
+        ('no pose mixtures', [empty, '--truth', truth_file]),
+        ('no ground truth', [silent]),
+        ('no ground truth', [bag, '--truth', silent]),
+        ('broken.mcap', [broken, '--truth', truth_file]),
+        ('no topic smoothed', [bag, '--topic', 'smoothed']),
+        ('no mixtures to evaluate', [bag, '--topic', 'ground_truth']),
+        ("frame 'map'", [write(tmp_path / 'map', body, mixtures, change=in_map), '--truth', bag]),
+        ('has no joints', [write(tmp_path / 'joints', body, mixtures, change=nameless), '--truth', bag]),
+        ('sum to', [write(tmp_path / 'heavy', body, mixtures, change=heavy), '--truth', bag]),
+        ('--model-sigma', [bag, '--model-sigma', '-1']),
+        ('no body', [bag, '--body', 'human99']),
+        ('--seed', [bag, '--seed', '-1']),
+        ('unrecognized', [bag, '--frobnicate']),
+    ]
+    for wanted, arguments in cases:
+        code, out, errors = run(capsys, *arguments)
+        assert (code, out, len(errors)) == (1, '', 1), (wanted, errors)
+        assert errors[0].startswith('evaluate: ')
+        assert wanted in errors[0], errors[0]
