@@ -246,9 +246,7 @@ def _common_joints(truth: Truth) -> tuple[str, ...]:
     return known
 
 
-def _indices(
-    names: tuple[str, ...], joints: tuple[str, ...], source: str
-) -> NDArray[np.intp]:
+def _indices(names: tuple[str, ...], joints: tuple[str, ...], source: str) -> NDArray[np.intp]:
     missing = [name for name in (ORIGIN, *joints) if name not in names]
     if missing:
         raise ValueError(f'{source} has no joints {missing}; it has {list(names)}')

@@ -180,7 +180,9 @@ def as_text(found: dict[str, TopicScores], truth: Truth) -> str:
                 f'{s["best_mm"]:.0f}',
                 f'{s["expected_mm"]:.0f}',
                 _percent(s['fraction_tracked']),
-                '-' if s['negative_log_likelihood'] is None else f'{s["negative_log_likelihood"]:.1f}',
+                '-'
+                if s['negative_log_likelihood'] is None
+                else f'{s["negative_log_likelihood"]:.1f}',
                 *(
                     _percent(s[f'{kind}coverage_{percent}'])
                     for kind in ('', 'joint_')

@@ -85,6 +85,42 @@ def enumerate_flips(
     return result, parents
 
 
+def rehang_chain(
+    body: Body, poses: ArrayLike, new_poses: ArrayLike, chain: str, *, slack: float = 0.1
+) -> tuple[Array, Index]:
+    """Poses whose chain hangs on another trunk and still has the image that it had.
+
+    When a trunk turns or flips, its limbs start elsewhere. Their joints are put back onto the rays
+    through their images, in all ways that lengths and limits allow.
+
+    Args:
+        body: the body.
+        poses: (N, d) that have the image.
+        new_poses: (N, d) with the other trunk.
+        chain: name.
+        slack: a ray that misses its sphere by less than this touches it, m.
+
+    Returns:
+        poses (M, d), equal to the new ones outside the chain, and the index (M,) of each.
+
+    Raises:
+        KeyError, ValueError: as `enumerate_flips`.
+    """
+    skeleton = body.skeleton
+    links = _links(skeleton, chain)
+    new = np.array(new_poses, dtype=np.float64, ndmin=2)
+    seen = forward(skeleton, poses)
+    targets = [seen.origins[k.segment] - k.length * seen.columns[k.segment, 2] for k in links]
+    frames = forward(skeleton, new)
+    positions, valid = _positions(frames, links, targets, slack)
+    angles, reachable = _joint_angles(frames, new, links, positions)
+    parents, choice = np.nonzero((valid & reachable).T)
+    result = new[parents]
+    own = [j for link in links for j in link.dofs]
+    result[:, own] = angles[choice, :, parents]
+    return result, parents
+
+
 def flip_counts(body: Body, poses: ArrayLike, chain: str) -> Index:
     """Number of leaves (N,) that the tree of one chain has at each pose."""
     q = np.array(poses, dtype=np.float64, ndmin=2)
@@ -153,7 +189,8 @@ def _leaves(
     frames: Frames, poses: Array, links: tuple[_Link, ...]
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Angles (leaves, chain dofs, N) and validity (leaves, N); leaf 0 is the given pose."""
-    positions, valid = _positions(frames, links)
+    targets = [frames.origins[k.segment] - k.length * frames.columns[k.segment, 2] for k in links]
+    positions, valid = _positions(frames, links, targets)
     angles, reachable = _joint_angles(frames, poses, links, positions)
     valid &= reachable
     valid[0] = True
@@ -162,14 +199,23 @@ def _leaves(
     return angles, valid
 
 
-def _positions(frames: Frames, links: tuple[_Link, ...]) -> tuple[list[Array], NDArray[np.bool_]]:
-    """Joint positions after 0, 1, ... links, (2^k, 3, N) each, and which of the last exist."""
+def _positions(
+    frames: Frames, links: tuple[_Link, ...], targets: list[Array], slack: float = 0.0
+) -> tuple[list[Array], NDArray[np.bool_]]:
+    """Joint positions after 0, 1, ... links, (2^k, 3, N) each, and which of the last exist.
+
+    Args:
+        frames: where the chain starts.
+        links: of the chain.
+        targets: (3, N) points on the rays of the joints; without slack those of the given pose, whose
+            own positions come out first.
+        slack: a ray that misses its sphere by less touches it, m.
+    """
     start = frames.origins[links[0].segment]
     result = [start[None]]
     valid = np.ones((1, frames.count), dtype=bool)
     given = start
-    for link in links:
-        target = frames.origins[link.segment] - link.length * frames.columns[link.segment, 2]
+    for link, target in zip(links, targets, strict=True):
         distance = np.sqrt((target * target).sum(0))
         ray = target / distance
         # The given pose takes the far solution where its joint lies beyond the foot of the parent.
@@ -179,12 +225,20 @@ def _positions(frames: Frames, links: tuple[_Link, ...]) -> tuple[list[Array], N
         discriminant = along * along - (parent * parent).sum(1) + link.length**2
         root = np.sqrt(np.maximum(discriminant, 0.0))
         s = np.stack([along + own_sign * root, along - own_sign * root], axis=1)
-        hit = (discriminant >= 0.0)[:, None] & (s > 0) & valid[:, None]
+        near_enough = discriminant >= link.length**2 - (link.length + slack) ** 2
+        hit = near_enough[:, None] & (s > 0) & valid[:, None]
         hit[:, 1] &= root > 0.5 * TOUCHING
-        # The given pose itself stays, however the rounding of its discriminant turns out.
-        s[0, 0] = distance
-        hit[0, 0] = True
-        result.append((s[:, :, None] * ray).reshape(-1, 3, frames.count))
+        if slack == 0:
+            # The given pose itself stays, however the rounding of its discriminant turns out.
+            s[0, 0] = distance
+            hit[0, 0] = True
+        points = s[:, :, None] * ray
+        if slack > 0:
+            # A joint put on the nearest point of a ray that misses keeps the length of its link.
+            away = points - parent[:, None]
+            away *= link.length / np.maximum(np.sqrt((away * away).sum(2)), 1e-9)[:, :, None]
+            points = parent[:, None] + away
+        result.append(points.reshape(-1, 3, frames.count))
         valid = hit.reshape(-1, frames.count)
         given = target
     return result, valid

@@ -2,8 +2,8 @@
 
 A settings dataclass, with the dataclasses inside it, is what a node is parametrised by. Its fields
 are the parameters (`likelihood.edges.weight` for a field of a field of a field), its docstring
-describes them, and its own checks decide whether values go together. So a field that is added to the
-settings is a parameter without being named a second time.
+describes them, and its own checks decide whether values go together. So a field that is added to
+the settings is a parameter without being named a second time.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class DeclaredParameter:
     limits: tuple[float, float] | None
     effect: str
 
-    def checked(self, value: Any) -> Value:
+    def checked(self, value: Any) -> Any:
         """A value from a file or a command line, with the type of the parameter.
 
         Raises:
@@ -147,7 +147,8 @@ def _parameters(
         own_effect = field.metadata.get(EFFECT, effect)
         if is_dataclass(value):
             inner = _inner_prefix(field, prefix)
-            named = {f'{inner}{name}': pair for name, pair in field.metadata.get(LIMITS, {}).items()}
+            named = field.metadata.get(LIMITS, {})
+            named = {f'{inner}{name}': pair for name, pair in named.items()}
             group = described.get(field.name, '')
             for parameter in _parameters(value, inner, own_effect, {**limits, **named}):
                 yield replace(parameter, description=_in_group(parameter, group, field))

@@ -73,19 +73,20 @@ class FilterParameters:
             images before the track starts.
         body_model: 'human37', 'human34', 'human32', a YAML file, or a motion file with a skeleton.
         random_seed: of all that is random. The same images give the same numbers.
-        reset_on_time_jump: whether an image that is older than the one before starts the track anew;
-            otherwise such images are skipped.
+        reset_on_time_jump: whether an image that is older than the one before starts the track
+            anew; otherwise such images are skipped.
         image_transport: 'raw' (topic image) or 'compressed' (topic image/compressed).
         queue_size: images that wait at most; when the node is late the oldest are dropped.
         use_keypoints: whether keypoints are a measurement. An image then waits for the keypoints of
             its stamp.
         keypoint_sigma_px: standard deviation of keypoints that come without a covariance, px.
-        keypoints_timeout: an image waits no longer when keypoints of a later stamp, or an image that
-            is so much younger, have come, s.
+        keypoints_timeout: an image waits no longer when keypoints of a later stamp, or an image
+            that is so much younger, have come, s.
         overlay_modes: heaviest modes that are drawn on the image; 0: no overlay.
         overlay_quality: of the JPEG pictures of the overlay.
         publish_tf: whether the segments of the heaviest mode are published on /tf.
-        frame_prefix: stands before the names of the segments on /tf, so that several persons differ.
+        frame_prefix: stands before the names of the segments on /tf, so that several persons
+            differ.
         autostart: whether the node configures and activates itself; otherwise it waits for its
             lifecycle services.
         tracker: settings of the tracker.

@@ -1,7 +1,7 @@
 """The modes of a mixture, drawn as skeletons on the image that they explain.
 
-Colours are those of the markers: the heaviest mode orange, the others blue, the fainter the lighter.
-The same modes on the same image give the same picture.
+Colours are those of the markers: the heaviest mode orange, the others blue, the lighter the
+fainter. The same modes on the same image give the same picture.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def draw_modes(
         return result
     thickness = max(round(min(image.shape[:2]) / 240), 1)
     pixels = camera.project(body.joint_positions(poses[order]))
-    usable = np.isfinite(pixels).all(2) & (np.abs(np.nan_to_num(pixels)) < _FAR).all(2)
+    usable = np.logical_and.reduce(np.abs(np.nan_to_num(pixels, nan=np.inf)) < _FAR, axis=2)
     # The heaviest last, on top.
     for rank in reversed(range(len(order))):
         share = float(weights[order[rank]] / weights[order[0]]) if weights[order[0]] > 0 else 1.0

@@ -1,12 +1,4 @@
-"""Parameter files of ROS 2: written with comments, and read without ROS.
-
-    /**:
-      ros__parameters:
-        max_hypotheses: 8
-        likelihood:
-          edges:
-            weight: 20.0
-"""
+"""Parameter files of ROS 2: written with comments, and read without ROS."""
 
 from __future__ import annotations
 
@@ -42,7 +34,7 @@ def parameter_file_text(node: str, settings: Any) -> str:
         '#',
         f'#     ros2 run hmt_ros {node} --ros-args --params-file FILE',
         '#',
-        '# In square brackets: the lowest and the highest value, and when a new value takes effect:',
+        '# In square brackets: lowest and highest value, and when a new value takes effect:',
         *(f'# "{name}": {text[0].lower()}{text[1:]}' for name, text in EFFECTS.items()),
         '/**:',
         f'  {_KEY}:',
@@ -53,8 +45,7 @@ def parameter_file_text(node: str, settings: Any) -> str:
         same = 0
         while open_groups[same : same + 1] == groups[same : same + 1] != []:
             same += 1
-        for depth in range(same, len(groups)):
-            lines.append(f'{_indent(depth)}{groups[depth]}:')
+        lines.extend(f'{_indent(depth)}{groups[depth]}:' for depth in range(same, len(groups)))
         open_groups = groups
         indent = _indent(len(groups))
         lines.extend(

@@ -34,17 +34,15 @@ class PublishedTopic(NamedTuple):
     Attributes:
         msgtype: for example 'hmt_msgs/msg/PoseMixture'.
         latched: late subscribers get the last message.
-        always: published even where nobody listens.
     """
 
     msgtype: str
     latched: bool = False
-    always: bool = False
 
 
 # In the order in which they are published.
 TOPICS = {
-    'body': PublishedTopic('hmt_msgs/msg/Body', latched=True, always=True),
+    'body': PublishedTopic('hmt_msgs/msg/Body', latched=True),
     'pose_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
     'likelihood_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
     'joint_states': PublishedTopic('sensor_msgs/msg/JointState'),
@@ -64,7 +62,7 @@ class TrackedImage:
         body, camera: of the track.
         posterior, likelihood: mixtures over poses, heaviest first.
         log_likelihoods: (K,) of the image at the means of the posterior.
-        starts: whether the track has a new body.
+        starts: whether the body is a new one, with other lengths than the image before.
     """
 
     image: NDArray[np.uint8]

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.interpretation_tree import enumerate_flips
+from hmt_ros.body.interpretation_tree import enumerate_flips, rehang_chain
 from hmt_ros.body.kinematics import forward
+from hmt_ros.body.torso_flips import flip_torso
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
 from hmt_ros.image.observation import Keypoints, Observation, ObservationSettings, observe
@@ -401,20 +402,27 @@ class Tracker:
         s, m = self.settings, self.modes
         everything: list[tuple[Array, Index, Array, Array]] = []
         for group in self._groups(base):
-            lead = group[0]
-            found = self._search(base.x[lead], covariances[lead], observation, int(lead))
+            lead = int(group[0])
+            found = self._search(base.x[lead], covariances[lead], observation, lead)
             alternatives = [
                 self._alternatives(base.x[group], chain, found.get(chain))
                 for chain in CHAINS
                 if chain in self.body.chains
             ]
-            changes, energy = self._rate(base.x[lead], alternatives, observation, int(lead))
-            combined = best_combinations(
-                self.body, base.x[group], m.log_weights[group], energy, alternatives, changes,
-                s.temperature, s.combinations,
-            )  # fmt: skip
-            parents = group[combined.parents]
-            everything.append((combined.poses, parents, combined.log_priors, combined.energies))
+            products = [(base.x[group], group, m.log_weights[group], alternatives)]
+            weight = np.logaddexp.reduce(m.log_weights[group]) + np.log(s.jump_probability)
+            for pose, hung in self._torso_flips(base.x[lead], [a.chain for a in alternatives]):
+                products.append((pose[None], group[:1], np.array([weight]), hung))
+            for modes, members, log_weights, choices in products:
+                changes, energy = self._rate(modes[0], choices, observation, lead)
+                combined = best_combinations(
+                    self.body, modes, log_weights, energy, choices, changes, s.temperature,
+                    s.combinations,
+                )  # fmt: skip
+                parents = members[combined.parents]
+                everything.append(
+                    (combined.poses, parents, combined.log_priors, combined.energies)
+                )
         poses, parents, log_priors, energies = (
             np.concatenate([part[i] for part in everything]) for i in range(4)
         )
@@ -514,6 +522,27 @@ class Tracker:
             self.body, modes[0], chain, np.concatenate(angles), np.concatenate(penalties, axis=1),
             apart=0.08, most=s.alternatives,
         )  # fmt: skip
+
+    def _torso_flips(
+        self, pose: Array, chains: list[str]
+    ) -> list[tuple[Array, list[Alternatives]]]:
+        """The pose with its torso flipped, and its limbs in all ways that keep their image."""
+        result = []
+        for flipped in flip_torso(self.body, pose[None])[0]:
+            base, alternatives = flipped.copy(), []
+            for chain in chains:
+                own = chain_dofs(self.body, chain)
+                hung, _ = rehang_chain(self.body, pose[None], flipped[None], chain)
+                angles = hung[:, own] if len(hung) else flipped[None, own]
+                base[own] = angles[0]
+                alternatives.append(
+                    distinct_alternatives(
+                        self.body, flipped, chain, angles, np.zeros((1, len(angles))),
+                        apart=0.08, most=self.settings.alternatives,
+                    )  # fmt: skip
+                )
+            result.append((base, alternatives))
+        return result
 
     def _rate(
         self, pose: Array, alternatives: list[Alternatives], observation: Observation, which: int

@@ -1,0 +1,95 @@
+"""flips: time per leaf of the interpretation trees, closed-form inverse kinematics included."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.clips import rounded, table
+from benchmarks.machine import best_time, description, dgemm_rate
+from hmt_ros.body import Body, load_body
+from hmt_ros.body.interpretation_tree import enumerate_flips, flip_counts
+
+CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg')
+LEAVES = 1024
+# The yardstick: a microsecond a leaf on a core that makes so many operations per second in dgemm.
+YARDSTICK_RATE = 58e9
+
+
+def main(argv: list[str]) -> int:
+    """Runs the benchmark."""
+    parser = argparse.ArgumentParser(prog='python -m benchmarks flips', description=__doc__)
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser.add_argument('--quick', action='store_true', help='measure less long')
+    options = parser.parse_args(argv)
+    result = measure(0.1 if options.quick else 1.0)
+    if options.json:
+        print(json.dumps(rounded(result), indent=1))
+        return 0
+    rows = [['', 'poses', 'leaves', 'us per leaf']]
+    for name, entry in result['cases'].items():
+        rows.append(
+            [name, str(entry['poses']), str(entry['leaves']), f'{entry["us_per_leaf"]:.3f}']
+        )
+    print(table(rows))
+    print(
+        f'dgemm {result["dgemm_gflops"]:.1f} GF/s; one tree at {YARDSTICK_RATE / 1e9:.0f} GF/s: '
+        f'{result["us_per_leaf_at_yardstick"]:.3f} us per leaf'
+    )
+    return 0
+
+
+def measure(seconds: float = 1.0) -> dict[str, Any]:
+    """Times of one tree of 1024 leaves, and of many trees of one limb."""
+    body = load_body('human37')
+    pose, chains = pose_with_leaves(body, LEAVES)
+    many = random_poses(body, 256, seed=1)
+    cases = {}
+    for name, poses, names in (
+        (' x '.join(chains), pose[None], list(chains)),
+        ('left_arm', many, ['left_arm']),
+        ('left_leg', many, ['left_leg']),
+    ):
+        leaves = len(enumerate_flips(body, None, poses, names)[0])
+        spent = best_time(lambda p=poses, n=names: enumerate_flips(body, None, p, n), seconds=seconds)  # type: ignore[misc]
+        cases[name] = {'poses': len(poses), 'leaves': leaves, 'us_per_leaf': 1e6 * spent / leaves}
+    rate = dgemm_rate()
+    first = next(iter(cases.values()))['us_per_leaf']
+    return {
+        'machine': description(),
+        'cases': cases,
+        'dgemm_gflops': rate / 1e9,
+        'us_per_leaf_at_yardstick': first * rate / YARDSTICK_RATE,
+    }
+
+
+def random_poses(body: Body, count: int, seed: int) -> NDArray[np.float64]:
+    """Poses (count, d) within the limits, near the mean, 4 m before the camera."""
+    rng = np.random.default_rng(seed)
+    sigma = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 0.5)
+    poses = body.prior_mean + sigma * rng.normal(size=(count, body.dimension))
+    poses = np.clip(poses, body.lower, body.upper)
+    poses[:, :3] = [0.0, 0.0, 4.0]
+    return poses
+
+
+def pose_with_leaves(body: Body, leaves: int) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """A pose and chains of which the product of trees has exactly so many leaves.
+
+    Raises:
+        ValueError: none was found.
+    """
+    poses = random_poses(body, 4000, seed=0)
+    counts = {chain: flip_counts(body, poses, chain) for chain in CHAINS}
+    for size in range(len(CHAINS), 0, -1):
+        for names in itertools.combinations(CHAINS, size):
+            product = np.prod([counts[name] for name in names], axis=0)
+            found = np.flatnonzero(product == leaves)
+            if len(found):
+                return poses[found[0]], names
+    raise ValueError(f'no pose has {leaves} leaves')

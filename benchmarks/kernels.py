@@ -1,0 +1,147 @@
+"""kernels: the compiled likelihood and pruning against vectorised numpy that computes the same."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from benchmarks import numpy_likelihood, numpy_pruning
+from benchmarks.clips import rounded, table
+from benchmarks.machine import best_time, description
+from hmt_ros.body import Camera, load_body
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.procedural_motion import procedural_motion
+from hmt_ros.body.viewpoint import Viewpoint
+from hmt_ros.image import likelihood as likelihood_module
+from hmt_ros.image.likelihood import ImageLikelihood, TermSettings
+from hmt_ros.image.observation import observe
+from hmt_ros.image.renderer import render_frames
+from hmt_ros.image.scene import Scene
+from hmt_ros.image.texture import capture_textures
+from hmt_ros.tracking.pruning import choose_hypotheses
+
+OFF = TermSettings(0.0, 1.0, 1.0)
+
+
+def main(argv: list[str]) -> int:
+    """Runs the benchmark."""
+    parser = argparse.ArgumentParser(prog='python -m benchmarks kernels', description=__doc__)
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser.add_argument('--quick', action='store_true', help='measure less long')
+    options = parser.parse_args(argv)
+    result = measure(0.1 if options.quick else 1.0)
+    if options.json:
+        print(json.dumps(rounded(result), indent=1))
+        return 0
+    rows = [['', 'batch', 'numpy, ms', 'compiled, ms', 'ratio', 'all cores, ms', 'largest difference']]
+    for entry in result['cases']:
+        threads = entry['compiled_threads_ms']
+        rows.append(
+            [
+                entry['what'],
+                str(entry['batch']),
+                f'{entry["numpy_ms"]:.2f}',
+                f'{entry["compiled_ms"]:.2f}',
+                f'{entry["ratio"]:.1f}',
+                '-' if threads is None else f'{threads:.2f}',
+                f'{entry["difference"]:.0e}',
+            ]
+        )
+    print(table(rows))
+    return 0
+
+
+def measure(seconds: float = 1.0) -> dict[str, Any]:
+    """Times and differences: all image terms with derivatives, and the choice of hypotheses."""
+    return {
+        'machine': description(),
+        'cases': [*_likelihoods(seconds), *_choices(seconds)],
+    }
+
+
+def _likelihoods(seconds: float) -> Iterator[dict[str, Any]]:
+    body = load_body('human37')
+    camera = Camera(660.0, 660.0, 319.5, 239.5, 640, 480)
+    view = Viewpoint(distance=3.6)
+    shown = procedural_motion('walk', body, 0.8, 10.0, 3, viewpoint=view)[4:6]
+    before, now = render_frames(body, shown, camera, Scene(viewpoint=view))
+    observation = observe(now.image, now.mask, last_image=before.image)
+    intensity = observe(before.image, before.mask).intensity
+    assert intensity is not None
+    textures = capture_textures(body, camera, forward(body.skeleton, shown[:1]), intensity)
+    likelihood = ImageLikelihood(body, camera)
+    likelihood = replace(likelihood, settings=replace(likelihood.settings, joints=OFF))
+    rng = np.random.default_rng(0)
+    for batch in (8, 32, 128):
+        poses = shown[1] + 0.1 * rng.normal(size=(batch, body.dimension))
+        poses[:, :3] = shown[1, :3] + 0.03 * rng.normal(size=(batch, 3))
+        poses = np.clip(poses, body.lower, body.upper)
+        which = np.zeros(batch, dtype=np.intp)
+
+        def compiled(x: Any = poses, w: Any = which) -> Any:
+            return likelihood.image_energy(forward(body.skeleton, x), observation, textures, w)
+
+        def vectorised(x: Any = poses, w: Any = which) -> Any:
+            return numpy_likelihood.image_energy(likelihood, x, observation, textures, w)
+
+        found, wanted = compiled(), vectorised()
+        difference = max(
+            float(np.abs(a - b).max() / np.abs(b).max())
+            for a, b in (
+                (found.value, wanted.value),
+                (found.gradient, wanted.gradient),
+                (found.hessian, wanted.hessian),
+            )
+        )
+        with one_thread():
+            alone = best_time(compiled, seconds=seconds)
+        yield _case(
+            'likelihood, gradient, Hessian', batch, best_time(vectorised, seconds=seconds), alone,
+            best_time(compiled, seconds=seconds), difference,
+        )  # fmt: skip
+
+
+def _choices(seconds: float) -> Iterator[dict[str, Any]]:
+    rng = np.random.default_rng(0)
+    for batch in (32, 256):
+        joints = rng.normal(0, 0.1, (batch, 19, 3))
+        log_weights = rng.normal(0, 3, batch)
+        weights = np.exp(log_weights - log_weights.max())
+        weights /= weights.sum()
+        found = choose_hypotheses(joints, log_weights, 16)
+        wanted, owners = numpy_pruning.choose(joints, weights, 16)
+        same = np.array_equal(found.chosen, wanted) and np.array_equal(found.owner, owners)
+        slow = best_time(lambda j=joints, w=weights: numpy_pruning.choose(j, w, 16), seconds=seconds)  # type: ignore[misc]
+        fast = best_time(lambda j=joints, w=log_weights: choose_hypotheses(j, w, 16), seconds=seconds)  # type: ignore[misc]
+        yield _case('choice of hypotheses', batch, slow, fast, None, 0.0 if same else np.inf)
+
+
+def _case(
+    what: str, batch: int, slow: float, fast: float, threads: float | None, difference: float
+) -> dict[str, Any]:
+    return {
+        'what': what,
+        'batch': batch,
+        'numpy_ms': 1e3 * slow,
+        'compiled_ms': 1e3 * fast,
+        'ratio': slow / fast,
+        'compiled_threads_ms': None if threads is None else 1e3 * threads,
+        'difference': difference,
+    }
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """The likelihood on one core, as numpy's loops are."""
+    usual = likelihood_module._thread_count
+    likelihood_module._thread_count = lambda: 1  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        likelihood_module._thread_count = usual

@@ -1,0 +1,62 @@
+"""What a time is measured with: repeated timing, the machine's own speed, memory."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import scipy
+
+
+def best_time(function: Callable[[], Any], *, seconds: float = 1.0, least: int = 3) -> float:
+    """Shortest of several runs, s: the one that nothing else disturbed; the first is not counted."""
+    function()
+    times: list[float] = []
+    end = time.perf_counter() + seconds
+    while len(times) < least or time.perf_counter() < end:
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def dgemm_rate(size: int = 768) -> float:
+    """Floating-point operations per second of a product of matrices, as numpy's BLAS is set."""
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, size, size))
+    return 2.0 * size**3 / best_time(lambda: a @ b, seconds=0.5)
+
+
+def description() -> dict[str, Any]:
+    """Processor, cores that may be used, and versions."""
+    model = ''
+    info = Path('/proc/cpuinfo')
+    if info.is_file():
+        lines = info.read_text('utf-8').splitlines()
+        model = next((x.partition(':')[2].strip() for x in lines if x.startswith('model name')), '')
+    return {
+        'processor': model or platform.machine(),
+        'cores': len(os.sched_getaffinity(0)),
+        'python': platform.python_version(),
+        'numpy': np.__version__,
+        'scipy': scipy.__version__,
+        'opencv': cv2.__version__,
+    }
+
+
+def peak_memory() -> float:
+    """Largest resident memory of this process so far, bytes."""
+    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def resident_memory() -> float:
+    """Resident memory of this process now, bytes."""
+    pages = int(Path('/proc/self/statm').read_text('utf-8').split()[1])
+    return float(pages * resource.getpagesize())

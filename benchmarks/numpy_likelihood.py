@@ -1,0 +1,436 @@
+"""The likelihood of an image in vectorised numpy: what the compiled kernels are measured against.
+
+Written from the same equations as `hmt_ros.image`, with the batch of poses on the last axis and matrix
+products where there are any. It serves twice: `python -m benchmarks kernels` compares the time, and the
+tests compare values, gradients and Hessians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body import Body, Camera
+from hmt_ros.body.flesh import occluding_contour
+from hmt_ros.body.kinematics import Frames, assemble, forward, segment_sums
+from hmt_ros.image.edge_term import FEWEST
+from hmt_ros.image.intensity_term import FLOW_ERROR
+from hmt_ros.image.likelihood import ImageLikelihood, TermSettings
+from hmt_ros.image.observation import Observation, Outline
+from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.silhouette_term import SPACING, TURN
+from hmt_ros.image.surface import COVER, HIDDEN
+from hmt_ros.image.texture import FACING, Textures, coarse_mesh
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+
+class Residuals(NamedTuple):
+    """One term for N poses, as M residuals at points of the body.
+
+    Attributes:
+        value: (N,) energy.
+        segments: (M,) or (M, N) segment of each residual's point.
+        points: (M, 3, N) camera frame, m.
+        directions: (M, 3, N) derivative of the residual with respect to its point.
+        pull, curvature: (M, N) first and second derivative of the energy by the residual.
+    """
+
+    value: Array
+    segments: Index
+    points: Array
+    directions: Array
+    pull: Array
+    curvature: Array
+
+
+class Energy(NamedTuple):
+    """Value (N,), gradient (N, d) and Gauss-Newton Hessian (N, d, d)."""
+
+    value: Array
+    gradient: Array
+    hessian: Array
+
+
+def image_energies(
+    likelihood: ImageLikelihood,
+    poses: Array,
+    observation: Observation,
+    textures: Textures | None = None,
+    which: Index | None = None,
+) -> dict[str, Energy]:
+    """The terms of the image, by name; arguments as `ImageLikelihood.energy`."""
+    frames = forward(likelihood.body.skeleton, poses)
+    found = _terms(likelihood, frames, observation, textures, which)
+    return {name: _assembled(frames, [term]) for name, term in found.items()}
+
+
+def image_energy(
+    likelihood: ImageLikelihood,
+    poses: Array,
+    observation: Observation,
+    textures: Textures | None = None,
+    which: Index | None = None,
+) -> Energy:
+    """Their sum, assembled once."""
+    frames = forward(likelihood.body.skeleton, poses)
+    found = _terms(likelihood, frames, observation, textures, which)
+    return _assembled(frames, list(found.values()))
+
+
+def _terms(
+    likelihood: ImageLikelihood,
+    frames: Frames,
+    observation: Observation,
+    textures: Textures | None,
+    which: Index | None,
+) -> dict[str, Residuals]:
+    body, camera, s = likelihood.body, likelihood.camera, likelihood.settings
+    result: dict[str, Residuals] = {}
+    surface = project_surface(body, camera, frames)
+    if observation.distance is not None and s.containment.weight > 0:
+        result['containment'] = containment(surface, observation.distance, s.containment)
+    if observation.outline is not None and s.coverage.weight > 0:
+        result['coverage'] = coverage(surface, observation.outline, s.coverage)
+    if observation.edges is not None and s.edges.weight > 0:
+        result['edges'] = edges(surface, observation.edges, s.edges)
+    if textures is None or which is None:
+        return result
+    if observation.intensity is not None and s.intensity.weight > 0:
+        result['intensity'] = intensity(
+            frames, camera, textures, which, observation.intensity, s.intensity
+        )
+    if observation.flow is not None and s.motion.weight > 0:
+        result['motion'] = motion(frames, camera, textures, which, observation.flow, s.motion)
+    return result
+
+
+def _assembled(frames: Frames, terms: list[Residuals]) -> Energy:
+    count = len(frames.skeleton.parents)
+    value = np.zeros(frames.count)
+    wrenches = np.zeros((count, 6, frames.count))
+    stiffnesses = np.zeros((count, 6, 6, frames.count))
+    for term in terms:
+        segments = term.segments
+        points, directions = term.points, term.directions
+        pull, curvature = term.pull, term.curvature
+        value += term.value
+        if segments.ndim == 1:
+            force, stiffness = segment_sums(segments, points, directions, pull, curvature, count)
+        else:
+            force, stiffness = _scattered_sums(term, count)
+        wrenches += force
+        stiffnesses += stiffness
+    return Energy(value, *assemble(frames, wrenches, stiffnesses))
+
+
+def _scattered_sums(term: Residuals, count: int) -> tuple[Array, Array]:
+    """`segment_sums` where the segment of a residual differs from pose to pose."""
+    n = term.points.shape[-1]
+    a, p = term.directions, term.points
+    b = np.concatenate([a, np.cross(p, a, axis=1)], axis=1).transpose(0, 2, 1)  # (M, N, 6)
+    owners = (term.segments * n + np.arange(n)).ravel()
+    order = np.argsort(owners, kind='stable')
+    present, starts = np.unique(owners[order], return_index=True)
+    force = (term.pull[..., None] * b).reshape(-1, 6)[order]
+    outer = ((term.curvature[..., None] * b)[..., None] * b[..., None, :]).reshape(-1, 36)[order]
+    wrenches, stiffnesses = np.zeros((count * n, 6)), np.zeros((count * n, 36))
+    wrenches[present] = np.add.reduceat(force, starts)
+    stiffnesses[present] = np.add.reduceat(outer, starts)
+    return (
+        wrenches.reshape(count, n, 6).transpose(0, 2, 1),
+        stiffnesses.reshape(count, n, 6, 6).transpose(0, 2, 3, 1),
+    )
+
+
+def geman_mcclure(residual: Array, scale: float, weight: Array | float) -> tuple[Array, ...]:
+    """Values, derivatives and curvatures of the robust kernel."""
+    square = residual * residual
+    shrink = 1.0 / (1.0 + square / (scale * scale))
+    curvature = weight * shrink * shrink
+    return 0.5 * weight * square * shrink, curvature * residual, curvature
+
+
+def sample(image_map: ImageMap, pixels: Array, channels: Index | int = 0) -> tuple[Array, Array]:
+    """Values (...) and gradients (2, ...) at pixels (2, ...); the nearest value outside."""
+    _, h, w = image_map.values.shape
+    x, y = pixels[0] - image_map.left, pixels[1] - image_map.top
+    cx = np.clip(np.nan_to_num(x), 0.0, w - 1.001)
+    cy = np.clip(np.nan_to_num(y), 0.0, h - 1.001)
+    column, row = cx.astype(np.intp), cy.astype(np.intp)
+    du, dv = cx - column, cy - row
+    flat = image_map.values.reshape(-1)
+    index = (np.asarray(channels) * h + row) * w + column
+    a, b, p, q = flat[index], flat[index + 1], flat[index + w], flat[index + w + 1]
+    top, bottom = a + (b - a) * du, p + (q - p) * du
+    gradient = np.stack([(b - a) * (1 - dv) + (q - p) * dv, bottom - top])
+    gradient[0] *= (x >= 0) & (x <= w - 1)
+    gradient[1] *= (y >= 0) & (y <= h - 1)
+    return top + (bottom - top) * dv, gradient
+
+
+def sample_distance(
+    image_map: ImageMap, pixels: Array, channels: Index | int = 0
+) -> tuple[Array, Array]:
+    """`sample` of a map of distances, continued outside by the way to the window."""
+    value, gradient = sample(image_map, pixels, channels)
+    _, h, w = image_map.values.shape
+    for axis, (first, size) in enumerate(((image_map.left, w), (image_map.top, h))):
+        at = pixels[axis] - first
+        value = value + np.maximum(-at, 0.0) + np.maximum(at - (size - 1), 0.0)
+        gradient[axis] = np.where(at < 0, -1.0, np.where(at > size - 1, 1.0, gradient[axis]))
+    return value, gradient
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Occluding contours of N poses in the image: P points.
+
+    Attributes:
+        segments: (P,).
+        points: (P, 3, N) camera frame, m.
+        pixels, projection, normals: (2, P, N), (2, 3, P, N), (2, P, N).
+        valid, covered, hidden: (P, N), see `hmt_ros.image.surface.Contour`.
+    """
+
+    segments: Index
+    points: Array
+    pixels: Array
+    projection: Array
+    normals: Array
+    valid: Mask
+    covered: Mask
+    hidden: Mask
+
+
+def project_surface(body: Body, camera: Camera, frames: Frames) -> Surface:
+    """Contours of the flesh at the frames of N poses."""
+    contour = occluding_contour(body.flesh, frames)
+    pixels, projection = camera.project_with_derivative(contour.points.transpose(1, 0, 2))
+    valid = contour.exists & np.isfinite(pixels[0])
+    # The normal of the contour is perpendicular to the ray: only its image part matters.
+    normals = np.stack([contour.normals[:, 0] / camera.fx, contour.normals[:, 1] / camera.fy])
+    normals /= np.maximum(np.hypot(normals[0], normals[1]), 1e-12)
+    covered, hidden = visibility(body, frames, contour.points, contour.parts)
+    return Surface(
+        contour.segments, contour.points, np.nan_to_num(pixels), np.nan_to_num(projection),
+        normals, valid, covered, hidden,
+    )  # fmt: skip
+
+
+def visibility(body: Body, frames: Frames, points: Array, parts: Index) -> tuple[Mask, Mask]:
+    """Whether other parts lie on the rays to points (P, 3, N), and whether before them; (P, N)."""
+    flesh = body.flesh
+    segments = np.array([part.segment for part in flesh.parts])
+    radii = COVER * np.array([part.radii for part in flesh.parts])
+    centres = frames.points(segments, np.array([part.centre for part in flesh.parts]))
+    n, count = frames.count, len(segments)
+    scaled = frames.columns[segments] / radii[:, :, None, None]  # (B, 3 axes, 3, N)
+    k = np.einsum('bixn,bxn->nbi', scaled, centres)
+    shapes = np.ascontiguousarray(scaled.reshape(-1, 3, n).transpose(2, 0, 1))
+    m = shapes @ np.ascontiguousarray(points.transpose(2, 1, 0))  # (N, 3B, P)
+    m = m.reshape(n, count, 3, -1)
+    mm = np.einsum('nbip,nbip->nbp', m, m)
+    mk = np.einsum('nbip,nbi->nbp', m, k)
+    discriminant = mk * mk - mm * ((k * k).sum(2) - 1.0)[:, :, None]
+    through = (discriminant > 0) & (np.arange(count)[:, None] != parts)
+    before = through & (mk - np.sqrt(np.maximum(discriminant, 0.0)) < (1.0 - HIDDEN) * mm)
+    return through.any(1).T, before.any(1).T
+
+
+def containment(surface: Surface, distance: ImageMap, term: TermSettings) -> Residuals:
+    """Contour points outside the silhouette pay their distance to it."""
+    value, gradient = sample_distance(distance, surface.pixels)
+    out = surface.valid & (value > 0)
+    residual = np.where(out, value / term.sigma, 0.0)
+    each = term.weight / len(residual)
+    rho, pull, curvature = geman_mcclure(residual, term.scale, each)
+    return Residuals(
+        rho.sum(0), surface.segments, surface.points,
+        _through(gradient / term.sigma, surface.projection), pull, np.where(out, curvature, 0.0),
+    )  # fmt: skip
+
+
+def coverage(surface: Surface, outline: Outline, term: TermSettings) -> Residuals:
+    """Points on the outline pay their distance to the nearest contour of the model."""
+    match = nearest_contour_points(surface, outline)  # (M, N)
+    batch = np.arange(match.shape[1])
+    offset = surface.pixels[:, match, batch] - outline.pixels.T[:, :, None]
+    nx, ny = outline.normals.T[:, :, None]
+    across = (nx * offset[0] + ny * offset[1]) / term.sigma
+    along = nx * offset[1] - ny * offset[0]
+    beyond = np.sign(along) * np.maximum(np.abs(along) - SPACING, 0.0) / term.sigma
+    # One kernel on the length of the two residuals together.
+    each = term.weight / max(len(match), 1)
+    rho, _, curvature = geman_mcclure(np.hypot(across, beyond), term.scale, each)
+    # Where nothing of the body is before the camera every sample costs all that it can.
+    seen = surface.valid.any(0)
+    rho = np.where(seen, rho, 0.5 * each * term.scale**2)
+    curvature = np.where(seen, curvature, 0.0)
+    projection = surface.projection[:, :, match, batch]  # (2, 3, M, N)
+    toward = nx * projection[0] + ny * projection[1]
+    sideways = nx * projection[1] - ny * projection[0]
+    directions = np.concatenate([toward, sideways], axis=1).transpose(1, 0, 2) / term.sigma
+    return Residuals(
+        rho.sum(0),
+        np.tile(surface.segments[match], (2, 1)),
+        np.tile(surface.points[match, :, batch].transpose(0, 2, 1), (2, 1, 1)),
+        directions,
+        np.concatenate([curvature * across, curvature * beyond]),
+        np.concatenate([curvature, np.where(beyond != 0, curvature, 0.0)]),
+    )
+
+
+def nearest_contour_points(surface: Surface, outline: Outline) -> Index:
+    """Index (M, N) of the contour point nearest to each sample, by position and direction.
+
+    |c - u|^2 + t^2 |n_c - n_u|^2, up to what does not depend on u, is one matrix product.
+    """
+    centre = outline.pixels.mean(0)
+    samples = np.concatenate(
+        [
+            -2.0 * (outline.pixels - centre),
+            np.ones((len(outline.pixels), 1)),
+            -2.0 * TURN**2 * outline.normals,
+        ],
+        axis=1,
+    )
+    use = surface.valid & ~surface.covered
+    # A pose whose contour is covered everywhere keeps all that exists.
+    use |= surface.valid & ~use.any(0)
+    u = np.where(use, surface.pixels - centre[:, None, None], 0.0)
+    square = np.where(use, u[0] * u[0] + u[1] * u[1], 1e12)
+    features = np.stack([u[0], u[1], square, surface.normals[0], surface.normals[1]])
+    features = np.ascontiguousarray(features.transpose(2, 0, 1))  # (N, 5, P)
+    return np.ascontiguousarray((samples @ features).argmin(2).T)
+
+
+def edges(surface: Surface, image_map: ImageMap, term: TermSettings) -> Residuals:
+    """Visible contour points pay their distance to the nearest edge of their direction."""
+    bins = image_map.values.shape[0]
+    angle = np.arctan2(surface.normals[1], surface.normals[0])
+    channels = np.round(angle * (bins / np.pi)).astype(np.intp) % bins
+    value, gradient = sample_distance(image_map, surface.pixels, channels)
+    seen = surface.valid & ~surface.hidden
+    each = np.where(seen, term.weight / np.maximum(seen.sum(0), FEWEST), 0.0)
+    residual = np.where(seen, value / term.sigma, 0.0)
+    rho, pull, curvature = geman_mcclure(residual, term.scale, each)
+    directions = _through(gradient / term.sigma, surface.projection)
+    return Residuals(rho.sum(0), surface.segments, surface.points, directions, pull, curvature)
+
+
+def intensity(
+    frames: Frames, camera: Camera, textures: Textures, which: Index, image_map: ImageMap,
+    term: TermSettings,
+) -> Residuals:  # fmt: skip
+    """Differences in colour between the texture and the image under it."""
+    segments, points, pixels, projection, each = _textured(frames, camera, textures, which, term)
+    at = np.broadcast_to(pixels[:, None], (2, 3, *pixels.shape[1:]))
+    value, slope = sample(image_map, at, np.arange(3)[:, None, None])  # (3, Q, N), (2, 3, Q, N)
+    error = (value - textures.colours[which].transpose(2, 1, 0)) / term.sigma
+    slope = slope / term.sigma
+    rho, _, curvature = geman_mcclure(np.sqrt((error * error).sum(0)), term.scale, each)
+    gradient = np.einsum('cqn,acqn->aqn', error, slope)
+    hessian = np.einsum('acqn,bcqn->abqn', slope, slope) + 1e-9 * np.eye(2)[:, :, None, None]
+    # As two residuals a point: with the Hessian G = L L^T, directions L^T and pulls L^-1 g.
+    l00 = np.sqrt(hessian[0, 0])
+    l10 = hessian[0, 1] / l00
+    l11 = np.sqrt(np.maximum(hessian[1, 1] - l10 * l10, 1e-12))
+    first = gradient[0] / l00
+    second = (gradient[1] - l10 * first) / l11
+    along = l00 * projection[0] + l10 * projection[1]  # (3, Q, N)
+    return _pairs(rho, segments, points, along, l11 * projection[1], first, second, curvature)
+
+
+def motion(
+    frames: Frames, camera: Camera, textures: Textures, which: Index, flow: ImageMap,
+    term: TermSettings,
+) -> Residuals:  # fmt: skip
+    """Differences between the motion of the texture in the image and the optical flow."""
+    segments, points, pixels, projection, each = _textured(frames, camera, textures, which, term)
+    start = textures.pixels.transpose(2, 0, 1)  # (2, K, Q)
+    at = np.broadcast_to(start[:, None], (2, 2, *start.shape[1:]))
+    moved, _ = sample(flow, at, np.arange(2)[:, None, None])  # (2, K, Q)
+    inverse = 1.0 / (term.sigma + FLOW_ERROR * np.hypot(moved[0], moved[1]))[which].T
+    error = (pixels - (start + moved)[:, which].transpose(0, 2, 1)) * inverse
+    rho, _, curvature = geman_mcclure(np.hypot(error[0], error[1]), term.scale, each)
+    return _pairs(
+        rho, segments, points, projection[0] * inverse, projection[1] * inverse, error[0],
+        error[1], curvature,
+    )  # fmt: skip
+
+
+def _textured(
+    frames: Frames, camera: Camera, textures: Textures, which: Index, term: TermSettings
+) -> tuple[Index, Array, Array, Array, Array]:
+    """Where the points of the textures are: segments, points, pixels, projections, weights."""
+    segments = textures.segments[which].T  # (Q, N)
+    local = textures.local[which].transpose(1, 2, 0)
+    batch = np.arange(frames.count)
+    columns = frames.columns[segments, :, :, batch]  # (Q, N, 3, 3)
+    points = np.einsum('qnix,qin->qxn', columns, local)
+    points += frames.origins[segments, :, batch].transpose(0, 2, 1)
+    pixels, projection = camera.project_with_derivative(points.transpose(1, 0, 2))
+    present = np.arange(len(segments))[:, None] < textures.counts[which]
+    each = term.weight / np.maximum(textures.counts[which], FEWEST)
+    each = np.where(present & np.isfinite(pixels[0]), each, 0.0)
+    return segments, points, np.nan_to_num(pixels), np.nan_to_num(projection), each
+
+
+def _pairs(
+    rho: Array, segments: Index, points: Array, along: Array, across: Array, first: Array,
+    second: Array, curvature: Array,
+) -> Residuals:  # fmt: skip
+    """Two residuals a point, whose derivatives (3, Q, N) are given."""
+    return Residuals(
+        rho.sum(0),
+        np.tile(segments, (2, 1)),
+        np.tile(points, (2, 1, 1)),
+        np.concatenate([along.transpose(1, 0, 2), across.transpose(1, 0, 2)]),
+        np.concatenate([curvature * first, curvature * second]),
+        np.concatenate([curvature, curvature]),
+    )
+
+
+def _through(gradient: Array, projection: Array) -> Array:
+    """Derivatives (P, 3, N) by the points of residuals with gradients (2, P, N) by the pixels."""
+    result: Array = np.einsum('apn,aipn->pin', gradient, projection)
+    return result
+
+
+def capture_textures(
+    body: Body, camera: Camera, frames: Frames, intensity_map: ImageMap, points: int = 120
+) -> Textures:
+    """Textures of the surface visible at K poses, as `hmt_ros.image.texture.capture_textures`."""
+    mesh = coarse_mesh(body)
+    places = frames.points(mesh.segments, mesh.vertices)
+    normals = frames.directions(mesh.segments, mesh.normals)
+    distance = np.sqrt((places * places).sum(1))
+    facing = -(places * normals).sum(1) > FACING * distance
+    _, hidden = visibility(body, frames, places, mesh.parts)
+    pixels = camera.project(places.transpose(0, 2, 1)).transpose(2, 0, 1)  # (2, V, K)
+    inside = (pixels[0] >= 0) & (pixels[0] < camera.width)
+    inside &= (pixels[1] >= 0) & (pixels[1] < camera.height)
+    visible = facing & ~hidden & inside
+    k = frames.count
+    result = Textures(
+        np.zeros(k, np.int64), np.zeros((k, points), np.int64), np.zeros((k, points, 3)),
+        np.zeros((k, points, 2)), np.zeros((k, points, 3)),
+    )  # fmt: skip
+    for i in range(k):
+        seen = np.flatnonzero(visible[:, i])
+        taken = min(len(seen), points)
+        chosen = seen[(np.arange(taken) * len(seen)) // max(taken, 1)]
+        at = pixels[:, chosen, i]
+        result.counts[i] = taken
+        result.segments[i, :taken] = mesh.segments[chosen]
+        result.local[i, :taken] = mesh.vertices[chosen]
+        result.pixels[i, :taken] = at.T
+        both = np.broadcast_to(at[:, None], (2, 3, taken))
+        result.colours[i, :taken] = sample(intensity_map, both, np.arange(3)[:, None])[0].T
+    return result

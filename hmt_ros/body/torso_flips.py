@@ -1,0 +1,150 @@
+"""Flips of the torso: the pelvis and the trunk leaning or turning the other way in depth (KJS 3).
+
+The line of the hips may turn towards or away from the camera, the neck may lie before or behind the
+pelvis, and the line of the shoulders may turn either way: three binary choices, with nearly the same
+image. The torso is not a chain of links that each end in one joint, so its flips do not keep the image
+of hips and shoulders exactly; limbs are then put back onto their rays by `rehang_chain`.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.body.skeleton import Skeleton
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+JOINTS = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
+# A flip that moves no joint of the torso by more than this in depth is none, m.
+SIGNIFICANT = 0.04
+
+
+def flip_torso(body: Body, poses: ArrayLike) -> tuple[Array, Index]:
+    """Poses whose torso is flipped in depth, up to seven for each given one.
+
+    Args:
+        body: with the joints of a torso, a root that turns about z, y and x, and a segment 'trunk' that
+            turns about x, y and, if it can twist, z. Other bodies have no such flips.
+        poses: (N, d).
+
+    Returns:
+        poses (M, d) within the limits, limbs at their old angles, and the index (M,) of the pose that
+        each comes from.
+    """
+    skeleton = body.skeleton
+    q = np.array(poses, dtype=np.float64, ndmin=2)
+    root, trunk = _root_dofs(skeleton), _trunk_dofs(skeleton)
+    if root is None or trunk is None or not set(JOINTS) <= set(skeleton.joint_names):
+        return np.empty((0, body.dimension)), np.empty(0, dtype=np.intp)
+    frames = forward(skeleton, q)
+    which = skeleton.joint_index(JOINTS)
+    torso = frames.points(skeleton.joint_segments[which], skeleton.joint_offsets[which])
+    pelvis, neck, left_hip, right_hip, left_shoulder, right_shoulder = torso
+    hips, shoulders = right_hip - left_hip, right_shoulder - left_shoulder
+    up = neck - pelvis
+    result, parents = [], []
+    for turn_hips, lean, turn_shoulders in itertools.product((False, True), repeat=3):
+        if not (turn_hips or lean or turn_shoulders):
+            continue
+        if len(trunk) < 2 and (lean or turn_shoulders != turn_hips):
+            continue
+        wanted_hips = _turned(hips, pelvis) if turn_hips else hips
+        wanted_up = _leaned(pelvis, neck) if lean else up
+        wanted_shoulders = _turned(shoulders, neck) if turn_shoulders else shoulders
+        change = np.abs(wanted_hips[2] - hips[2]) * turn_hips
+        change = np.maximum(change, np.abs(wanted_up[2] - up[2]))
+        change = np.maximum(change, np.abs(wanted_shoulders[2] - shoulders[2]))
+        new = q.copy()
+        fits = change > SIGNIFICANT
+        if turn_hips:
+            fits &= _turn_root(skeleton, frames, root, wanted_hips, new)
+        if len(trunk) >= 2:
+            fits &= _turn_trunk(skeleton, trunk, wanted_up, wanted_shoulders, new)
+        result.append(new[fits])
+        parents.append(np.flatnonzero(fits))
+    order = np.argsort(np.concatenate(parents), kind='stable')
+    return np.concatenate(result)[order], np.concatenate(parents)[order]
+
+
+def _root_dofs(skeleton: Skeleton) -> tuple[int, ...] | None:
+    """The rotations of the root, if they are about z, y and x in this order."""
+    own = [j for j in skeleton.segment_dofs[0] if skeleton.dof_is_rotation[j]]
+    axes = ''.join('xyz'[skeleton.dof_axes[j]] for j in own)
+    return tuple(own) if axes == 'zyx' else None
+
+
+def _trunk_dofs(skeleton: Skeleton) -> tuple[int, ...] | None:
+    """The rotations of the trunk, if they are about x, y and z, or x and y, or none."""
+    if 'trunk' not in skeleton.segment_names:
+        return None
+    own = skeleton.segment_dofs[skeleton.segment_names.index('trunk')]
+    axes = ''.join('xyz'[skeleton.dof_axes[j]] for j in own)
+    return own if axes in ('', 'xy', 'xyz') else None
+
+
+def _turned(line: Array, at: Array) -> Array:
+    """A line (3, N) with its component along the ray to a point reversed."""
+    ray = at / np.sqrt((at * at).sum(0))
+    result: Array = line - 2.0 * (line * ray).sum(0) * ray
+    return result
+
+
+def _leaned(start: Array, end: Array) -> Array:
+    """The other vector (3, N) from a start to the ray of an end, of the same length."""
+    distance = np.sqrt((end * end).sum(0))
+    ray = end / distance
+    result: Array = (2.0 * (ray * start).sum(0) - distance) * ray - start
+    return result
+
+
+def _turn_root(
+    skeleton: Skeleton, frames: Frames, dofs: tuple[int, ...], hips: Array, poses: Array
+) -> NDArray[np.bool_]:
+    """Turns the root so that its x axis follows the hips and its z axis stays as near as it can."""
+    x = hips / np.sqrt((hips * hips).sum(0))
+    z = frames.columns[0, 2]
+    z = z - (z * x).sum(0) * x
+    z = z / np.maximum(np.sqrt((z * z).sum(0)), 1e-9)
+    y = np.cross(z, x, axis=0)
+    r = np.einsum('ji,jkn->ikn', skeleton.mounts[0], np.stack([x, y, z], axis=1))
+    b = -np.arcsin(np.clip(r[2, 0], -1.0, 1.0))
+    a, c = np.arctan2(r[1, 0], r[0, 0]), np.arctan2(r[2, 1], r[2, 2])
+    return _set_within_limits(skeleton, dofs, (a, b, c), poses)
+
+
+def _turn_trunk(
+    skeleton: Skeleton, dofs: tuple[int, ...], up: Array, shoulders: Array, poses: Array
+) -> NDArray[np.bool_]:
+    """Turns the trunk so that it points up as wanted and its x axis follows the shoulders."""
+    trunk = skeleton.segment_names.index('trunk')
+    frames = forward(skeleton, poses)
+    base = np.einsum('ixn,ij->jxn', frames.columns[skeleton.parents[trunk]], skeleton.mounts[trunk])
+    # The trunk runs along its negative z axis: (sin b, -sin a cos b, cos a cos b) = base^T (-up).
+    v = -(base * (up / np.sqrt((up * up).sum(0)))).sum(1)
+    b = np.arcsin(np.clip(v[0], -1.0, 1.0))
+    a = np.arctan2(-v[1], v[2])
+    if len(dofs) == 2:
+        return _set_within_limits(skeleton, dofs, (a, b), poses)
+    tilted = poses.copy()
+    tilted[:, dofs[0]], tilted[:, dofs[1]], tilted[:, dofs[2]] = a, b, 0.0
+    columns = forward(skeleton, tilted).columns[trunk]
+    c = np.arctan2((columns[1] * shoulders).sum(0), (columns[0] * shoulders).sum(0))
+    return _set_within_limits(skeleton, dofs, (a, b, c), poses)
+
+
+def _set_within_limits(
+    skeleton: Skeleton, dofs: tuple[int, ...], angles: tuple[Array, ...], poses: Array
+) -> NDArray[np.bool_]:
+    """Writes angles into poses (N, d), nearest to the old ones modulo a turn; where they fit."""
+    fits = np.ones(len(poses), dtype=bool)
+    for j, angle in zip(dofs, angles, strict=True):
+        near = angle + 2 * np.pi * np.round((poses[:, j] - angle) / (2 * np.pi))
+        fits &= (near >= skeleton.lower[j]) & (near <= skeleton.upper[j])
+        poses[:, j] = near
+    return fits

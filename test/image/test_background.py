@@ -1,0 +1,124 @@
+"""Silhouettes by background subtraction: on made-up scenes, and on rendered ones with known masks."""
+
+import cv2
+import numpy as np
+import pytest
+
+from hmt_ros.image.background import BackgroundModel, BackgroundSettings
+
+METHODS = ('mog2', 'knn')
+
+
+@pytest.fixture(scope='module')
+def scene():
+    """An empty scene (120, 160, 3) with some texture."""
+    rng = np.random.default_rng(0)
+    return cv2.GaussianBlur(rng.integers(60, 200, (120, 160, 3)).astype(np.uint8), (0, 0), 3)
+
+
+def noisy(image, seed, sigma=2.0):
+    noise = np.random.default_rng(seed).normal(0, sigma, image.shape)
+    return np.clip(image + noise, 0, 255).astype(np.uint8)
+
+
+def model(scene, method):
+    return BackgroundModel.from_image(scene, BackgroundSettings(method=method))
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_what_differs_is_found_and_the_empty_scene_is_empty(scene, method):
+    background = model(scene, method)
+    assert not background.silhouette(noisy(scene, 1)).any()
+    image = noisy(scene, 2)
+    image[30:90, 60:90] = (10, 240, 30)
+    found = background.silhouette(image)
+    assert found.dtype == bool
+    wanted = np.zeros(found.shape, dtype=bool)
+    wanted[30:90, 60:90] = True
+    assert (found ^ wanted).sum() <= 4
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_shadow_is_no_foreground(scene, method):
+    background = model(scene, method)
+    image = scene.copy()
+    image[20:100, 10:50] = (0.6 * image[20:100, 10:50]).astype(np.uint8)
+    image[30:90, 60:90] = (10, 240, 30)
+    found = background.silhouette(image)
+    assert found[20:100, 10:50].mean() < 0.01
+    assert found[30:90, 60:90].mean() > 0.99
+    strict = BackgroundModel.from_image(
+        scene, BackgroundSettings(method=method, shadow_threshold=0.9)
+    )
+    assert strict.silhouette(image)[20:100, 10:50].mean() > 0.9
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_background_learned_while_a_person_walks_through(scene, method):
+    background = BackgroundModel(BackgroundSettings(method=method))
+    with pytest.raises(ValueError, match='no background has been learned'):
+        background.silhouette(scene)
+    for i in range(40):
+        image = noisy(scene, i)
+        image[30:90, 4 * i : 4 * i + 20] = (10, 240, 30)
+        background.learn(image)
+    assert background.frames == 40
+    image = noisy(scene, 99)
+    image[40:100, 100:130] = (200, 20, 30)
+    found = background.silhouette(image)
+    assert found[40:100, 100:130].mean() > 0.97
+    found[38:102, 98:132] = False
+    assert found.mean() < 0.01
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_asking_for_a_silhouette_does_not_teach(scene, method):
+    background = model(scene, method)
+    image = scene.copy()
+    image[30:90, 60:90] = (10, 240, 30)
+    first = background.silhouette(image)
+    for _ in range(20):
+        last = background.silhouette(image)
+    assert np.array_equal(first, last)
+
+
+def test_small_and_distant_pieces_are_left_out(scene):
+    background = BackgroundModel.from_image(
+        scene, BackgroundSettings(smallest_part=0.02, largest_gap=0.2)
+    )
+    image = scene.copy()
+    image[30:90, 60:90] = (10, 240, 30)  # 60 high: pieces within 12 px are the person's
+    image[40:60, 96:106] = (10, 240, 30)
+    image[40:60, 130:140] = (10, 240, 30)
+    image[75:80, 98:103] = (10, 240, 30)
+    found = background.silhouette(image)
+    assert found[40:60, 96:106].mean() > 0.9
+    assert not found[:, 120:].any()
+    assert not found[70:85, 92:110].any()
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_an_image_of_another_size_is_refused_and_changes_nothing(scene, method):
+    background = model(scene, method)
+    image = scene.copy()
+    image[30:90, 60:90] = (10, 240, 30)
+    before = background.silhouette(image)
+    for wrong in (scene[:60], scene[:, :80], scene[:, :, 0]):
+        with pytest.raises(ValueError, match='60|80|120'):
+            background.silhouette(np.ascontiguousarray(wrong))
+    assert np.array_equal(background.silhouette(image), before)
+    assert before.sum() > 1700
+
+
+def test_unknown_method_is_refused():
+    with pytest.raises(ValueError, match="'median'"):
+        BackgroundSettings(method='median')
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_rendered_person_with_shadow_and_noise(shot, method):
+    background = BackgroundModel.from_image(shot.background, BackgroundSettings(method=method))
+    for image, mask in zip(shot.images, shot.masks):
+        found = background.silhouette(image)
+        overlap = (found & mask).sum() / (found | mask).sum()
+        assert overlap > 0.8

@@ -1,0 +1,448 @@
+"""The compiled terms of the likelihood against vectorised numpy, finite differences and ray marching."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks import numpy_likelihood as oracle
+from hmt_ros.body import Camera, load_body
+from hmt_ros.body.flesh import occluding_contour
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image import likelihood as likelihood_module
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
+from hmt_ros.image.observation import Keypoints, Observation, observe
+from hmt_ros.image.surface import COVER, HIDDEN
+from hmt_ros.image.texture import capture_textures
+
+IMAGE_TERMS = ('containment', 'coverage', 'edges', 'intensity', 'motion')
+CONTOUR_TERMS = IMAGE_TERMS[:3]
+OFF = TermSettings(0.0, 1.0, 1.0)
+
+LENSES = {
+    'pinhole': ((), 'plumb_bob'),
+    'plumb_bob': ((-0.25, 0.06, 0.002, -0.001, 0.01), 'plumb_bob'),
+    'rational': ((0.1, 0.03, 0.001, 0.001, 0.02, 0.3, 0.02, 0.01), 'rational_polynomial'),
+    'fisheye': ((0.02, -0.01, 0.003, 0.001), 'equidistant'),
+}
+
+
+def keypoints_of(shot, sigma=2.0, seed=0):
+    rng = np.random.default_rng(seed)
+    pixels = shot.camera.project(shot.body.joint_positions(shot.poses[1:]))[0]
+    root = rng.normal(size=(len(pixels), 2, 2))
+    covariances = sigma**2 * (root @ root.transpose(0, 2, 1) + np.eye(2))
+    noise = sigma * rng.normal(size=pixels.shape)
+    return Keypoints(shot.body.joint_names, pixels + noise, covariances, np.ones(len(pixels)))
+
+
+@pytest.fixture(scope='module')
+def observation(shot):
+    return observe(
+        shot.images[1], shot.masks[1], keypoints_of(shot), last_image=shot.images[0]
+    )
+
+
+@pytest.fixture(scope='module')
+def textures(shot):
+    frames = forward(shot.body.skeleton, np.concatenate([shot.poses[:1], shot.near(2, 9)]))
+    before = observe(shot.images[0], shot.masks[0])
+    return capture_textures(shot.body, shot.camera, frames, before.intensity)
+
+
+def only(likelihood, *names):
+    """The likelihood with some of its terms."""
+    terms = {
+        name: getattr(likelihood.settings, name) if name in names else OFF
+        for name in (*IMAGE_TERMS, 'joints')
+    }
+    return replace(likelihood, settings=replace(likelihood.settings, **terms))
+
+
+def evaluate(likelihood, poses, observation, textures, **more):
+    which = np.arange(len(poses)) % len(textures.counts)
+    frames = forward(likelihood.body.skeleton, poses)
+    return likelihood.image_energy(frames, observation, textures, which, **more)
+
+
+def assert_same(found, wanted, tolerance=1e-9):
+    """Equal up to a tolerance relative to the largest entry of each pose."""
+    axes = tuple(range(1, found.ndim))
+    scale = np.abs(wanted).max(axis=axes, keepdims=True) if axes else np.abs(wanted)
+    assert (np.abs(found - wanted) <= tolerance * (scale + 1e-12)).all()
+
+
+def compare(body, camera, poses, observation, textures):
+    likelihood = ImageLikelihood(body, camera)
+    which = np.arange(len(poses)) % len(textures.counts)
+    wanted = oracle.image_energies(likelihood, poses, observation, textures, which)
+    assert tuple(wanted) == IMAGE_TERMS
+    for name, energy in wanted.items():
+        found = evaluate(only(likelihood, name), poses, observation, textures)
+        assert list(found.terms) == [name]
+        assert_same(found.value, energy.value)
+        assert_same(found.gradient, energy.gradient)
+        assert_same(found.hessian, energy.hessian)
+    together = evaluate(only(likelihood, *IMAGE_TERMS), poses, observation, textures)
+    assert_same(together.value, sum(e.value for e in wanted.values()))
+    assert_same(together.hessian, sum(e.hessian for e in wanted.values()))
+
+
+@pytest.mark.parametrize('lens', LENSES)
+def test_kernels_equal_numpy(shot, observation, textures, lens):
+    c = shot.camera
+    distortion, model = LENSES[lens]
+    camera = Camera(c.fx, c.fy, c.cx, c.cy, c.width, c.height, distortion, model)
+    compare(shot.body, camera, shot.near(24, 1), observation, textures)
+
+
+def test_kernels_equal_numpy_far_from_the_truth(shot, observation, textures):
+    """Also where limbs leave the image or come behind the camera."""
+    poses = shot.near(24, 2, spread=0.5)
+    poses[:6, 2] -= 3.0
+    poses[6:9, 2] = -1.0
+    poses[9:12, 0] += 2.0
+    depths = shot.body.joint_positions(poses)[..., 2]
+    assert (depths < 0).any()
+    compare(shot.body, shot.camera, poses, observation, textures)
+
+
+@pytest.mark.parametrize('name', ['human34', 'human32'])
+def test_kernels_equal_numpy_for_other_bodies(shot, observation, name):
+    body = load_body(name).with_stature(1.6)
+    rng = np.random.default_rng(5)
+    poses = np.clip(0.2 * rng.normal(size=(10, body.dimension)), body.lower, body.upper)
+    poses[:, :3] = shot.poses[1, :3]
+    frames = forward(body.skeleton, poses[:3])
+    before = observe(shot.images[0], shot.masks[0])
+    textures = capture_textures(body, shot.camera, frames, before.intensity)
+    compare(body, shot.camera, poses, observation, textures)
+
+
+def test_kernels_equal_numpy_where_the_image_cuts_the_person(shot):
+    cut = [np.ascontiguousarray(x[:, 130:200]) for x in shot.images]
+    masks = [np.ascontiguousarray(x[:, 130:200]) for x in shot.masks]
+    assert masks[1][:, 0].any() or masks[1][:, -1].any() or masks[1].any()
+    c = shot.camera
+    camera = Camera(c.fx, c.fy, c.cx - 130, c.cy, 70, c.height)
+    before = observe(cut[0], masks[0])
+    textures = capture_textures(
+        shot.body, camera, forward(shot.body.skeleton, shot.poses[:1]), before.intensity
+    )
+    compare(
+        shot.body, camera, shot.near(12, 3), observe(cut[1], masks[1], last_image=cut[0]), textures
+    )
+
+
+def test_textures_equal_numpy(shot):
+    before = observe(shot.images[0], shot.masks[0])
+    frames = forward(shot.body.skeleton, shot.near(6, 4, spread=0.3))
+    arguments = (shot.body, shot.camera, frames, before.intensity)
+    found, wanted = capture_textures(*arguments), oracle.capture_textures(*arguments)
+    assert np.array_equal(found.counts, wanted.counts)
+    assert found.counts.min() > 40
+    assert np.array_equal(found.segments, wanted.segments)
+    for a, b in zip(found[2:], wanted[2:]):
+        assert np.allclose(a, b, rtol=1e-12, atol=1e-9)
+
+
+def test_textures_are_the_colours_of_the_image(shot):
+    before = observe(shot.images[0], shot.masks[0])
+    found = capture_textures(
+        shot.body, shot.camera, forward(shot.body.skeleton, shot.poses[:1]), before.intensity
+    )
+    count = found.counts[0]
+    u, v = found.pixels[0, :count].astype(int).T
+    assert cv2.dilate(shot.masks[0].astype(np.uint8), np.ones((3, 3)))[v, u].all()
+    blurred = cv2.GaussianBlur(shot.images[0], (0, 0), 1.5).astype(float)
+    around = [blurred[np.minimum(v + i, 239), u + j] for i in (0, 1) for j in (0, 1)]
+    assert (found.colours[0, :count] > np.min(around, axis=0) - 1).all()
+    assert (found.colours[0, :count] < np.max(around, axis=0) + 1).all()
+
+
+# Derivatives.
+
+
+def numerical_gradient(function, poses, step=1e-6):
+    result = np.empty_like(poses)
+    for j in range(poses.shape[1]):
+        shift = np.zeros(poses.shape[1])
+        shift[j] = step
+        result[:, j] = (function(poses + shift) - function(poses - shift)) / (2 * step)
+    return result
+
+
+def relative_errors(found, wanted):
+    return np.abs(found - wanted) / np.abs(wanted).max(axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize('name', ['joints', 'intensity', 'motion'])
+def test_gradients_of_smooth_terms(shot, observation, textures, name):
+    likelihood = only(ImageLikelihood(shot.body, shot.camera), name)
+    poses = shot.near(8, 6)
+
+    def value(x):
+        return evaluate(likelihood, x, observation, textures, derivatives=False).value
+
+    found = evaluate(likelihood, poses, observation, textures).gradient
+    errors = relative_errors(found, numerical_gradient(value, poses))
+    # A pixel may cross into the next cell of the bilinear image within a step.
+    assert np.quantile(errors, 0.99) < 1e-6
+    assert errors.max() < 0.02
+
+
+@pytest.mark.parametrize('name', CONTOUR_TERMS)
+def test_gradients_of_contour_terms_at_material_points(shot, observation, name):
+    """The gradient is that of points which stay where they are on the skin."""
+    body, camera = shot.body, shot.camera
+    likelihood = only(ImageLikelihood(body, camera), name)
+    poses = shot.near(6, 7)
+    frames = forward(body.skeleton, poses)
+    surface = oracle.project_surface(body, camera, frames)
+    local = occluding_contour(body.flesh, frames).local
+    term = getattr(likelihood.settings, name)
+
+    def value(x):
+        moved = forward(body.skeleton, x).points(surface.segments, local)
+        pixels, projection = camera.project_with_derivative(moved.transpose(1, 0, 2))
+        held = replace(surface, points=moved, pixels=pixels, projection=projection)
+        if name == 'containment':
+            return oracle.containment(held, observation.distance, term).value
+        if name == 'coverage':
+            return oracle.coverage(held, observation.outline, term).value
+        return oracle.edges(held, observation.edges, term).value
+
+    which = np.full(len(poses), -1)
+    found = likelihood.image_energy(frames, observation, None, which).gradient
+    errors = relative_errors(found, numerical_gradient(value, poses))
+    assert np.quantile(errors, 0.99) < 1e-6
+    assert errors.max() < 1e-3
+
+
+@pytest.mark.parametrize('name', CONTOUR_TERMS)
+def test_sliding_of_the_contour_hardly_changes_the_gradient(shot, observation, textures, name):
+    """On the contour the skin is tangent to the ray: its points slide along the contour only."""
+    likelihood = only(ImageLikelihood(shot.body, shot.camera), name)
+    poses = shot.near(8, 8)
+
+    def value(x):
+        return evaluate(likelihood, x, observation, textures, derivatives=False).value
+
+    found = evaluate(likelihood, poses, observation, textures).gradient
+    wanted = numerical_gradient(value, poses)
+    assert np.median(relative_errors(found, wanted)) < 2e-3
+    cosine = (found * wanted).sum(1) / np.linalg.norm(found, axis=1) / np.linalg.norm(wanted, axis=1)
+    assert cosine.min() > 0.999
+
+
+def test_gradient_and_hessian_of_the_soft_prior(shot):
+    likelihood = ImageLikelihood(shot.body, shot.camera)
+    poses = shot.near(5, 10, spread=0.4)
+    value, gradient, hessian = likelihood.prior(poses)
+    wanted = numerical_gradient(lambda x: likelihood.prior(x)[0], poses)
+    assert np.allclose(gradient, wanted, atol=1e-6)
+    known = np.isfinite(shot.body.prior_sigma)
+    offset = (poses - shot.body.prior_mean)[:, known] / shot.body.prior_sigma[known]
+    assert np.allclose(value, 0.5 * (offset**2).sum(1))
+    assert np.allclose(hessian[0, known][:, known], np.diag(shot.body.prior_sigma[known] ** -2.0))
+
+
+def test_self_intersection_falls_against_its_gradient(shot):
+    """A Gauss-Newton model with the radii of the parts held: a direction of descent, not exact."""
+    body = shot.body
+    likelihood = ImageLikelihood(body, shot.camera)
+    rng = np.random.default_rng(11)
+    poses = body.prior_mean + 0.5 * rng.normal(size=(200, body.dimension))
+    poses = np.clip(poses, body.lower, body.upper)
+    value, gradient, hessian = likelihood.intersection(forward(body.skeleton, poses))
+    touching = value > 0.01
+    assert touching.sum() > 20
+    assert not gradient[value == 0].any()
+    poses, value, gradient, hessian = (
+        x[touching] for x in (poses, value, gradient, hessian)
+    )
+    wanted = numerical_gradient(
+        lambda x: likelihood.intersection(forward(body.skeleton, x))[0], poses
+    )
+    cosine = (gradient * wanted).sum(1)
+    cosine /= np.linalg.norm(gradient, axis=1) * np.linalg.norm(wanted, axis=1)
+    assert cosine.min() > 0.5
+    assert np.median(cosine) > 0.98
+    # With one pair touching: 1/2 o^2 has the gradient o r and the Hessian r r^T, so H g = |r|^2 g.
+    assert (np.linalg.eigvalsh(hessian)[:, 0] > -1e-9 * value.max()).all()
+    step = 1e-4 * gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
+    after = likelihood.intersection(forward(body.skeleton, poses - step))[0]
+    assert (after < value).all()
+
+
+# Visibility.
+
+
+def test_visibility_agrees_with_marching_along_the_rays(shot):
+    body = shot.body
+    poses = shot.near(3, 12, spread=0.4)
+    frames = forward(body.skeleton, poses)
+    contour = occluding_contour(body.flesh, frames)
+    covered, hidden = oracle.visibility(body, frames, contour.points, contour.parts)
+    assert 0.1 < hidden.mean() < 0.9
+    assert (covered & ~hidden).any()
+    parts = body.flesh.parts
+    steps = np.linspace(0.2, 1.8, 6001)
+    agree = []
+    for n in range(len(poses)):
+        rotations = frames.rotations()[n]
+        for p in range(0, len(contour.points), 7):
+            ray = contour.points[p, :, n]
+            inside = np.zeros(len(steps), dtype=bool)
+            for b, part in enumerate(parts):
+                if b == contour.parts[p]:
+                    continue
+                place = frames.origins[part.segment, :, n] + rotations[part.segment] @ part.centre
+                local = (steps[:, None] * ray - place) @ rotations[part.segment]
+                inside |= ((local / (COVER * np.array(part.radii))) ** 2).sum(1) < 1
+            seen = (inside.any(), inside[steps < 1 - HIDDEN].any())
+            agree.append(seen == (covered[p, n], hidden[p, n]))
+    # Rays that graze a part by less than a step are missed.
+    assert np.mean(agree) > 0.985
+
+
+# Switches.
+
+
+def test_the_number_of_threads_does_not_matter(shot, observation, textures, monkeypatch):
+    poses = shot.near(23, 13)
+    results = []
+    for count in (1, 2, 3):
+        monkeypatch.setattr(likelihood_module, '_thread_count', lambda count=count: count)
+        likelihood = ImageLikelihood(shot.body, shot.camera)
+        found = evaluate(likelihood, poses, observation, textures)
+        results.append((found.value, found.gradient, found.hessian, found.costs))
+    for other in results[1:]:
+        assert all(np.array_equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_a_pose_does_not_depend_on_its_neighbours_in_the_batch(shot, observation, textures):
+    poses = shot.near(9, 14)
+    likelihood = ImageLikelihood(shot.body, shot.camera)
+    which = np.zeros(9, dtype=int)
+    together = likelihood.energy(poses, observation, textures, which)
+    for n in (0, 4, 8):
+        alone = likelihood.energy(poses[n : n + 1], observation, textures, which[:1])
+        for a, b in zip(together, alone):
+            assert_same(a[n : n + 1], b, 1e-12)
+
+
+def test_values_without_derivatives_are_the_same(shot, observation, textures):
+    likelihood = ImageLikelihood(shot.body, shot.camera)
+    poses = shot.near(5, 15)
+    full = evaluate(likelihood, poses, observation, textures)
+    bare = evaluate(likelihood, poses, observation, textures, derivatives=False)
+    assert bare.gradient is None
+    assert np.array_equal(full.value, bare.value)
+
+
+def test_terms_without_evidence_are_off(shot, textures):
+    likelihood = ImageLikelihood(shot.body, shot.camera)
+    poses = shot.near(2, 16)
+    image = shot.images[1]
+    assert set(evaluate(likelihood, poses, observe(image), textures).terms) == {'edges', 'intensity'}
+    empty = observe(image, np.zeros(image.shape[:2], dtype=bool))
+    assert set(evaluate(likelihood, poses, empty, textures).terms) == {'edges', 'intensity'}
+    full = observe(image, shot.masks[1], last_image=shot.images[0])
+    assert set(evaluate(likelihood, poses, full, textures).terms) == set(IMAGE_TERMS)
+    frames = forward(shot.body.skeleton, poses)
+    assert set(likelihood.image_energy(frames, full).terms) == set(CONTOUR_TERMS)
+    nothing = likelihood.image_energy(frames, Observation())
+    assert np.array_equal(nothing.value, np.zeros(2))
+    assert not nothing.hessian.any()
+
+
+def test_the_truth_is_better_than_its_neighbours(shot, observation, textures):
+    likelihood = ImageLikelihood(shot.body, shot.camera)
+    near, truth = shot.near(40, 17, spread=0.15), shot.poses[1:]
+    which = np.zeros(41, dtype=int)
+    frames = forward(shot.body.skeleton, np.concatenate([truth, near]))
+    found = likelihood.image_energy(frames, observation, textures, which, derivatives=False)
+    for name in ('containment', 'coverage', 'edges', 'joints', 'intensity'):
+        assert np.mean(found.terms[name][1:] > found.terms[name][0]) > 0.95, name
+
+
+def test_what_others_explain_costs_no_more_than_that(shot, observation, textures):
+    likelihood = only(ImageLikelihood(shot.body, shot.camera), 'coverage')
+    poses = shot.near(4, 18)
+    free = evaluate(likelihood, poses, observation, textures)
+    assert np.allclose(free.costs.sum(1), free.value)
+    limit = np.random.default_rng(0).uniform(0, 2 * free.costs.mean(), free.costs.shape)
+    for explained in (limit, limit[:1]):
+        found = evaluate(likelihood, poses, observation, textures, explained=explained)
+        assert np.allclose(found.costs, np.minimum(free.costs, explained))
+        assert np.allclose(found.value, found.costs.sum(1))
+    nothing = evaluate(likelihood, poses, observation, textures, explained=np.zeros_like(limit))
+    assert not nothing.value.any()
+    assert not nothing.hessian.any()
+
+
+def test_parts_share_the_weight_of_the_whole_contour(shot, observation):
+    """Containment of all parts is the sum over groups of parts: each point has its own share."""
+    likelihood = only(ImageLikelihood(shot.body, shot.camera), 'containment')
+    poses = shot.near(5, 19, spread=0.2)
+    frames = forward(shot.body.skeleton, poses)
+    count = len(shot.body.flesh.parts)
+    whole = likelihood.image_energy(frames, observation)
+    groups = [tuple(range(0, count, 2)), tuple(range(1, count, 2))]
+    parts = [
+        replace(likelihood, parts=group).image_energy(frames, observation) for group in groups
+    ]
+    assert whole.value.min() > 0
+    assert np.allclose(whole.value, sum(part.value for part in parts))
+    assert np.allclose(whole.hessian, sum(part.hessian for part in parts))
+
+
+def test_keypoints_are_least_squares_with_their_covariances(shot):
+    body, camera = shot.body, shot.camera
+    keypoints = keypoints_of(shot)
+    settings = LikelihoodSettings(joints=TermSettings(2.0, 1.5, np.inf))
+    likelihood = ImageLikelihood(body, camera, settings)
+    poses = shot.near(4, 20)
+    found = likelihood.image_energy(
+        forward(body.skeleton, poses), Observation(keypoints=keypoints)
+    )
+    error = camera.project(body.joint_positions(poses)) - keypoints.pixels
+    precision = np.linalg.inv(keypoints.covariances)
+    square = np.einsum('nja,jab,njb->n', error, precision, error)
+    assert np.allclose(found.value, 0.5 * 2.0 / 1.5**2 * square)
+
+
+def test_keypoints_that_were_not_seen_do_not_count(shot):
+    body = shot.body
+    keypoints = keypoints_of(shot)
+    likelihood = only(ImageLikelihood(body, shot.camera), 'joints')
+    frames = forward(body.skeleton, shot.near(3, 21))
+    chosen = [2, 5, 11]
+    some = Keypoints(
+        tuple(keypoints.names[i] for i in chosen), keypoints.pixels[chosen],
+        keypoints.covariances[chosen], np.array([1.0, 0.5, 1.0]),
+    )  # fmt: skip
+    hidden = keypoints.pixels.copy()
+    hidden[[i for i in range(len(hidden)) if i not in chosen]] = np.nan
+    confidences = np.ones(len(hidden))
+    confidences[5] = 0.5
+    confidences[0] = 0.0
+    all_named = Keypoints(keypoints.names, hidden, keypoints.covariances, confidences)
+    a, b = (
+        likelihood.image_energy(frames, Observation(keypoints=k)) for k in (some, all_named)
+    )
+    assert a.value.min() > 0
+    assert np.allclose(a.value, b.value)
+    assert np.allclose(a.hessian, b.hessian)
+    with pytest.raises(KeyError, match='tail'):
+        likelihood.image_energy(
+            frames, Observation(keypoints=replace(keypoints, names=('tail', *keypoints.names[1:])))
+        )
+
+
+@pytest.mark.parametrize('wrong', [(-1.0, 1.0, 1.0), (1.0, 0.0, 1.0), (1.0, 1.0, -1.0)])
+def test_settings_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match='weight >= 0'):
+        TermSettings(*wrong)

@@ -1,0 +1,170 @@
+"""What is computed from an image, against brute force and by construction."""
+
+import numpy as np
+import pytest
+
+from hmt_ros.image.observation import (
+    EDGE_ORIENTATIONS,
+    Keypoints,
+    ObservationSettings,
+    observe,
+)
+
+SIZE = (120, 160)
+
+
+def grey(size=SIZE, value=90):
+    return np.full((*size, 3), value, dtype=np.uint8)
+
+
+def disc(centre=(80, 60), radius=25, size=SIZE):
+    v, u = np.mgrid[: size[0], : size[1]]
+    return (u - centre[0]) ** 2 + (v - centre[1]) ** 2 < radius**2
+
+
+def whole(image_map, channel=0, size=SIZE, fill=np.nan):
+    """A map on the grid of the whole image; `fill` where its window does not reach."""
+    result = np.full(size, fill)
+    values, left, top = image_map
+    h, w = values.shape[1:]
+    result[top : top + h, left : left + w] = values[channel]
+    return result
+
+
+def test_signed_distance_is_that_to_the_border_between_the_pixels():
+    mask = disc() | disc((110, 70), 12)
+    found = whole(observe(grey(), mask).distance)
+    inside, outside = np.argwhere(mask), np.argwhere(~mask)
+    rng = np.random.default_rng(0)
+    for v, u in rng.integers(0, SIZE, (200, 2)):
+        if np.isnan(found[v, u]):
+            continue
+        other = outside if mask[v, u] else inside
+        nearest = np.linalg.norm(other - [v, u], axis=1).min()
+        wanted = 0.5 - nearest if mask[v, u] else nearest - 0.5
+        # OpenCV's fast transform is exact to a few percent.
+        assert found[v, u] == pytest.approx(wanted, abs=0.1 + 0.03 * nearest)
+
+
+def test_the_window_holds_the_silhouette_and_its_margin():
+    settings = ObservationSettings(margin=10)
+    values, left, top = observe(grey(), disc(), settings=settings).distance
+    assert (left, top) == (80 - 24 - 10, 60 - 24 - 10)
+    assert values.shape == (1, 49 + 20, 49 + 20)
+
+
+def test_outline_points_are_even_and_their_normals_point_outwards():
+    observation = observe(grey(), disc(), settings=ObservationSettings(outline_points=60))
+    pixels, normals = observation.outline.pixels, observation.outline.normals
+    assert len(pixels) == 60
+    offset = pixels - [80, 60]
+    radius = np.linalg.norm(offset, axis=1)
+    assert np.allclose(radius, 25, atol=0.8)
+    assert ((offset / radius[:, None]) * normals).sum(1).min() > 0.98
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1)
+    gaps = np.linalg.norm(np.roll(pixels, -1, axis=0) - pixels, axis=1)
+    assert gaps.max() < 1.5 * gaps.mean()
+
+
+def test_outline_of_holes_points_into_them():
+    mask = disc() & ~disc(radius=12)
+    outline = observe(grey(), mask).outline
+    offset = outline.pixels - [80, 60]
+    radius = np.linalg.norm(offset, axis=1)
+    hole = radius < 18
+    assert hole.sum() > 20
+    along = (offset * outline.normals).sum(1) / radius
+    assert along[hole].max() < -0.95
+    assert along[~hole].min() > 0.95
+
+
+@pytest.mark.parametrize('quarter', range(EDGE_ORIENTATIONS))
+def test_edges_stand_in_the_bin_of_their_normal(quarter):
+    """A dark half-plane whose normal is at quarter * 45 degrees."""
+    angle = quarter * np.pi / EDGE_ORIENTATIONS
+    normal = np.array([np.cos(angle), np.sin(angle)])
+    v, u = np.mgrid[: SIZE[0], : SIZE[1]]
+    signed = (u - 80) * normal[0] + (v - 60) * normal[1]
+    image = grey(value=40)
+    image[signed > 0] = 200
+    edges = observe(image).edges
+    interior = (slice(20, 100), slice(20, 140))
+    own = whole(edges, quarter)[interior]
+    across = whole(edges, (quarter + 2) % EDGE_ORIENTATIONS)[interior]
+    assert np.abs(own - np.abs(signed[interior])).max() < 3.0
+    # No edge of the direction across: nothing is near.
+    assert across.min() >= 100
+
+
+def test_edges_far_outside_the_silhouette_belong_to_the_background():
+    image = grey()
+    image[:, 140:] = 250
+    mask = disc()
+    image[mask] = 20
+    with_silhouette = whole(observe(image, mask).edges, 0)
+    without = whole(observe(image).edges, 0)
+    assert without[60, 140] < 2
+    assert with_silhouette[60, 128] > 15
+    assert with_silhouette[60, 105] < 2.5
+
+
+def test_an_empty_silhouette_counts_as_unknown():
+    observation = observe(grey(), np.zeros(SIZE, dtype=bool))
+    assert observation.silhouette is None
+    assert observation.distance is None
+    assert observation.outline is None
+    assert observation.box is None
+    assert observation.edges.values.shape == (EDGE_ORIENTATIONS, *SIZE)
+
+
+@pytest.mark.parametrize(
+    'mask',
+    [disc((0, 60)), disc((159, 119)), disc((80, 60), 400), disc((80, 60), 2), disc((3, 3), 2)],
+    ids=['left', 'corner', 'everywhere', 'tiny', 'tiny in a corner'],
+)
+def test_a_person_cut_by_the_border_or_hardly_seen(mask):
+    image = grey()
+    image[mask] = 30
+    observation = observe(image, mask, last_image=grey())
+    assert observation.distance is not None
+    assert np.isfinite(observation.distance.values).all()
+    assert np.isfinite(observation.edges.values).all()
+    assert np.isfinite(observation.outline.pixels).all()
+    assert np.isfinite(observation.outline.normals).all()
+    height, width = observation.distance.values.shape[1:]
+    assert height >= 2
+    assert width >= 2
+    assert observation.distance.left >= 0
+    assert observation.distance.left + width <= SIZE[1]
+    found = whole(observation.distance)
+    known = ~np.isnan(found)
+    assert ((found[known] < 0) == mask[known]).all()
+
+
+def test_flow_is_the_shift_between_the_images():
+    rng = np.random.default_rng(1)
+    noise = np.kron(rng.integers(0, 255, (40, 50)), np.ones((4, 4))).astype(np.uint8)
+    big = np.repeat(noise[:, :, None], 3, axis=2)
+    before, after = big[10:130, 10:170].copy(), big[7:127, 5:165].copy()
+    flow = observe(after, disc(radius=40), last_image=before).flow
+    middle = [np.median(whole(flow, channel)[40:80, 60:100]) for channel in (0, 1)]
+    assert middle == pytest.approx([5.0, 3.0], abs=0.5)
+
+
+def test_intensity_is_the_blurred_image():
+    image = grey()
+    image[:, 80:] = (10, 120, 250)
+    observation = observe(image, disc())
+    assert [whole(observation.intensity, c)[60, 100] for c in range(3)] == [10, 120, 250]
+    assert [whole(observation.intensity, c)[60, 60] for c in range(3)] == [90, 90, 90]
+
+
+def test_input_that_contradicts_itself_is_refused():
+    with pytest.raises(ValueError, match=r'image must be \(H, W, 3\) uint8'):
+        observe(np.zeros(SIZE, dtype=np.uint8))
+    with pytest.raises(ValueError, match=r'image must be \(H, W, 3\) uint8'):
+        observe(np.zeros((*SIZE, 3)))
+    with pytest.raises(ValueError, match='silhouette'):
+        observe(grey(), np.zeros((10, 10), dtype=bool))
+    with pytest.raises(ValueError, match='2 keypoints'):
+        Keypoints(('a', 'b'), np.zeros((3, 2)), np.zeros((2, 2, 2)), np.ones(2))
