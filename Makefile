@@ -29,9 +29,7 @@ setup:
 demo:
 	@$(WORKSPACE) ros build
 	@rm -rf build/demo && mkdir -p build/demo
-	@$(SOURCED) python -m hmt_ros replay $(DEMO_BAG) -o build/demo/$(notdir $(DEMO_BAG)) \
-	  $(addprefix --subject ,$(wildcard $(DEMO_BAG)/subject.yaml)) \
-	  $(addprefix --background ,$(wildcard $(DEMO_BAG)/background.png))
+	@$(SOURCED) python -m hmt_ros.app.demo $(DEMO_BAG) -o build/demo --live
 
 test:
 	@$(WORKSPACE) ros test build
@@ -45,7 +43,7 @@ lint:
 
 bench:
 	@$(WORKSPACE) ros test build
-	@shopt -s nullglob; $(SOURCED) for benchmark in benchmarks/*.py; do echo "== $$benchmark"; python "$$benchmark"; done
+	@$(SOURCED) python -m benchmarks $(ARGS)
 
 clean:
 	rm -rf .venv build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info

@@ -1,1 +1,1 @@
-"""Measurements, each next to a peer's or a yardstick in the same run: `python -m benchmarks --help`."""
+"""Measurements, each next to a yardstick of the same run: `python -m benchmarks --help`."""

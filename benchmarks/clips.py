@@ -1,4 +1,4 @@
-"""Clips with known truth: a bag of images, a subject file, the empty scene, and truth.npz beside."""
+"""Clips with known truth: a bag of images, and beside it subject file, empty scene and truth."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ def find_clips(folder: Path | None) -> tuple[list[Path], str]:
     """Folders of clips with truth, and where they come from.
 
     Args:
-        folder: that holds the clips; None: the development data, and where that is absent the bags of
-            this repository.
+        folder: that holds the clips; None: the development data, and where that is absent the
+            bags of this repository.
 
     Raises:
         ValueError: there are none.
@@ -129,20 +129,20 @@ def read_clip(folder: Path, frames: int | None = None) -> Clip:
     )
 
 
-def table(rows: list[list[str]], *, markdown: bool = False) -> str:
-    """A table whose first row is its head."""
+def table(rows: list[list[str]], *, left: int = 1, markdown: bool = False) -> str:
+    """A table whose first row is its head; so many columns are aligned to the left."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
 
     def line(cells: list[str], separator: str) -> str:
         aligned = [
-            cell.ljust(width) if i == 0 else cell.rjust(width)
+            cell.ljust(width) if i < left else cell.rjust(width)
             for i, (cell, width) in enumerate(zip(cells, widths, strict=True))
         ]
         return separator.join(aligned)
 
     if not markdown:
         return '\n'.join(line(row, '  ').rstrip() for row in rows)
-    rule = [('-' * width) if i == 0 else '-' * (width - 1) + ':' for i, width in enumerate(widths)]
+    rule = ['-' * width if i < left else '-' * (width - 1) + ':' for i, width in enumerate(widths)]
     return '\n'.join(f'| {line(row, " | ")} |' for row in [rows[0], rule, *rows[1:]])
 
 

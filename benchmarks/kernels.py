@@ -7,13 +7,14 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from benchmarks import numpy_likelihood, numpy_pruning
 from benchmarks.clips import rounded, table
-from benchmarks.machine import best_time, description
+from benchmarks.machine import best_time, description, on_machine
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.procedural_motion import procedural_motion
@@ -39,7 +40,19 @@ def main(argv: list[str]) -> int:
     if options.json:
         print(json.dumps(rounded(result), indent=1))
         return 0
-    rows = [['', 'batch', 'numpy, ms', 'compiled, ms', 'ratio', 'all cores, ms', 'largest difference']]
+    print(as_text(result))
+    return 0
+
+
+def page() -> str:
+    """The part of the documentation that this benchmark writes."""
+    result = measure()
+    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
+
+
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+    """A table for people."""
+    rows = [['what', 'batch', 'numpy, ms', 'compiled, ms', 'ratio', 'all cores, ms', 'difference']]
     for entry in result['cases']:
         threads = entry['compiled_threads_ms']
         rows.append(
@@ -53,8 +66,7 @@ def main(argv: list[str]) -> int:
                 f'{entry["difference"]:.0e}',
             ]
         )
-    print(table(rows))
-    return 0
+    return table(rows, markdown=markdown)
 
 
 def measure(seconds: float = 1.0) -> dict[str, Any]:
@@ -117,8 +129,8 @@ def _choices(seconds: float) -> Iterator[dict[str, Any]]:
         found = choose_hypotheses(joints, log_weights, 16)
         wanted, owners = numpy_pruning.choose(joints, weights, 16)
         same = np.array_equal(found.chosen, wanted) and np.array_equal(found.owner, owners)
-        slow = best_time(lambda j=joints, w=weights: numpy_pruning.choose(j, w, 16), seconds=seconds)  # type: ignore[misc]
-        fast = best_time(lambda j=joints, w=log_weights: choose_hypotheses(j, w, 16), seconds=seconds)  # type: ignore[misc]
+        slow = best_time(partial(numpy_pruning.choose, joints, weights, 16), seconds=seconds)
+        fast = best_time(partial(choose_hypotheses, joints, log_weights, 16), seconds=seconds)
         yield _case('choice of hypotheses', batch, slow, fast, None, 0.0 if same else np.inf)
 
 

@@ -16,7 +16,7 @@ import scipy
 
 
 def best_time(function: Callable[[], Any], *, seconds: float = 1.0, least: int = 3) -> float:
-    """Shortest of several runs, s: the one that nothing else disturbed; the first is not counted."""
+    """Shortest of several runs, s, which nothing else disturbed; the first is not counted."""
     function()
     times: list[float] = []
     end = time.perf_counter() + seconds
@@ -49,6 +49,12 @@ def description() -> dict[str, Any]:
         'scipy': scipy.__version__,
         'opencv': cv2.__version__,
     }
+
+
+def on_machine(machine: dict[str, Any]) -> str:
+    """A line for the foot of a table."""
+    versions = ', '.join(f'{name} {machine[name]}' for name in ('python', 'numpy', 'opencv'))
+    return f'{machine["processor"]}, {machine["cores"]} cores; {versions}.'
 
 
 def peak_memory() -> float:

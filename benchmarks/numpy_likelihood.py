@@ -1,8 +1,8 @@
 """The likelihood of an image in vectorised numpy: what the compiled kernels are measured against.
 
-Written from the same equations as `hmt_ros.image`, with the batch of poses on the last axis and matrix
-products where there are any. It serves twice: `python -m benchmarks kernels` compares the time, and the
-tests compare values, gradients and Hessians.
+Written from the same equations as `hmt_ros.image`, with the batch of poses on the last axis and
+matrix products where there are any. It serves twice: `python -m benchmarks kernels` compares the
+time, and the tests compare values, gradients and Hessians.
 """
 
 from __future__ import annotations

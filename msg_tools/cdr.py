@@ -4,7 +4,8 @@ CDR leaves the bytes that pad a field to its alignment undefined, and the middle
 them with whatever its buffer held before; `rclpy.serialization.serialize_message` even appends some
 where a sequence is empty. `serialise` writes zeros into the padding and nothing behind the message:
 equal messages have equal bytes. A node that publishes these bytes (`Publisher.publish` takes them)
-puts the same bytes on the wire, and so into a recorded bag, as an offline run writes.
+puts the same bytes on the wire, and so into a recorded bag, as an offline run writes; only at the
+end the middleware may append some, up to a multiple of four, which `canonical` takes away again.
 """
 
 from __future__ import annotations

@@ -38,6 +38,12 @@ class RosbagsMessages:
         Raises:
             TypeError: a field that the type does not have.
         """
+        plain = _plain_class(msgtype)
+        if plain is not None and len(fields) == plain[1]:
+            try:
+                return plain[0](**fields)
+            except TypeError:
+                pass  # a wrong name, which is told below
         defaults = _defaults(msgtype)
         unknown = fields.keys() - defaults.keys()
         if unknown:
@@ -130,6 +136,15 @@ def _defaults(msgtype: str) -> dict[str, tuple[Callable[[], Any], str | None]]:
     if msgtype == 'geometry_msgs/msg/Quaternion':
         result['w'] = (lambda: 1.0), None
     return result
+
+
+@cache
+def _plain_class(msgtype: str) -> tuple[type, int] | None:
+    """Class and number of fields of a type without arrays of numbers, such as a point."""
+    defaults = _defaults(msgtype)
+    if any(dtype is not None for _, dtype in defaults.values()):
+        return None
+    return typestore().types[msgtype], len(defaults)
 
 
 def _element(detail: Any) -> tuple[Any, Any, int]:

@@ -22,8 +22,8 @@ Monocular 3D human motion tracking with mixtures.
 commands:
 {commands}
 
-python -m hmt_ros <command> --help tells what a command takes. Each is an executable of ROS 2 as well:
-ros2 run hmt_ros <command>. The node: ros2 run hmt_ros filter_node.
+python -m hmt_ros <command> --help tells what a command takes. Each is an executable of ROS 2 as
+well, ros2 run hmt_ros <command>, and so is the node, ros2 run hmt_ros filter_node.
 
 options:
   -h, --help  show this

@@ -1,7 +1,7 @@
 """Scores of all mixtures that a bag carries, against the true joint positions.
 
-Every topic of pose mixtures or trajectory mixtures is read once, in the order of the bag, and scored in
-batches: memory does not grow with the length of the bag. Frames are matched by stamp.
+Every topic of pose mixtures or trajectory mixtures is read once, in the order of the bag, and
+scored in batches: memory does not grow with the length of the bag. Frames are matched by stamp.
 """
 
 from __future__ import annotations

@@ -18,12 +18,13 @@ from hmt_ros.tracking.evaluation import MODEL_SIGMA
 from msg_tools import BagReader
 
 EPILOG = """\
-Errors are mean distances of hips, knees, ankles, shoulders, elbows, wrists and neck from where they
-were, after the pelvis was brought to its true place. A frame is lost when even the best component is
-150 mm off or more. The negative log-likelihood is that of the true joint positions (m), in nats; lower is
-better. Coverage is how often the truth lies in the smallest region that holds 50 or 90 percent of the
-mixture's probability, for all joints together and for each joint alone: honest mixtures cover 50 and 90
-percent.
+Errors are mean distances of hips, knees, ankles, shoulders, elbows, wrists and neck from where
+they were, after the pelvis was brought to its true place: of the heaviest component, of the best
+of all, and the mean over the components by weight. A frame is lost when even the best is 150 mm
+off. The negative log-likelihood is that of the true joint positions (m), in nats; lower is better.
+Coverage is how often the truth lies in the smallest region that holds 50 or 90 percent of the
+mixture's probability, for all joints together and for each joint alone: honest mixtures cover 50
+and 90 percent.
 
 examples:
   evaluate out --truth truth.npz             a table
@@ -158,9 +159,9 @@ def as_json(
     }
 
 
-def as_text(found: dict[str, TopicScores], truth: Truth) -> str:
+def as_text(found: dict[str, TopicScores], truth: Truth, *, by_joint: bool = True) -> str:
     """Tables for people: one row a topic, and the errors joint by joint."""
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             '', 'frames', 'missing', 'modes', 'heaviest', 'best of K', 'expected', 'under',
             '-log p', 'all', 'joints', 'each', 'joint',
@@ -190,13 +191,15 @@ def as_text(found: dict[str, TopicScores], truth: Truth) -> str:
                 ),
             )
         )
-    by_joint = [('best of K, mm', *found)]
-    for joint in next(iter(found.values())).scores.names:
-        cells = [summary['by_joint'][joint]['best_mm'] for summary in summaries.values()]
-        by_joint.append((joint, *(f'{cell:.0f}' for cell in cells)))
-    notes = [f'{name}: {topic.note}' for name, topic in found.items() if topic.note]
-    head = f'against {truth.source}, {len(truth.joints)} frames'
-    return '\n'.join([head, '', *table(rows), '', *table(by_joint), *notes])
+    lines = [f'against {truth.source}, {len(truth.joints)} frames', '', *table(rows)]
+    if by_joint:
+        joints = [('best of K, mm', *found)]
+        for joint in next(iter(found.values())).scores.names:
+            cells = [summary['by_joint'][joint]['best_mm'] for summary in summaries.values()]
+            joints.append((joint, *(f'{cell:.0f}' for cell in cells)))
+        lines += ['', *table(joints)]
+    lines += [f'{name}: {topic.note}' for name, topic in found.items() if topic.note]
+    return '\n'.join(lines)
 
 
 def _percent(value: float | None) -> str:

@@ -28,7 +28,7 @@ from hmt_ros.nodes.filter_parameters import FilterParameters
 from hmt_ros.nodes.filter_session import CAMERA_INFO, IMAGE, KEYPOINTS, Handled
 from hmt_ros.nodes.parameter_file import yaml_scalar
 from hmt_ros.nodes.track_messages import TOPICS
-from msg_tools.cdr import deserialise, serialise
+from msg_tools.cdr import canonical, deserialise, serialise
 
 # Generous: they end a replay that hangs. A node that ends is noticed at once.
 START_SECONDS = 120.0
@@ -96,7 +96,8 @@ class LiveFilter:
         handled = _handled(self._next(self._answers, MESSAGE_SECONDS, f'an answer to a {source}'))
         for topic, stamp in handled.published:
             data = self._next(self._arrived[topic], START_SECONDS, f'{topic} of {stamp} ns')
-            self._write(topic, stamp, data)
+            # On its way a message may get bytes behind its end, up to a multiple of four.
+            self._write(topic, stamp, canonical(data, TOPICS[topic].msgtype))
         return handled
 
     def _next(self, queue: deque[bytes], seconds: float, what: str) -> bytes:
@@ -183,12 +184,12 @@ class LiveFilter:
             node.create_subscription(
                 classes[published.msgtype],
                 topic,
-                self._arrived[topic].append,
+                _into(self._arrived[topic]),
                 latched if published.latched else reliable,
                 raw=True,
             )
         node.create_subscription(
-            DiagnosticStatus, f'{_NODE}/handled', self._answers.append, reliable, raw=True
+            DiagnosticStatus, f'{_NODE}/handled', _into(self._answers), reliable, raw=True
         )
         # The last of all: discovery tells the node of the topics above before it tells of this.
         self._state = node.create_client(GetState, f'{_NODE}/get_state')
@@ -246,6 +247,15 @@ class LiveFilter:
         except subprocess.TimeoutExpired:
             process.kill()
             return process.wait()
+
+
+def _into(queue: deque[bytes]) -> Callable[[bytes], None]:
+    """A callback; rclpy wants one whose signature it can read."""
+
+    def receive(data: bytes) -> None:
+        queue.append(data)
+
+    return receive
 
 
 def _handled(data: bytes) -> Handled:

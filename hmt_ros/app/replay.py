@@ -177,7 +177,7 @@ def _replay(options: argparse.Namespace) -> str:
         raise ValueError(f'{target} is the bag that is read; give another name')
     with BagReader(source) as bag:
         if bag.damage is not None and not options.keep_going:
-            raise BagError(bag.damage)
+            raise BagError(f'{source} {bag.damage}')
         recorded = recorded_input(bag, options.image_topic, options.camera_info_topic)
         parameters = _parameters(options, recorded)
         if not parameters.subject_file:

@@ -71,8 +71,8 @@ def read_truth(path: Path) -> Truth:
         topic = truth_topic(bag)
         if topic is None:
             raise ValueError(
-                f'{path} has no ground truth: wanted a .npz file with {", ".join(FIELDS)}, or a bag '
-                f'with a topic of PoseMixture whose kind is GROUND_TRUTH'
+                f'{path} has no ground truth: wanted a .npz file with {", ".join(FIELDS)}, or a '
+                'bag with a topic of PoseMixture whose kind is GROUND_TRUTH'
             )
         return truth_of(bag, topic)
 

@@ -86,18 +86,26 @@ def enumerate_flips(
 
 
 def rehang_chain(
-    body: Body, poses: ArrayLike, new_poses: ArrayLike, chain: str, *, slack: float = 0.1
+    body: Body,
+    poses: ArrayLike,
+    new_poses: ArrayLike,
+    chain: str,
+    *,
+    image_of: str | None = None,
+    slack: float = 0.1,
 ) -> tuple[Array, Index]:
     """Poses whose chain hangs on another trunk and still has the image that it had.
 
     When a trunk turns or flips, its limbs start elsewhere. Their joints are put back onto the rays
-    through their images, in all ways that lengths and limits allow.
+    through their images, in all ways that lengths and limits allow. With `image_of` they are put onto
+    the image of another chain: a left leg onto the right one's.
 
     Args:
         body: the body.
         poses: (N, d) that have the image.
         new_poses: (N, d) with the other trunk.
         chain: name.
+        image_of: name of the chain whose image is taken; the chain itself when None.
         slack: a ray that misses its sphere by less than this touches it, m.
 
     Returns:
@@ -110,7 +118,10 @@ def rehang_chain(
     links = _links(skeleton, chain)
     new = np.array(new_poses, dtype=np.float64, ndmin=2)
     seen = forward(skeleton, poses)
-    targets = [seen.origins[k.segment] - k.length * seen.columns[k.segment, 2] for k in links]
+    ends = links if image_of is None else _links(skeleton, image_of)
+    if len(ends) != len(links):
+        raise ValueError(f'chains {chain} and {image_of} differ in their number of segments')
+    targets = [seen.origins[k.segment] - k.length * seen.columns[k.segment, 2] for k in ends]
     frames = forward(skeleton, new)
     positions, valid = _positions(frames, links, targets, slack)
     angles, reachable = _joint_angles(frames, new, links, positions)

@@ -18,8 +18,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.skeleton import Skeleton
@@ -111,54 +113,19 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
     Raises:
         ValueError: poses that do not have d columns or are not finite.
     """
-    q = np.asarray(poses, dtype=np.float64)
+    q = np.ascontiguousarray(poses, dtype=np.float64)
     if q.ndim != 2 or q.shape[1] != skeleton.dimension:
         raise ValueError(
             f'poses of {skeleton.name} must have shape (N, {skeleton.dimension}), saw {q.shape}'
         )
     if not np.isfinite(q).all():
         raise ValueError(f'poses of {skeleton.name} must be finite')
-    q = np.ascontiguousarray(q.T)
-    sin, cos = np.sin(q), np.cos(q)
-    n = q.shape[1]
-    s_count = len(skeleton.parents)
-    columns = np.empty((s_count, 3, 3, n))
-    origins = np.empty((s_count, 3, n))
-    axes = np.empty((skeleton.dimension, 3, n))
-    dof_origins = np.empty((skeleton.dimension, 3, n))
-    offsets = skeleton.offsets
-
-    for level in _schedule(skeleton):
-        parents = level.parents
-        if parents is None:
-            columns[level.segments] = skeleton.mounts[level.segments].transpose(0, 2, 1)[..., None]
-            origins[level.segments] = offsets[level.segments][..., None]
-        else:
-            c = columns[parents].reshape(len(parents), 3, 3 * n)
-            mounted = level.mounts @ c if level.mounts is not None else c
-            columns[level.segments] = mounted.reshape(-1, 3, 3, n)
-            shift = offsets[level.segments][:, None, :] @ c
-            origins[level.segments] = origins[parents] + shift.reshape(-1, 3, n)
-        for step in level.steps:
-            where, dofs, axis = step.segments, step.dofs, step.axis
-            if step.is_rotation:
-                axes[dofs] = columns[where, axis]
-                i, j = (axis + 1) % 3, (axis + 2) % 3
-                a, b = columns[where, i], columns[where, j]
-                cq, sq = cos[dofs][:, None], sin[dofs][:, None]
-                columns[where, i] = cq * a + sq * b
-                columns[where, j] = cq * b - sq * a
-            else:
-                along = (
-                    np.eye(3)[axis][None, :, None]
-                    if parents is None
-                    else columns[step.parents, axis]
-                )
-                axes[dofs] = along
-                origins[where] += along * q[dofs][:, None]
-    rotational = skeleton.dof_is_rotation
-    dof_origins[rotational] = origins[skeleton.dof_segments[rotational]]
-    dof_origins[~rotational] = 0.0
+    n, s, d = len(q), len(skeleton.parents), skeleton.dimension
+    columns, origins = np.empty((s, 3, 3, n)), np.empty((s, 3, n))
+    axes, dof_origins = np.empty((d, 3, n)), np.zeros((d, 3, n))
+    _place_segments(
+        _plan(skeleton), skeleton.mounts, skeleton.offsets, q, columns, origins, axes, dof_origins
+    )
     return Frames(skeleton, columns, origins, axes, dof_origins)
 
 
@@ -265,53 +232,75 @@ def assemble(frames: Frames, wrenches: Array, stiffnesses: Array) -> tuple[Array
     return gradient, hessian
 
 
-@dataclass(frozen=True)
-class _Step:
-    """One degree of freedom of some segments that turn or move about the same axis letter."""
+class _Plan(NamedTuple):
+    """The tree as the compiled code reads it."""
 
-    segments: Index
-    parents: Index
-    dofs: Index
-    axis: int
-    is_rotation: bool
-
-
-@dataclass(frozen=True)
-class _Level:
-    """Segments of equal depth, moved together."""
-
-    segments: Index
-    parents: Index | None
-    mounts: Array | None  # transposed, None where all are the identity
-    steps: tuple[_Step, ...]
+    parents: NDArray[np.int64]
+    first_dofs: NDArray[np.int64]  # (S + 1,) the degrees of freedom of segment s start here
+    dof_axes: NDArray[np.int64]
+    dof_is_rotation: NDArray[np.bool_]
 
 
 @lru_cache(maxsize=64)
-def _schedule(skeleton: Skeleton) -> tuple[_Level, ...]:
-    depth = np.zeros(len(skeleton.parents), dtype=int)
-    for s, parent in enumerate(skeleton.parents):
-        depth[s] = 0 if parent < 0 else depth[parent] + 1
-    levels = []
-    for k in range(depth.max() + 1):
-        segments = np.flatnonzero(depth == k)
-        parents = np.array([skeleton.parents[s] for s in segments]) if k else None
-        mounts = skeleton.mounts[segments].transpose(0, 2, 1)
-        identity = np.array_equal(mounts, np.broadcast_to(np.eye(3), mounts.shape))
-        steps = []
-        dofs = [skeleton.segment_dofs[s] for s in segments]
-        for turn in range(max(len(x) for x in dofs)):
-            groups: dict[tuple[int, bool], list[tuple[int, int]]] = {}
-            for s, own in zip(segments, dofs, strict=True):
-                if turn < len(own):
-                    j = own[turn]
-                    key = (int(skeleton.dof_axes[j]), bool(skeleton.dof_is_rotation[j]))
-                    groups.setdefault(key, []).append((int(s), j))
-            for (axis, is_rotation), members in groups.items():
-                where, which = np.array(members).T
-                above = np.array([skeleton.parents[s] for s in where])
-                steps.append(_Step(where, above, which, axis, is_rotation))
-        levels.append(_Level(segments, parents, None if identity else mounts, tuple(steps)))
-    return tuple(levels)
+def _plan(skeleton: Skeleton) -> _Plan:
+    counts = [len(own) for own in skeleton.segment_dofs]
+    return _Plan(
+        np.array(skeleton.parents, dtype=np.int64),
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        np.array(skeleton.dof_axes, dtype=np.int64),
+        np.array(skeleton.dof_is_rotation),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _place_segments(  # type: ignore[no-untyped-def]
+    plan, mounts, offsets, poses, columns, origins, axes, dof_origins
+):
+    """Fills the arrays of `Frames`, pose by pose."""
+    count = len(plan.parents)
+    frame, place = np.empty((count, 3, 3)), np.empty((count, 3))
+    for n in range(len(poses)):
+        for s in range(count):
+            parent = plan.parents[s]
+            for k in range(3):
+                place[s, k] = offsets[s, k]
+            if parent >= 0:
+                for k in range(3):
+                    place[s, k] = place[parent, k]
+                    for i in range(3):
+                        place[s, k] += offsets[s, i] * frame[parent, i, k]
+            for i in range(3):
+                for k in range(3):
+                    if parent >= 0:
+                        total = 0.0
+                        for j in range(3):
+                            total += mounts[s, j, i] * frame[parent, j, k]
+                        frame[s, i, k] = total
+                    else:
+                        frame[s, i, k] = mounts[s, k, i]
+            for d in range(plan.first_dofs[s], plan.first_dofs[s + 1]):
+                axis, value = plan.dof_axes[d], poses[n, d]
+                if plan.dof_is_rotation[d]:
+                    cos, sin = np.cos(value), np.sin(value)
+                    i, j = (axis + 1) % 3, (axis + 2) % 3
+                    for k in range(3):
+                        axes[d, k, n] = frame[s, axis, k]
+                        dof_origins[d, k, n] = place[s, k]
+                        a, b = frame[s, i, k], frame[s, j, k]
+                        frame[s, i, k] = cos * a + sin * b
+                        frame[s, j, k] = cos * b - sin * a
+                else:
+                    for k in range(3):
+                        along = 1.0 if k == axis else 0.0
+                        if parent >= 0:
+                            along = frame[parent, axis, k]
+                        axes[d, k, n] = along
+                        place[s, k] += along * value
+        for s in range(count):
+            for k in range(3):
+                origins[s, k, n] = place[s, k]
+                for i in range(3):
+                    columns[s, i, k, n] = frame[s, i, k]
 
 
 @lru_cache(maxsize=64)

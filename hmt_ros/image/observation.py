@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import cv2
@@ -110,6 +111,7 @@ def observe(
     settings: ObservationSettings | None = None,
     window: tuple[int, int, int, int] | None = None,
     last_image: Image | None = None,
+    wanted: Collection[str] = ('edges', 'intensity', 'flow'),
 ) -> Observation:
     """Everything that the likelihood asks of an image.
 
@@ -121,6 +123,7 @@ def observe(
         window: (left, top, right, bottom) where the person is expected, for images without a
             silhouette; the whole image when None.
         last_image: the image before, of the same size, for the optical flow.
+        wanted: which of 'edges', 'intensity' and 'flow' to compute; the silhouette always is.
 
     Raises:
         ValueError: shapes that contradict each other.
@@ -141,11 +144,13 @@ def observe(
         distance = ImageMap(signed[None], left, top)
         outline = _outline(mask, left, top, s.outline_points)
         near = signed <= s.edge_margin
-    edges = ImageMap(_edge_distances(part, near, s), left, top)
-    blurred = cv2.GaussianBlur(part, (0, 0), s.intensity_blur).astype(np.float32)
-    intensity = ImageMap(np.ascontiguousarray(blurred.transpose(2, 0, 1)), left, top)
-    flow = None
-    if last_image is not None:
+    edges, intensity, flow = None, None, None
+    if 'edges' in wanted:
+        edges = ImageMap(_edge_distances(part, near, s), left, top)
+    if 'intensity' in wanted:
+        blurred = cv2.GaussianBlur(part, (0, 0), s.intensity_blur).astype(np.float32)
+        intensity = ImageMap(np.ascontiguousarray(blurred.transpose(2, 0, 1)), left, top)
+    if 'flow' in wanted and last_image is not None:
         before = np.ascontiguousarray(last_image[top:bottom, left:right])
         flow = ImageMap(_optical_flow(before, np.ascontiguousarray(part)), left, top)
     return Observation(

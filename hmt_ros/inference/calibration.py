@@ -1,13 +1,14 @@
 """Whether densities are honest: where known values fall in the highest-density regions.
 
-The level of a value x under a density p is the probability content of the smallest region that holds x,
+The level of a value x under a density p is the probability content of the smallest region that
+holds x,
 
     level(x) = P(p(X) > p(x)),  X ~ p,
 
 so that the highest-density region of probability q holds x exactly when level(x) <= q. Values that
 were drawn from their densities have levels that are uniform on [0, 1], whatever the densities are:
-the share of levels up to q is the coverage of the region q, to be compared with q. The reliability of
-multi-hypothesis pose estimates is judged by it in Pierzchlewicz et al., "Multi-hypothesis 3D human
+the share of levels up to q is the coverage of the region q, to be compared with q. That best-of-N
+errors alone reward dishonest densities is shown by Pierzchlewicz et al., "Multi-hypothesis 3D human
 pose estimation metrics favor miscalibrated distributions" (2022).
 """
 
@@ -106,6 +107,6 @@ def coverage(levels: ArrayLike, probability: float) -> float:
 
 
 def calibration_error(levels: ArrayLike) -> float:
-    """Mean difference between coverage and probability, over the probabilities 0.05, 0.1, ... 0.95."""
+    """Mean distance of coverage from probability, over the probabilities 0.05, 0.1, ... 0.95."""
     probabilities = np.arange(1, 20) / 20
     return float(np.mean([abs(coverage(levels, p) - p) for p in probabilities]))

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import os
+import signal
 import sys
 import threading
 import time
@@ -33,11 +34,12 @@ from rcl_interfaces.msg import (
 )
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
@@ -182,6 +184,8 @@ class FilterNode(LifecycleNode):
             self._subscribe(IMAGE, CompressedImage, 'image/compressed')
         else:
             self._subscribe(IMAGE, Image, 'image')
+        topic = self._inputs[-1].topic_name
+        self.get_logger().info(f'images from {topic}; waits for {self._session.state.wants}')
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -303,8 +307,6 @@ class FilterNode(LifecycleNode):
             try:
                 self._handle(session, waiting)
             except Exception as error:  # noqa: BLE001
-                if not self.context.ok():
-                    return
                 # A fault of ours. The person in the next image may not suffer from it.
                 self.get_logger().error(''.join(traceback.format_exception(error)))
                 session.restart(session.start)
@@ -464,8 +466,12 @@ def _first_line(error: BaseException) -> str:
 
 def main(args: list[str] | None = None) -> int:
     """Runs the node until it is told to stop; 0, or 1 where it could not start."""
+    # The handlers of rclpy end the context under whatever is going on; ours let it come to its end.
+    stopped = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopped.set())
     try:
-        rclpy.init(args=args)
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = FilterNode()
     except (ParameterException, ValueError, RuntimeError) as error:
         sys.stderr.write(f'filter_node: {_first_line(error)}\n')
@@ -473,13 +479,11 @@ def main(args: list[str] | None = None) -> int:
         return 1
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    try:
-        node.start()
-        executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    ended = node.stop(_LAST_ESTIMATE)
-    if not ended:
+    node.start()
+    while not stopped.is_set():
+        # A signal does not wake who waits for messages.
+        executor.spin_once(timeout_sec=0.2)
+    if not node.stop(_LAST_ESTIMATE):
         sys.stderr.flush()
         os._exit(0)
     executor.shutdown()

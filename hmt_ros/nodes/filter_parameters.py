@@ -71,7 +71,7 @@ class FilterParameters:
             empty: the node waits for ~/reset with a mixture.
         background_file: image of the empty scene, as the camera sees it; empty: learned from the
             images before the track starts.
-        body_model: 'human37', 'human34', 'human32', a YAML file, or a motion file with a skeleton.
+        body_model: 'human37', 'human34', 'human32', or a YAML file.
         random_seed: of all that is random. The same images give the same numbers.
         reset_on_time_jump: whether an image that is older than the one before starts the track
             anew; otherwise such images are skipped.

@@ -30,7 +30,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes.filter_parameters import FilterParameters
 from hmt_ros.nodes.track_messages import Presentation, TrackedImage, track_messages
 from hmt_ros.nodes.track_start import TrackStart, prepare_start
-from hmt_ros.tracking import Status, Tracker
+from hmt_ros.tracking import Status, Subject, Tracker
 from msg_tools import MessageError, RosbagsMessages
 from msg_tools.camera_info import CameraInfoError, camera_from_info
 from msg_tools.cdr import serialise
@@ -41,6 +41,8 @@ from msg_tools.keypoints import keypoints_of
 CAMERA_INFO, IMAGE, KEYPOINTS = 'camera_info', 'image', 'keypoints'
 FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a frame
 
+# A person hardly moves meanwhile.
+_SAME_MOMENT_NS = SECOND_NS // 5
 # Stamps of keypoints that are remembered.
 _REMEMBERED = 256
 
@@ -250,8 +252,7 @@ class FilterSession:
                 )
                 return
             self._note('time jumps back', f'{text}: the track starts anew')
-            self._images['skipped'] += len(self._waiting)
-            self._waiting.clear()
+            self._track_all()
             self._keypoints.clear()
             self._newest_keypoints = -1
             self._newest_image = None
@@ -317,6 +318,13 @@ class FilterSession:
                     f'come, and queue_size is {self.parameters.queue_size}',
                 )
 
+    def _track_all(self) -> None:
+        """Nothing more comes of this track: what waits is tracked as it is."""
+        while self._waiting and self._camera is not None:
+            self._track(self._waiting.popleft(), self._camera)
+        self._images['dropped'] += len(self._waiting)
+        self._waiting.clear()
+
     def _has_keypoints(self, waiting: _WaitingImage) -> bool:
         if not self.parameters.use_keypoints:
             return True
@@ -345,6 +353,8 @@ class FilterSession:
             if self._tracker is None:
                 self._tracker = self.start.tracker(camera)
             posterior, likelihood = self._tracker.step(waiting.image, waiting.stamp_ns, keypoints)
+            if starts and posterior is not None:
+                self._tell_how_old_the_start_is(waiting.stamp_ns)
             if posterior is not None and likelihood is not None:
                 self._publish(self._tracker, waiting, posterior, likelihood)
         except (ValueError, ArithmeticError) as error:
@@ -355,6 +365,15 @@ class FilterSession:
             # The next image would fail as this one did, after as long a time.
             self._skip('start', f'no track starts at the image of {waiting.stamp_ns} ns: {text}')
             self.restart(replace(self.start, background=None, initial=None))
+
+    def _tell_how_old_the_start_is(self, stamp_ns: int) -> None:
+        initial = self.start.initial
+        if isinstance(initial, Subject) and stamp_ns - initial.stamp_ns > _SAME_MOMENT_NS:
+            age = (stamp_ns - initial.stamp_ns) / SECOND_NS
+            self._note(
+                'old start',
+                f'the joints that start the track were seen {age:.1f} s before its first image',
+            )
 
     def _publish(
         self,

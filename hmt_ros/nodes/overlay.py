@@ -6,11 +6,13 @@ fainter. The same modes on the same image give the same picture.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.body import Body, Camera
+from hmt_ros.body import Camera
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -22,43 +24,61 @@ _FAR = 2.0**14  # px; OpenCV draws nothing that begins further away
 
 
 def draw_modes(
-    image: Image, body: Body, camera: Camera, poses: Array, weights: Array, count: int
+    image: Image,
+    camera: Camera,
+    joints: Array,
+    bones: Sequence[tuple[int, int]],
+    weights: Array,
+    count: int,
 ) -> Image:
     """A copy of an image with the heaviest modes on it.
 
     Args:
         image: (H, W, 3) BGR.
-        body, camera: whose poses they are, and what they are seen with.
-        poses: (K, d).
+        camera: that took it.
+        joints: (K, J, 3) joint positions of the modes, camera frame, m.
+        bones: pairs of joints that are connected.
         weights: (K,).
-        count: how many are drawn at most.
+        count: how many modes are drawn at most.
     """
     result = image.copy()
     order = np.argsort(-weights, kind='stable')[:count]
     if len(order) == 0:
         return result
     thickness = max(round(min(image.shape[:2]) / 240), 1)
-    pixels = camera.project(body.joint_positions(poses[order]))
+    pixels = camera.project(joints[order])
     usable = np.logical_and.reduce(np.abs(np.nan_to_num(pixels, nan=np.inf)) < _FAR, axis=2)
     # The heaviest last, on top.
     for rank in reversed(range(len(order))):
-        share = float(weights[order[rank]] / weights[order[0]]) if weights[order[0]] > 0 else 1.0
-        layer = result.copy() if rank else result
-        fixed = np.rint(np.where(usable[rank][:, None], pixels[rank], 0.0) * 2**_SHIFT).astype(int)
-        for start, end in body.skeleton.bones:
-            if usable[rank, start] and usable[rank, end]:
-                cv2.line(
-                    layer,
-                    fixed[start].tolist(),
-                    fixed[end].tolist(),
-                    _OTHERS if rank else _FIRST,
-                    thickness + (rank == 0),
-                    cv2.LINE_AA,
-                    _SHIFT,
-                )
-        if rank:
-            strength = _FAINTEST + (1 - _FAINTEST) * share
-            result = cv2.addWeighted(layer, strength, result, 1 - strength, 0.0).astype(
-                np.uint8, copy=False
+        lines = [(a, b) for a, b in bones if usable[rank, a] and usable[rank, b]]
+        ends = pixels[rank, sorted({joint for line in lines for joint in line})]
+        left, top, right, bottom = _box(ends, 4 * thickness, image.shape)
+        if left >= right or top >= bottom:
+            continue
+        part = result[top:bottom, left:right]
+        layer = part.copy()
+        fixed = np.zeros(pixels[rank].shape, dtype=int)
+        fixed[usable[rank]] = np.rint((pixels[rank][usable[rank]] - [left, top]) * 2**_SHIFT)
+        for start, end in lines:
+            cv2.line(
+                layer,
+                fixed[start].tolist(),
+                fixed[end].tolist(),
+                _OTHERS if rank else _FIRST,
+                thickness + (rank == 0),
+                cv2.LINE_AA,
+                _SHIFT,
             )
+        share = float(weights[order[rank]] / weights[order[0]]) if weights[order[0]] > 0 else 1.0
+        strength = _FAINTEST + (1 - _FAINTEST) * share
+        cv2.addWeighted(layer, strength, part, 1 - strength, 0.0, dst=part)
     return result
+
+
+def _box(pixels: Array, margin: int, shape: tuple[int, ...]) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of the part of an image that some points lie in."""
+    if len(pixels) == 0:
+        return 0, 0, 0, 0
+    low = np.floor(pixels.min(0)).astype(int) - margin
+    high = np.ceil(pixels.max(0)).astype(int) + margin + 1
+    return max(low[0], 0), max(low[1], 0), min(high[0], shape[1]), min(high[1], shape[0])

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body import Body, Camera
-from hmt_ros.body.kinematics import forward
+from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes.overlay import draw_modes
 from msg_tools import MessageFactory
@@ -115,8 +115,19 @@ def track_messages(
         MessageError: a mixture that a message must not have.
     """
     stamp, frame = track.stamp_ns, track.frame_id
-    posterior = _content(track, track.posterior, MixtureKind.POSTERIOR, track.log_likelihoods)
-    likelihood = _content(track, track.likelihood, MixtureKind.LIKELIHOOD, None)
+    skeleton = track.body.skeleton
+    frames = forward(skeleton, track.posterior.means)
+    joints = frames.joints().transpose(2, 0, 1)
+    posterior = _content(
+        track, track.posterior, joints, MixtureKind.POSTERIOR, track.log_likelihoods
+    )
+    likelihood = _content(
+        track,
+        track.likelihood,
+        track.body.joint_positions(track.likelihood.means),
+        MixtureKind.LIKELIHOOD,
+        None,
+    )
     if track.starts:
         publish('body', message_of_body(messages, track.body, stamp, frame))
     if wanted('pose_mixture'):
@@ -126,16 +137,16 @@ def track_messages(
     if wanted('joint_states'):
         publish('joint_states', heaviest_joint_state(messages, posterior))
     if presentation.publish_tf and wanted('/tf'):
-        publish('/tf', _segment_transforms(messages, track, presentation.frame_prefix))
+        publish('/tf', _segment_transforms(messages, track, frames, presentation.frame_prefix))
     if wanted('markers'):
         names = track.body.joint_names
         publish(
             'markers',
             skeleton_markers(
                 messages,
-                posterior.joint_positions,
+                joints,
                 names,
-                [(names[a], names[b]) for a, b in track.body.skeleton.bones],
+                [(names[a], names[b]) for a, b in skeleton.bones],
                 track.posterior.weights,
                 stamp,
                 frame,
@@ -145,9 +156,9 @@ def track_messages(
     if presentation.overlay_modes and wanted('overlay/compressed'):
         drawn = draw_modes(
             track.image,
-            track.body,
             track.camera,
-            track.posterior.means,
+            joints,
+            skeleton.bones,
             track.posterior.weights,
             presentation.overlay_modes,
         )
@@ -158,14 +169,18 @@ def track_messages(
 
 
 def _content(
-    track: TrackedImage, mixture: GaussianMixture, kind: MixtureKind, log_likelihoods: Array | None
+    track: TrackedImage,
+    mixture: GaussianMixture,
+    joints: Array,
+    kind: MixtureKind,
+    log_likelihoods: Array | None,
 ) -> PoseMixture:
     return PoseMixture(
         mixture=mixture,
         body_model=track.body.name,
         dof_names=track.body.dof_names,
         joint_names=track.body.joint_names,
-        joint_positions=track.body.joint_positions(mixture.means),
+        joint_positions=joints,
         kind=kind,
         stamp_ns=track.stamp_ns,
         frame_id=track.frame_id,
@@ -173,16 +188,17 @@ def _content(
     )
 
 
-def _segment_transforms(messages: MessageFactory, track: TrackedImage, prefix: str) -> Any:
+def _segment_transforms(
+    messages: MessageFactory, track: TrackedImage, frames: Frames, prefix: str
+) -> Any:
     """Every segment of the heaviest mode, seen from the camera."""
-    skeleton = track.body.skeleton
+    names = track.body.skeleton.segment_names
     heaviest = int(np.argmax(track.posterior.weights))
-    frames = forward(skeleton, track.posterior.means[heaviest : heaviest + 1])
     return transforms_message(
         messages,
-        [track.frame_id] * len(skeleton.segment_names),
-        [f'{prefix}{name}' for name in skeleton.segment_names],
-        frames.rotations()[0],
-        frames.origins[:, :, 0],
+        [track.frame_id] * len(names),
+        [f'{prefix}{name}' for name in names],
+        frames.rotations()[heaviest],
+        frames.origins[:, :, heaviest],
         track.stamp_ns,
     )

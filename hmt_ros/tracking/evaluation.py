@@ -1,13 +1,13 @@
 """Errors and calibration of mixtures over poses, against the true joint positions.
 
-All is measured on the joints, relative to the pelvis, so that bodies with other degrees of freedom can
-be compared: a component N(m, S) over poses becomes one over joint positions by linearisation,
+All is measured on the joints, relative to the pelvis, so that bodies with other degrees of freedom
+can be compared: a component N(m, S) over poses becomes one over joint positions by linearisation,
 
     N(f(m), J S J^T + s^2 I),   f: joints minus pelvis,   J = df/dx at m.
 
-The isotropic part s stands for what no pose of the body can meet, because lengths and joint centres of
-the model are not exactly those of the person. Without it the density would be confined to a surface:
-13 joints have 39 coordinates, and a body fewer degrees of freedom that move them.
+The isotropic part s stands for what no pose of the body can meet, because lengths and joint centres
+of the model are not exactly those of the person. Without it the density would be confined to a
+surface: 13 joints have 39 coordinates, and a body has fewer degrees of freedom that move them.
 """
 
 from __future__ import annotations
@@ -100,8 +100,8 @@ def joint_mixtures(
         mixtures: (T,) over poses (d,).
         names: joints, J of them.
         model_sigma: standard deviation of what the body itself gets wrong, a coordinate, m.
-        positions: for each mixture (K, J', 3) of all joints of the body at the means, where they are
-            known, m; None: computed.
+        positions: for each mixture (K, J', 3) of all joints of the body at the means, where they
+            are known, m; None: computed.
 
     Raises:
         KeyError: a joint that the body does not have.
@@ -161,7 +161,7 @@ class Scores:
 
     @staticmethod
     def concatenate(parts: Sequence[Scores]) -> Scores:
-        """Scores of one stretch of time after the other; densities are known where all parts' are."""
+        """Scores of stretches of time in turn; densities are known where those of all parts are."""
 
         def joined(name: str) -> Any:
             values = [getattr(part, name) for part in parts]
@@ -237,7 +237,7 @@ def score(
     """
     if len(mixtures) == 0 or truth.shape != (len(mixtures), len(names), 3):
         raise ValueError(
-            f'{len(mixtures)} mixtures and truth of shape {truth.shape}: wanted (T, {len(names)}, 3)'
+            f'{len(mixtures)} mixtures, truth of shape {truth.shape}: wanted (T, {len(names)}, 3)'
         )
     rng = np.random.default_rng(seed)
     heaviest, best, expected = (np.empty(truth.shape[:2]) for _ in range(3))

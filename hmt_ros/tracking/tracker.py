@@ -45,6 +45,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Image = NDArray[np.uint8]
 
+# Groups of modes with a trunk of their own whose products are rated.
+MOST_GROUPS = 3
 CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
 
 
@@ -69,6 +71,7 @@ class TrackerSettings:
         alternatives: configurations of a chain that are rated.
         samples: samples an image of 'css' and 'ss'.
         sample_scale: their stretch; 0: Cauchy tails.
+        exploration: power of the weights when candidates are chosen; below 1 favours unlikely ones.
         vote: how chains are chosen for search: 'trace', 'eigenvalue' or 'uniform'.
         searched_chains: chains searched in an image.
         jump_probability: of a flip of one chain from one image to the next.
@@ -89,9 +92,10 @@ class TrackerSettings:
     proposals: str = 'kjs'
     candidates: int = 16
     combinations: int = 96
-    alternatives: int = 6
+    alternatives: int = 10
     samples: int = 256
     sample_scale: float = 2.0
+    exploration: float = 0.5
     vote: str = 'trace'
     searched_chains: int = 4
     jump_probability: float = 0.1
@@ -401,7 +405,7 @@ class Tracker:
         """Candidates of kinematic jump sampling: poses, parents, log priors and centres."""
         s, m = self.settings, self.modes
         everything: list[tuple[Array, Index, Array, Array]] = []
-        for group in self._groups(base):
+        for group in self._groups(base)[:MOST_GROUPS]:
             lead = int(group[0])
             found = self._search(base.x[lead], covariances[lead], observation, lead)
             alternatives = [
@@ -428,7 +432,7 @@ class Tracker:
         )
         kept = choose_hypotheses(
             self._relative_joints(poses),
-            log_priors - s.temperature * energies,
+            s.exploration * (log_priors - s.temperature * energies),
             s.candidates,
             same=s.hypothesis_merge_distance,
         ).chosen
@@ -485,7 +489,8 @@ class Tracker:
         self, pose: Array, covariance: Array, observation: Observation, which: int
     ) -> dict[str, Array]:
         """Configurations of some chains, chosen by vote, that fit the image."""
-        names = list(self._searches)
+        shape = observation.distance is not None or observation.edges is not None
+        names = list(self._searches) if shape else []
         count = min(self.settings.searched_chains, len(names))
         if count == 0:
             return {}
@@ -510,6 +515,14 @@ class Tracker:
         if found is not None:
             angles.append(found)
             penalties.append(np.full((len(modes), len(found)), jump))
+        sibling = chain.replace('left_', 'right_') if 'left_' in chain else chain.replace('right_', 'left_')
+        if sibling != chain:
+            # Limbs that cross in the image are easily taken for each other.
+            swapped, _ = rehang_chain(
+                self.body, modes[:1], modes[:1], chain, image_of=sibling
+            )
+            angles.append(swapped[:, own])
+            penalties.append(np.full((len(modes), len(swapped)), jump))
         sources = np.concatenate(angles)
         poses = np.repeat(modes[:1], len(sources), axis=0)
         poses[:, own] = sources
@@ -641,10 +654,23 @@ class Tracker:
         return np.where(self.body.skeleton.dof_is_rotation, 0.3, 0.2)
 
     def _observe(self, image: Image, keypoints: Keypoints | None) -> Observation:
-        silhouette = self.background.silhouette(image) if self.background.frames else None
+        t = self.settings.likelihood
+        shape = t.containment.weight > 0 or t.coverage.weight > 0
+        textured = t.intensity.weight > 0 or t.motion.weight > 0
+        wanted = [
+            name
+            for name, needed in (
+                ('edges', t.edges.weight > 0),
+                ('intensity', textured),
+                ('flow', t.motion.weight > 0),
+            )
+            if needed
+        ]
+        silhouette = self.background.silhouette(image) if shape and self.background.frames else None
         return observe(
-            image, silhouette, keypoints, self.settings.observation, last_image=self._last_image
-        )
+            image, silhouette, keypoints, self.settings.observation,
+            last_image=self._last_image, wanted=wanted,
+        )  # fmt: skip
 
     def _energy(
         self, poses: Array, observation: Observation, textures: Textures | None, which: Index | None

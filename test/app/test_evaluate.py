@@ -64,7 +64,14 @@ def truth_file(tmp_path_factory, body, poses):
 def mixture_message(body, mixture, stamp, kind=MixtureKind.POSTERIOR, frame_id=FRAME_ID, name=None):
     positions = body.joint_positions(mixture.means)
     content = PoseMixture(
-        mixture, name or body.name, body.dof_names, body.joint_names, positions, kind, stamp, frame_id
+        mixture,
+        name or body.name,
+        body.dof_names,
+        body.joint_names,
+        positions,
+        kind,
+        stamp,
+        frame_id,
     )
     return pose_mixture_message(MESSAGES, content)
 
@@ -79,7 +86,9 @@ def write(path, body, mixtures, *, poses=None, with_body=True, change=None):
             bag.write('pose_mixture', stamp, message if change is None else change(message))
             if poses is not None:
                 joints = body.joint_positions(poses[i : i + 1])[0]
-                bag.write('ground_truth', stamp, ground_truth(MESSAGES, body, poses[i], joints, stamp))
+                bag.write(
+                    'ground_truth', stamp, ground_truth(MESSAGES, body, poses[i], joints, stamp)
+                )
     return path
 
 
@@ -151,8 +160,11 @@ def test_table_for_people(capsys, bag, truth_file):
     summary = report(capsys, bag, '--truth', truth_file)['topics']['pose_mixture']
     (row,) = (line.split() for line in lines if line.startswith('pose_mixture'))
     assert row[1:7] == [
-        str(FRAMES), '0', '2.0', *(f'{summary[f"{key}_mm"]:.0f}' for key in ('heaviest', 'best', 'expected'))
-    ]  # fmt: skip
+        str(FRAMES),
+        '0',
+        '2.0',
+        *(f'{summary[f"{key}_mm"]:.0f}' for key in ('heaviest', 'best', 'expected')),
+    ]
     assert max(map(len, lines)) <= 120
     assert [line.split()[0] for line in lines[-13:]] == list(EVALUATED_JOINTS)
 
@@ -166,7 +178,9 @@ def test_frames_without_mixture_and_mixtures_without_truth(capsys, tmp_path, bod
     assert (found['frames'], found['missing'], found['without_truth']) == (3, 2, 1)
 
 
-def test_a_bag_without_body_has_errors_but_no_densities(capsys, tmp_path, body, mixtures, bag, truth_file):
+def test_a_bag_without_body_has_errors_but_no_densities(
+    capsys, tmp_path, body, mixtures, bag, truth_file
+):
     path = write(tmp_path / 'out', body, mixtures, with_body=False)
     found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
     wanted = report(capsys, bag, '--truth', truth_file)['topics']['pose_mixture']
@@ -210,7 +224,9 @@ def test_the_body_may_change_on_the_way(capsys, tmp_path, body, poses, truth_fil
     with BagWriter(path) as bag:
         for i, stature in enumerate((1.82, 1.70)):
             own = body.with_stature(stature)
-            bag.write('body', STAMPS[3 * i], message_of_body(MESSAGES, own, STAMPS[3 * i], FRAME_ID))
+            bag.write(
+                'body', STAMPS[3 * i], message_of_body(MESSAGES, own, STAMPS[3 * i], FRAME_ID)
+            )
             for t in range(3 * i, 3 * i + 3):
                 mean = poses[t] + 0.01 * rng.normal(size=body.dimension)
                 mixture = GaussianMixture([1.0], mean[None], 0.001 * np.eye(body.dimension)[None])
@@ -231,11 +247,15 @@ def test_model_that_only_the_option_knows(capsys, tmp_path, body, mixtures, trut
             bag.write('pose_mixture', stamp, mixture_message(body, mixture, stamp, name='my_body'))
     unknown = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
     assert unknown['coverage_90'] is None
-    named = report(capsys, path, '--truth', truth_file, '--body', 'human37')['topics']['pose_mixture']
+    named = report(capsys, path, '--truth', truth_file, '--body', 'human37')['topics'][
+        'pose_mixture'
+    ]
     assert named['coverage_90'] is not None
 
 
-def test_every_topic_gets_a_row_and_one_can_be_chosen(capsys, tmp_path, body, poses, mixtures, truth_file):
+def test_every_topic_gets_a_row_and_one_can_be_chosen(
+    capsys, tmp_path, body, poses, mixtures, truth_file
+):
     path = tmp_path / 'out'
     kinds = {
         'p/pose_mixture': MixtureKind.POSTERIOR,
@@ -261,9 +281,7 @@ def test_every_topic_gets_a_row_and_one_can_be_chosen(capsys, tmp_path, body, po
 
 
 @pytest.mark.parametrize('with_covariances', [True, False])
-def test_marginals_of_trajectories(
-    capsys, tmp_path, body, mixtures, truth_file, with_covariances
-):
+def test_marginals_of_trajectories(capsys, tmp_path, body, mixtures, truth_file, with_covariances):
     """Windows overlap; of a frame the newest one counts."""
     path = tmp_path / 'out'
 
@@ -322,7 +340,9 @@ def test_truth_that_can_not_be_used(capsys, tmp_path, bag, body):
     cases = {
         'can not be read': tmp_path / 'nowhere.npz',
         'no truth file': text,
-        "no ['joints']": save(tmp_path / 'a.npz', **{k: good[k] for k in ('stamps', 'joint_names')}),
+        "no ['joints']": save(
+            tmp_path / 'a.npz', **{k: good[k] for k in ('stamps', 'joint_names')}
+        ),
         '5 stamps': save(tmp_path / 'b.npz', **{**good, 'stamps': good['stamps'][:5]}),
         'whole nanoseconds': save(tmp_path / 'c.npz', **{**good, 'stamps': good['stamps'] * 1e-9}),
         'not finite': save(tmp_path / 'd.npz', **{**good, 'joints': infinite}),
@@ -377,7 +397,10 @@ def test_bags_that_can_not_be_used(capsys, tmp_path, bag, body, mixtures, truth_
         ('no topic smoothed', [bag, '--topic', 'smoothed']),
         ('no mixtures to evaluate', [bag, '--topic', 'ground_truth']),
         ("frame 'map'", [write(tmp_path / 'map', body, mixtures, change=in_map), '--truth', bag]),
-        ('has no joints', [write(tmp_path / 'joints', body, mixtures, change=nameless), '--truth', bag]),
+        (
+            'has no joints',
+            [write(tmp_path / 'joints', body, mixtures, change=nameless), '--truth', bag],
+        ),
         ('sum to', [write(tmp_path / 'heavy', body, mixtures, change=heavy), '--truth', bag]),
         ('--model-sigma', [bag, '--model-sigma', '-1']),
         ('no body', [bag, '--body', 'human99']),

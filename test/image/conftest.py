@@ -45,6 +45,4 @@ def shot() -> Shot:
     scene = Scene(viewpoint=VIEW, seed=2)
     frames = list(render_frames(body, poses, camera, scene))
     empty = np.rint(scene.background(camera)).astype(np.uint8)
-    return Shot(
-        body, camera, poses, [f.image for f in frames], [f.mask for f in frames], empty
-    )
+    return Shot(body, camera, poses, [f.image for f in frames], [f.mask for f in frames], empty)

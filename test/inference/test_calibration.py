@@ -79,7 +79,9 @@ def test_calibration_error_of_too_narrow_and_too_wide_densities():
 def test_stratified_samples_have_the_moments_and_weights_of_the_mixture():
     rng = np.random.default_rng(2)
     mixture = GaussianMixture(
-        np.array([0.6, 0.1, 0.3]), np.array([[0.0, 0], [50, 0], [0, 50]]), np.tile(np.eye(2), (3, 1, 1))
+        np.array([0.6, 0.1, 0.3]),
+        np.array([[0.0, 0], [50, 0], [0, 50]]),
+        np.tile(np.eye(2), (3, 1, 1)),
     )
     samples = stratified_samples(mixture, 1000, rng)
     assert samples.shape == (1000, 2)

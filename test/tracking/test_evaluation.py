@@ -121,9 +121,7 @@ def test_coverage_tells_honest_mixtures_from_others(body, inflation):
     rng = np.random.default_rng(3)
     honest = joint_mixtures(body, pose_mixtures(body, 200, spread=0.1))
     truth = np.array([m.density().sample(1, rng)[0].reshape(-1, 3) for m in honest])
-    said = [
-        JointMixture(m.weights, m.joints, inflation**2 * m.covariances) for m in honest
-    ]
+    said = [JointMixture(m.weights, m.joints, inflation**2 * m.covariances) for m in honest]
     summary = score(said, truth, samples=200).summary()
     error = np.sqrt(0.25 / len(truth))
     if inflation == 1.0:

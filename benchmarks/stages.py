@@ -1,0 +1,88 @@
+"""Where the time of a tracking step goes: a clock around the parts of the tracker, from outside."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.tracking import tracker as tracker_module
+from hmt_ros.tracking.tracker import Tracker
+
+# Part of the tracker -> name of the stage; time in a part that another part calls is its own.
+STAGES: tuple[tuple[Any, str, str], ...] = (
+    (BackgroundModel, 'silhouette', 'background'),
+    (tracker_module, 'observe', 'observation'),
+    (Tracker, '_begin', 'start of the track'),
+    (Tracker, '_follow_motion', 'motion'),
+    (Tracker, '_jumps', 'combinations'),
+    (Tracker, '_samples', 'samples'),
+    (Tracker, '_search', 'chain search'),
+    (Tracker, '_rate', 'rating'),
+    (Tracker, '_minimise', 'candidates'),
+    (Tracker, '_keep', 'keeping'),
+    (Tracker, '_fit_flesh', 'flesh'),
+    (Tracker, 'likelihood_mixture', 'likelihood modes'),
+)
+# In these, minimisation is part of the stage.
+WHOLE = ('motion', 'start of the track', 'flesh')
+PROPOSED = ('combinations', 'samples')
+
+
+class StageClock:
+    """Seconds per stage, summed up."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._stack: list[str] = []
+        self._since = 0.0
+        self._proposed = False
+
+    def begin_step(self) -> None:
+        """A new image: minimisation before proposals is that of the predictions."""
+        self._proposed = False
+
+    def _enter(self, stage: str) -> None:
+        if stage == 'candidates':
+            if self._stack and self._stack[-1] in WHOLE:
+                stage = self._stack[-1]
+            elif not self._proposed:
+                stage = 'predictions'
+        self._proposed |= stage in PROPOSED
+        self._charge()
+        self._stack.append(stage)
+
+    def _leave(self) -> None:
+        self._charge()
+        self._stack.pop()
+
+    def _charge(self) -> None:
+        now = time.perf_counter()
+        if self._stack:
+            stage = self._stack[-1]
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._since
+        self._since = now
+
+    def _wrapped(self, function: Callable[..., Any], stage: str) -> Callable[..., Any]:
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            self._enter(stage)
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self._leave()
+
+        return timed
+
+    @contextmanager
+    def running(self) -> Iterator[StageClock]:
+        """While it runs, the parts of all trackers are timed."""
+        usual = [(owner, name, getattr(owner, name)) for owner, name, _ in STAGES]
+        try:
+            for (owner, name, stage), (_, _, function) in zip(STAGES, usual, strict=True):
+                setattr(owner, name, self._wrapped(function, stage))
+            yield self
+        finally:
+            for owner, name, function in usual:
+                setattr(owner, name, function)

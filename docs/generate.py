@@ -1,0 +1,89 @@
+"""Writes the parts of the pages that are made by programs.
+
+    python docs/generate.py parameters     the table of parameters in nodes.md
+    python docs/generate.py flips          times in flips.md
+    python docs/generate.py kernels        times in likelihood.md
+    python docs/generate.py tracking       accuracy and speed in tracking.md (minutes)
+
+Such a part stands between `<!-- begin NAME -->` and `<!-- end -->`.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from pathlib import Path
+
+for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
+    os.environ.setdefault(_name, '1')
+DOCS = Path(__file__).resolve().parent
+sys.path.insert(0, str(DOCS.parent))
+
+PAGES = {
+    'parameters': 'nodes.md',
+    'flips': 'flips.md',
+    'kernels': 'likelihood.md',
+    'tracking': 'tracking.md',
+}
+
+
+def main(argv: list[str]) -> int:
+    """Writes the parts that are named."""
+    if not argv or any(name not in PAGES for name in argv):
+        sys.stderr.write(f'generate.py: wanted some of {", ".join(PAGES)}\n')
+        return 1
+    for name in argv:
+        path = DOCS / PAGES[name]
+        path.write_text(with_part(path.read_text('utf-8'), name, part(name)), 'utf-8')
+    return 0
+
+
+def with_part(page: str, name: str, content: str) -> str:
+    """A page with a part replaced.
+
+    Raises:
+        ValueError: the page has no such part.
+    """
+    begin, end = f'<!-- begin {name} -->\n', '<!-- end -->\n'
+    head, found, rest = page.partition(begin)
+    _, closed, tail = rest.partition(end)
+    if not found or not closed:
+        raise ValueError(f'no part {name!r}')
+    return f'{head}{begin}{content}\n{end}{tail}'
+
+
+def part(name: str) -> str:
+    """The content of a part."""
+    if name == 'parameters':
+        return parameter_table()
+    from benchmarks import flips, kernels, tracking
+
+    return {'flips': flips, 'kernels': kernels, 'tracking': tracking}[name].page()
+
+
+def parameter_table() -> str:
+    """All parameters of the filter node, as the node declares them."""
+    from hmt_ros.nodes.declared_parameters import declared_parameters
+    from hmt_ros.nodes.filter_parameters import FilterParameters
+
+    lines = ['| parameter | default | range | takes effect | what |', '|---|---|---|---|---|']
+    for parameter in declared_parameters(FilterParameters()):
+        value = parameter.default
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        default = f'`{text}`' if text else 'empty'
+        bounds = ''
+        if parameter.limits is not None:
+            low, high = (_number(limit) for limit in parameter.limits)
+            bounds = f'{low} to {high}' if high else f'at least {low}'
+        cells = (f'`{parameter.name}`', default, bounds, parameter.effect, parameter.description)
+        lines.append(f'| {" | ".join(cells)} |')
+    return '\n'.join(lines)
+
+
+def _number(limit: float) -> str:
+    return '' if math.isinf(limit) or limit == 2**31 - 1 else f'{limit:g}'
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1:]))

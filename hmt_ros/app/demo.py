@@ -1,0 +1,151 @@
+"""The demonstration that `make demo` runs: a bag through the tracker, pictures, a table of errors.
+
+`python -m hmt_ros.app.demo bags/reach -o build/demo --live`
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from hmt_ros.app import replay
+from hmt_ros.app.bag_scores import score_bag
+from hmt_ros.app.evaluate import as_text
+from hmt_ros.app.pictures import draw_overlays, draw_overview, draw_side_views, draw_weights
+from hmt_ros.app.recorded_track import RecordedTrack, read_images, read_track
+from hmt_ros.app.truth import Truth, read_truth, truth_of, truth_topic
+from msg_tools import BagReader
+
+# Times that are shown in the overview and on the sheets.
+IN_OVERVIEW, ON_SHEETS = 4, 8
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the demonstration; 0: done, 1: bad input, and one line on stderr says which."""
+    try:
+        options = _parser().parse_args(argv)
+        return _demonstrate(options)
+    except (ValueError, OSError) as error:
+        text = ' '.join(str(error).split()) or type(error).__name__
+        print(f'demo: {text}', file=sys.stderr)
+        return 1
+
+
+class _Parser(argparse.ArgumentParser):
+    """Bad input is one line and exit code 1, as everywhere else."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f'{message}; --help tells more')
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog='demo',
+        description='Tracks the person of a bag, draws pictures of the track and, where the truth '
+        'is known, prints errors.',
+    )
+    parser.add_argument(
+        'bag',
+        type=Path,
+        help='folder of a bag with subject.yaml and, if there is one, background.png in it',
+    )
+    parser.add_argument(
+        '-o', '--output', type=Path, required=True, metavar='DIR',
+        help='folder for the bag of the track and the pictures',
+    )  # fmt: skip
+    parser.add_argument('--live', action='store_true', help='through the real node, over DDS')
+    return parser
+
+
+def _demonstrate(options: argparse.Namespace) -> int:
+    source, folder = options.bag, options.output
+    target = folder / source.resolve().name
+    how = 'filter_node' if options.live else 'the tracker'
+    print(f'{source} through {how}', flush=True)
+    arguments = [str(source), '-o', str(target), '--overwrite']
+    for option, name in (('--subject', 'subject.yaml'), ('--background', 'background.png')):
+        if (source / name).is_file():
+            arguments += [option, str(source / name)]
+    start = time.monotonic()
+    code = replay.main([*arguments, *(['--live'] if options.live else [])])
+    if code != 0:
+        return code
+    spent = time.monotonic() - start
+    track = read_track(target)
+    truth = _truth(source, target)
+    pictures = draw(source, folder, track, truth)
+    print(_summary(track, spent))
+    if truth is not None:
+        print(as_text(score_bag(target, truth), truth, by_joint=False))
+    print('\nwhat came out')
+    for path, what in ((target, 'bag: ' + ', '.join(_topics(target))), *pictures):
+        print(f'  {path!s:{max(len(str(x)) for x, _ in pictures)}}  {what}')
+    return 0
+
+
+def draw(
+    source: Path, folder: Path, track: RecordedTrack, truth: Truth | None
+) -> list[tuple[Path, str]]:
+    """Draws all pictures of a track; each with what it shows.
+
+    Args:
+        source: bag of the images.
+        folder: for the pictures.
+        track: what was tracked.
+        truth: None: not known.
+    """
+    few, many = _spread(track, IN_OVERVIEW), _spread(track, ON_SHEETS)
+    camera, images = read_images(source, {*few, *many})
+    pictures = [
+        (folder / 'overview.png', 'images with the heaviest modes, and the same from the side'),
+        (folder / 'overlays.png', 'the heaviest modes on more images'),
+        (folder / 'side_views.png', 'all modes from the side'),
+        (folder / 'weights.png', 'weights of the modes over time' + (', errors' if truth else '')),
+    ]
+    overview, overlays, side_views, weights = (path for path, _ in pictures)
+    draw_overview(overview, track, camera, {t: images[t] for t in few}, truth)
+    draw_overlays(overlays, track, camera, {t: images[t] for t in many})
+    draw_side_views(side_views, track, many, truth)
+    draw_weights(weights, track, truth)
+    return pictures
+
+
+def _spread(track: RecordedTrack, count: int) -> list[int]:
+    """Stamps spread evenly over a track."""
+    last = len(track.moments) - 1
+    chosen = np.unique(np.rint((np.arange(count) + 0.5) / count * last).astype(int))
+    return [track.moments[i].stamp_ns for i in chosen]
+
+
+def _truth(source: Path, target: Path) -> Truth | None:
+    """The truth in the bag, or beside its source."""
+    with BagReader(target) as bag:
+        topic = truth_topic(bag)
+        if topic is not None:
+            return truth_of(bag, topic)
+    beside = source / 'truth.npz'
+    return read_truth(beside) if beside.is_file() else None
+
+
+def _summary(track: RecordedTrack, spent: float) -> str:
+    count = len(track.moments)
+    modes = np.mean([len(moment.weights) for moment in track.moments])
+    heaviest = np.mean([moment.weights[0] for moment in track.moments])
+    return (
+        f'{spent:.1f} s for {count} images; {modes:.1f} modes an image, the heaviest with '
+        f'{100 * heaviest:.0f} % of the weight on average\n'
+    )
+
+
+def _topics(bag: Path) -> list[str]:
+    with BagReader(bag) as reader:
+        return [topic.name for topic in reader.topics.values() if topic.message_count]
+
+
+if __name__ == '__main__':
+    sys.exit(main())

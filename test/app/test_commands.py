@@ -1,0 +1,60 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import hmt_ros
+from hmt_ros.app import COMMANDS, main
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize('option', ['-h', '--help'])
+def test_help_names_all_commands(option, capsys):
+    assert main([option]) == 0
+    text = capsys.readouterr().out
+    for name, (_, what) in COMMANDS.items():
+        assert f'  {name}' in text
+        assert what in text
+    assert max(len(line) for line in text.splitlines()) <= 100
+
+
+def test_version(capsys):
+    assert main(['--version']) == 0
+    assert capsys.readouterr().out == f'hmt_ros {hmt_ros.__version__}\n'
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [([], 'no command given'), (['replya'], "no command 'replya'"), (['--live'], "'--live'")],
+)
+def test_unknown_commands_are_one_line(arguments, message, capsys):
+    assert main(arguments) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+    assert 'replay, make-bag, evaluate' in line
+
+
+@pytest.mark.parametrize('command', ['replay', 'make-bag', 'evaluate'])
+def test_commands_explain_themselves(command, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main([command, '--help'])
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f'usage: {command} ')
+    assert main([command]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f'{command}: the following arguments are required')
+
+
+def test_module_is_the_command():
+    result = subprocess.run(
+        [sys.executable, '-m', 'hmt_ros', 'make-bag', 'swim', '-o', '/nowhere/bag'],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 1
+    assert result.stderr.startswith('make-bag: ')

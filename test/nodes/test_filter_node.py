@@ -1,0 +1,505 @@
+"""The node itself, over DDS; with a tracker that costs nothing."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_ros.nodes.declared_parameters import EFFECTS, declared_parameters
+from hmt_ros.nodes.filter_parameters import FilterParameters
+from hmt_ros.nodes.parameter_file import read_parameter_file
+from hmt_ros.nodes.track_messages import TOPICS
+from msg_tools.cdr import serialise
+
+pytestmark = pytest.mark.ros
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml'
+PATIENCE = 60.0  # s
+
+
+class World:
+    """A filter node, and somebody who talks to it, in a context of their own."""
+
+    def __init__(self, **values):
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+        from hmt_msgs.msg import Keypoints2D
+        from rcl_interfaces.msg import Log
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.parameter import Parameter
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        from sensor_msgs.msg import CameraInfo, Image
+
+        from hmt_ros.nodes.filter_node import FilterNode
+
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        for topic in ('/image', '/camera_info', '/keypoints'):
+            values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
+        overrides = [Parameter(name, value=value) for name, value in values.items()]
+        self.node = FilterNode(context=self.context, parameter_overrides=overrides)
+        self.other = rclpy.create_node('other', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.executor.add_node(self.other)
+        self.publishers = {
+            'image': self.other.create_publisher(Image, 'image', 100),
+            'camera_info': self.other.create_publisher(CameraInfo, 'camera_info', 100),
+            'keypoints': self.other.create_publisher(Keypoints2D, 'keypoints', 100),
+        }
+        self.handled, self.diagnostics, self.log = [], [], []
+        self.listen(DiagnosticStatus, 'filter_node/handled', self.handled)
+        self.listen(DiagnosticArray, '/diagnostics', self.diagnostics)
+        latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.listen(Log, '/rosout', self.log, latched)
+
+    def listen(self, kind, topic, into, qos=100):
+        def receive(message):
+            into.append(message)
+
+        return self.other.create_subscription(kind, topic, receive, qos)
+
+    def spin_until(self, done, what='it'):
+        end = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < end, f'waited in vain for {what}'
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def start(self):
+        self.node.start()
+        return self.connect()
+
+    def connect(self):
+        """Returns when both sides know all topics of each other."""
+        self.spin_until(
+            lambda: (
+                all(p.get_subscription_count() for p in self.publishers.values())
+                and self.other.count_publishers('filter_node/handled') == 1
+                and self.node.count_subscribers('filter_node/handled') == 1
+                and self.node._handled.get_subscription_count() == 1
+            )
+        )
+        return self
+
+    def send(self, source, message):
+        """Publishes a message; what became of it."""
+        count = len(self.handled)
+        self.publishers[source].publish(serialise(message))
+        self.spin_until(lambda: len(self.handled) > count, f'an answer to {source}')
+        return self.handled[-1]
+
+    def call(self, kind, service, **fields):
+        client = self.other.create_client(kind, f'filter_node/{service}')
+        self.spin_until(client.service_is_ready, service)
+        future = client.call_async(kind.Request(**fields))
+        self.spin_until(future.done, f'an answer of {service}')
+        self.other.destroy_client(client)
+        return future.result()
+
+    def change_state(self, label):
+        from lifecycle_msgs.msg import Transition
+        from lifecycle_msgs.srv import ChangeState
+
+        number = getattr(Transition, f'TRANSITION_{label.upper()}')
+        return self.call(ChangeState, 'change_state', transition=Transition(id=number)).success
+
+    @property
+    def state(self):
+        from lifecycle_msgs.srv import GetState
+
+        return self.call(GetState, 'get_state').current_state.label
+
+    def set(self, **values):
+        """Sets parameters; the reasons why not."""
+        from rcl_interfaces.srv import SetParametersAtomically
+        from rclpy.parameter import Parameter
+
+        parameters = [
+            Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
+            for name, value in values.items()
+        ]
+        result = self.call(
+            SetParametersAtomically, 'set_parameters_atomically', parameters=parameters
+        ).result
+        return result.successful, result.reason
+
+    def warnings(self):
+        """Texts that the node has logged as warnings or worse."""
+        return [line.msg for line in self.log if line.name == 'filter_node' and line.level >= 30]
+
+    def diagnosis(self):
+        """The newest diagnostics: level, message, values."""
+        count = len(self.diagnostics)
+        self.spin_until(lambda: len(self.diagnostics) > count, 'diagnostics')
+        (status,) = self.diagnostics[-1].status
+        return status.level[0], status.message, {v.key: v.value for v in status.values}
+
+    def close(self):
+        import rclpy
+
+        self.node.stop()
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.other.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+@pytest.fixture
+def world(stub_tracker, subject_file):
+    worlds = []
+
+    def make(**values):
+        values.setdefault('subject_file', str(subject_file))
+        worlds.append(World(**values))
+        return worlds[-1]
+
+    yield make
+    for one in worlds:
+        one.close()
+
+
+@pytest.fixture
+def running(world):
+    return world().start()
+
+
+def faults(handled):
+    return [value.value for value in handled.values if value.key == 'fault']
+
+
+def published(handled):
+    return [value.key for value in handled.values if value.key in TOPICS]
+
+
+def test_images_become_messages(running, small_camera):
+    from hmt_msgs.msg import Body, PoseMixture
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from tf2_msgs.msg import TFMessage
+
+    mixtures, transforms, bodies = [], [], []
+    running.listen(PoseMixture, 'pose_mixture', mixtures)
+    running.listen(TFMessage, '/tf', transforms)
+    running.spin_until(lambda: running.node.count_subscribers('pose_mixture') == 1)
+    running.spin_until(lambda: running.node._is_wanted('/tf'))
+    running.send('camera_info', small_camera.info())
+    first = running.send('image', small_camera.image(0))
+    assert first.name == 'image'
+    assert (first.values[0].key, first.values[0].value) == ('stamp', str(small_camera.stamp(0)))
+    # What nobody listens to is not made.
+    assert published(first) == ['body', 'pose_mixture', '/tf']
+    assert published(running.send('image', small_camera.image(1))) == ['pose_mixture', '/tf']
+    running.spin_until(lambda: len(mixtures) == 2 and len(transforms) == 2)
+    assert [len(m.components) for m in mixtures] == [2, 2]
+    assert mixtures[0].header.frame_id == 'lens'
+    assert transforms[0].transforms[0].header.frame_id == 'lens'
+    # The body waits for those who come late.
+    late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    running.listen(Body, 'body', bodies, late)
+    running.spin_until(lambda: len(bodies) == 1)
+    assert bodies[0].name == 'human37'
+
+
+def test_parameters_are_those_of_the_file(running):
+    descriptors = {p.name: p for p in declared_parameters(FilterParameters())}
+    of_ros = ('use_sim_time', 'start_type_description_service')
+    names = [
+        name
+        for name in running.node._parameters
+        if name not in of_ros and not name.startswith('qos_overrides.')
+    ]
+    assert sorted(names) == sorted(read_parameter_file(CONFIG, 'filter_node'))
+    for name in names:
+        declared = descriptors[name]
+        if name != 'subject_file':
+            assert running.node.get_parameter(name).value == declared.default
+        descriptor = running.node.describe_parameter(name)
+        assert descriptor.description == f'{declared.description} {EFFECTS[declared.effect]}'
+        ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
+        assert [(r.from_value, r.to_value) for r in ranges] == (
+            [declared.limits] if declared.limits else []
+        )
+
+
+def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
+    for values, reason in (
+        ({'max_hypotheses': 0}, 'out of range. Min: 1, Max: 64, value: 0'),
+        ({'max_hypotheses': 20}, 'max_hypotheses <= candidates, saw 20 and 16'),
+        ({'proposals': 'guess'}, "saw 'guess'"),
+        ({'likelihood__edges__sigma': 0.0}, 'sigma > 0'),
+        ({'subject_file': str(tmp_path / 'none.yaml')}, 'none.yaml: can not be read'),
+        ({'body_model': 'nobody'}, "no body 'nobody'"),
+        ({'autostart': False}, 'read-only'),
+        ({'max_hypotheses': 8.0}, 'type'),
+    ):
+        good, why = running.set(**values)
+        assert not good
+        assert reason in why, why
+    before = FilterParameters()
+    assert running.node._settings.tracker == before.tracker
+    assert running.set(max_hypotheses=20, candidates=24, queue_size=2) == (True, '')
+    assert running.node._settings.tracker.max_hypotheses == 20
+    assert running.node._session.parameters is running.node._settings
+    assert running.node._queue._limits['image'] == 2
+
+
+def test_one_warning_for_each_kind_and_the_node_lives(running, small_camera):
+    def of_unknown_encoding(index):
+        image = small_camera.image(index)
+        image.encoding = 'yuv9'
+        return image
+
+    def of_another_size(index):
+        return small_camera.image(index, size=(32, 24))
+
+    for _ in range(3):
+        running.send('camera_info', small_camera.uncalibrated())
+    running.send('camera_info', small_camera.info())
+    assert faults(running.send('image', small_camera.image(2))) == []
+    for make, indices in (
+        (small_camera.image, (2, 2)),
+        (small_camera.image, (1, 0)),
+        (of_unknown_encoding, (3, 4)),
+        (of_another_size, (5, 6)),
+    ):
+        for index in indices:
+            assert len(faults(running.send('image', make(index)))) == 1
+    running.set(use_keypoints=True)
+    for index in (7, 8):
+        wrong = small_camera.keypoints(index, names=('head', 'neck'), u=np.array([np.nan, 1.0]))
+        assert len(faults(running.send('keypoints', wrong))) == 1
+    assert faults(running.send('image', small_camera.image(8))) == []
+    wanted = (
+        'camera is not calibrated',
+        'wanted stamps that increase',
+        'with reset_on_time_jump the track would start anew',
+        "encoding 'yuv9' is not known",
+        'has 32x24 pixels, wanted the 64x48',
+        'keypoint head lies at (nan',
+    )
+    running.spin_until(lambda: len(running.warnings()) >= len(wanted))
+    for text, part in zip(running.warnings(), wanted, strict=True):
+        assert part in text
+        assert '\n' not in text
+    _, _, values = running.diagnosis()
+    assert values['images tracked'] == '2'
+    assert values['images skipped'] == '8'
+    assert values['faults: camera_info'] == '3'
+    assert values['faults: keypoints'] == '2'
+
+
+def test_bytes_that_are_no_message(running, small_camera):
+    running.send('camera_info', small_camera.info())
+    data = serialise(small_camera.image(0))
+    count = len(running.handled)
+    running.node._queue.put('image', data[:60], time.monotonic())
+    running.spin_until(lambda: len(running.handled) > count)
+    assert faults(running.handled[-1])[0].startswith('message of image can not be read: ')
+    assert faults(running.send('image', small_camera.image(1))) == []
+
+
+def test_faults_of_our_own_do_not_end_the_node(running, small_camera, stub_tracker):
+    running.send('camera_info', small_camera.info())
+    running.send('image', small_camera.image(0))
+    stub_tracker.fault = TypeError('a fault of ours')
+    running.publishers['image'].publish(serialise(small_camera.image(1)))
+    running.spin_until(lambda: len(running.warnings()) == 1)
+    assert 'TypeError: a fault of ours' in running.warnings()[0]
+    assert 'Traceback' in running.warnings()[0]
+    stub_tracker.fault = None
+    assert faults(running.send('image', small_camera.image(2))) == []
+    assert len(stub_tracker.made) == 2
+
+
+def test_lifecycle(world, small_camera):
+    from hmt_msgs.srv import Reset
+
+    one = world(autostart=False)
+    one.node.start()
+    assert one.state == 'unconfigured'
+    assert one.publishers['image'].get_subscription_count() == 0
+    assert not one.change_state('activate')
+    one.spin_until(lambda: len(one.warnings()) == 1)
+    assert 'transition 3 is not possible' in one.warnings()[0]
+    assert one.change_state('configure')
+    assert one.state == 'inactive'
+    answer = one.call(Reset, 'reset')
+    assert (answer.success, answer.message) == (False, 'the node is not active')
+    assert one.change_state('activate')
+    one.connect()
+    one.send('camera_info', small_camera.info())
+    one.send('image', small_camera.image(0))
+    assert one.change_state('deactivate')
+    assert one.state == 'inactive'
+    one.spin_until(lambda: one.publishers['image'].get_subscription_count() == 0)
+    assert one.change_state('activate')
+    one.connect()
+    # The track and the camera are those of before.
+    assert faults(one.send('image', small_camera.image(1))) == []
+    assert one.node._session.state.images['tracked'] == 2
+    assert one.change_state('deactivate')
+    assert one.change_state('cleanup')
+    assert one.state == 'unconfigured'
+    assert one.node._session is None
+    assert one.change_state('configure')
+    assert one.change_state('activate')
+    assert one.change_state('active_shutdown')
+    assert one.state == 'finalized'
+
+
+def test_node_without_its_subject_lives(world, subject_file, small_camera):
+    missing = subject_file.with_name('missing.yaml')
+    one = world(subject_file=str(missing))
+    one.node.start()
+    assert one.state == 'unconfigured'
+    one.spin_until(lambda: len(one.warnings()) == 1)
+    assert one.warnings() == [f'{missing}: can not be read (No such file or directory)']
+    assert one.diagnosis()[:2] == (2, one.warnings()[0])
+    assert one.set(subject_file=str(subject_file)) == (True, '')
+    assert one.change_state('configure')
+    assert one.change_state('activate')
+    one.connect()
+    one.send('camera_info', small_camera.info())
+    assert published(one.send('image', small_camera.image(0))) == ['body']
+
+
+def test_reset(running, small_camera, stub_tracker, subject_file, body):
+    from hmt_msgs.msg import PoseComponent, PoseMixture
+    from hmt_msgs.srv import Reset
+
+    running.send('camera_info', small_camera.info())
+    running.send('image', small_camera.image(0))
+    answer = running.call(Reset, 'reset')
+    assert (answer.success, answer.message) == (True, 'the next image starts a new track')
+    assert published(running.send('image', small_camera.image(1))) == ['body']
+    assert len(stub_tracker.made) == 2
+    mixture = PoseMixture(
+        body_model='human37',
+        dof_names=list(body.dof_names),
+        components=[
+            PoseComponent(
+                weight=1.0,
+                mean=body.prior_mean.tolist(),
+                covariance=np.eye(body.dimension).reshape(-1).tolist(),
+            )
+        ],
+    )
+    assert running.call(Reset, 'reset', initial=mixture).success
+    running.send('image', small_camera.image(2))
+    assert np.array_equal(stub_tracker.made[2]._start.means, [body.prior_mean])
+    mixture.components[0].weight = 0.5
+    answer = running.call(Reset, 'reset', initial=mixture)
+    assert (answer.success, answer.message) == (
+        False,
+        'mixture has weights that sum to 0.5, wanted 1',
+    )
+    subject_file.write_text(
+        'stamp_ns: 1\nkeypoints: {haed: [1, 2], a: [1, 2], b: [1, 2], c: [1, 2]}'
+    )
+    answer = running.call(Reset, 'reset')
+    assert not answer.success
+    assert 'human37 has no joint' in answer.message
+    running.send('image', small_camera.image(3))
+    assert len(stub_tracker.made) == 3
+
+
+def test_late_node_drops_the_oldest_and_answers_meanwhile(
+    world, small_camera, stub_tracker, monkeypatch
+):
+    go = threading.Event()
+    step = stub_tracker.step
+
+    def slow(self, *arguments):
+        assert go.wait(PATIENCE)
+        return step(self, *arguments)
+
+    monkeypatch.setattr(stub_tracker, 'step', slow)
+    one = world(queue_size=2).start()
+    one.send('camera_info', small_camera.info())
+    try:
+        queue = one.node._queue
+        for index in range(12):
+            one.publishers['image'].publish(serialise(small_camera.image(index)))
+            # The first is being estimated.
+            one.spin_until(lambda index=index: len(queue) + queue._dropped == index)
+        assert (len(queue), queue._dropped) == (2, 9)
+        assert one.state == 'active'
+        assert one.set(overlay_modes=1) == (True, '')
+    finally:
+        go.set()
+    one.spin_until(lambda: one.node._session.state.images['tracked'] == 3)
+    stamps = [stamp for stamp, _ in stub_tracker.made[0].seen]
+    assert stamps == [small_camera.stamp(index) for index in (0, 10, 11)]
+    assert one.node._session.state.images == {'received': 12, 'tracked': 3, 'dropped': 9}
+    one.spin_until(lambda: any('late: 9 images' in d.status[0].message for d in one.diagnostics))
+    level, _, values = one.diagnosis()
+    assert values['images dropped'] == '9'
+    assert level in (0, 1)
+
+
+def test_diagnostics(running, small_camera):
+    level, message, values = running.diagnosis()
+    assert (level, message) == (1, 'waits for a calibrated camera_info')
+    assert values['lifecycle'] == 'active'
+    running.send('camera_info', small_camera.info())
+    running.send('image', small_camera.image(0))
+    # Told at once, when the status changes.
+    running.spin_until(lambda: running.diagnostics[-1].status[0].message == 'tracking, 2 modes')
+    _, _, values = running.diagnosis()
+    assert running.diagnostics[-1].status[0].name == 'filter_node: track'
+    assert values['status'] == 'tracking'
+    assert np.isclose(float(values['entropy of the weights, nats']), 0.562, atol=1e-3)
+    assert values['misfit'] == '0.125'
+    assert values['evaluations of the likelihood'] == '7'
+    assert {'latency, mean, ms', 'images tracked a second', 'last fault'} <= values.keys()
+
+
+# The executable.
+
+
+def start_node(*arguments, **environment):
+    return subprocess.Popen(
+        [sys.executable, '-m', 'hmt_ros.nodes.filter_node', '--ros-args', *arguments],
+        cwd=ROOT,
+        env={**os.environ, **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_ends_cleanly(number, subject_file):
+    node = start_node('-p', f'subject_file:={subject_file}', '--params-file', str(CONFIG))
+    lines = []
+    try:
+        for line in node.stdout:
+            lines.append(line)
+            if 'images from /image' in line:
+                node.send_signal(number)
+        assert node.wait(PATIENCE) == 0
+    finally:
+        node.kill()
+    assert len(lines) == 1, lines
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (('-p', 'max_hypotheses:=99'), 'out of range'),
+        (('-p', 'proposals:=guess'), "saw 'guess'"),
+    ],
+)
+def test_wrong_arguments_are_one_line(arguments, message):
+    node = start_node(*arguments)
+    output, _ = node.communicate(timeout=PATIENCE)
+    assert node.returncode == 1
+    (line,) = output.splitlines()
+    assert line.startswith('filter_node: ')
+    assert message in line

@@ -1,0 +1,156 @@
+import cv2
+import numpy as np
+import pytest
+
+from hmt_ros.body import Camera
+from hmt_ros.body.kinematics import forward
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.nodes.overlay import draw_modes
+from hmt_ros.nodes.track_messages import TOPICS, Presentation, TrackedImage, track_messages
+from msg_tools import MessageError, RosbagsMessages
+from msg_tools.cdr import serialise
+from msg_tools.images import decode_image
+from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
+
+CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
+STAMP = 1_700_000_000_123_456_789
+
+
+def poses_of(body, count):
+    poses = np.tile(body.prior_mean, (count, 1))
+    poses[:, :3] = [0.0, 0.0, 4.0]
+    poses[:, 0] = np.linspace(-0.5, 0.5, count)
+    return poses
+
+
+@pytest.fixture
+def track(body):
+    rng = np.random.default_rng(0)
+    poses = poses_of(body, 3)
+    root = rng.normal(size=(3, body.dimension, body.dimension))
+    covariances = root @ root.transpose(0, 2, 1) / body.dimension + 0.1 * np.eye(body.dimension)
+    covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
+    return TrackedImage(
+        image=np.full((240, 320, 3), 200, np.uint8),
+        stamp_ns=STAMP,
+        frame_id='lens',
+        body=body,
+        camera=CAMERA,
+        posterior=GaussianMixture(np.array([0.5, 0.3, 0.2]), poses, covariances),
+        likelihood=GaussianMixture(np.array([0.6, 0.4]), poses[:2], covariances[:2]),
+        log_likelihoods=np.array([-3.0, -2.0, -1.0]),
+        starts=True,
+    )
+
+
+def draw(body, poses, weights, count, image):
+    joints = body.joint_positions(poses)
+    return draw_modes(image, CAMERA, joints, body.skeleton.bones, weights, count)
+
+
+SHOWN = Presentation(8, 3, 90, True, 'anna/')
+
+
+def made(track, presentation=SHOWN):
+    found = {}
+    track_messages(RosbagsMessages(), track, presentation, lambda topic: True, found.__setitem__)
+    assert [topic for topic in TOPICS if topic in found] == list(found)
+    for topic, message in found.items():
+        assert message.__msgtype__ == TOPICS[topic].msgtype
+        assert len(serialise(message)) > 0
+    return found
+
+
+def test_mixtures(track, body):
+    found = made(track)
+    for topic, mixture, kind in (
+        ('pose_mixture', track.posterior, MixtureKind.POSTERIOR),
+        ('likelihood_mixture', track.likelihood, MixtureKind.LIKELIHOOD),
+    ):
+        content = pose_mixture_of(found[topic], body.dof_names, body.joint_names)
+        assert content.mixture == mixture
+        assert (content.kind, content.stamp_ns, content.frame_id) == (kind, STAMP, 'lens')
+        assert np.array_equal(content.joint_positions, body.joint_positions(mixture.means))
+        assert not np.any(content.degrees_of_freedom)
+    assert np.array_equal(
+        [c.log_likelihood for c in found['pose_mixture'].components], [-3.0, -2.0, -1.0]
+    )
+    assert np.isnan([c.log_likelihood for c in found['likelihood_mixture'].components]).all()
+
+
+def test_joint_states_are_those_of_the_heaviest(track, body):
+    state = made(track)['joint_states']
+    assert tuple(state.name) == body.dof_names
+    assert np.array_equal(state.position, track.posterior.means[0])
+
+
+def test_transforms_lead_from_the_camera_to_the_segments(track, body):
+    frames = forward(body.skeleton, track.posterior.means[:1])
+    transforms = made(track)['/tf'].transforms
+    assert [t.child_frame_id for t in transforms] == [
+        f'anna/{name}' for name in body.skeleton.segment_names
+    ]
+    for index, transform in enumerate(transforms):
+        assert transform.header.frame_id == 'lens'
+        t, q = transform.transform.translation, transform.transform.rotation
+        assert np.array_equal([t.x, t.y, t.z], frames.origins[index, :, 0])
+        x, y, z, w = q.x, q.y, q.z, q.w
+        third = [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)]
+        assert np.allclose(third, frames.rotations()[0, index, :, 2], atol=1e-12)
+
+
+def test_markers_speak_about_all_ranks(track):
+    markers = made(track)['markers'].markers
+    assert [m.ns for m in markers] == [f'mode_{k // 2}' for k in range(16)]
+    assert [m.action for m in markers] == [0] * 6 + [2] * 10
+    shares = [m.color.a for m in markers[:6:2]]
+    assert shares == sorted(shares, reverse=True)
+    assert np.isclose(shares[0], 1.0)
+
+
+def test_body_comes_with_its_first_image_only(track):
+    assert next(iter(made(track))) == 'body'
+    again = TrackedImage(**{**track.__dict__, 'starts': False})
+    assert 'body' not in made(again)
+    assert made(track)['body'].header.frame_id == 'lens'
+
+
+def test_overlay_shows_the_modes(track, body):
+    message = made(track)['overlay/compressed']
+    picture = decode_image(message)
+    drawn = draw(body, track.posterior.means, track.posterior.weights, 3, track.image)
+    assert cv2.absdiff(picture, drawn).mean() < 2.0
+    assert np.all(track.image == 200)
+    pixels = CAMERA.project(body.joint_positions(track.posterior.means))
+    knee = body.joint_names.index('left_knee')
+    red = [drawn[round(v), round(u)].astype(int) for u, v in pixels[:, knee]]
+    # Orange where the heaviest is, bluish where the others are, the fainter the lighter.
+    assert red[0][2] > red[0][0] + 100
+    assert red[1][0] > red[1][2] + 10
+    assert red[1][0] - red[1][2] > red[2][0] - red[2][2]
+
+
+def test_overlay_with_people_partly_outside_and_behind(body):
+    image = np.zeros((240, 320, 3), np.uint8)
+    poses = poses_of(body, 4)
+    poses[1, 0] = 40.0
+    poses[2, 2] = -4.0
+    poses[3, 2] = 0.3
+    assert draw(body, poses, np.full(4, 0.25), 4, image).shape == image.shape
+    assert np.any(draw(body, poses[:1], np.ones(1), 4, image))
+    assert not np.any(draw(body, poses[1:3], np.full(2, 0.5), 4, image))
+    assert not np.any(draw(body, poses, np.full(4, 0.25), 0, image))
+    assert not np.any(draw(body, poses[:0], np.empty(0), 3, image))
+    assert not np.any(image)
+
+
+def test_impossible_mixtures_are_refused_before_anything_is_published(track):
+    covariances = -track.likelihood.covariances
+    likelihood = GaussianMixture(track.likelihood.weights, track.likelihood.means, covariances)
+    bad = TrackedImage(**{**track.__dict__, 'likelihood': likelihood})
+    published = []
+    with pytest.raises(MessageError, match='not positive definite'):
+        track_messages(
+            RosbagsMessages(), bad, SHOWN, lambda topic: True, lambda *x: published.append(x)
+        )
+    assert published == []

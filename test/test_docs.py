@@ -1,0 +1,213 @@
+"""The documentation tells the truth: its code runs, its commands parse, its names exist."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import runpy
+import shlex
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import pytest
+import yaml
+
+from hmt_ros.app import COMMANDS
+from hmt_ros.body import load_body
+from hmt_ros.nodes.declared_parameters import declared_parameters
+from hmt_ros.nodes.filter_parameters import FilterParameters
+from hmt_ros.nodes.track_messages import TOPICS
+from hmt_ros.tracking.evaluation import Scores
+from hmt_ros.tracking.subject import parse_subject
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [
+    ROOT / 'README.md',
+    ROOT / 'CONTRIBUTING.md',
+    ROOT / 'bags' / 'README.md',
+    *sorted((ROOT / 'docs').glob('*.md')),
+]
+PAGE_IDS = [str(path.relative_to(ROOT)) for path in PAGES]
+BLOCK = re.compile(r'^(<!-- run -->\n)?```(\w+)\n(.*?)^```$', re.MULTILINE | re.DOTALL)
+# Programs that are not part of this repository.
+FOREIGN = {
+    'sudo',
+    'source',
+    'rosdep',
+    'pip',
+    'colcon',
+    'ros2',
+    'git',
+    'install/hmt_ros/lib/hmt_ros/filter_node',
+}
+
+
+def blocks(page: Path, language: str) -> list[tuple[str, bool]]:
+    """Code of a page in a language, and whether it is marked to be run."""
+    found = BLOCK.findall(page.read_text('utf-8'))
+    return [(code, bool(mark)) for mark, kind, code in found if kind == language]
+
+
+def commands(page: Path) -> Iterator[tuple[list[str], bool]]:
+    """Commands in the bash blocks of a page."""
+    for code, run in blocks(page, 'bash'):
+        for line in code.replace('\\\n', ' ').splitlines():
+            words = shlex.split(line, comments=True)
+            if words:
+                yield words, run
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch):
+    """A folder in which commands of the documentation find the bags of the repository."""
+    (tmp_path / 'bags').symlink_to(ROOT / 'bags')
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize('page', PAGES, ids=PAGE_IDS)
+def test_links_lead_somewhere(page):
+    text = page.read_text('utf-8')
+    links = re.findall(r'\]\(([^)\s]+)\)', text)
+    for link in links:
+        if link.startswith(('http://', 'https://')):
+            continue
+        path, _, anchor = link.partition('#')
+        target = (page.parent / path).resolve() if path else page
+        assert target.is_file(), link
+        if anchor:
+            headings = re.findall(r'^#+ (.*)$', target.read_text('utf-8'), re.MULTILINE)
+            slugs = {re.sub(r'[^\w\- ]', '', x).strip().lower().replace(' ', '-') for x in headings}
+            assert anchor in slugs, link
+
+
+@pytest.mark.parametrize(
+    'page', [page for page in PAGES if blocks(page, 'python')], ids=lambda page: page.stem
+)
+def test_python_of_a_page_runs(page, workplace, capsys):
+    namespace = {'__name__': 'page'}
+    for code, _ in blocks(page, 'python'):
+        exec(compile(code, str(page), 'exec'), namespace)
+    assert capsys.readouterr().out
+
+
+@pytest.mark.parametrize('page', PAGES, ids=PAGE_IDS)
+def test_commands_are_understood(page):
+    targets = set(re.findall(r'^([a-z]+):', (ROOT / 'Makefile').read_text('utf-8'), re.MULTILINE))
+    parameters = {parameter.name for parameter in declared_parameters(FilterParameters())}
+    for words, _ in commands(page):
+        if words[:3] == ['python', '-m', 'hmt_ros']:
+            parse(words[3:])
+        elif words[:3] == ['python', '-m', 'benchmarks']:
+            assert (ROOT / 'benchmarks' / f'{words[3]}.py').is_file()
+        elif words[0] == 'make':
+            named = [word for word in words[1:] if '=' not in word]
+            assert set(named) <= targets, words
+        else:
+            assert words[0] in FOREIGN, words
+        if words[:4] == ['ros2', 'run', 'hmt_ros', 'filter_node']:
+            given = [b.partition(':=')[0] for a, b in pairwise(words) if a == '-p']
+            assert set(given) <= parameters
+
+
+def parse(words: list[str]) -> None:
+    """Fails where a command of the package does not know the arguments."""
+    if words == ['--help']:
+        return
+    module = importlib.import_module(COMMANDS[words[0]][0])
+    module._parser().parse_args(words[1:])
+
+
+def test_marked_commands_run(workplace, capsys):
+    """The first steps of the README, from a rendered bag to its evaluation."""
+    ran = []
+    for words, run in commands(ROOT / 'README.md'):
+        if run:
+            assert words[:3] == ['python', '-m', 'hmt_ros']
+            module = importlib.import_module(COMMANDS[words[3]][0])
+            assert module.main(words[4:]) == 0, capsys.readouterr().err
+            ran.append(words[3])
+    assert ran == ['make-bag', 'replay', 'evaluate', 'evaluate']
+    assert '"fraction_tracked"' in capsys.readouterr().out
+
+
+def test_subject_file_of_the_readme():
+    (text,) = (code for code, _ in blocks(ROOT / 'README.md', 'yaml'))
+    subject = parse_subject(yaml.safe_load(text), load_body('human37'))
+    assert len(subject.keypoints.names) == 14
+    assert subject.stature == 1.7
+
+
+def test_model_file_of_the_body_page(tmp_path):
+    (text,) = (code for code, _ in blocks(ROOT / 'docs' / 'body.md', 'yaml'))
+    path = tmp_path / 'stiff_back.yaml'
+    path.write_text(text, 'utf-8')
+    assert load_body(path).dimension == 32
+
+
+def test_generated_parts_are_up_to_date():
+    generate = runpy.run_path(str(ROOT / 'docs' / 'generate.py'))
+    page = (ROOT / 'docs' / 'nodes.md').read_text('utf-8')
+    fresh = generate['with_part'](page, 'parameters', generate['parameter_table']())
+    assert page == fresh, 'run: python docs/generate.py parameters'
+    for name, page_name in generate['PAGES'].items():
+        text = (ROOT / 'docs' / page_name).read_text('utf-8')
+        part = text.partition(f'<!-- begin {name} -->\n')[2].partition('<!-- end -->')[0]
+        assert part.count('\n|') > 2, f'run: python docs/generate.py {name}'
+    with pytest.raises(ValueError, match="no part 'weather'"):
+        generate['with_part'](page, 'weather', '')
+
+
+def rows(page: Path, heading: str) -> list[list[str]]:
+    """Cells of the tables under a heading, without their heads."""
+    text = page.read_text('utf-8').partition(f'{heading}\n')[2]
+    text = re.split(r'^#', text, maxsplit=1, flags=re.MULTILINE)[0]
+    lines = [line for line in text.splitlines() if line.startswith('|')]
+    return [[cell.strip() for cell in line.strip('|').split('|')] for line in lines[2:]]
+
+
+def test_topics_of_the_node():
+    nodes = ROOT / 'docs' / 'nodes.md'
+    published = {row[0].strip('`'): row[1] for row in rows(nodes, '### Published topics')}
+    wanted = {topic: kind.msgtype.replace('/msg/', '/') for topic, kind in TOPICS.items()}
+    assert {topic: published[topic] for topic in wanted} == wanted
+    assert set(published) - set(wanted) == {'/diagnostics', '~/handled'}
+    readme = rows(ROOT / 'README.md', '## The node and its topics')
+    named = {name for row in readme for name in re.findall(r'`([^`]+)`', row[0])}
+    assert set(wanted) <= named
+
+
+def test_numbers_of_evaluate_are_explained():
+    text = (ROOT / 'docs' / 'evaluation.md').read_text('utf-8')
+    named = set(re.findall(r'`([a-z_0-9]+)`', text))
+    fields = set(Scores.__dataclass_fields__)
+    explained = {
+        'fraction_tracked',
+        'frames_lost',
+        'modes',
+        'perplexity',
+        'negative_log_likelihood',
+    }
+    explained |= {f'{name}_mm' for name in ('heaviest', 'best', 'expected')}
+    explained |= {f'{kind}coverage_{q}' for kind in ('', 'joint_') for q in (50, 90)}
+    assert explained <= named
+    assert {'heaviest', 'best', 'expected', 'modes', 'perplexity'} <= fields
+
+
+def test_the_picture_of_the_readme():
+    path = ROOT / 'docs' / 'overview.png'
+    assert path.stat().st_size < 300_000
+    height, width = cv2.imread(str(path)).shape[:2]
+    assert width >= 800
+    assert height >= 400
+
+
+@pytest.mark.parametrize('page', PAGES, ids=PAGE_IDS)
+def test_types_exist(page):
+    folder = ROOT / 'msg_tools' / 'hmt_msgs'
+    for name in re.findall(r'hmt_msgs/(?:msg/)?([A-Z]\w+)', page.read_text('utf-8')):
+        assert (folder / 'msg' / f'{name}.msg').is_file() or (
+            folder / 'srv' / f'{name}.srv'
+        ).is_file()
