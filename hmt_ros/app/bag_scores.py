@@ -176,7 +176,7 @@ def score_bag(
     model_sigma: float = MODEL_SIGMA,
     body_model: str | None = None,
     seed: int = 0,
-    progress: Callable[[int], None] | None = None,
+    progress: Callable[[int], object] | None = None,
 ) -> dict[str, TopicScores]:
     """Scores of the topics of a bag, by name in the order of the bag.
 

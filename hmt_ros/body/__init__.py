@@ -12,7 +12,7 @@ __all__ = ['Body', 'Camera', 'load_body', 'model_names']
 
 
 def load_body(source: str | Path) -> Body:
-    """The body with this name ('human37', 'human34', 'human32'), of a YAML file or of a motion file.
+    """The body of this name ('human37', 'human34', 'human32'), of a YAML file or of a motion file.
 
     A motion file (.bvh, .asf, .amc) gives the body of its own skeleton, without flesh.
 

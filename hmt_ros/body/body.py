@@ -22,7 +22,8 @@ class PartShape:
 
     Attributes:
         segment: index of the segment that carries the part.
-        length: index of the length that the part spans, or None where `centre` and three radii say all.
+        length: index of the length that the part spans, or None where `centre` and three radii say
+            all.
         centre: of the part in its segment's frame, m; with a length, its shift from the middle.
         radii: (x, y) with a length, else (x, y, z), m.
         extend: how far the part reaches beyond the start and the end of the length, m.
@@ -65,11 +66,11 @@ class Body:
         skeleton: segments, degrees of freedom, joints, lengths.
         shapes: one entry a part of the flesh; empty for a bare skeleton.
         widths: factors on the x and y radii of each part.
-        prior_mean, prior_sigma: (d,) soft prior of each degree of freedom; sigma is inf where nothing
-            is believed.
+        prior_mean, prior_sigma: (d,) soft prior of each degree of freedom; sigma is inf where
+            nothing is believed.
         length_sigma: (L,) standard deviation of the lengths over people, m.
-        stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra (m, at
-            the default lengths; it scales with them).
+        stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra (m,
+            at the default lengths; it scales with them).
         default_lengths: (L,) of the model file, m.
     """
 

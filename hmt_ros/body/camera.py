@@ -29,12 +29,12 @@ class Camera:
         cx, cy: principal point, px.
         width, height: of the image, px.
         distortion: coefficients in the order of CameraInfo.d; empty: none.
-        distortion_model: 'plumb_bob' (k1 k2 p1 p2 [k3]), 'rational_polynomial' (k1 k2 p1 p2 k3 k4 k5
-            k6) or 'equidistant' (k1 k2 k3 k4).
+        distortion_model: 'plumb_bob' (k1 k2 p1 p2 [k3]), 'rational_polynomial' (k1 k2 p1 p2 k3 k4
+            k5 k6) or 'equidistant' (k1 k2 k3 k4).
 
     Raises:
-        ValueError: a focal length that is not positive, values that are not finite, an unknown model,
-            or a number of coefficients that the model does not have.
+        ValueError: a focal length that is not positive, values that are not finite, an unknown
+            model, or a number of coefficients that the model does not have.
     """
 
     fx: float
@@ -91,8 +91,8 @@ class Camera:
     ) -> tuple[Array, Array]:
         """Pixels (2, ...) of points (3, ...), and their derivatives (2, 3, ...).
 
-        The first axis is the coordinate, so that batches stay contiguous. Points with z below 0.01 m
-        give NaN.
+        The first axis is the coordinate, so that batches stay contiguous. Points with z below
+        0.01 m give NaN.
         """
         x, y, z = points
         z = np.where(z > NEAR, z, np.nan)
@@ -123,8 +123,8 @@ class Camera:
     def rays(self, pixels: ArrayLike) -> Array:
         """Unit rays (..., 3) through pixels (..., 2).
 
-        Distortion is undone by Newton's method; pixels that the model does not reach come out as the
-        best that a few iterations find.
+        Distortion is undone by Newton's method; pixels that the model does not reach come out as
+        the best that a few iterations find.
         """
         uv = np.asarray(pixels, dtype=np.float64)
         target = np.stack([(uv[..., 0] - self.cx) / self.fx, (uv[..., 1] - self.cy) / self.fy])

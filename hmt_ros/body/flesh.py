@@ -1,13 +1,14 @@
-"""Flesh: superquadric ellipsoids with tapering and bending around the segments (KJS 2, [Barr 1984]).
+"""Flesh: superquadric ellipsoids with taper and bend around the segments (KJS 2, [Barr 1984]).
 
 A part is a stack of rings along the axis of its segment. With s from -1 (start) to 1 (end of the
 segment) and the angle w around the axis, its surface in the frame of the segment is
 
-    x = c_x + b_x (1 - s^2) + r_x(s) C(w),   y = c_y + b_y (1 - s^2) + r_y(s) S(w),   z = c_z - a_z s,
+    x = c_x + b_x (1 - s^2) + r_x(s) C(w),   y = c_y + b_y (1 - s^2) + r_y(s) S(w),
+    z = c_z - a_z s,
     r(s) = a (1 + t s) (1 - |s|^(2/e1))^(e1/2),   C = sgn(cos) |cos|^e2,   S = sgn(sin) |sin|^e2
 
-with three radii a, two exponents e, two tapers t and two bends b: nine shape parameters. Contours are
-exact: on every ring the points whose normal is perpendicular to the ray from the camera.
+with three radii a, two exponents e, two tapers t and two bends b: nine shape parameters. Contours
+are exact: on every ring the points whose normal is perpendicular to the ray from the camera.
 """
 
 from __future__ import annotations
@@ -217,13 +218,13 @@ class Contour:
 def occluding_contour(flesh: Flesh, frames: Frames) -> Contour:
     """Points of the flesh whose normal is perpendicular to the ray from the camera.
 
-    On a ring with centre u relative to the camera, in the segment's frame, and angle w the condition
-    normal . point = 0 reads
+    On a ring with centre u relative to the camera, in the segment's frame, and angle w the
+    condition normal . point = 0 reads
 
         g(w) = 1 + U_x C'(w) + U_y S'(w) - u_z (k_x cos^2 w + k_y sin^2 w) = 0,
 
-    with U = (u - u_z lean) / radius, k the slopes, C' and S' the signed powers 2 - e2. With one slope
-    and e2 = 1 it is solved in closed form, elsewhere by bracketing.
+    with U = (u - u_z lean) / radius, k the slopes, C' and S' the signed powers 2 - e2. With one
+    slope and e2 = 1 it is solved in closed form, elsewhere by bracketing.
     """
     ring, segments = flesh.rings, flesh.ring_segments
     columns, origins = frames.columns[segments], frames.origins[segments]
@@ -251,10 +252,10 @@ def occluding_contour(flesh: Flesh, frames: Frames) -> Contour:
         outline = _signed_power(powers, e2[..., None])
         lateral = _signed_power(powers, 2 - e2[..., None])
     count = 2 * len(segments)
-    local = np.empty((2, len(segments), 3, frames.count))
+    local: Array = np.empty((2, len(segments), 3, frames.count))
     local[:, :, :2] = ring.centre[:, :2, None] + radius * outline
     local[:, :, 2] = ring.centre[:, 2, None]
-    normal = np.empty_like(local)
+    normal: Array = np.empty_like(local)
     normal[:, :, :2] = lateral / radius
     normal[:, :, 2] = -(slope * powers * powers).sum(2) - (normal[:, :, :2] * lean).sum(2)
     normal /= np.sqrt(np.einsum('krin,krin->krn', normal, normal))[:, :, None]
@@ -281,7 +282,8 @@ def _bracketed_angles(
         cos, sin = np.cos(w), np.sin(w)
         result: Array = 1 + big_u[:, 0] * _signed_power(cos, power)
         result += big_u[:, 1] * _signed_power(sin, power)
-        return result - uz * (kx * cos * cos + ky * sin * sin)
+        slope: Array = kx * cos * cos + ky * sin * sin
+        return result - uz * slope
 
     steps = 48
     grid = np.linspace(-np.pi, np.pi, steps + 1)
@@ -326,7 +328,11 @@ def _mesh(parts: Sequence[Superquadric], stacks: int, slices: int) -> Mesh:
         k = (j + 1) % slices
         body += [(first, j, k), (last, last - 2 - slices + 1 + k, last - 2 - slices + 1 + j)]
     triangles = np.array(body)
-    vertices, normals, segments, part_of, faces = [], [], [], [], []
+    vertices: list[Array] = []
+    normals: list[Array] = []
+    segments: list[Index] = []
+    part_of: list[Index] = []
+    faces: list[Index] = []
     for i, part in enumerate(parts):
         point, normal = part.surface(grid_s, grid_w)
         cx, cy, cz = part.centre
@@ -336,4 +342,10 @@ def _mesh(parts: Sequence[Superquadric], stacks: int, slices: int) -> Mesh:
         normals.append(np.concatenate([normal, [[0, 0, 1.0], [0, 0, -1.0]]]))
         segments.append(np.full(len(vertices[-1]), part.segment))
         part_of.append(np.full(len(vertices[-1]), i))
-    return Mesh(*(np.concatenate(x) for x in (vertices, normals, segments, part_of, faces)))
+    return Mesh(
+        np.concatenate(vertices),
+        np.concatenate(normals),
+        np.concatenate(segments),
+        np.concatenate(part_of),
+        np.concatenate(faces),
+    )

@@ -1,16 +1,16 @@
-"""Forwards/backwards flips of limbs: interpretation trees and closed-form inverse kinematics (KJS 3).
+"""Forwards/backwards flips of limbs: interpretation trees, closed-form inverse kinematics (KJS 3).
 
 For a link from a known joint P, of length l, to a joint seen along the unit ray r, the joint is at
 
     s r,    s = r.P +- sqrt((r.P)^2 - |P|^2 + l^2).
 
-All choices of sign along a chain are the leaves of its interpretation tree; a branching body takes the
-product of the trees of its chains. Every leaf has the image and the segment lengths of the given pose,
-which is itself the first leaf. Branches whose ray misses the sphere, that put a joint behind the
-camera, or that no joint angles within the limits reach, are pruned.
+All choices of sign along a chain are the leaves of its interpretation tree; a branching body takes
+the product of the trees of its chains. Every leaf has the image and the segment lengths of the
+given pose, which is itself the first leaf. Branches whose ray misses the sphere, that put a joint
+behind the camera, or that no joint angles within the limits reach, are pruned.
 
-Joint angles follow from the joint positions by descending the chain, with v the segment's z axis seen
-from the frame before its rotations:
+Joint angles follow from the joint positions by descending the chain, with v the segment's z axis
+seen from the frame before its rotations:
 
     spherical, first two   v = (sin b, -sin a cos b, cos a cos b)
     its third, and hinge   v = (sin c sin e, -cos c sin e, cos e)
@@ -48,8 +48,8 @@ def enumerate_flips(
 
     Args:
         body: whose `chains` have the names.
-        camera: that looks; flips live on its rays, whatever its lens, so it only has to stand at the
-            origin of the poses' frame. May be None.
+        camera: that looks; flips live on its rays, whatever its lens, so it only has to stand at
+            the origin of the poses' frame. May be None.
         poses: (N, d).
         chains: one name or several; of several the product of their trees is taken.
 
@@ -97,8 +97,8 @@ def rehang_chain(
     """Poses whose chain hangs on another trunk and still has the image that it had.
 
     When a trunk turns or flips, its limbs start elsewhere. Their joints are put back onto the rays
-    through their images, in all ways that lengths and limits allow. With `image_of` they are put onto
-    the image of another chain: a left leg onto the right one's.
+    through their images, in all ways that lengths and limits allow. With `image_of` they are put
+    onto the image of another chain: a left leg onto the right one's.
 
     Args:
         body: the body.
@@ -136,7 +136,8 @@ def flip_counts(body: Body, poses: ArrayLike, chain: str) -> Index:
     """Number of leaves (N,) that the tree of one chain has at each pose."""
     q = np.array(poses, dtype=np.float64, ndmin=2)
     _, valid = _leaves(forward(body.skeleton, q), q, _links(body.skeleton, chain))
-    return valid.sum(0)
+    counts: Index = valid.sum(0)
+    return counts
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +162,7 @@ def _links(skeleton: Skeleton, name: str) -> tuple[_Link, ...]:
     if name not in skeleton.chains:
         raise KeyError(f'{skeleton.name} has no chain {name!r}; it has {sorted(skeleton.chains)}')
     segments = skeleton.chains[name]
-    result = []
+    result: list[_Link] = []
     for k, s in enumerate(segments):
         dofs = skeleton.segment_dofs[s]
         axes = ''.join('xyz'[skeleton.dof_axes[j]] for j in dofs)
@@ -179,7 +180,8 @@ def _links(skeleton: Skeleton, name: str) -> tuple[_Link, ...]:
         if not (rotations and straight and fits and follows and skeleton.parents[s] >= 0):
             raise ValueError(
                 f'chain {name} of {skeleton.name} has no closed form at segment '
-                f'{skeleton.segment_names[s]} (rotations {axes!r}); use iterative inverse kinematics'
+                f'{skeleton.segment_names[s]} (rotations {axes!r}); '
+                'use iterative inverse kinematics'
             )
         own = list(dofs)
         result.append(
@@ -191,7 +193,7 @@ def _links(skeleton: Skeleton, name: str) -> tuple[_Link, ...]:
                 dofs,
                 skeleton.lower[own],
                 skeleton.upper[own],
-            )  # fmt: skip
+            )
         )
     return tuple(result)
 
@@ -218,8 +220,8 @@ def _positions(
     Args:
         frames: where the chain starts.
         links: of the chain.
-        targets: (3, N) points on the rays of the joints; without slack those of the given pose, whose
-            own positions come out first.
+        targets: (3, N) points on the rays of the joints; without slack those of the given pose,
+            whose own positions come out first.
         slack: a ray that misses its sphere by less touches it, m.
     """
     start = frames.origins[links[0].segment]
@@ -304,7 +306,7 @@ def _joint_angles(
 
 
 def _two_angles(v: Array, given: Array, link: _Link) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """a and b of v = (sin b, -sin a cos b, cos a cos b), within the limits and nearest the given."""
+    """a and b of v = (sin b, -sin a cos b, cos a cos b), within limits and nearest the given."""
     b_first = np.arcsin(np.clip(v[:, 0], -1.0, 1.0))
     best: tuple[Array, Array, NDArray[np.bool_]] | None = None
     for b, side in ((b_first, 1.0), (np.pi - b_first, -1.0)):
@@ -324,7 +326,7 @@ def _two_angles(v: Array, given: Array, link: _Link) -> tuple[Array, Array, NDAr
 def _hinge(
     w: Array, given_c: Array, given_e: Array, spherical: _Link, link: _Link
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """c and e of w = (sin c sin e, -cos c sin e, cos e), within the limits and nearest the given."""
+    """c and e of w = (sin c sin e, -cos c sin e, cos e), within limits and nearest the given."""
     bent = np.arccos(np.clip(w[:, 2], -1.0, 1.0))
     across = np.hypot(w[:, 0], w[:, 1])
     best: tuple[Array, Array, NDArray[np.bool_]] | None = None
@@ -351,7 +353,7 @@ def _possible(lower: float, upper: float, function: np.ufunc, side: float) -> bo
 def _into_limits(
     angle: Array, lower: float, upper: float, given: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """The angle plus the multiple of 2 pi that fits the limits, nearest the given one if several do."""
+    """The angle plus the multiple of 2 pi that fits the limits; if several, nearest the given."""
     turn = 2 * np.pi
     shifted = angle + turn * np.round((given - angle) / turn)
     shifted = np.where(shifted < lower - LIMIT_TOLERANCE, shifted + turn, shifted)

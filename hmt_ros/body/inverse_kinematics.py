@@ -1,8 +1,8 @@
 """Iterative inverse kinematics: poses that put joints where they should be (KJS 3.2).
 
-Bounded damped Newton on the squared distances of the joints to their targets, with the hard limits and
-the soft prior. The fall-back where the closed form of `interpretation_tree` does not reach: a ray that
-misses its sphere, a violated limit, joints without a closed form.
+Bounded damped Newton on the squared distances of the joints to their targets, with the hard limits
+and the soft prior. The fall-back where the closed form of `interpretation_tree` does not reach: a
+ray that misses its sphere, a violated limit, joints without a closed form.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ def solve_joint_positions(
 ) -> Minimum:
     """Poses nearest to given joint positions, for a batch of N problems.
 
-    Minimises 1/2 sum |joint - target|^2 / sigma^2 + prior_weight / 2 sum ((x - mean) / prior sigma)^2.
+    Minimises
+
+        1/2 sum |joint - target|^2 / sigma^2 + prior_weight / 2 sum ((x - mean) / prior sigma)^2.
 
     Args:
         body: the body.
@@ -51,7 +53,7 @@ def solve_joint_positions(
     goal = np.asarray(targets, dtype=np.float64)
     if goal.shape != (len(start), len(names), 3):
         raise ValueError(f'targets have shape {goal.shape}, wanted {(len(start), len(names), 3)}')
-    known = np.isfinite(goal).all(2)
+    known = np.asarray(np.isfinite(goal).all(2), dtype=np.bool_)
     weight = np.where(known, np.broadcast_to(np.asarray(sigma) ** -2.0, known.shape), 0.0)
     goal = np.where(known[..., None], goal, 0.0)
     precision = (

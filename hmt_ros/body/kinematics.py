@@ -3,11 +3,11 @@
 Everything works on a batch of N poses with the batch on the last axis, so that every operation runs
 over contiguous memory, and touches only the degrees of freedom that move a segment.
 
-An energy that depends on the pose through points on segments needs no Jacobian of the points. A small
-motion of a segment is a twist (v, w): the point p moves by v + w x p. A residual whose derivative with
-respect to its point is the 3-vector a therefore has, with respect to the twist, the 6-vector
-b = (a, p x a), and a Gauss-Newton term adds `k b b^T` (6 x 6) and `g b` (6) to its segment. Summed from
-the leaves to the root these are all that gradient and Hessian need:
+An energy that depends on the pose through points on segments needs no Jacobian of the points. A
+small motion of a segment is a twist (v, w): the point p moves by v + w x p. A residual whose
+derivative with respect to its point is the 3-vector a therefore has, with respect to the twist, the
+6-vector b = (a, p x a), and a Gauss-Newton term adds `k b b^T` (6 x 6) and `g b` (6) to its
+segment. Summed from the leaves to the root these are all that gradient and Hessian need:
 
     g_j = s_j . F_j,    H_ij = s_i . K_j s_j    for i on the path from the root to j,
 
@@ -81,7 +81,10 @@ class Frames:
         return self.points(self.skeleton.joint_segments, self.skeleton.joint_offsets)
 
     def twists(self) -> Array:
-        """Twists (d, 6, N) of the degrees of freedom: velocity of the point at the camera, rotation."""
+        """Twists (d, 6, N) of the degrees of freedom.
+
+        First the velocity of the point at the camera, then the rotation.
+        """
         rotation = self.skeleton.dof_is_rotation[:, None, None]
         result = np.empty((self.skeleton.dimension, 6, self.count))
         result[:, :3] = np.where(rotation, _cross(self.dof_origins, self.axes), self.axes)
@@ -96,7 +99,7 @@ class Frames:
         )
 
     def dofs_by_pose(self) -> tuple[Array, Array]:
-        """Axes and points on the axes (N, d, 3) of the degrees of freedom, pose by pose in memory."""
+        """Axes and points on them (N, d, 3) of the degrees of freedom, pose by pose in memory."""
         return (
             np.ascontiguousarray(self.axes.transpose(2, 0, 1)),
             np.ascontiguousarray(self.dof_origins.transpose(2, 0, 1)),
@@ -307,7 +310,8 @@ def _place_segments(  # type: ignore[no-untyped-def]
 def _coupled_pairs(skeleton: Skeleton) -> tuple[Index, Index]:
     """Pairs (i, j) of degrees of freedom with i on the path from the root to j, or i = j."""
     moves = skeleton.moves[skeleton.dof_segments]  # (d, d): column moves the segment of the row
-    rows, cols = [], []
+    rows: list[np.intp] = []
+    cols: list[int] = []
     for j in range(skeleton.dimension):
         before = np.flatnonzero(moves[j])
         before = before[before <= j]

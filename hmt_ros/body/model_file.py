@@ -16,7 +16,10 @@ from hmt_ros.body.skeleton import Skeleton
 
 Array = NDArray[np.float64]
 
-AXES = {'x': (0, True), 'y': (1, True), 'z': (2, True), 'tx': (0, False), 'ty': (1, False), 'tz': (2, False)}  # fmt: skip
+AXES = {
+    'x': (0, True), 'y': (1, True), 'z': (2, True),
+    'tx': (0, False), 'ty': (1, False), 'tz': (2, False),
+}  # fmt: skip
 MIRROR = np.array([-1.0, 1.0, 1.0])
 LARGEST_FILE = 1_000_000  # bytes; a body is a few kB
 
@@ -40,7 +43,8 @@ def read_body(source: str | Path) -> Body:
         return _build(_read(source))
     except (KeyError, TypeError, AttributeError, IndexError) as fault:
         raise ValueError(
-            f'{source}: not a body model ({type(fault).__name__}: {fault}); compare with human37.yaml'
+            f'{source}: not a body model ({type(fault).__name__}: {fault}); '
+            'compare with human37.yaml'
         ) from fault
     except (ValueError, yaml.YAMLError) as fault:
         text = ' '.join(str(fault).split())
@@ -103,7 +107,7 @@ def _linear(term: Any, names: tuple[str, ...]) -> tuple[float, Array]:
 
 
 def _mount(entry: dict[str, Any]) -> Array:
-    """Rotation whose negative z axis points where the segment points and whose x axis is as given."""
+    """Rotation whose negative z axis points where the segment points, with the x axis as given."""
     x = np.array(entry.get('x_axis', [1, 0, 0]), dtype=float)
     down = np.array(entry.get('points', [0, 0, -1]), dtype=float)
     x /= np.linalg.norm(x)

@@ -1,7 +1,7 @@
 """Soft prior against parts of the body that run through each other (KJS 2).
 
-Two parts overlap by the sum of their radii minus the distance of their axes, taken along the line that
-connects the axes where they are nearest; the overlap is penalised quadratically.
+Two parts overlap by the sum of their radii minus the distance of their axes, taken along the line
+that connects the axes where they are nearest; the overlap is penalised quadratically.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hmt_ros.body.kinematics import Frames, forward
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-# Overlap that is tolerated before it costs anything: flesh gives way, and ellipsoids are a rough fit.
+# Overlap that is tolerated before it costs anything: flesh gives way, and ellipsoids fit roughly.
 TOLERANCE = 0.02  # m
 
 
@@ -56,7 +56,7 @@ def self_intersection_energy(
 def _overlaps(
     body: Body, frames: Frames, first: Index, second: Index
 ) -> tuple[Array, Array, Array, Array]:
-    """Nearest points of pairs of parts, the direction between them, (X, 3, N), and overlap (X, N)."""
+    """Nearest points of pairs of parts and the direction between, (X, 3, N); overlap (X, N)."""
     segments = np.array([p.segment for p in body.flesh.parts])
     radii = np.array([p.radii for p in body.flesh.parts])
     # The axis of a capsule of the part's length.

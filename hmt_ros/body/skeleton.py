@@ -1,12 +1,13 @@
 """The skeleton: a tree of segments, their degrees of freedom, and the lengths that shape them.
 
-Every segment has a frame. Seen from its parent it sits at an offset, moved by its translations, with
-a fixed mount rotation, and is then turned by its rotations, one after the other:
+Every segment has a frame. Seen from its parent it sits at an offset, moved by its translations,
+with a fixed mount rotation, and is then turned by its rotations, one after the other:
 
     T_segment = T_parent * Trans(offset + t) * mount * Rot(axis_1, q_1) * ... * Rot(axis_n, q_n)
 
-Translations are along the axes of the parent's frame, rotations about axes of the moving frame. Offsets
-are linear in the lengths (`thigh`, `hip_width`, ...), so lengths can be set, scaled and estimated.
+Translations are along the axes of the parent's frame, rotations about axes of the moving frame.
+Offsets are linear in the lengths (`thigh`, `hip_width`, ...), so lengths can be set, scaled and
+estimated.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ class Skeleton:
         mounts: (S, 3, 3) rotation from the segment's frame at rest to its parent's frame.
         fixed_offsets, offset_basis: (S, 3), (S, 3, L): offset = fixed + basis @ lengths, m, in the
             parent's frame.
-        dof_names, dof_segments, dof_axes, dof_is_rotation: (d,) name, segment, axis 0 to 2, kind; in
-            the order in which they act.
+        dof_names, dof_segments, dof_axes, dof_is_rotation: (d,) name, segment, axis 0 to 2, kind;
+            in the order in which they act.
         lower, upper: (d,) hard limits, m or rad.
         joint_names, joint_segments: (J,) named points and the segment that carries them.
         joint_fixed, joint_basis: (J, 3), (J, 3, L): place of a joint in the frame of its segment.
@@ -63,7 +64,8 @@ class Skeleton:
     chains: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        s, d, j, n = (len(x) for x in (self.segment_names, self.dof_names, self.joint_names, self.length_names))  # fmt: skip
+        s, d = len(self.segment_names), len(self.dof_names)
+        j, n = len(self.joint_names), len(self.length_names)
         wanted = {
             'mounts': (s, 3, 3), 'fixed_offsets': (s, 3), 'offset_basis': (s, 3, n),
             'dof_segments': (d,), 'dof_axes': (d,), 'dof_is_rotation': (d,),

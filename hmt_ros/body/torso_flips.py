@@ -1,9 +1,9 @@
 """Flips of the torso: the pelvis and the trunk leaning or turning the other way in depth (KJS 3).
 
 The line of the hips may turn towards or away from the camera, the neck may lie before or behind the
-pelvis, and the line of the shoulders may turn either way: three binary choices, with nearly the same
-image. The torso is not a chain of links that each end in one joint, so its flips do not keep the image
-of hips and shoulders exactly; limbs are then put back onto their rays by `rehang_chain`.
+pelvis, and the line of the shoulders may turn either way: three binary choices, with nearly the
+same image. The torso is not a chain of links that each end in one joint, so its flips do not keep
+the image of hips and shoulders exactly; limbs are then put back onto their rays by `rehang_chain`.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ def flip_torso(body: Body, poses: ArrayLike) -> tuple[Array, Index]:
     """Poses whose torso is flipped in depth, up to seven for each given one.
 
     Args:
-        body: with the joints of a torso, a root that turns about z, y and x, and a segment 'trunk' that
-            turns about x, y and, if it can twist, z. Other bodies have no such flips.
+        body: with the joints of a torso, a root that turns about z, y and x, and a segment 'trunk'
+            that turns about x, y and, if it can twist, z. Other bodies have no such flips.
         poses: (N, d).
 
     Returns:
-        poses (M, d) within the limits, limbs at their old angles, and the index (M,) of the pose that
-        each comes from.
+        poses (M, d) within the limits, limbs at their old angles, and the index (M,) of the pose
+        that each comes from.
     """
     skeleton = body.skeleton
     q = np.array(poses, dtype=np.float64, ndmin=2)

@@ -1,1 +1,1 @@
-"""What an image says about a pose: silhouette, edges, motion, likelihood terms, and the renderer."""
+"""What an image says about a pose: silhouette, edges, motion, likelihood terms, the renderer."""

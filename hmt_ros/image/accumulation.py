@@ -1,8 +1,8 @@
 """From residuals at points of the body to a gradient and a Gauss-Newton Hessian over the pose.
 
-The compiled counterpart of `body.kinematics.segment_sums` and `assemble`, one pose at a time: a residual
-at the point p with derivative a adds `g b` and `k b b^T` to its segment, b = (a, p x a); sums over what
-a degree of freedom moves give its row of the gradient and of the Hessian.
+The compiled counterpart of `body.kinematics.segment_sums` and `assemble`, one pose at a time: a
+residual at the point p with derivative a adds `g b` and `k b b^T` to its segment, b = (a, p x a);
+sums over what a degree of freedom moves give its row of the gradient and of the Hessian.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The person's silhouette by background subtraction, shadows removed.
 
-The background is either a given image of the empty scene or learned from frames in which the person is
-absent or moves. OpenCV's mixture (MOG2) or nearest-neighbour (KNN) model does the per-pixel work.
+The background is either a given image of the empty scene or learned from frames in which the person
+is absent or moves. OpenCV's mixture (MOG2) or nearest-neighbour (KNN) model does the per-pixel
+work.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ class BackgroundSettings:
 
     Attributes:
         method: 'mog2' or 'knn'.
-        threshold: squared distance, in variances of the background, above which a pixel is foreground.
-        shadow_threshold: a pixel of the background's colour, darkened down to this factor, is shadow.
+        threshold: squared distance, in variances of the background, above which a pixel is
+            foreground.
+        shadow_threshold: a pixel of the background's colour, darkened down to this factor, is
+            shadow.
         smallest_part: pieces with less than this fraction of the largest one are dropped.
         largest_gap: pieces further than this from the largest one are dropped, as a fraction of its
             height.
@@ -46,6 +49,7 @@ class BackgroundModel:
     def __init__(self, settings: BackgroundSettings | None = None) -> None:
         self.settings = settings or BackgroundSettings()
         s = self.settings
+        self._model: cv2.BackgroundSubtractorMOG2 | cv2.BackgroundSubtractorKNN
         if s.method == 'mog2':
             self._model = cv2.createBackgroundSubtractorMOG2(varThreshold=s.threshold)
         else:
@@ -83,7 +87,7 @@ class BackgroundModel:
         mask = (raw == 255).astype(np.uint8)
         mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
         mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-        return _pieces_of_one_person(mask, self.settings)
+        return _pieces_of_one_person(np.asarray(mask, dtype=np.uint8), self.settings)
 
 
 def _pieces_of_one_person(mask: Image, settings: BackgroundSettings) -> Mask:

@@ -1,4 +1,4 @@
-"""All image terms of the likelihood for a range of poses, compiled; no Python between the pixels."""
+"""All image terms of the likelihood for a range of poses, compiled; no Python between pixels."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Model(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """Frames of N poses: columns (N, S, 3, 3), origins (N, S, 3), axes and dof origins (N, d, 3)."""
+    """Frames of N poses: columns (N, S, 3, 3), origins (N, S, 3); axes, dof origins (N, d, 3)."""
 
     columns: Array
     origins: Array
@@ -104,10 +104,12 @@ def add_energies(  # type: ignore[no-untyped-def]
         first, last: range of poses.
         model, terms, evidence, placement: what is compared with what.
         textures, which: (N,) index of the texture of each pose; negative: none.
-        explained: (X, M) what samples of the outline cost at most; a row a pose, or one row for all.
+        explained: (X, M) what samples of the outline cost at most; a row a pose, or one row for
+            all.
         energies: (N, TERM_COUNT) result.
         costs: (N, M) result: what each sample of the outline costs.
-        gradients, hessians: (N, d), (N, d, d), added to; hessians of no pose: no derivatives wanted.
+        gradients, hessians: (N, d), (N, d, d), added to; hessians of no pose: no derivatives
+            wanted.
     """
     segments = len(model.tree.parents)
     wrenches, stiffnesses = np.empty((segments, 6)), np.empty((segments, 6, 6))

@@ -1,8 +1,8 @@
 """Likelihood of intensities and of motion along the surface (KJS 2).
 
 The model carries the texture of the last accepted image. The intensity term compares it with the
-present image; the motion term compares where the texture has moved with the optical flow, which says
-the same to first order but reaches further.
+present image; the motion term compares where the texture has moved with the optical flow, which
+says the same to first order but reaches further.
 """
 
 from __future__ import annotations

@@ -20,9 +20,9 @@ def joint_energy(
 ) -> tuple[Array, Array, Array]:
     """Energy (N,), gradient (N, d) and Gauss-Newton Hessian (N, d, d) of keypoints.
 
-    Residuals are whitened by the covariances of the keypoints, with one Geman-McClure kernel an axis.
-    Keypoints that were not seen (NaN) or have no confidence do not count; a confidence below 1 divides
-    the precision.
+    Residuals are whitened by the covariances of the keypoints, with one Geman-McClure kernel an
+    axis. Keypoints that were not seen (NaN) or have no confidence do not count; a confidence below
+    1 divides the precision.
 
     Args:
         frames: of N poses.

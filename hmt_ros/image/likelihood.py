@@ -1,4 +1,4 @@
-"""Negative log-likelihood of an image, and the soft prior of the body, for a batch of poses (KJS 2)."""
+"""Negative log-likelihood of an image, and soft prior of the body, for a batch of poses (KJS 2)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,10 +44,10 @@ class TermSettings:
     """One term of the likelihood.
 
     Attributes:
-        weight: how many independent measurements the term counts for; 0 switches it off. For joints:
-            a factor.
-        sigma: standard deviation of one measurement, px (intensity: grey levels; joints: a factor on
-            the keypoints' own).
+        weight: how many independent measurements the term counts for; 0 switches it off. For
+            joints: a factor.
+        sigma: standard deviation of one measurement, px (intensity: grey levels; joints: a factor
+            on the keypoints' own).
         scale: of the Geman-McClure kernel, in sigmas.
     """
 
@@ -102,7 +103,8 @@ class ImageEnergy:
     @property
     def value(self) -> Array:
         """The sum of the terms, (N,)."""
-        return np.sum(list(self.terms.values()), axis=0)
+        total: Array = np.sum(list(self.terms.values()), axis=0)
+        return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,8 +211,8 @@ class ImageLikelihood:
     def with_scaled_widths(self, factors: Array) -> ImageLikelihood:
         """The likelihood with the x and y radii of the parts (B,) multiplied.
 
-        Made from what is compiled for this one: much cheaper than from a body with other widths, which
-        `body` does not become.
+        Made from what is compiled for this one: much cheaper than from a body with other widths,
+        which `body` does not become.
         """
         flesh = self._model.flesh
         radii = flesh.part_radii.copy()
@@ -308,13 +310,13 @@ def _thread_count() -> int:
 
 
 def _in_threads(work: Callable[[int, int], None], count: int) -> None:
-    """Shares poses among threads; every pose is worked on alone, so the result does not depend on it."""
+    """Shares poses among threads; each is worked on alone, so the result does not depend on it."""
     threads = min(_thread_count(), count // 4)
     if threads < 2:
         work(0, count)
         return
     ends = [count * i // threads for i in range(threads + 1)]
-    jobs = [_pool().submit(work, a, b) for a, b in zip(ends[1:-1], ends[2:])]
+    jobs = [_pool().submit(work, a, b) for a, b in pairwise(ends[1:])]
     work(0, ends[1])
     for job in jobs:
         job.result()

@@ -1,9 +1,10 @@
-"""What one image says: silhouette, its outline and distances, edges, motion since the last image."""
+"""What one image says: silhouette, its outline and distances, edges, motion since the last one."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -250,8 +251,9 @@ def _optical_flow(before: Image, after: Image) -> NDArray[np.float32]:
     grey = [cv2.cvtColor(x, cv2.COLOR_BGR2GRAY) for x in (before, after)]
     if min(grey[0].shape) < 32:
         return np.zeros((2, *grey[0].shape), np.float32)
-    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-    flow = method.calc(grey[0], grey[1], None)
+    # The stubs do not know that there may be no flow to start from.
+    method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    flow: NDArray[np.float32] = method.calc(grey[0], grey[1], None)
     return np.ascontiguousarray(flow.transpose(2, 0, 1))
 
 

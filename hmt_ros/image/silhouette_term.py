@@ -1,8 +1,8 @@
 """Likelihood of a silhouette, both ways (KJS 2; Sminchisescu and Triggs, IJRR 2003).
 
-The model explains the silhouette when its contour lies inside, and when the outline of the silhouette
-lies on the contour of the model: the first alone would let the model shrink, the second alone would let
-limbs stick out.
+The model explains the silhouette when its contour lies inside, and when the outline of the
+silhouette lies on the contour of the model: the first alone would let the model shrink, the second
+alone would let limbs stick out.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from hmt_ros.image.sampling import sample_distance
 
 # Pixels that opposite directions count like when outline and contour are matched, per unit.
 TURN = 12.0
-# Along the outline distances up to this cost nothing: the contour's points stand that far apart, px.
+# Along the outline distances up to this, px, cost nothing: the contour's points stand that far
+# apart.
 SPACING = 8.0
 
 

@@ -1,4 +1,4 @@
-"""The body's occluding contour in the image, and which parts of it can be seen; compiled, pose by pose.
+"""The occluding contour in the image, and which parts of it can be seen; compiled, pose by pose.
 
 The counterpart of `body.flesh.occluding_contour` and `Camera.project` for the inner loop of the
 likelihood: on every ring of the flesh the two points whose normal is perpendicular to the ray.
@@ -27,7 +27,7 @@ LENSES = {'plumb_bob': 0, 'rational_polynomial': 0, 'equidistant': 1}
 
 
 class Lens(NamedTuple):
-    """A camera as the compiled code reads it: fx fy cx cy, model (-1: no distortion), coefficients."""
+    """A camera as compiled code reads it: fx fy cx cy, model (-1: no distortion), coefficients."""
 
     focal: Array
     centre: Array
@@ -111,7 +111,7 @@ def empty_contour(rings):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, inline='always')
 def project(lens, x, y, z, i, pixels, projections):  # type: ignore[no-untyped-def]
-    """Pixel and derivative of a point, into row i of (P, 2) and (P, 2, 3); False behind the camera."""
+    """Pixel and derivative of a point into row i of (P, 2), (P, 2, 3); False behind the camera."""
     if not z > NEAR:
         return False
     a, b = x / z, y / z
@@ -240,7 +240,7 @@ def _signed_power(x, exponent):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _bracketed_roots(bx, by, uz, kx, ky, power, cosines, sines):  # type: ignore[no-untyped-def]
-    """Cosine and sine of the two roots of g(w), of `flesh.occluding_contour`; False if there are none."""
+    """Cosines, sines of the two roots of g(w) of `flesh.occluding_contour`; False: none."""
     steps = 48
     found_up, found_down = False, False
     before = 0.0

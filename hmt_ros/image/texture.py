@@ -53,7 +53,8 @@ def capture_textures(
 ) -> Textures:
     """Textures of the surface visible at K poses.
 
-    The points are spread evenly over the visible vertices of a coarse mesh, the same way every time.
+    The points are spread evenly over the visible vertices of a coarse mesh, the same way every
+    time.
 
     Args:
         body: with flesh.

@@ -4,9 +4,9 @@ Minimises E(x) subject to lower <= x <= upper (KJS 3.2, VMS 5): every iteration 
 
     (H + lambda W) step = -g
 
-on the free variables, projects the step onto the box, and moves lambda by the ratio of the actual to
-the predicted decrease. A variable rests on its limit as long as the gradient pushes it outwards. Each
-problem has its own lambda and its own active set, and leaves the batch when it has converged.
+on the free variables, projects the step onto the box, and moves lambda by the ratio of the actual
+to the predicted decrease. A variable rests on its limit as long as the gradient pushes it outwards.
+Each problem has its own lambda and its own active set, and leaves the batch when it has converged.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from scipy.linalg.lapack import dposv
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-# objective(x (n, d), problem (n,)) -> value (n,), gradient (n, d), Hessian (n, d, d); `problem` says
-# which of the N problems each row belongs to, as converged ones are left out.
+# objective(x (n, d), problem (n,)) -> value (n,), gradient (n, d), Hessian (n, d, d); `problem`
+# says which of the N problems each row belongs to, as converged ones are left out.
 Objective = Callable[[Array, Index], tuple[Array, Array, Array]]
 
 DAMPING_LIMIT = 1e12
@@ -76,7 +76,8 @@ def minimise(
         objective: value, gradient and Hessian (exact or Gauss-Newton) for some of the problems.
         x: starts (N, d); projected onto the box.
         lower, upper: limits (d,) or (N, d), or scalars.
-        step_scale: (d,) length of a step that is moderate for each variable; W = diag(step_scale^-2).
+        step_scale: (d,) length of a step that is moderate for each variable;
+            W = diag(step_scale^-2).
         damping: first lambda, in units of energy.
         max_iterations: evaluations per problem after the first one.
         tolerance: converged when a step is predicted to gain less than this, in units of energy.
@@ -156,10 +157,10 @@ def _steps(
     curvature = np.einsum('ni,nij,nj->n', step, hessian, step)
     predicted = -(np.einsum('ni,ni->n', gradient, step) + 0.5 * curvature)
     resting = _resting(x, gradient, lower, upper)
-    for i in np.flatnonzero(predicted <= 0):
-        downhill = np.where(resting[i], 0.0, -gradient[i])
-        step[i], predicted[i] = _gradient_step(
-            x[i], downhill, hessian[i], lower[i], upper[i], metric
+    for k in np.flatnonzero(predicted <= 0):
+        downhill = np.where(resting[k], 0.0, -gradient[k])
+        step[k], predicted[k] = _gradient_step(
+            x[k], downhill, hessian[k], lower[k], upper[k], metric
         )
     return step, predicted
 
@@ -169,8 +170,8 @@ def _box_step(
 ) -> tuple[Array, float]:
     """Minimiser of the damped quadratic model in the box low <= step <= high, and the damping used.
 
-    An active set: what the step on the free variables drives across a limit is put on it, the others
-    are solved again, and what pulls away from its limit is set free.
+    An active set: what the step on the free variables drives across a limit is put on it, the
+    others are solved again, and what pulls away from its limit is set free.
     """
     bound = ((low >= 0) & (gradient > 0)) | ((high <= 0) & (gradient < 0))
     step = np.where(bound, np.clip(0.0, low, high), 0.0)

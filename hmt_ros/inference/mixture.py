@@ -2,7 +2,8 @@
 
     p(x) = sum_k w_k N(x; m_k, S_k)
 
-The posterior, the likelihood and the prediction of a pose are all of this form (KJS 4, VMS 4, BME 2).
+The posterior, the likelihood and the prediction of a pose are all of this form (KJS 4,
+VMS 4, BME 2).
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ class GaussianMixture:
             ValueError: a covariance is not positive definite.
         """
         try:
-            return np.linalg.cholesky(self.covariances)
+            return np.asarray(np.linalg.cholesky(self.covariances), dtype=np.float64)
         except np.linalg.LinAlgError:
             smallest = np.linalg.eigvalsh(self.covariances)[:, 0]
             worst = int(np.argmin(smallest))
@@ -112,7 +113,8 @@ class GaussianMixture:
         """Draws n points, (n, d)."""
         k = rng.choice(len(self), size=n, p=self.normalised().weights)
         noise = rng.standard_normal((n, self.dimension))
-        return self.means[k] + np.einsum('nij,nj->ni', self.cholesky()[k], noise)
+        result: Array = self.means[k] + np.einsum('nij,nj->ni', self.cholesky()[k], noise)
+        return result
 
     def mean(self) -> Array:
         """Mean of the normalised mixture, (d,)."""
@@ -151,8 +153,8 @@ class GaussianMixture:
     def reduce(self, k: int) -> GaussianMixture:
         """A mixture of at most k components with the same mean and covariance.
 
-        Greedy pairwise merging. The pair that costs least is merged first, by the upper bound on the
-        Kullback-Leibler divergence that the merge causes [Runnalls, IEEE TAES 2007]:
+        Greedy pairwise merging. The pair that costs least is merged first, by the upper bound on
+        the Kullback-Leibler divergence that the merge causes [Runnalls, IEEE TAES 2007]:
 
             B(i, j) = 1/2 ((w_i + w_j) log|S_ij| - w_i log|S_i| - w_j log|S_j|)
 
@@ -174,17 +176,17 @@ class GaussianMixture:
         remaining = len(w)
         active = np.ones(len(w), dtype=bool)
         while remaining > k:
-            i, j = np.unravel_index(int(np.argmin(cost)), cost.shape)
-            total, mean, cov = _merged(w, m, s, int(i), np.array([j]))
+            i, j = (int(x) for x in np.unravel_index(int(np.argmin(cost)), cost.shape))
+            total, mean, cov = _merged(w, m, s, i, np.array([j]))
             w[i], m[i], s[i] = total[0], mean[0], cov[0]
             log_det[i] = np.linalg.slogdet(s[i])[1]
             active[j] = False
             cost[j, :] = cost[:, j] = np.inf
             others = np.flatnonzero(active & (np.arange(len(w)) != i))
             if len(others):
-                new = _merge_cost(w, m, s, log_det, int(i), others)
+                new = _merge_cost(w, m, s, log_det, i, others)
                 for other, value in zip(others, new, strict=True):
-                    cost[min(i, other), max(i, other)] = value
+                    cost[min(i, int(other)), max(i, int(other))] = value
             remaining -= 1
         return GaussianMixture(w[active], m[active], s[active])
 

@@ -70,7 +70,8 @@ class DeclaredParameter:
         wanted = type(self.default)
         if wanted is float and type(value) is int:
             value = float(value)
-        if type(value) is not wanted:
+        kind = type(value)
+        if kind is not wanted:
             raise ParameterError(f'{self.name} must be a {_NAMES[wanted]}, saw {value!r}')
         if self.limits is not None and not self.limits[0] <= value <= self.limits[1]:
             low, high = self.limits

@@ -1,9 +1,10 @@
 """Products of chain alternatives: whole poses from one configuration of each limb.
 
 Modes with nearly the same trunk form a group. For each chain the group has alternatives: the
-configurations of its modes, their flips, and what a search of the image found. Because limbs are nearly
-independent given the trunk, the energy of a combination is the energy of the group's leading mode plus
-the change that each alternative makes alone: a few dozen evaluations rate thousands of poses.
+configurations of its modes, their flips, and what a search of the image found. Because limbs are
+nearly independent given the trunk, the energy of a combination is the energy of the group's leading
+mode plus the change that each alternative makes alone: a few dozen evaluations rate thousands of
+poses.
 """
 
 from __future__ import annotations
@@ -143,7 +144,7 @@ def _least_sums(costs: list[Array], count: int) -> list[tuple[float, tuple[int, 
     start = (0,) * len(costs)
     heap = [(float(sum(r[0] for r in ranked)), start)]
     seen = {start}
-    result = []
+    result: list[tuple[float, tuple[int, ...]]] = []
     while heap and len(result) < count:
         total, ranks = heapq.heappop(heap)
         result.append((total, tuple(int(o[i]) for o, i in zip(orders, ranks))))

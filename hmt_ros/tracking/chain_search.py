@@ -1,8 +1,8 @@
 """Covariance-scaled sampling of one kinematic chain at a time.
 
-Given the trunk, limbs are nearly independent: instead of 37 degrees of freedom at once, samples of the
-four to six of one limb are compared with the image there, and the best are refined. What the rest of
-the body explains of the silhouette's outline costs a limb nothing.
+Given the trunk, limbs are nearly independent: instead of 37 degrees of freedom at once, samples of
+the four to six of one limb are compared with the image there, and the best are refined. What the
+rest of the body explains of the silhouette's outline costs a limb nothing.
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ class DynamicsSettings:
         velocity_kept: share of the velocity that lasts from one image to the next; 1: all.
         velocity_gain: how far the velocity follows the newest displacement, 0 to 1.
         translation: standard deviation of the root's position after one second, m.
-        root, trunk, hip, knee, shoulder, elbow, neck, extremity: of the angles, rad after one second.
-            Deviations grow with the square root of time.
+        root, trunk, hip, knee, shoulder, elbow, neck, extremity: of the angles, rad after one
+            second. Deviations grow with the square root of time.
     """
 
     model: str = 'constant_velocity'

@@ -1,9 +1,10 @@
-"""Widths of the flesh from the first images of a track (KJS 2: shape is estimated at initialisation).
+"""Widths of the flesh from the first images of a track (KJS 2: shape estimated at initialisation).
 
-How thick limbs and clothes are is unknown at the start, and a wrong width pushes poses: a model that is
-too thin hugs one side of a limb, one that is too thick turns it away. The widths of the parts, left and
-right alike, are moved by damped Newton steps on the energy of the silhouette and the edges at the
-present modes; every image adds its curvature, so that later ones move them less and less.
+How thick limbs and clothes are is unknown at the start, and a wrong width pushes poses: a model
+that is too thin hugs one side of a limb, one that is too thick turns it away. The widths of the
+parts, left and right alike, are moved by damped Newton steps on the energy of the silhouette and
+the edges at the present modes; every image adds its curvature, so that later ones move them less
+and less.
 """
 
 from __future__ import annotations
@@ -63,7 +64,8 @@ class FleshFit:
 
         def energy(change: Array) -> float:
             scaled = likelihood.with_scaled_widths(np.exp(change[self._group]))
-            return float(weights @ scaled.image_energy(frames, observation, derivatives=False).value)
+            terms = scaled.image_energy(frames, observation, derivatives=False)
+            return float(weights @ terms.value)
 
         here = energy(np.zeros(len(self._names)))
         gradient, curvature = np.zeros(len(self._names)), np.zeros(len(self._names))

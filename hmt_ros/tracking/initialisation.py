@@ -1,8 +1,9 @@
-"""The start of a track: poses, depth, lengths and widths from joints seen in one image (KJS 2, 5.2).
+"""The start of a track: poses, depth, lengths and widths from joints in one image (KJS 2, 5.2).
 
-From several headings the pose is fitted to the joints together with the lengths, each length held by
-what was measured or by its spread over people. The lengths are then fixed, the flips of all limbs that
-the image and the limits allow are enumerated and fitted again, and the best stand as the first mixture.
+From several headings the pose is fitted to the joints together with the lengths, each length held
+by what was measured or by its spread over people. The lengths are then fixed, the flips of all
+limbs that the image and the limits allow are enumerated and fitted again, and the best stand as the
+first mixture.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ def _fit_with_lengths(
     skeleton = body.skeleton
     d, count = body.dimension, len(skeleton.length_names)
     which = skeleton.joint_index(keypoints.names)
-    seen = np.isfinite(keypoints.pixels).all(1)
+    seen = np.asarray(np.isfinite(keypoints.pixels).all(1), dtype=np.bool_)
     precision = np.linalg.inv(keypoints.covariances) * seen[:, None, None]
     target = np.where(seen[:, None], keypoints.pixels, 0.0)
     sigma = np.where(measured, MEASURED, body.length_sigma)
@@ -122,7 +123,7 @@ def _fit_with_lengths(
         # People differ in size first and in proportions second.
         common = STATURE_SPREAD * skeleton.lengths
         covariance = np.diag(sigma**2) + np.outer(common, common)
-        length_precision = np.linalg.inv(covariance)
+        length_precision = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
     prior_precision = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, np.inf) ** -2.0
     default = skeleton.lengths
 
@@ -185,7 +186,7 @@ def _fit_with_lengths(
 
 def _first_guesses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
     """Mean poses at several headings, where the joints are and as far as their spread says."""
-    seen = np.isfinite(keypoints.pixels).all(1)
+    seen = np.asarray(np.isfinite(keypoints.pixels).all(1), dtype=np.bool_)
     pixels = keypoints.pixels[seen]
     names = [x for x, ok in zip(keypoints.names, seen, strict=True) if ok]
     rays = camera.rays(pixels)

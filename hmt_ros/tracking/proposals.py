@@ -1,4 +1,4 @@
-"""Where new hypotheses come from: spherical, covariance-scaled and kinematic jump sampling (KJS 3, 5)."""
+"""Where hypotheses come from: spherical, covariance-scaled, kinematic jump sampling (KJS 3, 5)."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def spherical_samples(
 ) -> Array:
     """Isotropic noise around each mean, of the volume that its covariance has; (K, count, d).
 
-    The radius is the geometric mean of the axes of the ellipsoid, |S|^(1/2d). Samples that leave the
-    limits are projected back.
+    The radius is the geometric mean of the axes of the ellipsoid, |S|^(1/2d). Samples that leave
+    the limits are projected back.
 
     Args:
         body: with the limits.
@@ -34,7 +34,8 @@ def spherical_samples(
     d = means.shape[1]
     radius = np.exp(np.linalg.slogdet(covariances)[1] / (2 * d))
     noise = _noise((len(means), count, d), scale, rng)
-    return np.clip(means[:, None] + radius[:, None, None] * noise, body.lower, body.upper)
+    samples: Array = np.clip(means[:, None] + radius[:, None, None] * noise, body.lower, body.upper)
+    return samples
 
 
 def covariance_scaled_samples(
@@ -43,9 +44,10 @@ def covariance_scaled_samples(
     """Noise with the covariance of each mean, stretched; (K, count, d). Arguments as above."""
     factors = np.linalg.cholesky(covariances)
     noise = _noise((len(means), count, means.shape[1]), scale, rng)
-    return np.clip(
+    samples: Array = np.clip(
         means[:, None] + np.einsum('kij,knj->kni', factors, noise), body.lower, body.upper
     )
+    return samples
 
 
 def chain_votes(
@@ -53,8 +55,8 @@ def chain_votes(
 ) -> Array:
     """Probabilities (K, C) with which each mode's chains are chosen, by their local uncertainty.
 
-    'trace': the trace of the block of the covariance that belongs to the rotations of the chain, which
-    equals the sum over the eigenvectors of eigenvalue times squared length inside the chain;
+    'trace': the trace of the block of the covariance that belongs to the rotations of the chain,
+    which equals the sum over the eigenvectors of eigenvalue times squared length inside the chain;
     'eigenvalue': the largest eigenvalue of that block; 'uniform': all alike.
 
     Raises:
@@ -71,7 +73,8 @@ def chain_votes(
                 result[:, i] = np.einsum('kii->k', block)
             else:
                 result[:, i] = np.linalg.eigvalsh(block)[:, -1]
-    return result / result.sum(1, keepdims=True)
+    shares: Array = result / result.sum(1, keepdims=True)
+    return shares
 
 
 def chain_dofs(body: Body, chain: str) -> Index:

@@ -1,12 +1,12 @@
 """Which of many hypotheses to keep: few that stand for all.
 
-Keeping the K heaviest modes keeps near copies of the heaviest one. Here the K are chosen that leave the
-least expected distance from a hypothesis to the nearest kept one,
+Keeping the K heaviest modes keeps near copies of the heaviest one. Here the K are chosen that leave
+the least expected distance from a hypothesis to the nearest kept one,
 
     min over S, |S| = K:   sum_i w_i min_{s in S} d(i, s),
 
-greedily, heaviest first; d is the mean distance of the joints, each capped, below which two hypotheses
-count as the same. What is not kept gives its weight to the nearest that is.
+greedily, heaviest first; d is the mean distance of the joints, each capped, below which two
+hypotheses count as the same. What is not kept gives its weight to the nearest that is.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Subject files: where a person's joints are in one image, and what is known of the person's size."""
+"""Subject files: a person's joints in one image, and what is known of the person's size."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def read_subject(path: str | Path, body: Body) -> Subject:
     `segment_lengths_m` (name: length) and `stature_m`.
 
     Raises:
-        SubjectError: a file that is missing, is not YAML, lacks an entry, or names a joint or a length
-            that the body does not have.
+        SubjectError: a file that is missing, is not YAML, lacks an entry, or names a joint or a
+            length that the body does not have.
     """
     path = Path(path)
     try:
@@ -118,7 +118,10 @@ def _positive(value: Any, name: str, largest: float = 1e4) -> float:
 
 
 def _pixel(name: str, value: Any) -> tuple[float, float]:
-    if isinstance(value, (list, tuple)) and len(value) == 2:
-        if all(isinstance(x, (int, float)) and np.isfinite(x) for x in value):
-            return float(value[0]), float(value[1])
+    if (
+        isinstance(value, (list, tuple))
+        and len(value) == 2
+        and all(isinstance(x, (int, float)) and np.isfinite(x) for x in value)
+    ):
+        return float(value[0]), float(value[1])
     raise SubjectError(f'keypoint {name} must be [u, v] in pixels, saw {value!r}')
