@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
+# Learning rate at which nothing is learned; at 0 the KNN model would replace its samples at once.
+FROZEN = 1e-7
+
 
 @dataclass(frozen=True)
 class BackgroundSettings:
@@ -57,6 +60,7 @@ class BackgroundModel:
         self._model.setDetectShadows(True)
         self._model.setShadowThreshold(s.shadow_threshold)
         self.frames = 0
+        self._shape: tuple[int, ...] = ()
 
     @classmethod
     def from_image(
@@ -69,7 +73,14 @@ class BackgroundModel:
         return model
 
     def learn(self, image: Image) -> None:
-        """Takes one more frame (H, W, 3) of the scene into the model."""
+        """Takes one more frame (H, W, 3) of the scene into the model.
+
+        Raises:
+            ValueError: the image is not like those before.
+        """
+        if self.frames == 0:
+            self._shape = image.shape
+        self._check(image)
         self.frames += 1
         self._model.apply(image, learningRate=1.0 / self.frames)
 
@@ -83,11 +94,17 @@ class BackgroundModel:
         """
         if self.frames == 0:
             raise ValueError('no background has been learned: give an image or some frames first')
-        raw = self._model.apply(image, learningRate=0)
+        self._check(image)
+        raw = self._model.apply(image, learningRate=FROZEN)
         mask = (raw == 255).astype(np.uint8)
         mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
         mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
         return _pieces_of_one_person(np.asarray(mask, dtype=np.uint8), self.settings)
+
+    def _check(self, image: Image) -> None:
+        # OpenCV would silently begin a new model.
+        if image.shape != self._shape:
+            raise ValueError(f'the background has shape {self._shape}, saw an image {image.shape}')
 
 
 def _pieces_of_one_person(mask: Image, settings: BackgroundSettings) -> Mask:

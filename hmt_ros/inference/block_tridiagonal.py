@@ -74,11 +74,15 @@ class BlockTridiagonal:
             NotPositiveDefiniteError: the matrix is not positive definite.
         """
         t, n = self.diagonal.shape[:2]
-        width = self.bandwidth
-        band = np.zeros((t * n, width + 1)).T
-        fill_diagonal(band.T, np.ascontiguousarray(self.diagonal))
-        fill_lower(band.T, np.ascontiguousarray(self.lower))
-        return factorise_band(band, t, n)
+        return factorise_band(self.band().T, t, n)
+
+    def band(self) -> Array:
+        """The columns (T n, width + 1) of LAPACK's band storage: [j, i - j] = P[i, j]."""
+        t, n = self.diagonal.shape[:2]
+        columns = np.zeros((t * n, self.bandwidth + 1))
+        fill_diagonal(columns, np.ascontiguousarray(self.diagonal))
+        fill_lower(columns, np.ascontiguousarray(self.lower))
+        return columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,3 +227,18 @@ def fill_lower(columns: Array, lower: Array) -> None:
         for b in range(n):
             for a in range(min(n, width - n + b + 1)):
                 columns[t * n + b, n + a - b] = lower[t, a, b]
+
+
+@njit(cache=True, nogil=True, fastmath={'reassoc', 'contract', 'nsz'})
+def add_band_product(columns: Array, x: Array, result: Array) -> None:
+    """Adds P x, (S, T n), of vectors x (S, T n) and P in the columns (T n, width + 1) of a band."""
+    total, width = columns.shape
+    for s in range(len(x)):
+        for c in range(total):
+            last = min(width, total - c)
+            own = x[s, c]
+            dot = columns[c, 0] * own
+            for b in range(1, last):
+                dot += columns[c, b] * x[s, c + b]
+                result[s, c + b] += columns[c, b] * own
+            result[s, c] += dot

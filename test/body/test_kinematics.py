@@ -156,20 +156,6 @@ def test_assembled_gradient_and_hessian_equal_the_dense_ones(body, random_poses)
     assert np.linalg.eigvalsh(hessian).min() > -1e-9
 
 
-def test_sums_with_segments_that_differ_from_pose_to_pose(random_poses):
-    body = BODIES['human37']
-    poses = random_poses(body, 4, 6)
-    rng, segments, _, points = random_points(body, poses, 2, 7)
-    directions = rng.normal(size=points.shape)
-    pull, curvature = rng.uniform(0, 2, size=(2, len(segments), len(poses)))
-    count = len(body.skeleton.parents)
-    same = segment_sums(segments, points, directions, pull, curvature, count)
-    spread = np.tile(segments[:, None], (1, len(poses)))
-    other = segment_sums(spread, points, directions, pull, curvature, count)
-    for a, b in zip(same, other):
-        np.testing.assert_allclose(a, b, atol=1e-12)
-
-
 def test_point_jacobians_equal_central_differences(body, random_poses):
     poses = random_poses(body, 2, 8)
     rng = np.random.default_rng(9)

@@ -1,6 +1,7 @@
 """The node itself, over DDS; with a tracker that costs nothing."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -27,14 +28,12 @@ PATIENCE = 60.0  # s
 class World:
     """A filter node, and somebody who talks to it, in a context of their own."""
 
-    def __init__(self, **values):
+    def __init__(self, stderr, **values):
         import rclpy
         from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
         from hmt_msgs.msg import Keypoints2D
-        from rcl_interfaces.msg import Log
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.parameter import Parameter
-        from rclpy.qos import DurabilityPolicy, QoSProfile
         from sensor_msgs.msg import CameraInfo, Image
 
         from hmt_ros.nodes.filter_node import FilterNode
@@ -54,11 +53,10 @@ class World:
             'camera_info': self.other.create_publisher(CameraInfo, 'camera_info', 100),
             'keypoints': self.other.create_publisher(Keypoints2D, 'keypoints', 100),
         }
-        self.handled, self.diagnostics, self.log = [], [], []
+        self.handled, self.diagnostics = [], []
+        self.stderr, self.logged = stderr, ''
         self.listen(DiagnosticStatus, 'filter_node/handled', self.handled)
         self.listen(DiagnosticArray, '/diagnostics', self.diagnostics)
-        latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.listen(Log, '/rosout', self.log, latched)
 
     def listen(self, kind, topic, into, qos=100):
         def receive(message):
@@ -131,8 +129,16 @@ class World:
         return result.successful, result.reason
 
     def warnings(self):
-        """Texts that the node has logged as warnings or worse."""
-        return [line.msg for line in self.log if line.name == 'filter_node' and line.level >= 30]
+        """Texts that the node has logged as warnings or worse.
+
+        From stderr: what contexts that have ended in this process leave behind may keep /rosout
+        of a node with the same name silent.
+        """
+        self.logged += self.stderr.readouterr().err
+        head = re.compile(r'^\[(\w+)\] \[[0-9.]+\] \[filter_node\]: ', re.MULTILINE)
+        lines = head.split(self.logged)
+        entries = zip(lines[1::2], lines[2::2], strict=True)
+        return [text.strip() for level, text in entries if level in ('WARN', 'ERROR', 'FATAL')]
 
     def diagnosis(self):
         """The newest diagnostics: level, message, values."""
@@ -152,12 +158,12 @@ class World:
 
 
 @pytest.fixture
-def world(stub_tracker, subject_file):
+def world(stub_tracker, subject_file, capfd):
     worlds = []
 
     def make(**values):
         values.setdefault('subject_file', str(subject_file))
-        worlds.append(World(**values))
+        worlds.append(World(capfd, **values))
         return worlds[-1]
 
     yield make
@@ -412,10 +418,11 @@ def test_reset(running, small_camera, stub_tracker, subject_file, body):
 def test_late_node_drops_the_oldest_and_answers_meanwhile(
     world, small_camera, stub_tracker, monkeypatch
 ):
-    go = threading.Event()
+    begun, go = threading.Event(), threading.Event()
     step = stub_tracker.step
 
     def slow(self, *arguments):
+        begun.set()
         assert go.wait(PATIENCE)
         return step(self, *arguments)
 
@@ -426,7 +433,7 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
         queue = one.node._queue
         for index in range(12):
             one.publishers['image'].publish(serialise(small_camera.image(index)))
-            # The first is being estimated.
+            one.spin_until(begun.is_set, 'the estimate of the first image')
             one.spin_until(lambda index=index: len(queue) + queue._dropped == index)
         assert (len(queue), queue._dropped) == (2, 9)
         assert one.state == 'active'
