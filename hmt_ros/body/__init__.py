@@ -6,9 +6,11 @@ from pathlib import Path
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.interpretation_tree import enumerate_flips
 from hmt_ros.body.model_file import model_names, read_body
+from hmt_ros.body.motion_file import SUFFIXES, read_skeleton
 
-__all__ = ['Body', 'Camera', 'load_body', 'model_names']
+__all__ = ['Body', 'Camera', 'enumerate_flips', 'load_body', 'model_names']
 
 
 def load_body(source: str | Path) -> Body:
@@ -20,4 +22,6 @@ def load_body(source: str | Path) -> Body:
         FileNotFoundError: neither a known name nor a file.
         ValueError: a file that is not a body; one line that says what is wrong.
     """
+    if Path(source).suffix.lower() in SUFFIXES:
+        return read_skeleton(source)
     return read_body(source)

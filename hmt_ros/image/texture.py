@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,27 @@ class Textures(NamedTuple):
     local: Array
     pixels: Array
     colours: Array
+
+
+def with_swapped_sides(
+    textures: Textures, row: int, left: Sequence[int], right: Sequence[int]
+) -> Textures:
+    """The textures and one row more: that of a pose, had two limbs been taken for each other.
+
+    Args:
+        textures: of K poses.
+        row: of the pose.
+        left, right: segments of the limbs, in the same order; their frames mirror each other.
+    """
+    mirror = np.arange(1 + max(int(textures.segments.max(initial=0)), *left, *right))
+    mirror[list(left)], mirror[list(right)] = right, left
+    segments = mirror[textures.segments[row]]
+    local = textures.local[row].copy()
+    local[segments != textures.segments[row], 0] *= -1.0
+    added = (
+        textures.counts[row], segments, local, textures.pixels[row], textures.colours[row]
+    )  # fmt: skip
+    return Textures(*(np.concatenate([a, b[None]]) for a, b in zip(textures, added, strict=True)))
 
 
 def no_textures() -> Textures:

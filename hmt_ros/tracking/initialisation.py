@@ -18,7 +18,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.interpretation_tree import enumerate_flips
 from hmt_ros.body.kinematics import forward, joint_length_jacobians, point_jacobians
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
-from hmt_ros.image.observation import Keypoints, Observation
+from hmt_ros.image.observation import Keypoints, Observation, Outline
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.tracking.subject import Subject
 
@@ -92,6 +92,29 @@ def start_from_keypoints(
     solved = _distinct(_solve(energy, flips[keep], body), body, 96)
     order = np.argsort(solved.value, kind='stable')
     return Start(body, solved.x[order], solved.value[order], solved.hessian[order])
+
+
+def poses_from_keypoints(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
+    """Poses (M, d) of a body of known lengths that explain the joints of an image."""
+    subject = Subject(0, keypoints, dict(body.segment_lengths))
+    return start_from_keypoints(body, camera, subject).poses
+
+
+def poses_from_outline(body: Body, camera: Camera, outline: Outline) -> Array:
+    """Mean poses (HEADINGS, d) of all headings, as high and where the silhouette is."""
+    low, high = np.quantile(outline.pixels, 0.02, axis=0), np.quantile(outline.pixels, 0.98, axis=0)
+    middle = 0.5 * (low + high)
+    ends = camera.rays(np.array([[middle[0], low[1]], [middle[0], high[1]], middle]))
+    ends = ends / ends[:, 2:]
+    result = np.tile(body.prior_mean, (HEADINGS, 1))
+    result[:, :3] = 0.0
+    result[:, body.dof_names.index('root_z')] = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
+    joints = body.joint_positions(result)
+    top, bottom = joints[..., 1].min(1), joints[..., 1].max(1)
+    depth = (bottom - top) / max(ends[1, 1] - ends[0, 1], 1e-3)
+    result[:, :3] = depth[:, None] * ends[2]
+    result[:, 1] -= 0.5 * (top + bottom)
+    return np.clip(result, body.lower, body.upper)
 
 
 def _sized(body: Body, subject: Subject) -> Body:

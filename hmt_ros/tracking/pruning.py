@@ -17,6 +17,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hmt_ros.inference.mixture import GaussianMixture, bhattacharyya_distances
+
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
@@ -52,6 +54,30 @@ def choose_hypotheses(
     chosen, owner = _choose(np.ascontiguousarray(joints), weights / weights.sum(), count, same, cap)
     groups = np.array([np.logaddexp.reduce(log_weights[owner == k]) for k in range(len(chosen))])
     return Kept(chosen, owner, groups)
+
+
+def inherited_log_weights(
+    means: Array, covariances: Array, order: Index, before: GaussianMixture
+) -> Array:
+    """Log weights (K,) that new modes take over from a mixture before (KJS fig. 4, step 5).
+
+    Each takes the weight of the nearest component by the Bhattacharyya distance, which is then
+    taken out; modes that none is left for get the smallest weight. So a track keeps the modes that
+    it had, while new ones may emerge.
+
+    Args:
+        means, covariances: (K, d), (K, d, d).
+        order: (K,) in which they choose.
+        before: the mixture.
+    """
+    distances = bhattacharyya_distances(means, covariances, before.means, before.covariances)
+    log_weights = np.log(np.maximum(before.normalised().weights, np.finfo(np.float64).tiny))
+    result = np.full(len(means), log_weights.min())
+    for k in order[: len(before)]:
+        nearest = int(np.argmin(distances[k]))
+        result[k] = log_weights[nearest]
+        distances[:, nearest] = np.inf
+    return result
 
 
 @njit(cache=True, nogil=True)

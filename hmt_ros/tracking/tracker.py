@@ -1,4 +1,4 @@
-"""Mixture density propagation with kinematic jumps and covariance-scaled sampling (KJS fig. 4 and 5)."""
+"""Mixture density propagation with kinematic jumps and covariance-scaled sampling (KJS 4, 5)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from hmt_ros.body.torso_flips import flip_torso
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
 from hmt_ros.image.observation import Keypoints, Observation, ObservationSettings, observe
-from hmt_ros.image.texture import Textures, capture_textures
+from hmt_ros.image.texture import Textures, capture_textures, with_swapped_sides
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.chain_product import (
@@ -29,7 +30,11 @@ from hmt_ros.tracking.chain_product import (
 from hmt_ros.tracking.chain_search import ChainSearch, ChainSearchSettings
 from hmt_ros.tracking.dynamics import DynamicsSettings, predict, update_velocities
 from hmt_ros.tracking.flesh_fitting import FleshFit
-from hmt_ros.tracking.initialisation import start_from_keypoints
+from hmt_ros.tracking.initialisation import (
+    poses_from_keypoints,
+    poses_from_outline,
+    start_from_keypoints,
+)
 from hmt_ros.tracking.proposals import (
     PROPOSALS,
     VOTES,
@@ -38,7 +43,7 @@ from hmt_ros.tracking.proposals import (
     covariance_scaled_samples,
     spherical_samples,
 )
-from hmt_ros.tracking.pruning import choose_hypotheses
+from hmt_ros.tracking.pruning import choose_hypotheses, inherited_log_weights
 from hmt_ros.tracking.subject import Subject
 
 Array = NDArray[np.float64]
@@ -47,6 +52,14 @@ Image = NDArray[np.uint8]
 
 # Groups of modes with a trunk of their own whose products are rated.
 MOST_GROUPS = 3
+REWEIGHTINGS = ('ancestry', 'bhattacharyya')
+# An outline or a keypoint further away than this from where it should be is unexplained, in sigmas.
+UNEXPLAINED = 4.0
+# Keypoints from which a lost track starts anew.
+FEWEST_KEYPOINTS = 6
+PAIRS = (('left_arm', 'right_arm'), ('left_leg', 'right_leg'))
+SIBLINGS = {a: b for pair in PAIRS for a, b in (pair, pair[::-1])}
+TRUNK = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
 CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
 
 
@@ -65,12 +78,16 @@ class TrackerSettings:
     Attributes:
         max_hypotheses: modes that are kept, K.
         hypothesis_merge_distance: mean distance of the joints below which two modes are one, m.
-        proposals: 'kjs' (covariance-scaled samples and kinematic jumps), 'css' or 'ss' (samples alone).
+        proposals: 'kjs' (covariance-scaled samples and kinematic jumps), 'css' or 'ss' (samples
+            alone).
         candidates: hypotheses that are optimised fully an image.
         combinations: combinations of chain alternatives that are rated an image.
         alternatives: configurations of a chain that are rated.
         samples: samples an image of 'css' and 'ss'.
         sample_scale: their stretch; 0: Cauchy tails.
+        reweighting: what the images before say of a new mode: 'ancestry', the weight of the mode it
+            comes from and of its jumps, or 'bhattacharyya', the weight of the nearest mode before
+            (KJS 5.1).
         exploration: power of the weights when candidates are chosen; below 1 favours unlikely ones.
         vote: how chains are chosen for search: 'trace', 'eigenvalue' or 'uniform'.
         searched_chains: chains searched in an image.
@@ -81,8 +98,8 @@ class TrackerSettings:
         tails: degrees of freedom of the Student distribution around a prediction.
         least_log_weight: no kept mode's weight falls below this.
         flesh_images: images from which the widths of the flesh are estimated; 0: the model's.
-        lost_misfit: share of the outline, or of the keypoints, that no mode explains, above which an
-            image counts as lost.
+        lost_misfit: share of the outline, or of the keypoints, that no mode explains, above which
+            an image counts as lost.
         lost_images: so many in a row start the track anew.
         dynamics, likelihood, observation, search: settings of the parts.
     """
@@ -95,6 +112,7 @@ class TrackerSettings:
     alternatives: int = 10
     samples: int = 256
     sample_scale: float = 2.0
+    reweighting: str = 'ancestry'
     exploration: float = 0.5
     vote: str = 'trace'
     searched_chains: int = 4
@@ -115,6 +133,8 @@ class TrackerSettings:
     def __post_init__(self) -> None:
         if self.proposals not in PROPOSALS:
             raise ValueError(f'proposals must be one of {PROPOSALS}, saw {self.proposals!r}')
+        if self.reweighting not in REWEIGHTINGS:
+            raise ValueError(f'reweighting must be one of {REWEIGHTINGS}, saw {self.reweighting!r}')
         if self.vote not in VOTES:
             raise ValueError(f'vote must be one of {VOTES}, saw {self.vote!r}')
         if self.max_hypotheses < 1 or self.candidates < self.max_hypotheses:
@@ -144,6 +164,48 @@ class Modes:
     log_weights: Array
     log_likelihoods: Array
     textures: Textures | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Product:
+    """A trunk, configurations of each limb, and what they cost.
+
+    Attributes:
+        modes, members, log_weights: (G, d), (G,), (G,) of the modes with this trunk.
+        alternatives: one entry a chain.
+        changes: energy change that each alternative makes alone.
+        energy: of the first mode.
+        row: of the textures.
+    """
+
+    modes: Array
+    members: Index
+    log_weights: Array
+    alternatives: list[Alternatives]
+    changes: list[Array]
+    energy: float
+    row: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """Poses to be optimised.
+
+    Attributes:
+        poses: (N, d).
+        parents: (N,) the mode that each comes from.
+        log_priors: (N,) log probability given the modes before.
+        centres: (N, d) where each is expected.
+        textures: of the last image.
+        texture_rows: (N,) row of the textures that each carries.
+    """
+
+    poses: Array
+    parents: Index
+    log_priors: Array
+    centres: Array
+    textures: Textures | None
+    texture_rows: Index
 
 
 class Tracker:
@@ -188,8 +250,8 @@ class Tracker:
         """Drops the track; the next image starts a new one.
 
         Args:
-            start: a subject, whose track starts at the first image at or after its stamp, or a mixture
-                over poses of the present body, or None: the start that was given last.
+            start: a subject, whose track starts at the first image at or after its stamp, or a
+                mixture over poses of the present body, or None: the start that was given last.
         """
         if isinstance(start, GaussianMixture) and start.dimension != self.body.dimension:
             raise ValueError(
@@ -216,8 +278,8 @@ class Tracker:
             keypoints: joints seen in this image, if any.
 
         Returns:
-            The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses, heaviest
-            first with weights that sum to 1; (None, None) while there is no track.
+            The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses,
+            heaviest first with weights that sum to 1; (None, None) while there is no track.
 
         Raises:
             ValueError: an image of another size, or a stamp that does not increase.
@@ -238,7 +300,10 @@ class Tracker:
         else:
             assert self._last_stamp is not None
             observation = self._observe(image, keypoints)
-            self._propagate(observation, (stamp - self._last_stamp) * 1e-9)
+            if self.status is Status.LOST and self._recover(observation):
+                self._bad_images = 0
+            else:
+                self._propagate(observation, (stamp - self._last_stamp) * 1e-9)
         self._last_image, self._last_stamp = image, stamp
         self._judge(observation)
         return self.posterior, self.likelihood_mixture(observation)
@@ -299,7 +364,7 @@ class Tracker:
             poses = self._start.means
             with np.errstate(divide='ignore'):
                 log_weights = np.log(self._start.normalised().weights)
-            precisions = np.linalg.inv(self._start.covariances)
+            precisions = _inverses(self._start.covariances)
 
         def energy(x: Array, index: Index) -> tuple[Array, Array, Array]:
             value, gradient, hessian = self._energy(x, observation, None, None)
@@ -319,6 +384,31 @@ class Tracker:
                 break
             solved = self._minimise(energy, solved.x, s.iterations)
             self._keep(solved, log_weights, still, observation)
+
+    def _recover(self, observation: Observation) -> bool:
+        """Starts anew from what an image alone shows; False where that is not enough.
+
+        The body keeps its lengths and widths. From keypoints come all poses that explain them, from
+        a silhouette mean poses of several headings at its place; the present modes stay in
+        the race.
+        """
+        s, poses = self.settings, None
+        if observation.keypoints is not None:
+            seen = np.isfinite(observation.keypoints.pixels).all(1)
+            if seen.sum() >= FEWEST_KEYPOINTS:
+                poses = poses_from_keypoints(self.body, self.camera, observation.keypoints)
+        if poses is None and observation.outline is not None:
+            poses = poses_from_outline(self.body, self.camera, observation.outline)
+        if poses is None:
+            return False
+        poses = np.concatenate([self.modes.poses, poses])
+
+        def energy(x: Array, _: Index) -> tuple[Array, Array, Array]:
+            return self._energy(x, observation, None, None)
+
+        solved = self._minimise(energy, poses, 3 * s.iterations)
+        self._keep(solved, np.zeros(len(poses)), np.zeros_like(poses), observation)
+        return True
 
     def _fit_flesh(self, observation: Observation) -> bool:
         """Moves the widths of the flesh by what an image says; False where it says nothing more."""
@@ -346,32 +436,37 @@ class Tracker:
             s.dynamics, self._rates, m.poses, m.covariances, m.velocities, dt
         )
         predicted = np.clip(predicted, body.lower, body.upper)
-        precisions = np.linalg.inv(covariances)
+        precisions = _inverses(covariances)
         everyone = np.arange(len(m.poses))
         moved = self._follow_motion(predicted, precisions, observation)
         base = self._minimise(
-            self._posterior_energy(observation, everyone, moved, precisions),
+            self._posterior_energy(observation, everyone, moved, precisions, m.textures, everyone),
             moved,
             s.base_iterations,
         )
-        if s.proposals == 'kjs':
-            poses, parents, log_priors, centres = self._jumps(base, moved, covariances, observation)
-        else:
-            poses, parents, log_priors, centres = self._samples(
-                base, moved, covariances, observation
-            )
+        propose = self._jumps if s.proposals == 'kjs' else self._samples
+        candidates = propose(base, moved, covariances, observation)
+        poses, parents = candidates.poses, candidates.parents
         solved = self._minimise(
-            self._posterior_energy(observation, parents, centres, precisions),
+            self._posterior_energy(
+                observation, parents, candidates.centres, precisions,
+                candidates.textures, candidates.texture_rows,
+            ),
             poses,
             s.iterations,
-        )
+        )  # fmt: skip
         velocities = update_velocities(
             s.dynamics, m.velocities[parents], m.poses[parents], solved.x, dt
         )
         # Where a chain has jumped, its displacement is no motion.
         jumped = np.abs(poses - base.x[parents]) > 1e-9
         velocities = np.where(jumped, 0.0, velocities)
-        self._keep(solved, log_priors, velocities, observation)
+        log_priors = candidates.log_priors
+        predicted_mixture = None
+        if s.reweighting == 'bhattacharyya':
+            log_priors = np.zeros(len(solved.x))
+            predicted_mixture = GaussianMixture(np.exp(m.log_weights), moved, covariances)
+        self._keep(solved, log_priors, velocities, observation, predicted_mixture)
         self._fit_flesh(observation)
 
     def _follow_motion(
@@ -401,34 +496,70 @@ class Tracker:
 
     def _jumps(
         self, base: Minimum, moved: Array, covariances: Array, observation: Observation
-    ) -> tuple[Array, Index, Array, Array]:
-        """Candidates of kinematic jump sampling: poses, parents, log priors and centres."""
+    ) -> _Candidates:
+        """Candidates of kinematic jump sampling."""
         s, m = self.settings, self.modes
-        everything: list[tuple[Array, Index, Array, Array]] = []
+        textures = m.textures
+        everything: list[tuple[Array, Index, Array, Array, Index]] = []
         for group in self._groups(base)[:MOST_GROUPS]:
             lead = int(group[0])
-            found = self._search(base.x[lead], covariances[lead], observation, lead)
+            pose = base.x[lead]
+            found = self._search(pose, covariances[lead], observation, lead)
             alternatives = [
                 self._alternatives(base.x[group], chain, found.get(chain))
                 for chain in CHAINS
                 if chain in self.body.chains
             ]
-            products = [(base.x[group], group, m.log_weights[group], alternatives)]
-            weight = np.logaddexp.reduce(m.log_weights[group]) + np.log(s.jump_probability)
-            for pose, hung in self._torso_flips(base.x[lead], [a.chain for a in alternatives]):
-                products.append((pose[None], group[:1], np.array([weight]), hung))
-            for modes, members, log_weights, choices in products:
-                changes, energy = self._rate(modes[0], choices, observation, lead)
-                combined = best_combinations(
-                    self.body, modes, log_weights, energy, choices, changes, s.temperature,
-                    s.combinations,
-                )  # fmt: skip
-                parents = members[combined.parents]
-                everything.append(
-                    (combined.poses, parents, combined.log_priors, combined.energies)
+            changes, energy = self._rate(pose, alternatives, observation, textures, lead)
+            own = _Product(
+                base.x[group], group, m.log_weights[group], alternatives, changes, energy, lead
+            )
+            products = [own]
+            weight = np.array(
+                [np.logaddexp.reduce(m.log_weights[group]) + np.log(s.jump_probability)]
+            )
+            for pair in PAIRS:
+                if not set(pair) <= set(self.body.chains):
+                    continue
+                swapped = self._swap(pose, pair)
+                if swapped is None:
+                    continue
+                row = lead
+                if textures is not None:
+                    row = len(textures.counts)
+                    textures = with_swapped_sides(
+                        textures, lead, *(self.body.skeleton.chains[chain] for chain in pair)
+                    )
+                rated, energy = self._rate(swapped[0], swapped[1], observation, textures, row)
+                choices, joined = [], []
+                for chain, change in zip(alternatives, changes, strict=True):
+                    if chain.chain in pair:
+                        i = pair.index(chain.chain)
+                        choices.append(swapped[1][i])
+                        joined.append(rated[i])
+                    else:
+                        choices.append(Alternatives(chain.chain, chain.angles, chain.penalties[:1]))
+                        joined.append(change)
+                products.append(
+                    _Product(swapped[0][None], group[:1], weight, choices, joined, energy, row)
                 )
-        poses, parents, log_priors, energies = (
-            np.concatenate([part[i] for part in everything]) for i in range(4)
+            for flipped, hung in self._torso_flips(pose, [a.chain for a in alternatives]):
+                changes, energy = self._rate(flipped, hung, observation, textures, lead)
+                products.append(
+                    _Product(flipped[None], group[:1], weight, hung, changes, energy, lead)
+                )
+            for product in products:
+                combined = best_combinations(
+                    self.body, product.modes, product.log_weights, product.energy,
+                    product.alternatives, product.changes, s.temperature, s.combinations,
+                )  # fmt: skip
+                parents = product.members[combined.parents]
+                rows = parents if product.row == lead else np.full(len(parents), product.row)
+                everything.append(
+                    (combined.poses, parents, combined.log_priors, combined.energies, rows)
+                )
+        poses, parents, log_priors, energies, rows = (
+            np.concatenate([part[i] for part in everything]) for i in range(5)
         )
         kept = choose_hypotheses(
             self._relative_joints(poses),
@@ -439,11 +570,11 @@ class Tracker:
         poses, parents = poses[kept], parents[kept]
         # A chain that jumped is expected where it landed, the rest where it was predicted.
         centres = np.where(np.abs(poses - base.x[parents]) > 1e-9, poses, moved[parents])
-        return poses, parents, log_priors[kept], centres
+        return _Candidates(poses, parents, log_priors[kept], centres, textures, rows[kept])
 
     def _samples(
         self, base: Minimum, moved: Array, covariances: Array, observation: Observation
-    ) -> tuple[Array, Index, Array, Array]:
+    ) -> _Candidates:
         """Candidates of covariance-scaled or spherical sampling."""
         s, m = self.settings, self.modes
         draw = covariance_scaled_samples if s.proposals == 'css' else spherical_samples
@@ -459,23 +590,16 @@ class Tracker:
             s.candidates,
             same=s.hypothesis_merge_distance,
         ).chosen
-        return poses[kept], parents[kept], m.log_weights[parents[kept]], moved[parents[kept]]
+        parents = parents[kept]
+        return _Candidates(
+            poses[kept], parents, m.log_weights[parents], moved[parents], m.textures, parents
+        )
 
     def _groups(self, base: Minimum) -> list[Index]:
         """Modes with nearly the same trunk, each group with its best mode first."""
-        names = [
-            name
-            for name in (
-                'pelvis',
-                'neck',
-                'left_hip',
-                'right_hip',
-                'left_shoulder',
-                'right_shoulder',
-            )
-            if name in self.body.joint_names
-        ]
-        trunk = self.body.joint_positions(base.x)[:, self.body.skeleton.joint_index(names)]
+        names = [name for name in TRUNK if name in self.body.joint_names]
+        which = self.body.skeleton.joint_index(names)
+        trunk = self.body.joint_positions(base.x)[:, which]
         left = list(np.argsort(base.value, kind='stable'))
         groups = []
         while left:
@@ -515,11 +639,10 @@ class Tracker:
         if found is not None:
             angles.append(found)
             penalties.append(np.full((len(modes), len(found)), jump))
-        sibling = chain.replace('left_', 'right_') if 'left_' in chain else chain.replace('right_', 'left_')
-        if sibling != chain:
+        if chain in SIBLINGS:
             # Limbs that cross in the image are easily taken for each other.
             swapped, _ = rehang_chain(
-                self.body, modes[:1], modes[:1], chain, image_of=sibling
+                self.body, modes[:1], modes[:1], chain, image_of=SIBLINGS[chain]
             )
             angles.append(swapped[:, own])
             penalties.append(np.full((len(modes), len(swapped)), jump))
@@ -548,17 +671,41 @@ class Tracker:
                 hung, _ = rehang_chain(self.body, pose[None], flipped[None], chain)
                 angles = hung[:, own] if len(hung) else flipped[None, own]
                 base[own] = angles[0]
-                alternatives.append(
-                    distinct_alternatives(
-                        self.body, flipped, chain, angles, np.zeros((1, len(angles))),
-                        apart=0.08, most=self.settings.alternatives,
-                    )  # fmt: skip
-                )
+                distinct = distinct_alternatives(
+                    self.body, flipped, chain, angles, np.zeros((1, len(angles))),
+                    apart=0.08, most=self.settings.alternatives,
+                )  # fmt: skip
+                alternatives.append(distinct)
             result.append((base, alternatives))
         return result
 
+    def _swap(self, pose: Array, pair: tuple[str, str]) -> tuple[Array, list[Alternatives]] | None:
+        """The pose with two limbs each on the other's image, in all ways; None if they reach not.
+
+        Limbs that cross in the image are easily taken for each other, and one alone that changes
+        sides leaves its own place empty.
+        """
+        base, alternatives = pose.copy(), []
+        for chain, sibling in (pair, pair[::-1]):
+            own = chain_dofs(self.body, chain)
+            hung, _ = rehang_chain(self.body, pose[None], pose[None], chain, image_of=sibling)
+            if len(hung) == 0:
+                return None
+            base[own] = hung[0, own]
+            distinct = distinct_alternatives(
+                self.body, pose, chain, hung[:, own], np.zeros((1, len(hung))),
+                apart=0.08, most=self.settings.alternatives,
+            )  # fmt: skip
+            alternatives.append(distinct)
+        return base, alternatives
+
     def _rate(
-        self, pose: Array, alternatives: list[Alternatives], observation: Observation, which: int
+        self,
+        pose: Array,
+        alternatives: list[Alternatives],
+        observation: Observation,
+        textures: Textures | None,
+        row: int,
     ) -> tuple[list[Array], float]:
         """Energy change that each alternative makes alone, and the energy of the pose itself."""
         poses = [pose[None]]
@@ -567,16 +714,22 @@ class Tracker:
             block[:, chain_dofs(self.body, chain.chain)] = chain.angles
             poses.append(block)
         everything = np.concatenate(poses)
-        value = self._value(
-            everything, observation, self.modes.textures, np.full(len(everything), which)
-        )
+        value = self._value(everything, observation, textures, np.full(len(everything), row))
         ends = np.cumsum([1] + [len(c.angles) for c in alternatives])
-        return [value[a:b] - value[0] for a, b in zip(ends[:-1], ends[1:])], float(value[0])
+        return [value[a:b] - value[0] for a, b in pairwise(ends)], float(value[0])
 
     def _keep(
-        self, solved: Minimum, log_priors: Array, velocities: Array, observation: Observation
+        self,
+        solved: Minimum,
+        log_priors: Array,
+        velocities: Array,
+        observation: Observation,
+        predicted: GaussianMixture | None = None,
     ) -> None:
-        """Makes the modes of the next mixture from optimised candidates."""
+        """Makes the modes of the next mixture from optimised candidates.
+
+        A predicted mixture, where there is one, gives its weights to the modes nearest to it.
+        """
         s = self.settings
         usable = np.flatnonzero(np.isfinite(solved.value))
         if len(usable) == 0:
@@ -589,6 +742,13 @@ class Tracker:
             same=s.hypothesis_merge_distance,
         )
         weights = kept.log_weights - np.logaddexp.reduce(kept.log_weights)
+        if predicted is not None:
+            rows = usable[kept.chosen]
+            weights = weights + inherited_log_weights(
+                solved.x[rows], _covariances(solved.hessian[rows], solved.free[rows]),
+                np.argsort(-weights, kind='stable'), predicted,
+            )  # fmt: skip
+            weights -= np.logaddexp.reduce(weights)
         weights = np.maximum(weights, s.least_log_weight)
         weights -= np.logaddexp.reduce(weights)
         order = np.argsort(-weights, kind='stable')
@@ -610,16 +770,32 @@ class Tracker:
         self._outline_costs = image.costs
 
     def _judge(self, observation: Observation) -> None:
-        """Whether the track is lost: how much of the image the best mode leaves unexplained."""
+        """Whether the track is lost: how much of the image no mode explains."""
         s = self.settings
+        shares = [0.0]
         if self._outline_costs.size:
             t = s.likelihood.coverage
             most = 0.5 * t.weight / self._outline_costs.shape[1] * t.scale**2
-            self.misfit = float((self._outline_costs > 0.5 * most).mean(1).min())
-        else:
-            self.misfit = 0.0
+            limit = UNEXPLAINED**2 / (UNEXPLAINED**2 + t.scale**2)
+            shares.append(float((self._outline_costs > limit * most).mean(1).min()))
+        if observation.keypoints is not None:
+            shares.append(self._unexplained_keypoints(observation.keypoints))
+        self.misfit = max(shares)
         self._bad_images = self._bad_images + 1 if self.misfit > s.lost_misfit else 0
         self.status = Status.LOST if self._bad_images >= s.lost_images else Status.TRACKING
+
+    def _unexplained_keypoints(self, keypoints: Keypoints) -> float:
+        """Share of the keypoints that the best mode does not explain."""
+        seen = np.flatnonzero(np.isfinite(keypoints.pixels).all(1))
+        if len(seen) == 0:
+            return 0.0
+        which = self.body.skeleton.joint_index([keypoints.names[i] for i in seen])
+        pixels = self.camera.project(self.body.joint_positions(self.modes.poses)[:, which])
+        error = pixels - keypoints.pixels[seen]
+        precisions = np.linalg.inv(keypoints.covariances[seen])
+        sigma = self.settings.likelihood.joints.sigma
+        distance = np.einsum('kna,nab,knb->kn', error, precisions, error) / sigma**2
+        return float((~(distance < UNEXPLAINED**2)).mean(1).min())
 
     # Energies.
 
@@ -690,15 +866,20 @@ class Tracker:
         return image.value + soft + overlap
 
     def _posterior_energy(
-        self, observation: Observation, parents: Index, centres: Array, precisions: Array
+        self,
+        observation: Observation,
+        parents: Index,
+        centres: Array,
+        precisions: Array,
+        textures: Textures | None,
+        texture_rows: Index,
     ) -> Callable[[Array, Index], tuple[Array, Array, Array]]:
         """Energy of candidates: image, body, and a Student prior around where each is expected."""
         nu, d = self.settings.tails, self.body.dimension
-        textures = self.modes.textures
 
         def energy(x: Array, index: Index) -> tuple[Array, Array, Array]:
             own = parents[index]
-            value, gradient, hessian = self._energy(x, observation, textures, own)
+            value, gradient, hessian = self._energy(x, observation, textures, texture_rows[index])
             offset = x - centres[index]
             pulled = np.einsum('nij,nj->ni', precisions[own], offset)
             distance = (offset * pulled).sum(1)
@@ -726,6 +907,10 @@ class Tracker:
         return joints - joints[:, :1]
 
 
+def _inverses(matrices: Array) -> Array:
+    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
+
+
 def _resting(poses: Array, gradient: Array, body: Body) -> NDArray[np.bool_]:
     at_lower = (poses <= body.lower) & (gradient > 0)
     result: NDArray[np.bool_] = at_lower | ((poses >= body.upper) & (gradient < 0))
@@ -733,7 +918,10 @@ def _resting(poses: Array, gradient: Array, body: Body) -> NDArray[np.bool_]:
 
 
 def _covariances(hessians: Array, free: NDArray[np.bool_]) -> Array:
-    """Inverse Hessians on the free variables; a variable at its limit has a deviation of 3 degrees."""
+    """Inverse Hessians on the free variables.
+
+    A variable at its limit has a deviation of 3 degrees.
+    """
     h = hessians.copy()
     rows, dofs = np.nonzero(~free)
     h[rows, dofs, :] = 0.0
