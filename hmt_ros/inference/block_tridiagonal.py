@@ -1,15 +1,15 @@
-"""Symmetric block-tridiagonal matrices: Cholesky factors, solutions, and the blocks of the inverse.
+"""Symmetric block-tridiagonal matrices: Cholesky factors, solutions, blocks of the inverse.
 
-The precision of a trajectory X = (x_1 .. x_T) of a Markov process has this form (VMS 5): observations
-fill the diagonal blocks, the dynamics couple neighbours,
+The precision of a trajectory X = (x_1 .. x_T) of a Markov process has this form (VMS 5):
+observations fill the diagonal blocks, the dynamics couple neighbours,
 
     P = | D_1  E_1'          |        P = L L',  L lower triangular with the same blocks.
         | E_1  D_2  E_2'     |
         |      E_2  D_3  ... |
 
-Elimination forwards is filtering, substitution backwards is smoothing. The cost is O(T n^3) and there
-is never a dense (T n, T n) array: the matrix is kept in LAPACK's band storage, whose width follows
-from the coupling; where E_t is diagonal it is half of what full blocks need.
+Elimination forwards is filtering, substitution backwards is smoothing. The cost is O(T n^3) and
+there is never a dense (T n, T n) array: the matrix is kept in LAPACK's band storage, whose width
+follows from the coupling; where E_t is diagonal it is half of what full blocks need.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
     dx = F x dt + dw,  E[dw dw'] = Qc dt     =>     p(x_{t+1} | x_t) = N(A x_t, Q)
     A = exp(F dt),  Q = int_0^dt exp(F s) Qc exp(F s)' ds                       [Van Loan 1978]
 
-so that gaps and uneven intervals need no further rule: the prediction over two intervals is that over
-their sum. The random walk has F = 0; at constant velocity the state is the pose and its velocity, and
-what is white is the acceleration.
+so that gaps and uneven intervals need no further rule: the prediction over two intervals is that
+over their sum. The random walk has F = 0; at constant velocity the state is the pose and its
+velocity, and what is white is the acceleration.
 """
 
 from __future__ import annotations
@@ -29,11 +29,13 @@ class TrajectoryPrior:
         precision: P.
         information: (T, n) h.
         constant: c, nats; where nothing is known of the first pose its density is taken as 1.
+        dimension: d, the first variables of each state are the pose.
     """
 
     precision: BlockTridiagonal
     information: Array
     constant: float
+    dimension: int
 
     def energy(self, states: Array) -> tuple[Array, Array]:
         """-log p (N,) and its gradient (N, T, n) at trajectories (N, T, n)."""
@@ -210,8 +212,12 @@ class LinearGaussianDynamics:
             a[i], q[i] = self.transition(float(interval))
         return a[which], q[which]
 
-    def prior(self, intervals: Array) -> TrajectoryPrior:
+    def prior(self, intervals: Array, *, initial: bool = True) -> TrajectoryPrior:
         """The density of trajectories with these intervals (T-1,) between their states, s.
+
+        Args:
+            intervals: (T-1,).
+            initial: whether what is known of the first state is part of it.
 
         Raises:
             ValueError: the noise over an interval is not positive definite.
@@ -221,9 +227,10 @@ class LinearGaussianDynamics:
         diagonal = np.zeros((times, n, n))
         lower = np.zeros((times - 1, n, n))
         information = np.zeros((times, n))
-        diagonal[0] = self.initial_precision
-        information[0] = self.initial_precision @ self.initial_mean
-        known = np.linalg.eigvalsh(self.initial_precision)
+        start = self.initial_precision if initial else np.zeros((n, n))
+        diagonal[0] = start
+        information[0] = start @ self.initial_mean
+        known = np.linalg.eigvalsh(start)
         known = known[known > 1e-12 * max(float(known[-1]), 1e-300)]
         constant = 0.5 * (
             len(known) * np.log(2 * np.pi)
@@ -240,7 +247,8 @@ class LinearGaussianDynamics:
             diagonal[at + 1] += inverse
             lower[at] = -forth
             constant += 0.5 * len(at) * (n * np.log(2 * np.pi) + log_det)
-        return TrajectoryPrior(BlockTridiagonal(diagonal, lower), information, float(constant))
+        precision = BlockTridiagonal(diagonal, lower)
+        return TrajectoryPrior(precision, information, float(constant), self.dimension)
 
 
 def _precision_of(covariance: Array) -> tuple[Array, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from functools import cached_property
 from itertools import pairwise
@@ -57,6 +57,8 @@ REWEIGHTINGS = ('ancestry', 'bhattacharyya')
 UNEXPLAINED = 4.0
 # Keypoints from which a lost track starts anew.
 FEWEST_KEYPOINTS = 6
+# How far the usual energy follows that of the last image.
+USUAL_GAIN = 0.1
 PAIRS = (('left_arm', 'right_arm'), ('left_leg', 'right_leg'))
 SIBLINGS = {a: b for pair in PAIRS for a, b in (pair, pair[::-1])}
 TRUNK = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
@@ -91,6 +93,8 @@ class TrackerSettings:
         exploration: power of the weights when candidates are chosen; below 1 favours unlikely ones.
         vote: how chains are chosen for search: 'trace', 'eigenvalue' or 'uniform'.
         searched_chains: chains searched in an image.
+        surprise: an image whose least energy exceeds the usual one by this is searched again.
+        rounds: of search in such an image at most.
         jump_probability: of a flip of one chain from one image to the next.
         base_iterations, iterations: Newton steps on the predictions and on the candidates.
         temperature: factor on the image's energy in a mode's weight; below 1 because neighbouring
@@ -116,6 +120,8 @@ class TrackerSettings:
     exploration: float = 0.5
     vote: str = 'trace'
     searched_chains: int = 4
+    surprise: float = 6.0
+    rounds: int = 3
     jump_probability: float = 0.1
     base_iterations: int = 6
     iterations: int = 6
@@ -196,6 +202,7 @@ class _Candidates:
         parents: (N,) the mode that each comes from.
         log_priors: (N,) log probability given the modes before.
         centres: (N, d) where each is expected.
+        jumped: (N, d) what did not move there.
         textures: of the last image.
         texture_rows: (N,) row of the textures that each carries.
     """
@@ -204,6 +211,7 @@ class _Candidates:
     parents: Index
     log_priors: Array
     centres: Array
+    jumped: NDArray[np.bool_]
     textures: Textures | None
     texture_rows: Index
 
@@ -242,6 +250,7 @@ class Tracker:
         self._last_stamp: int | None = None
         self._bad_images = 0
         self._flesh = FleshFit(body)
+        self._usual_energy = np.inf
         self.status = Status.WAITING
         self.misfit = 0.0
         self.evaluations = 0
@@ -265,6 +274,7 @@ class Tracker:
         self._last_image, self._last_stamp = None, None
         self._bad_images = 0
         self._flesh = FleshFit(self.body)
+        self._usual_energy = np.inf
         self.status = Status.WAITING
 
     def step(
@@ -444,23 +454,29 @@ class Tracker:
             moved,
             s.base_iterations,
         )
-        propose = self._jumps if s.proposals == 'kjs' else self._samples
-        candidates = propose(base, moved, covariances, observation)
-        poses, parents = candidates.poses, candidates.parents
-        solved = self._minimise(
-            self._posterior_energy(
-                observation, parents, candidates.centres, precisions,
-                candidates.textures, candidates.texture_rows,
-            ),
-            poses,
-            s.iterations,
-        )  # fmt: skip
+        still = np.zeros(moved.shape, dtype=np.bool_)
+        sources = _Candidates(moved, everyone, m.log_weights, moved, still, m.textures, everyone)
+        if s.proposals == 'kjs':
+            candidates = self._jumps(base, sources, covariances, observation)
+        else:
+            candidates = self._samples(base, sources, covariances, observation)
+        solved = self._solve(candidates, precisions, observation)
+        for _ in range(s.rounds - 1 if s.proposals == 'kjs' else 0):
+            if solved.value.min() < self._usual_energy + s.surprise:
+                break
+            base, sources = self._search_around(
+                solved, candidates, covariances, precisions, observation
+            )
+            more = self._jumps(base, sources, covariances, observation)
+            solved = _joined_minima(solved, self._solve(more, precisions, observation))
+            candidates = _joined_candidates(candidates, more)
+        self._learn_usual_energy(float(solved.value.min()))
+        parents = candidates.parents
         velocities = update_velocities(
             s.dynamics, m.velocities[parents], m.poses[parents], solved.x, dt
         )
         # Where a chain has jumped, its displacement is no motion.
-        jumped = np.abs(poses - base.x[parents]) > 1e-9
-        velocities = np.where(jumped, 0.0, velocities)
+        velocities = np.where(candidates.jumped, 0.0, velocities)
         log_priors = candidates.log_priors
         predicted_mixture = None
         if s.reweighting == 'bhattacharyya':
@@ -468,6 +484,64 @@ class Tracker:
             predicted_mixture = GaussianMixture(np.exp(m.log_weights), moved, covariances)
         self._keep(solved, log_priors, velocities, observation, predicted_mixture)
         self._fit_flesh(observation)
+
+    def _solve(
+        self, candidates: _Candidates, precisions: Array, observation: Observation
+    ) -> Minimum:
+        c = candidates
+        energy = self._posterior_energy(
+            observation, c.parents, c.centres, precisions, c.textures, c.texture_rows
+        )
+        return self._minimise(energy, c.poses, self.settings.iterations)
+
+    def _search_around(
+        self,
+        solved: Minimum,
+        candidates: _Candidates,
+        covariances: Array,
+        precisions: Array,
+        observation: Observation,
+    ) -> tuple[Minimum, _Candidates]:
+        """What a further round of jumps starts from: the best optima, and what was sampled nearby.
+
+        Jumps change limbs; a trunk that was predicted badly needs covariance-scaled samples.
+        """
+        s, c = self.settings, candidates
+        order = np.argsort(solved.value, kind='stable')
+        best = order[: max(s.max_hypotheses // 2, 1)]
+        lead = best[:1]
+        drawn = covariance_scaled_samples(
+            self.body, solved.x[lead], covariances[c.parents[lead]], s.samples, s.sample_scale,
+            self._rng,
+        )[0]  # fmt: skip
+        rows = np.full(len(drawn), c.texture_rows[lead[0]])
+        value = self._value(drawn, observation, c.textures, rows)
+        drawn = drawn[np.argsort(value, kind='stable')[: s.max_hypotheses]]
+        n = len(drawn)
+        sampled = _Candidates(
+            drawn,
+            np.full(n, c.parents[lead[0]]),
+            np.full(n, c.log_priors[lead[0]] + np.log(s.jump_probability)),
+            drawn,
+            np.ones(drawn.shape, dtype=np.bool_),
+            c.textures,
+            rows[:n],
+        )
+        found = self._solve(sampled, precisions, observation)
+        kept = _Candidates(
+            c.poses[best], c.parents[best], c.log_priors[best], c.centres[best], c.jumped[best],
+            c.textures, c.texture_rows[best],
+        )  # fmt: skip
+        return _joined_minima(_some_minima(solved, best), found), _joined_candidates(kept, sampled)
+
+    def _learn_usual_energy(self, energy: float) -> None:
+        usual = self._usual_energy
+        if not np.isfinite(usual):
+            self._usual_energy = energy
+        else:
+            # What is unusual is not learned at once.
+            change = min(energy - usual, self.settings.surprise)
+            self._usual_energy = usual + USUAL_GAIN * change
 
     def _follow_motion(
         self, predicted: Array, precisions: Array, observation: Observation
@@ -495,40 +569,39 @@ class Tracker:
         return self._minimise(energy, predicted, 5).x
 
     def _jumps(
-        self, base: Minimum, moved: Array, covariances: Array, observation: Observation
+        self, base: Minimum, sources: _Candidates, covariances: Array, observation: Observation
     ) -> _Candidates:
-        """Candidates of kinematic jump sampling."""
-        s, m = self.settings, self.modes
-        textures = m.textures
+        """Candidates of kinematic jump sampling, from optima and how each of them came about."""
+        s, textures = self.settings, sources.textures
         everything: list[tuple[Array, Index, Array, Array, Index]] = []
         for group in self._groups(base)[:MOST_GROUPS]:
             lead = int(group[0])
-            pose = base.x[lead]
-            found = self._search(pose, covariances[lead], observation, lead)
+            pose, lead_row = base.x[lead], int(sources.texture_rows[lead])
+            found = self._search(
+                pose, covariances[sources.parents[lead]], observation, textures, lead_row
+            )
+            log_weights = sources.log_priors[group]
             alternatives = [
                 self._alternatives(base.x[group], chain, found.get(chain))
                 for chain in CHAINS
                 if chain in self.body.chains
             ]
-            changes, energy = self._rate(pose, alternatives, observation, textures, lead)
-            own = _Product(
-                base.x[group], group, m.log_weights[group], alternatives, changes, energy, lead
-            )
-            products = [own]
-            weight = np.array(
-                [np.logaddexp.reduce(m.log_weights[group]) + np.log(s.jump_probability)]
-            )
+            changes, energy = self._rate(pose, alternatives, observation, textures, lead_row)
+            products = [
+                _Product(base.x[group], group, log_weights, alternatives, changes, energy, lead_row)
+            ]
+            weight = np.array([np.logaddexp.reduce(log_weights) + np.log(s.jump_probability)])
             for pair in PAIRS:
                 if not set(pair) <= set(self.body.chains):
                     continue
                 swapped = self._swap(pose, pair)
                 if swapped is None:
                     continue
-                row = lead
+                row = lead_row
                 if textures is not None:
                     row = len(textures.counts)
                     textures = with_swapped_sides(
-                        textures, lead, *(self.body.skeleton.chains[chain] for chain in pair)
+                        textures, lead_row, *(self.body.skeleton.chains[chain] for chain in pair)
                     )
                 rated, energy = self._rate(swapped[0], swapped[1], observation, textures, row)
                 choices, joined = [], []
@@ -544,21 +617,23 @@ class Tracker:
                     _Product(swapped[0][None], group[:1], weight, choices, joined, energy, row)
                 )
             for flipped, hung in self._torso_flips(pose, [a.chain for a in alternatives]):
-                changes, energy = self._rate(flipped, hung, observation, textures, lead)
+                changes, energy = self._rate(flipped, hung, observation, textures, lead_row)
                 products.append(
-                    _Product(flipped[None], group[:1], weight, hung, changes, energy, lead)
+                    _Product(flipped[None], group[:1], weight, hung, changes, energy, lead_row)
                 )
             for product in products:
                 combined = best_combinations(
                     self.body, product.modes, product.log_weights, product.energy,
                     product.alternatives, product.changes, s.temperature, s.combinations,
                 )  # fmt: skip
-                parents = product.members[combined.parents]
-                rows = parents if product.row == lead else np.full(len(parents), product.row)
+                members = product.members[combined.parents]
+                rows = np.full(len(members), product.row)
+                if product.row == lead_row:
+                    rows = sources.texture_rows[members]
                 everything.append(
-                    (combined.poses, parents, combined.log_priors, combined.energies, rows)
+                    (combined.poses, members, combined.log_priors, combined.energies, rows)
                 )
-        poses, parents, log_priors, energies, rows = (
+        poses, members, log_priors, energies, rows = (
             np.concatenate([part[i] for part in everything]) for i in range(5)
         )
         kept = choose_hypotheses(
@@ -567,17 +642,26 @@ class Tracker:
             s.candidates,
             same=s.hypothesis_merge_distance,
         ).chosen
-        poses, parents = poses[kept], parents[kept]
+        poses, members = poses[kept], members[kept]
         # A chain that jumped is expected where it landed, the rest where it was predicted.
-        centres = np.where(np.abs(poses - base.x[parents]) > 1e-9, poses, moved[parents])
-        return _Candidates(poses, parents, log_priors[kept], centres, textures, rows[kept])
+        changed = np.abs(poses - base.x[members]) > 1e-9
+        return _Candidates(
+            poses,
+            sources.parents[members],
+            log_priors[kept],
+            np.where(changed, poses, sources.centres[members]),
+            changed | sources.jumped[members],
+            textures,
+            rows[kept],
+        )
 
     def _samples(
-        self, base: Minimum, moved: Array, covariances: Array, observation: Observation
+        self, base: Minimum, sources: _Candidates, covariances: Array, observation: Observation
     ) -> _Candidates:
         """Candidates of covariance-scaled or spherical sampling."""
         s, m = self.settings, self.modes
         draw = covariance_scaled_samples if s.proposals == 'css' else spherical_samples
+        moved = sources.poses
         k = len(moved)
         each = max(s.samples // k, 1)
         drawn = draw(self.body, moved, covariances, each, s.sample_scale, self._rng)
@@ -592,8 +676,9 @@ class Tracker:
         ).chosen
         parents = parents[kept]
         return _Candidates(
-            poses[kept], parents, m.log_weights[parents], moved[parents], m.textures, parents
-        )
+            poses[kept], parents, m.log_weights[parents], moved[parents],
+            np.zeros((len(parents), self.body.dimension), dtype=np.bool_), m.textures, parents,
+        )  # fmt: skip
 
     def _groups(self, base: Minimum) -> list[Index]:
         """Modes with nearly the same trunk, each group with its best mode first."""
@@ -610,7 +695,12 @@ class Tracker:
         return groups
 
     def _search(
-        self, pose: Array, covariance: Array, observation: Observation, which: int
+        self,
+        pose: Array,
+        covariance: Array,
+        observation: Observation,
+        textures: Textures | None,
+        row: int,
     ) -> dict[str, Array]:
         """Configurations of some chains, chosen by vote, that fit the image."""
         shape = observation.distance is not None or observation.edges is not None
@@ -623,9 +713,7 @@ class Tracker:
         result = {}
         for i in sorted(chosen):
             search = self._searches[names[i]]
-            result[names[i]] = search.find(
-                pose, covariance, observation, self.modes.textures, which, self._rng
-            )
+            result[names[i]] = search.find(pose, covariance, observation, textures, row, self._rng)
             own = self.settings.search
             self.evaluations += own.samples + own.refined * own.iterations
         return result
@@ -905,6 +993,25 @@ class Tracker:
     def _relative_joints(self, poses: Array) -> Array:
         joints = self.body.joint_positions(poses)
         return joints - joints[:, :1]
+
+
+def _some_minima(minima: Minimum, which: Index) -> Minimum:
+    return Minimum(*(getattr(minima, f.name)[which] for f in fields(Minimum)))
+
+
+def _joined_minima(a: Minimum, b: Minimum) -> Minimum:
+    return Minimum(
+        *(np.concatenate([getattr(a, f.name), getattr(b, f.name)]) for f in fields(Minimum))
+    )
+
+
+def _joined_candidates(a: _Candidates, b: _Candidates) -> _Candidates:
+    """Both; the textures of the second contain those of the first."""
+    joined = {
+        name: np.concatenate([getattr(a, name), getattr(b, name)])
+        for name in ('poses', 'parents', 'log_priors', 'centres', 'jumped', 'texture_rows')
+    }
+    return _Candidates(textures=b.textures, **joined)
 
 
 def _inverses(matrices: Array) -> Array:
