@@ -14,6 +14,7 @@ USAGE = """usage: python -m benchmarks [NAME [options]]
   tracking   accuracy, calibration and speed of the tracker on clips with known truth
   flips      time per leaf of the interpretation trees
   kernels    the compiled likelihood against vectorised numpy
+  smoothing  exactness, speed and peers of the smoother
 
 Without a name all of them run. Every benchmark takes --json and --help.
 """
@@ -22,9 +23,14 @@ Without a name all of them run. Every benchmark takes --json and --help.
 def main(argv: list[str]) -> int:
     """Runs one benchmark, or all; the exit code is that of the first that fails."""
     # Only now: they import numpy.
-    from benchmarks import flips, kernels, tracking
+    from benchmarks import flips, kernels, smoothing, tracking
 
-    benchmarks = {'flips': flips.main, 'kernels': kernels.main, 'tracking': tracking.main}
+    benchmarks = {
+        'flips': flips.main,
+        'kernels': kernels.main,
+        'smoothing': smoothing.main,
+        'tracking': tracking.main,
+    }
     if argv and argv[0] in ('-h', '--help'):
         print(USAGE, end='')
         return 0

@@ -36,6 +36,7 @@ _TRACKER_LIMITS = {
     'combinations': (1, 65536),
     'alternatives': (1, 64),
     'samples': (1, 65536),
+    'rounds': (1, 100),
     'jump_probability': _FRACTION,
     'base_iterations': (1, 100),
     'iterations': (1, 100),

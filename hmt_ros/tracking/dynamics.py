@@ -31,8 +31,8 @@ class DynamicsSettings:
     velocity_kept: float = 0.7
     velocity_gain: float = 0.5
     translation: float = 0.25
-    root: float = 0.7
-    trunk: float = 0.6
+    root: float = 1.4
+    trunk: float = 1.2
     hip: float = 1.3
     knee: float = 1.6
     shoulder: float = 2.2

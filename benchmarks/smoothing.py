@@ -1,0 +1,352 @@
+"""smoothing: exactness against known posteriors, speed and memory at the size of VMS, peers."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.arm_waving import STEP, Waving, waving
+from benchmarks.clips import rounded, table
+from benchmarks.exact_smoothing import (
+    divergence,
+    enumerated,
+    grid_marginals,
+    modes,
+    particle_marginals,
+)
+from benchmarks.machine import best_time, description, on_machine, peak_memory
+from benchmarks.smoothing_peers import (
+    RobustSequence,
+    gtsam_missing,
+    gtsam_trajectory,
+    scipy_trajectory,
+)
+from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
+from hmt_ros.smoothing.embedded_network import embedded_network
+from hmt_ros.smoothing.likelihood import Curvature, MixtureLikelihood
+from hmt_ros.smoothing.mode_sequence import ModeSequence
+from hmt_ros.smoothing.paths import most_probable_paths
+from hmt_ros.smoothing.trajectory_refinement import refine
+from hmt_ros.smoothing.variational_mixture import laplace_weights, minimise_free_energy
+
+Array = NDArray[np.float64]
+
+TIMES = 47
+# Variances that a step of the random walk adds, against modes of unit size.
+WALKS = (1.0, 4.0, 16.0)
+
+
+def main(argv: list[str]) -> int:
+    """Runs the benchmark."""
+    parser = argparse.ArgumentParser(prog='python -m benchmarks smoothing', description=__doc__)
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser.add_argument('--quick', action='store_true', help='fewer sequences and repetitions')
+    options = parser.parse_args(argv)
+    result = measure(quick=options.quick)
+    if options.json:
+        print(json.dumps(rounded(result), indent=1))
+        return 0
+    print(as_text(result))
+    return 0
+
+
+def page() -> str:
+    """The part of the documentation that this benchmark writes."""
+    result = measure()
+    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
+
+
+def measure(*, quick: bool = False) -> dict[str, Any]:
+    """Everything; memory first, in a process of its own."""
+    context = multiprocessing.get_context('spawn')
+    with context.Pool(1) as pool:
+        memory = pool.apply(memory_of_a_run, (12 if quick else TIMES,))
+    return {
+        'machine': description(),
+        'peak_memory_mb': memory / 1e6,
+        'exactness': exactness(1 if quick else 4),
+        'grid': grid(1 if quick else 3),
+        'stages': stages(12 if quick else TIMES, 0.0 if quick else 3.0),
+        'peers': peers(12 if quick else TIMES, 0.0 if quick else 2.0),
+        'length': length(*((6, 12) if quick else (TIMES, 10 * TIMES))),
+        'relations': relations(12 if quick else TIMES),
+    }
+
+
+def exactness(seeds: int) -> dict[str, Any]:
+    """Mean over t of KL(exact || smoothed), K = 3, T = 6, d = 2, and of a particle smoother."""
+    result: dict[str, Any] = {}
+    for kind in ('separated', 'overlapping'):
+        ours, particles, spent = [], [], []
+        for walk in WALKS:
+            dynamics = LinearGaussianDynamics.random_walk([walk, walk])
+            smoother = MixtureSmoother(dynamics)
+            for seed in range(seeds):
+                mixtures = modes(kind, seed, 6)
+                exact = enumerated(mixtures, dynamics)
+                smoother.smooth(mixtures)
+                begin = time.process_time()
+                found = smoother.smooth(mixtures)
+                spent.append(time.process_time() - begin)
+                rng = np.random.default_rng(seed)
+                ours.append(
+                    np.mean(
+                        [
+                            divergence(p, found.marginal(t).log_density, rng)
+                            for t, p in enumerate(exact)
+                        ]
+                    )
+                )
+                peer = particle_marginals(mixtures, dynamics, spent[-1], seed)
+                rng = np.random.default_rng(seed)
+                particles.append(
+                    np.mean([divergence(p, q.log_density, rng, 500) for p, q in zip(exact, peer)])
+                )
+        result[kind] = {
+            'mean_kl': float(np.mean(ours)),
+            'worst_kl': float(np.max(ours)),
+            'particle_mean_kl': float(np.mean(particles)),
+            'particle_better_in': int((np.array(particles) < np.array(ours)).sum()),
+            'sequences': len(ours),
+            'cpu_s': float(np.mean(spent)),
+        }
+    return result
+
+
+def grid(seeds: int) -> dict[str, Any]:
+    """The same in one dimension over 40 times, against sums on a grid."""
+    result: dict[str, Any] = {}
+    points = np.linspace(-20, 20, 1201)
+    for kind in ('separated', 'overlapping'):
+        ours = []
+        for seed in range(seeds):
+            dynamics = LinearGaussianDynamics.random_walk([1.0])
+            mixtures = modes(kind, seed, 40, dimension=1)
+            exact = grid_marginals(mixtures, dynamics, points)
+            found = MixtureSmoother(dynamics).smooth(mixtures)
+            each = []
+            for t, density in enumerate(exact):
+                log = found.marginal(t).log_density(points[:, None])
+                inside = density > 1e-12
+                gap = density[inside] * (np.log(density[inside]) - log[inside])
+                each.append(gap.sum() * (points[1] - points[0]))
+            ours.append(np.mean(each))
+        result[kind] = {'mean_kl': float(np.mean(ours)), 'worst_kl': float(np.max(ours))}
+    return result
+
+
+def stages(times: int, seconds: float) -> dict[str, Any]:
+    """Times of the stages at d = 32, K = 8, 64 trajectories."""
+    sequence = waving(times)
+    dynamics, mixtures = sequence.dynamics, sequence.mixtures
+    intervals = np.full(times - 1, STEP)
+    layers = ModeSequence(tuple(mixtures), dynamics, intervals)
+    prior, likelihood = layers.prior, layers.likelihood
+    starts = layers.states(layers.paths(64))
+    refined = refine(starts, prior, likelihood, sequence.lower, sequence.upper)
+    distinct = refined.without_duplicates()
+    weights = laplace_weights(distinct.energies, distinct.factors)
+
+    def descend() -> Any:
+        return minimise_free_energy(
+            weights, distinct.states, distinct.factors, prior, likelihood,
+            low=sequence.lower, high=sequence.upper, samples=4,
+        )  # fmt: skip
+
+    found = descend()
+    return {
+        'times': times,
+        'trajectories': len(starts),
+        'distinct': len(distinct),
+        'network_and_paths_ms': 1e3
+        * best_time(
+            lambda: most_probable_paths(embedded_network(mixtures, dynamics, intervals)),
+            seconds=seconds,
+        ),
+        'refinement_s': best_time(
+            lambda: refine(starts, prior, likelihood, sequence.lower, sequence.upper),
+            seconds=seconds,
+        ),
+        'variational_s': best_time(descend, seconds=seconds),
+        'most_iterations': int(refined.iterations.max()),
+        'not_converged': int((refined.status != 0).sum()),
+        'free_energy': found.free_energy.tolist(),
+        'free_energy_fresh': list(found.fresh),
+    }
+
+
+def memory_of_a_run(times: int) -> float:
+    """Largest resident memory of a process that smooths one sequence, bytes."""
+    sequence = waving(times)
+    smoother = MixtureSmoother(sequence.dynamics, sequence.lower, sequence.upper)
+    smoother.smooth(sequence.mixtures).marginal(0)
+    return peak_memory()
+
+
+def robust_problem(times: int, seed: int = 0) -> tuple[RobustSequence, Array, Array]:
+    """Observations of a waving person with one outlier in eight, variances, and a start."""
+    rng = np.random.default_rng(seed)
+    sequence = waving(times, seed)
+    covariances = np.array([mixture.covariances[0] for mixture in sequence.mixtures])
+    whiteners = np.linalg.inv(np.linalg.cholesky(covariances))
+    white = rng.normal(size=sequence.truth.shape)
+    white[::8] *= 4.0
+    means = sequence.truth + np.linalg.solve(whiteners, white[:, :, None])[:, :, 0]
+    variances = np.diagonal(sequence.dynamics.diffusion) * STEP
+    return RobustSequence(means, whiteners, 8.0), variances, means.copy()
+
+
+def peers(times: int, seconds: float) -> dict[str, Any]:
+    """One trajectory's refinement by us, scipy and GTSAM, to the same energy."""
+    sequence, variances, start = robust_problem(times)
+    dynamics = LinearGaussianDynamics.random_walk(variances)
+    prior = dynamics.prior(np.ones(times - 1))
+    found = refine(start[None], prior, sequence)
+    energy = float(found.energies[0] - prior.constant)
+    ours = best_time(lambda: refine(start[None], prior, sequence), seconds=seconds)
+    cost, spent, evaluations = scipy_trajectory(sequence, variances, start)
+    result: dict[str, Any] = {
+        'ours_s': ours,
+        'ours_iterations': int(found.iterations[0]),
+        'ours_energy': energy,
+        'scipy_s': spent,
+        'scipy_evaluations': evaluations,
+        'scipy_energy': cost,
+        'scipy_ratio': spent / ours,
+    }
+    reason = gtsam_missing()
+    if reason:
+        return {**result, 'gtsam': f'skipped: {reason}'}
+    runs = [gtsam_trajectory(sequence, variances, start) for _ in range(3)]
+    spent = min(run[1] for run in runs)
+    return {
+        **result,
+        'gtsam_s': spent,
+        'gtsam_iterations': runs[0][2],
+        'gtsam_energy': runs[0][0],
+        'gtsam_ratio': spent / ours,
+    }
+
+
+def length(short: int, long: int) -> dict[str, Any]:
+    """Cost of a long sequence over that of a short one, whole smoother."""
+    spent = {}
+    for times in (short, long):
+        sequence = waving(times)
+        smoother = MixtureSmoother(sequence.dynamics, sequence.lower, sequence.upper)
+        runs = []
+        for _ in range(2):
+            begin = time.perf_counter()
+            smoother.smooth(sequence.mixtures)
+            runs.append(time.perf_counter() - begin)
+        spent[times] = min(runs)
+    return {
+        'short_s': spent[short],
+        'long_s': spent[long],
+        'times_longer': long / short,
+        'ratio': spent[long] / spent[short],
+    }
+
+
+def relations(times: int) -> dict[str, Any]:
+    """What VMS reports of its sequence, on a synthetic one."""
+    sequence = waving(times)
+    intervals = np.full(times - 1, STEP)
+    layers = ModeSequence(tuple(sequence.mixtures), sequence.dynamics, intervals)
+    prior, likelihood = layers.prior, layers.likelihood
+    starts = layers.states(layers.paths(64))
+    refined = refine(starts, prior, likelihood, sequence.lower, sequence.upper)
+    at = np.tile(np.arange(times), len(starts))
+    flat = starts.reshape(-1, starts.shape[2])
+    before = likelihood.energy(flat, at, Curvature.NONE)[0].reshape(len(starts), -1).sum(1)
+    found = MixtureSmoother(sequence.dynamics, sequence.lower, sequence.upper).smooth(
+        sequence.mixtures
+    )
+    trace = found.free_energy
+    return {
+        'eigenvalue_ratio': {
+            str(frames): eigenvalue_ratio(sequence, refined.states[0], frames)
+            for frames in (1, 8, times)
+        },
+        'difference_deg': float(np.degrees(np.abs(refined.states - starts).mean())),
+        'roughness_ratio': roughness(refined.states) / roughness(starts),
+        'log_likelihood_change': float(
+            np.mean((refined.observation_energies - before) / abs(before))
+        ),
+        'free_energy_start': float(trace[0]),
+        'free_energy_end': float(trace[-1]),
+        'share_of_fall_within_8': float(
+            (trace[0] - trace[min(8, len(trace) - 1)]) / max(trace[0] - trace[-1], 1e-12)
+        ),
+    }
+
+
+def eigenvalue_ratio(sequence: Waving, states: Array, frames: int) -> float:
+    """Largest over smallest eigenvalue of the Hessian of the first frames, at an optimum."""
+    likelihood = MixtureLikelihood.of(sequence.mixtures[:frames])
+    poses = states[:frames]
+    hessian = likelihood.energy(poses, np.arange(frames), Curvature.POSITIVE)[2]
+    assert hessian is not None
+    d = poses.shape[1]
+    precision = sequence.dynamics.prior(np.full(frames - 1, STEP)).precision
+    dense = np.zeros((frames, d, frames, d))
+    for t in range(frames):
+        dense[t, :, t] = precision.diagonal[t] + hessian[t]
+    for t, block in enumerate(precision.lower):
+        dense[t + 1, :, t], dense[t, :, t + 1] = block, block.T
+    values = np.linalg.eigvalsh(dense.reshape(frames * d, -1))
+    return float(values[-1] / values[0])
+
+
+def roughness(states: Array) -> float:
+    """Mean square of second differences."""
+    return float((np.diff(states, n=2, axis=1) ** 2).mean())
+
+
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+    """A table for people."""
+    rows = [['measure', 'value', 'wanted']]
+    for kind, limit in (('separated', 0.02), ('overlapping', 0.1)):
+        entry = result['exactness'][kind]
+        rows.append(
+            [
+                f'KL from exact, {kind} (particle smoother, same time)',
+                f'{entry["mean_kl"]:.4f} ({entry["particle_mean_kl"]:.4f}) nats',
+                f'{limit}',
+            ]
+        )
+        rows.append(
+            [
+                f'KL from a grid, 40 times, {kind}',
+                f'{result["grid"][kind]["mean_kl"]:.4f} nats',
+                f'{limit}',
+            ]
+        )
+    stage, peer, ratio = result['stages'], result['peers'], result['relations']['eigenvalue_ratio']
+    rows += [
+        ['network and paths', f'{stage["network_and_paths_ms"]:.1f} ms', '10'],
+        ['refinement of 64 trajectories', f'{stage["refinement_s"]:.2f} s', '1.2'],
+        ['most iterations', str(stage['most_iterations']), '20'],
+        ['variational refinement', f'{stage["variational_s"]:.2f} s', '1.5'],
+        ['peak memory', f'{result["peak_memory_mb"]:.0f} MB', '400'],
+        ['ten times the length costs', f'{result["length"]["ratio"]:.1f} times', '11'],
+        ['one trajectory', f'{1e3 * peer["ours_s"]:.1f} ms', ''],
+        ['faster than scipy', f'{peer["scipy_ratio"]:.0f} times', '25'],
+        [
+            'faster than GTSAM',
+            f'{peer["gtsam_ratio"]:.1f} times' if 'gtsam_ratio' in peer else peer['gtsam'],
+            '2',
+        ],
+        [
+            'eigenvalue ratio, by frames',
+            ', '.join(f'{k}: {v:.0f}' for k, v in ratio.items()),
+            'falls',
+        ],
+    ]
+    return table(rows, markdown=markdown)

@@ -1,0 +1,205 @@
+"""Flips of the torso: lines mirrored at rays, lengths and images by plain geometry."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import Body, load_body
+from hmt_ros.body.torso_flips import flip_torso
+
+TORSO = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
+# hips turned, trunk leaned the other way, shoulders turned
+FLIPS = list(itertools.product((False, True), repeat=3))[1:]
+
+
+@pytest.fixture(scope='module', params=['human37', 'human34', 'human32'])
+def body(request) -> Body:
+    return load_body(request.param)
+
+
+@pytest.fixture(scope='module')
+def twisting() -> Body:
+    """The body whose trunk can do everything that a flip asks for."""
+    return load_body('human37')
+
+
+def torso_of(body, poses):
+    """Joints of the torso (6, N, 3)."""
+    which = body.skeleton.joint_index(TORSO)
+    return body.joint_positions(poses)[:, which].transpose(1, 0, 2)
+
+
+def turned_people(body, count, seed):
+    """Poses that are neither in profile nor frontal, trunks leaning a little, limbs anywhere."""
+    rng = np.random.default_rng(seed)
+    poses = np.clip(rng.normal(0, 0.3, (count, body.dimension)), body.lower, body.upper)
+    poses[:, :3] = [0.3, -0.2, 3.0] + 0.3 * rng.normal(size=(count, 3))
+    names = body.dof_names
+    poses[:, names.index('root_z')] = rng.choice([-1, 1], count) * rng.uniform(0.35, 0.6, count)
+    for name in names:
+        if 'clavicle' in name:
+            poses[:, names.index(name)] = 0.0
+        elif name.startswith('trunk') or name in ('root_x', 'root_y'):
+            poses[:, names.index(name)] = rng.uniform(-0.2, 0.2, count)
+    return poses
+
+
+def mirrored_in_depth(line, at):
+    """A line (3,) with its component along the ray to a point reversed."""
+    ray = at / np.linalg.norm(at)
+    return line - 2 * (line @ ray) * ray
+
+
+def complete(body, count=60, seed=0):
+    """Poses that have all seven flips, and these (N, 7, d)."""
+    poses = turned_people(body, count, seed)
+    flips, parents = flip_torso(body, poses)
+    all_seven = np.flatnonzero(np.bincount(parents, minlength=count) == 7)
+    assert len(all_seven) >= 3
+    return poses[all_seven], np.array([flips[parents == p] for p in all_seven])
+
+
+def test_all_choices_on_a_body_that_twists(twisting):
+    poses, flips = complete(twisting)
+    before = torso_of(twisting, poses)
+    after = torso_of(twisting, flips.reshape(-1, twisting.dimension)).reshape(6, *flips.shape[:2], 3)
+    assert np.allclose(after[0], before[0][:, None], atol=1e-12)
+    for n, (i, (hips, lean, shoulders)) in itertools.product(range(len(poses)), enumerate(FLIPS)):
+        pelvis, neck, left_hip, right_hip, left_shoulder, right_shoulder = before[:, n]
+        new = after[:, n, i]
+        wanted = right_hip - left_hip
+        if hips:
+            wanted = mirrored_in_depth(wanted, pelvis)
+        assert np.allclose(new[3] - new[2], wanted, atol=1e-9)
+        # The neck stays where it is, or is where its ray meets the trunk's sphere again.
+        if lean:
+            ray = neck / np.linalg.norm(neck)
+            assert np.linalg.norm(np.cross(new[1], ray)) < 1e-9
+            nearest = (ray @ pelvis) * ray
+            assert np.allclose(new[1] + neck, 2 * nearest, atol=1e-9)
+        else:
+            assert np.allclose(new[1], neck, atol=1e-9)
+        # The shoulders turn to the wanted line as far as the trunk's direction lets them.
+        wanted = right_shoulder - left_shoulder
+        if shoulders:
+            wanted = mirrored_in_depth(wanted, neck)
+        up = (new[1] - new[0]) / np.linalg.norm(new[1] - new[0])
+        across = wanted - (wanted @ up) * up
+        found = new[5] - new[4]
+        assert np.allclose(np.cross(found, across), 0.0, atol=1e-9)
+        assert found @ across > 0
+
+
+def test_lengths_and_other_degrees_of_freedom_stay(body):
+    poses = turned_people(body, 40, 1)
+    flips, parents = flip_torso(body, poses)
+    assert len(flips) > 0
+    names = body.dof_names
+    torso = [i for i, n in enumerate(names) if n in ('root_x', 'root_y', 'root_z') or 'trunk' in n]
+    others = np.setdiff1d(np.arange(body.dimension), torso)
+    assert np.array_equal(flips[:, others], poses[parents][:, others])
+    assert (flips >= body.lower).all()
+    assert (flips <= body.upper).all()
+    assert (np.diff(parents) >= 0).all()
+    assert np.bincount(parents).max() <= 7
+
+
+def test_the_torso_moves_in_depth_and_hardly_in_the_image(body):
+    """Mirrored lines are foreshortened alike: under 2 % of the distance across, far more along."""
+    poses = turned_people(body, 40, 2)
+    poses[:, 2] += 5.0
+    flips, parents = flip_torso(body, poses)
+    before, after = torso_of(body, poses)[:, parents], torso_of(body, flips)
+    shift = np.abs(after[..., 2] - before[..., 2]).max(0)
+    assert shift.min() > 0.03
+    hips, shoulders = slice(2, 4), slice(4, 6)
+    for pair in (hips, shoulders) if body.name == 'human37' else (hips,):
+        rays = (x[pair, :, :2] / x[pair, :, 2:] for x in (before, after))
+        gap = np.linalg.norm(np.subtract(*rays), axis=2)
+        assert np.median(gap) < 0.004
+    image_of_neck = (x[1, :, :2] / x[1, :, 2:] for x in (before, after))
+    gap = np.linalg.norm(np.subtract(*image_of_neck), axis=1)
+    if body.name != 'human32':
+        assert gap.max() < 1e-9
+
+
+def test_a_body_whose_trunk_leans_but_does_not_twist():
+    body = load_body('human34')
+    poses = turned_people(body, 40, 3)
+    flips, parents = flip_torso(body, poses)
+    before, after = torso_of(body, poses)[:, parents], torso_of(body, flips)
+    for old, new in zip(before.transpose(1, 0, 2), after.transpose(1, 0, 2)):
+        line = old[3] - old[2]
+        mirrored = mirrored_in_depth(line, old[0])
+        gaps = [np.abs(new[3] - new[2] - x).max() for x in (line, mirrored)]
+        assert min(gaps) < 1e-9
+        trunk = [np.linalg.norm(x[1] - x[0]) for x in (old, new)]
+        assert trunk[0] == pytest.approx(trunk[1], abs=1e-12)
+        assert np.linalg.norm(np.cross(new[1], old[1])) < 1e-9
+
+
+def test_a_rigid_torso_turns_only():
+    body = load_body('human32')
+    poses = turned_people(body, 20, 4)
+    flips, parents = flip_torso(body, poses)
+    assert np.array_equal(parents, np.arange(20))
+    before, after = torso_of(body, poses), torso_of(body, flips)
+    for n in range(20):
+        wanted = mirrored_in_depth(before[3, n] - before[2, n], before[0, n])
+        assert np.allclose(after[3, n] - after[2, n], wanted, atol=1e-9)
+    # Pairwise distances of a rigid torso stay.
+    gaps = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (before, after)]
+    assert np.allclose(*gaps, atol=1e-12)
+
+
+def test_flipping_back_gives_the_torso_again(twisting):
+    poses, flips = complete(twisting, seed=5)
+    before = torso_of(twisting, poses)
+    only_hips = FLIPS.index((True, False, False))
+    only_lean = FLIPS.index((False, True, False))
+    for flip, joints in ((only_hips, slice(None)), (only_lean, slice(0, 4))):
+        for n, flipped in enumerate(flips[:, flip]):
+            back, _ = flip_torso(twisting, flipped)
+            gaps = np.abs(torso_of(twisting, back) - before[:, n, None])[joints]
+            assert gaps.max(axis=(0, 2)).min() < 1e-9
+
+
+def test_a_torso_across_the_line_of_sight_has_no_flips(twisting):
+    """Far away rays are parallel: nothing upright and frontal is behind anything."""
+    pose = np.zeros(twisting.dimension)
+    pose[1:3] = 0.215, 20.0
+    assert len(flip_torso(twisting, pose)[0]) == 0
+    pose[twisting.dof_names.index('root_z')] = 0.5
+    flips, parents = flip_torso(twisting, pose)
+    assert len(flips) >= 3
+    assert (parents == 0).all()
+
+
+def test_narrow_limits_leave_no_flips(twisting):
+    poses = turned_people(twisting, 1, 6)
+    s = twisting.skeleton
+    turns = s.dof_is_rotation
+    lower, upper = np.where(turns, poses[0] - 1e-3, s.lower), np.where(turns, poses[0] + 1e-3, s.upper)
+    narrow = replace(twisting, skeleton=replace(s, lower=lower, upper=upper))
+    assert len(flip_torso(twisting, poses)[0]) > 0
+    assert len(flip_torso(narrow, poses)[0]) == 0
+
+
+def test_several_poses_at_once_are_one_by_one(body):
+    poses = turned_people(body, 12, 7)
+    together, parents = flip_torso(body, poses)
+    alone = [flip_torso(body, pose)[0] for pose in poses]
+    assert np.array_equal(np.bincount(parents, minlength=12), [len(x) for x in alone])
+    assert np.abs(together - np.concatenate(alone)).max() < 1e-12
+
+
+def test_bodies_without_a_torso_have_no_flips(twisting):
+    s = twisting.skeleton
+    renamed = replace(s, joint_names=tuple(x.replace('neck', 'collar') for x in s.joint_names))
+    flips, parents = flip_torso(replace(twisting, skeleton=renamed), turned_people(twisting, 3, 8))
+    assert flips.shape == (0, twisting.dimension)
+    assert parents.shape == (0,)
