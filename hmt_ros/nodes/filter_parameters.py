@@ -37,6 +37,7 @@ _TRACKER_LIMITS = {
     'alternatives': (1, 64),
     'samples': (1, 65536),
     'rounds': (1, 100),
+    'image_trust': _FRACTION,
     'jump_probability': _FRACTION,
     'base_iterations': (1, 100),
     'iterations': (1, 100),

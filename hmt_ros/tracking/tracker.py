@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.interpretation_tree import enumerate_flips, rehang_chain
-from hmt_ros.body.kinematics import forward
+from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.body.torso_flips import flip_torso
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
@@ -99,6 +99,8 @@ class TrackerSettings:
         base_iterations, iterations: Newton steps on the predictions and on the candidates.
         temperature: factor on the image's energy in a mode's weight; below 1 because neighbouring
             measurements err together.
+        image_trust: factor on the curvature of the image's energy, keypoints apart, in a mode's
+            covariance; below 1 because shapes, shadows and clothes are not the model's.
         tails: degrees of freedom of the Student distribution around a prediction.
         least_log_weight: no kept mode's weight falls below this.
         flesh_images: images from which the widths of the flesh are estimated; 0: the model's.
@@ -126,6 +128,7 @@ class TrackerSettings:
     base_iterations: int = 6
     iterations: int = 6
     temperature: float = 0.3
+    image_trust: float = 0.05
     tails: float = 8.0
     least_log_weight: float = -10.0
     flesh_images: int = 15
@@ -158,7 +161,9 @@ class Modes:
 
     Attributes:
         poses, velocities: (K, d), velocities per second.
-        covariances: (K, d, d).
+        covariances: (K, d, d) of the posterior.
+        filtered: (K, d, d) covariances that are propagated, as if errors were independent from
+            image to image.
         log_weights: (K,) normalised.
         log_likelihoods: (K,) of the image at the poses.
         textures: of the image at the poses, or None.
@@ -167,6 +172,7 @@ class Modes:
     poses: Array
     velocities: Array
     covariances: Array
+    filtered: Array
     log_weights: Array
     log_likelihoods: Array
     textures: Textures | None
@@ -349,6 +355,9 @@ class Tracker:
         limit = 3.0 * np.sqrt(np.einsum('kii->ki', m.covariances))
         step = np.clip(step, -limit, limit)
         means = np.clip(m.poses + step, body.lower, body.upper)
+        if _shows_shape(observation):
+            frames = forward(body.skeleton, m.poses)
+            covariances = self._honest_covariances(m.poses, frames, free, observation)
         log_weights = -self.settings.temperature * value
         weights = np.exp(log_weights - log_weights.max())
         return GaussianMixture(weights / weights.sum(), means, covariances).sorted()
@@ -443,7 +452,7 @@ class Tracker:
     def _propagate(self, observation: Observation, dt: float) -> None:
         s, m, body = self.settings, self.modes, self.body
         predicted, covariances = predict(
-            s.dynamics, self._rates, m.poses, m.covariances, m.velocities, dt
+            s.dynamics, self._rates, m.poses, m.filtered, m.velocities, dt
         )
         predicted = np.clip(predicted, body.lower, body.upper)
         precisions = _inverses(covariances)
@@ -847,15 +856,27 @@ class Tracker:
         if observation.intensity is not None:
             textures = capture_textures(self.body, self.camera, frames, observation.intensity)
         image = self._likelihood.image_energy(frames, observation, derivatives=False)
+        filtered = _covariances(solved.hessian[rows], solved.free[rows])
+        covariances = filtered
+        if _shows_shape(observation):
+            covariances = self._honest_covariances(poses, frames, solved.free[rows], observation)
         self._modes = Modes(
-            poses,
-            velocities[rows],
-            _covariances(solved.hessian[rows], solved.free[rows]),
-            weights[order],
-            -image.value,
-            textures,
+            poses, velocities[rows], covariances, filtered, weights[order], -image.value, textures
         )
         self._outline_costs = image.costs
+
+    def _honest_covariances(
+        self, poses: Array, frames: Frames, free: NDArray[np.bool_], observation: Observation
+    ) -> Array:
+        """Covariances that an image alone leaves, of which only a share is believed.
+
+        Shapes, shadows and clothes differ from the model's in much the same way in image after
+        image: such errors do not average out, over pixels or over time.
+        """
+        _, _, hessian = self._likelihood.energy(poses, observation)
+        shape = self._likelihood.image_energy(frames, replace(observation, keypoints=None))
+        assert shape.hessian is not None
+        return _covariances(hessian - (1.0 - self.settings.image_trust) * shape.hessian, free)
 
     def _judge(self, observation: Observation) -> None:
         """Whether the track is lost: how much of the image no mode explains."""
@@ -993,6 +1014,11 @@ class Tracker:
     def _relative_joints(self, poses: Array) -> Array:
         joints = self.body.joint_positions(poses)
         return joints - joints[:, :1]
+
+
+def _shows_shape(observation: Observation) -> bool:
+    maps = (observation.distance, observation.edges, observation.flow, observation.intensity)
+    return any(m is not None for m in maps)
 
 
 def _some_minima(minima: Minimum, which: Index) -> Minimum:

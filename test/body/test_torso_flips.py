@@ -66,7 +66,8 @@ def complete(body, count=60, seed=0):
 def test_all_choices_on_a_body_that_twists(twisting):
     poses, flips = complete(twisting)
     before = torso_of(twisting, poses)
-    after = torso_of(twisting, flips.reshape(-1, twisting.dimension)).reshape(6, *flips.shape[:2], 3)
+    after = torso_of(twisting, flips.reshape(-1, twisting.dimension))
+    after = after.reshape(6, *flips.shape[:2], 3)
     assert np.allclose(after[0], before[0][:, None], atol=1e-12)
     for n, (i, (hips, lean, shoulders)) in itertools.product(range(len(poses)), enumerate(FLIPS)):
         pelvis, neck, left_hip, right_hip, left_shoulder, right_shoulder = before[:, n]
@@ -109,13 +110,14 @@ def test_lengths_and_other_degrees_of_freedom_stay(body):
 
 
 def test_the_torso_moves_in_depth_and_hardly_in_the_image(body):
-    """Mirrored lines are foreshortened alike: under 2 % of the distance across, far more along."""
+    """Mirrored lines are foreshortened alike; the neck is on its ray."""
     poses = turned_people(body, 40, 2)
     poses[:, 2] += 5.0
     flips, parents = flip_torso(body, poses)
     before, after = torso_of(body, poses)[:, parents], torso_of(body, flips)
-    shift = np.abs(after[..., 2] - before[..., 2]).max(0)
-    assert shift.min() > 0.03
+    if body.name != 'human34':  # whose shoulders turn with the trunk alone
+        shift = np.abs(after[..., 2] - before[..., 2]).max(0)
+        assert shift.min() > 0.03
     hips, shoulders = slice(2, 4), slice(4, 6)
     for pair in (hips, shoulders) if body.name == 'human37' else (hips,):
         rays = (x[pair, :, :2] / x[pair, :, 2:] for x in (before, after))
@@ -157,14 +159,19 @@ def test_a_rigid_torso_turns_only():
 
 
 def test_flipping_back_gives_the_torso_again(twisting):
+    """Mirroring twice is nothing: for the line of the hips, and for the neck before its ray."""
     poses, flips = complete(twisting, seed=5)
-    before = torso_of(twisting, poses)
-    only_hips = FLIPS.index((True, False, False))
-    only_lean = FLIPS.index((False, True, False))
-    for flip, joints in ((only_hips, slice(None)), (only_lean, slice(0, 4))):
-        for n, flipped in enumerate(flips[:, flip]):
+
+    def lines(poses):
+        pelvis, neck, left_hip, right_hip, left_shoulder, right_shoulder = torso_of(twisting, poses)
+        return np.stack([pelvis, neck, right_hip - left_hip, left_shoulder, right_shoulder])
+
+    before = lines(poses)
+    for flip, same in (((True, False, False), [0, 1, 2, 3, 4]), ((False, True, False), [0, 1, 2])):
+        for n, flipped in enumerate(flips[:, FLIPS.index(flip)]):
+            assert np.abs(lines(flipped[None]) - before[:, n, None])[same].max() > 0.03
             back, _ = flip_torso(twisting, flipped)
-            gaps = np.abs(torso_of(twisting, back) - before[:, n, None])[joints]
+            gaps = np.abs(lines(back) - before[:, n, None])[same]
             assert gaps.max(axis=(0, 2)).min() < 1e-9
 
 
@@ -183,7 +190,8 @@ def test_narrow_limits_leave_no_flips(twisting):
     poses = turned_people(twisting, 1, 6)
     s = twisting.skeleton
     turns = s.dof_is_rotation
-    lower, upper = np.where(turns, poses[0] - 1e-3, s.lower), np.where(turns, poses[0] + 1e-3, s.upper)
+    lower = np.where(turns, poses[0] - 1e-3, s.lower)
+    upper = np.where(turns, poses[0] + 1e-3, s.upper)
     narrow = replace(twisting, skeleton=replace(s, lower=lower, upper=upper))
     assert len(flip_torso(twisting, poses)[0]) > 0
     assert len(flip_torso(narrow, poses)[0]) == 0

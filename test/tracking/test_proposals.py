@@ -1,0 +1,175 @@
+"""Samplers and votes against moments, quantiles and eigenvectors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from hmt_ros.tracking.proposals import (
+    chain_dofs,
+    chain_votes,
+    covariance_scaled_samples,
+    spherical_samples,
+)
+
+N = 40_000
+SAMPLERS = (spherical_samples, covariance_scaled_samples)
+
+
+@pytest.fixture(scope='module')
+def free(human32):
+    """The body without limits."""
+    s = human32.skeleton
+    far = np.full(s.dimension, 1e9)
+    return replace(human32, skeleton=replace(s, lower=-far, upper=far))
+
+
+@pytest.fixture(scope='module')
+def modes(human32):
+    """Means (2, d) in the middle of the limits and correlated covariances (2, d, d)."""
+    d = human32.dimension
+    rng = np.random.default_rng(0)
+    means = np.tile(0.5 * (human32.lower + human32.upper), (2, 1))
+    root = rng.normal(size=(2, d, d)) * np.array([0.02, 0.05])[:, None, None] / np.sqrt(d)
+    scales = np.exp(rng.normal(0, 0.5, (2, d)))
+    root = scales[:, :, None] * root
+    return means, root @ root.transpose(0, 2, 1) + 1e-6 * np.eye(d)
+
+
+@pytest.mark.parametrize('scale', [1.0, 4.0])
+def test_covariance_scaled_samples_have_the_covariance(free, modes, scale):
+    means, covariances = modes
+    samples = covariance_scaled_samples(free, *modes, N, scale, np.random.default_rng(1))
+    assert samples.shape == (2, N, free.dimension)
+    for k in range(2):
+        wanted = scale**2 * covariances[k]
+        deviations = np.sqrt(np.diag(wanted))
+        error = (np.cov(samples[k].T) - wanted) / np.outer(deviations, deviations)
+        assert np.abs(error).max() < 5.5 * np.sqrt(2 / N)
+        shift = (samples[k].mean(0) - means[k]) / deviations
+        assert np.abs(shift).max() < 5 / np.sqrt(N)
+
+
+@pytest.mark.parametrize('scale', [1.0, 8.0])
+def test_spherical_samples_have_the_volume_of_the_covariance(free, modes, scale):
+    means, covariances = modes
+    samples = spherical_samples(free, *modes, N, scale, np.random.default_rng(2))
+    for k in range(2):
+        # The geometric mean of the axes, from the eigenvalues.
+        radius = np.exp(0.5 * np.log(np.linalg.eigvalsh(covariances[k])).mean())
+        found = np.cov(samples[k].T) / (scale * radius) ** 2
+        assert np.abs(found - np.eye(free.dimension)).max() < 5.5 * np.sqrt(2 / N)
+        assert np.abs(samples[k].mean(0) - means[k]).max() < 5 * scale * radius / np.sqrt(N)
+
+
+def test_cauchy_tails_of_covariance_scaled_samples(free, modes):
+    """Along any direction a standard Cauchy; the Mahalanobis distance squared is d F(d, 1)."""
+    means, covariances = modes
+    samples = covariance_scaled_samples(free, *modes, N, 0.0, np.random.default_rng(3))
+    d = free.dimension
+    for k in range(2):
+        white = np.linalg.solve(np.linalg.cholesky(covariances[k]), (samples[k] - means[k]).T)
+        for line in (white[0], white[-1], white[:4].sum(0) / 2):
+            assert stats.kstest(line, stats.cauchy.cdf).statistic < 1.95 / np.sqrt(N)
+        square = (white**2).sum(0) / d
+        # The tail is cut where noise is divided by 1e-3 or less: once in 1250.
+        assert stats.kstest(square, stats.f(d, 1).cdf).statistic < 1.95 / np.sqrt(N) + 1e-3
+
+
+def test_cauchy_tails_of_spherical_samples(free, modes):
+    means, covariances = modes
+    samples = spherical_samples(free, *modes, N, 0.0, np.random.default_rng(4))
+    for k in range(2):
+        radius = np.linalg.det(covariances[k] / 1e-4) ** (0.5 / free.dimension) * 1e-2
+        noise = (samples[k] - means[k]) / radius
+        for j in (0, 7, 31):
+            assert stats.kstest(noise[:, j], stats.cauchy.cdf).statistic < 1.95 / np.sqrt(N)
+
+
+@pytest.mark.parametrize('draw', SAMPLERS)
+@pytest.mark.parametrize('scale', [0.0, 4.0])
+def test_samples_that_leave_the_limits_are_projected_back(human32, free, modes, draw, scale):
+    means, covariances = modes
+    wide = 400 * covariances
+    samples = draw(human32, means, wide, 500, scale, np.random.default_rng(5))
+    loose = draw(free, means, wide, 500, scale, np.random.default_rng(5))
+    nearest = np.minimum(np.maximum(loose, human32.lower), human32.upper)
+    assert np.array_equal(samples, nearest)
+    assert (samples == human32.lower).any()
+    assert (samples == human32.upper).any()
+
+
+@pytest.mark.parametrize('draw', SAMPLERS)
+def test_the_same_seed_gives_the_same_samples(free, modes, draw):
+    first, again, other = (draw(free, *modes, 5, 2.0, np.random.default_rng(s)) for s in (6, 6, 7))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
+
+
+def test_chains_own_their_degrees_of_freedom(human32):
+    owned = {chain: chain_dofs(human32, chain) for chain in CHAINS}
+    everything = np.concatenate(list(owned.values()))
+    assert len(everything) == len(np.unique(everything)) == 26
+    names = {human32.dof_names[j] for j in owned['left_arm']}
+    assert names == {
+        'left_shoulder_x', 'left_shoulder_y', 'left_shoulder_z',
+        'left_elbow', 'left_wrist_x', 'left_wrist_y',
+    }  # fmt: skip
+
+
+def test_votes_by_trace_are_those_of_the_eigenvectors(human32, modes):
+    """Sum over eigenvectors of eigenvalue times squared length inside the chain."""
+    _, covariances = modes
+    votes = chain_votes(human32, covariances, CHAINS)
+    for k in range(2):
+        values, vectors = np.linalg.eigh(covariances[k])
+        shares = []
+        for chain in CHAINS:
+            inside = vectors[chain_dofs(human32, chain)]
+            shares.append((values * (inside**2).sum(0)).sum())
+        assert np.allclose(votes[k], np.array(shares) / np.sum(shares), rtol=1e-10)
+
+
+def test_votes_by_the_largest_eigenvalue(human32, modes):
+    """Found by power iteration on the block of the chain."""
+    _, covariances = modes
+    votes = chain_votes(human32, covariances, CHAINS, 'eigenvalue')
+    for k in range(2):
+        largest = []
+        for chain in CHAINS:
+            own = chain_dofs(human32, chain)
+            block = covariances[k][own][:, own]
+            x = np.ones(len(own))
+            for _ in range(3000):
+                x = block @ x
+                x /= np.linalg.norm(x)
+            largest.append(x @ block @ x)
+        assert np.allclose(votes[k], np.array(largest) / np.sum(largest), rtol=1e-6)
+
+
+def test_uniform_votes(human32, modes):
+    votes = chain_votes(human32, modes[1], CHAINS[:4], 'uniform')
+    assert np.array_equal(votes, np.full((2, 4), 0.25))
+
+
+def test_an_uncertain_chain_gets_the_votes(human32):
+    covariance = 1e-4 * np.eye(32)[None]
+    own = chain_dofs(human32, 'right_arm')
+    covariance[:, own, own] = 1e-2
+    for vote, share in (('trace', 100 * 6 / (100 * 6 + 3 * 6 + 2)), ('eigenvalue', 100 / 104)):
+        votes = chain_votes(human32, covariance, CHAINS, vote)
+        assert votes[0, CHAINS.index('right_arm')] == pytest.approx(share, rel=1e-12)
+        assert votes.sum() == pytest.approx(1.0, rel=1e-12)
+
+
+def test_what_is_unknown_is_refused(human32, modes):
+    with pytest.raises(ValueError, match=r"vote must be one of .*trace.*saw 'loud'"):
+        chain_votes(human32, modes[1], CHAINS, 'loud')
+    with pytest.raises(KeyError, match='tail'):
+        chain_votes(human32, modes[1], ('tail',))
