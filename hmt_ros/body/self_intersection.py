@@ -7,8 +7,10 @@ that connects the axes where they are nearest; the overlap is penalised quadrati
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
@@ -19,6 +21,23 @@ Index = NDArray[np.intp]
 
 # Overlap that is tolerated before it costs anything: flesh gives way, and ellipsoids fit roughly.
 TOLERANCE = 0.02  # m
+SMALL = 1e-9
+
+
+class _Axes(NamedTuple):
+    """The parts as capsules with elliptic cross-sections, as the compiled code reads them.
+
+    Attributes:
+        segments: (B,) that carry them.
+        centres: (B, 3) of the axes in the segments' frames, m.
+        halves: (B,) half lengths of the axes, m.
+        radii: (B, 3) along x, y and, for the caps, z, m.
+    """
+
+    segments: NDArray[np.int64]
+    centres: Array
+    halves: Array
+    radii: Array
 
 
 def self_intersection_energy(
@@ -33,43 +52,25 @@ def self_intersection_energy(
     """
     first, second = _pairs(body)
     n, d = frames.count, body.dimension
-    if len(first) == 0:
-        return np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d))
-    segments = np.array([p.segment for p in body.flesh.parts])
-    p, q, direction, depth = _overlaps(body, frames, first, second)
-    overlap = (depth - TOLERANCE) / sigma
-    touching = overlap > 0
-    value = 0.5 * np.where(touching, overlap * overlap, 0.0).sum(0)
-    gradient, hessian = np.zeros((n, d)), np.zeros((n, d, d))
-    pairs, poses = np.nonzero(touching)
-    if len(pairs):
-        moved = _relative_motion(
-            frames, segments[first[pairs]], segments[second[pairs]],
-            p[pairs, :, poses], q[pairs, :, poses], direction[pairs, :, poses], poses,
-        )  # fmt: skip
-        rows = -moved / sigma  # derivative of the overlap with respect to the pose, (X, d)
-        np.add.at(gradient, poses, overlap[pairs, poses][:, None] * rows)
-        np.add.at(hessian, poses, rows[:, :, None] * rows[:, None, :])
+    value, gradient, hessian = np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d))
+    _add_overlaps(
+        _axes_of(body), first, second, *frames.by_pose(), *frames.dofs_by_pose(),
+        body.skeleton.dof_is_rotation, body.skeleton.moves, sigma, value, gradient, hessian,
+    )  # fmt: skip
     return value, gradient, hessian
 
 
-def _overlaps(
-    body: Body, frames: Frames, first: Index, second: Index
-) -> tuple[Array, Array, Array, Array]:
-    """Nearest points of pairs of parts and the direction between, (X, 3, N); overlap (X, N)."""
-    segments = np.array([p.segment for p in body.flesh.parts])
-    radii = np.array([p.radii for p in body.flesh.parts])
-    # The axis of a capsule of the part's length.
-    half = np.maximum(radii[:, 2] - radii[:, :2].mean(1), 0.0)
-    middle = frames.points(segments, np.array([p.centre for p in body.flesh.parts]))
-    axis = frames.columns[segments, 2] * half[:, None, None]
-    p, q = _nearest_points(middle, axis, first, second)
-    offset = p - q
-    distance = np.sqrt((offset * offset).sum(1))
-    direction = offset / np.maximum(distance, 1e-9)[:, None]
-    reach = _radius_along(frames, segments, radii, first, direction)
-    reach += _radius_along(frames, segments, radii, second, direction)
-    return p, q, direction, reach - distance
+@lru_cache(maxsize=64)
+def _axes_of(body: Body) -> _Axes:
+    parts = body.flesh.parts
+    radii = np.array([p.radii for p in parts]).reshape(-1, 3)
+    mean = radii[:, :2].mean(1)
+    return _Axes(
+        np.array([p.segment for p in parts], dtype=np.int64),
+        np.array([p.centre for p in parts]).reshape(-1, 3),
+        np.maximum(radii[:, 2] - mean, 0.0),
+        np.column_stack([radii[:, :2], mean]),
+    )
 
 
 @lru_cache(maxsize=64)
@@ -95,44 +96,105 @@ def _pairs(body: Body) -> tuple[Index, Index]:
     first, second = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
     rest = body.prior_mean.copy()
     rest[~body.skeleton.dof_is_rotation] = 0.0
-    apart = _overlaps(body, forward(body.skeleton, rest[None]), first, second)[3][:, 0] < TOLERANCE
+    columns, origins = forward(body.skeleton, rest[None]).by_pose()
+    axes = _axes_of(body)
+    apart = [
+        _overlap(axes, i, j, columns[0], origins[0])[9] < TOLERANCE
+        for i, j in zip(first, second, strict=True)
+    ]
     return first[apart], second[apart]
 
 
-def _nearest_points(middle: Array, axis: Array, first: Index, second: Index) -> tuple[Array, Array]:
-    """Nearest points (X, 3, N) of the axes middle + s axis, s in [-1, 1], of pairs of parts."""
-    c1, c2, u, v = middle[first], middle[second], axis[first], axis[second]
-    w = c1 - c2
-    a, b, c = (u * u).sum(1), (u * v).sum(1), (v * v).sum(1)
-    d, e = (u * w).sum(1), (v * w).sum(1)
-    small = 1e-9
-    denominator = np.maximum(a * c - b * b, small)
-    s = np.clip((b * e - c * d) / denominator, -1.0, 1.0)
-    t = np.clip((b * s + e) / np.maximum(c, small), -1.0, 1.0)
-    s = np.clip((b * t - d) / np.maximum(a, small), -1.0, 1.0)
-    return c1 + s[:, None] * u, c2 + t[:, None] * v
+@njit(cache=True, nogil=True)
+def _overlap(parts, i, j, columns, origins):  # type: ignore[no-untyped-def]
+    """Nearest points p and q of the axes of two parts, the direction between, and the overlap.
+
+    The axes are middle + s axis, s in [-1, 1]; all ten numbers are scalars, as small arrays would
+    cost more than the arithmetic.
+    """
+    a, b = parts.segments[i], parts.segments[j]
+    c0 = c1 = c2 = e0 = e1 = e2 = 0.0
+    for k in range(3):
+        c0 += columns[a, k, 0] * parts.centres[i, k]
+        c1 += columns[a, k, 1] * parts.centres[i, k]
+        c2 += columns[a, k, 2] * parts.centres[i, k]
+        e0 += columns[b, k, 0] * parts.centres[j, k]
+        e1 += columns[b, k, 1] * parts.centres[j, k]
+        e2 += columns[b, k, 2] * parts.centres[j, k]
+    c0, c1, c2 = c0 + origins[a, 0], c1 + origins[a, 1], c2 + origins[a, 2]
+    e0, e1, e2 = e0 + origins[b, 0], e1 + origins[b, 1], e2 + origins[b, 2]
+    h, g = parts.halves[i], parts.halves[j]
+    u0, u1, u2 = columns[a, 2, 0] * h, columns[a, 2, 1] * h, columns[a, 2, 2] * h
+    v0, v1, v2 = columns[b, 2, 0] * g, columns[b, 2, 1] * g, columns[b, 2, 2] * g
+    w0, w1, w2 = c0 - e0, c1 - e1, c2 - e2
+    uu = u0 * u0 + u1 * u1 + u2 * u2
+    uv = u0 * v0 + u1 * v1 + u2 * v2
+    vv = v0 * v0 + v1 * v1 + v2 * v2
+    uw = u0 * w0 + u1 * w1 + u2 * w2
+    vw = v0 * w0 + v1 * w1 + v2 * w2
+    s = min(max((uv * vw - vv * uw) / max(uu * vv - uv * uv, SMALL), -1.0), 1.0)
+    t = min(max((uv * s + vw) / max(vv, SMALL), -1.0), 1.0)
+    s = min(max((uv * t - uw) / max(uu, SMALL), -1.0), 1.0)
+    p0, p1, p2 = c0 + s * u0, c1 + s * u1, c2 + s * u2
+    q0, q1, q2 = e0 + t * v0, e1 + t * v1, e2 + t * v2
+    d0, d1, d2 = p0 - q0, p1 - q1, p2 - q2
+    distance = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+    away = max(distance, SMALL)
+    d0, d1, d2 = d0 / away, d1 / away, d2 / away
+    reach = 0.0
+    for part, segment in ((i, a), (j, b)):
+        total = 0.0
+        for k in range(3):
+            x = columns[segment, k, 0] * d0 + columns[segment, k, 1] * d1
+            x = (x + columns[segment, k, 2] * d2) * parts.radii[part, k]
+            total += x * x
+        reach += np.sqrt(total)
+    return p0, p1, p2, q0, q1, q2, d0, d1, d2, reach - distance
 
 
-def _radius_along(
-    frames: Frames, segments: Index, radii: Array, parts: Index, direction: Array
-) -> Array:
-    """Extent (X, N) of the cross-section of parts along directions (X, 3, N)."""
-    columns = frames.columns[segments[parts]]
-    x = (columns[:, 0] * direction).sum(1) * radii[parts, 0][:, None]
-    y = (columns[:, 1] * direction).sum(1) * radii[parts, 1][:, None]
-    z = (columns[:, 2] * direction).sum(1) * radii[parts, :2].mean(1)[:, None]
-    result: Array = np.sqrt(x * x + y * y + z * z)
-    return result
-
-
-def _relative_motion(
-    frames: Frames, first: Index, second: Index, p: Array, q: Array, direction: Array, poses: Index
-) -> Array:
-    """Derivative (X, d) of direction . (p - q) with respect to the poses."""
-    moves = frames.skeleton.moves
-    twists = frames.twists().transpose(2, 0, 1)[poses]  # (X, d, 6)
-    at_p = np.concatenate([direction, np.cross(p, direction)], axis=1)
-    at_q = np.concatenate([direction, np.cross(q, direction)], axis=1)
-    result: Array = np.einsum('xda,xa->xd', twists, at_p) * moves[first]
-    result -= np.einsum('xda,xa->xd', twists, at_q) * moves[second]
-    return result
+@njit(cache=True, nogil=True)
+def _add_overlaps(  # type: ignore[no-untyped-def]
+    parts, first, second, columns, origins, dof_axes, dof_origins, is_rotation, moves, sigma,
+    value, gradient, hessian,
+):  # fmt: skip
+    """Adds energy, gradient and Gauss-Newton Hessian of all pairs that overlap, pose by pose."""
+    d = dof_axes.shape[1]
+    row = np.zeros(d)
+    for n in range(len(value)):
+        for pair in range(len(first)):
+            i, j = first[pair], second[pair]
+            p0, p1, p2, q0, q1, q2, d0, d1, d2, depth = _overlap(
+                parts, i, j, columns[n], origins[n]
+            )
+            overlap = (depth - TOLERANCE) / sigma
+            if overlap <= 0.0:
+                continue
+            value[n] += 0.5 * overlap * overlap
+            a, b = parts.segments[i], parts.segments[j]
+            for k in range(d):
+                moved = 0.0
+                x0, x1, x2 = dof_axes[n, k, 0], dof_axes[n, k, 1], dof_axes[n, k, 2]
+                if not is_rotation[k]:
+                    along = x0 * d0 + x1 * d1 + x2 * d2
+                    if moves[a, k]:
+                        moved += along
+                    if moves[b, k]:
+                        moved -= along
+                else:
+                    o0, o1, o2 = dof_origins[n, k, 0], dof_origins[n, k, 1], dof_origins[n, k, 2]
+                    # direction . (axis x arm) = axis . (arm x direction)
+                    if moves[a, k]:
+                        r0, r1, r2 = p0 - o0, p1 - o1, p2 - o2
+                        moved += x0 * (r1 * d2 - r2 * d1) + x1 * (r2 * d0 - r0 * d2)
+                        moved += x2 * (r0 * d1 - r1 * d0)
+                    if moves[b, k]:
+                        r0, r1, r2 = q0 - o0, q1 - o1, q2 - o2
+                        moved -= x0 * (r1 * d2 - r2 * d1) + x1 * (r2 * d0 - r0 * d2)
+                        moved -= x2 * (r0 * d1 - r1 * d0)
+                row[k] = -moved / sigma
+            for k in range(d):
+                if row[k] == 0.0:
+                    continue
+                gradient[n, k] += overlap * row[k]
+                for m in range(d):
+                    hessian[n, k, m] += row[k] * row[m]

@@ -9,7 +9,6 @@ poses.
 
 from __future__ import annotations
 
-import heapq
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,45 +113,45 @@ def best_combinations(
         temperature: factor on energies in a log weight.
         count: how many.
     """
-    found: list[tuple[float, int, tuple[int, ...]]] = []
+    sizes = tuple(len(c) for c in changes)
+    keys, costs, parents, priors = [], [], [], []
     for g in range(len(modes)):
-        costs = [temperature * e + a.penalties[g] for e, a in zip(changes, alternatives)]
-        for cost, pick in _least_sums(costs, count):
-            found.append((cost - log_weights[g], g, pick))
-    found.sort(key=lambda item: item[0])
-    best: dict[tuple[int, ...], tuple[float, int]] = {}
-    priors: dict[tuple[int, ...], float] = {}
-    for cost, g, pick in found:
-        best.setdefault(pick, (cost, g))
-        prior = log_weights[g] - sum(a.penalties[g][i] for a, i in zip(alternatives, pick))
-        priors[pick] = float(np.logaddexp(priors.get(pick, -np.inf), prior))
-    picks = list(best)[:count]
-    parents = np.array([best[p][1] for p in picks], dtype=np.intp)
-    poses = modes[parents]
-    energies = np.full(len(picks), base_energy)
+        tempered = [temperature * e + a.penalties[g] for e, a in zip(changes, alternatives)]
+        sums, picks = _least_sums(tempered, count)
+        penalty = sum(a.penalties[g][picks[:, c]] for c, a in enumerate(alternatives))
+        keys.append(np.ravel_multi_index(tuple(picks.T), sizes))
+        costs.append(sums - log_weights[g])
+        parents.append(np.full(len(sums), g))
+        priors.append(log_weights[g] - penalty)
+    key, cost = np.concatenate(keys), np.concatenate(costs)
+    order = np.argsort(cost, kind='stable')
+    # The same combination from several modes: the best is its parent, their priors add up.
+    unique, first, group = np.unique(key[order], return_index=True, return_inverse=True)
+    total = np.full(len(unique), -np.inf)
+    np.logaddexp.at(total, group, np.concatenate(priors)[order])
+    best = np.argsort(first, kind='stable')[:count]
+    parent = np.concatenate(parents)[order][first[best]]
+    picks = np.stack(np.unravel_index(unique[best], sizes), axis=1)
+    poses = modes[parent]
+    energies = np.full(len(best), base_energy)
     for c, (own, change) in enumerate(zip(alternatives, changes, strict=True)):
-        index = np.array([p[c] for p in picks], dtype=np.intp)
-        poses[:, chain_dofs(body, own.chain)] = own.angles[index]
-        energies = energies + change[index]
-    return Combinations(poses, parents, energies, np.array([priors[p] for p in picks]))
+        poses[:, chain_dofs(body, own.chain)] = own.angles[picks[:, c]]
+        energies = energies + change[picks[:, c]]
+    return Combinations(poses, parent, energies, total[best])
 
 
-def _least_sums(costs: list[Array], count: int) -> list[tuple[float, tuple[int, ...]]]:
-    """The `count` choices of one entry per list with the least sums, least first."""
-    orders = [np.argsort(c, kind='stable') for c in costs]
-    ranked = [c[o] for c, o in zip(costs, orders)]
-    start = (0,) * len(costs)
-    heap = [(float(sum(r[0] for r in ranked)), start)]
-    seen = {start}
-    result: list[tuple[float, tuple[int, ...]]] = []
-    while heap and len(result) < count:
-        total, ranks = heapq.heappop(heap)
-        result.append((total, tuple(int(o[i]) for o, i in zip(orders, ranks))))
-        for c, rank in enumerate(ranks):
-            if rank + 1 < len(ranked[c]):
-                following = (*ranks[:c], rank + 1, *ranks[c + 1 :])
-                if following not in seen:
-                    seen.add(following)
-                    step = float(ranked[c][rank + 1] - ranked[c][rank])
-                    heapq.heappush(heap, (total + step, following))
-    return result
+def _least_sums(costs: list[Array], count: int) -> tuple[Array, Index]:
+    """The `count` choices of one entry per list with the least sums, least first.
+
+    Whatever is among the best of all lists is among the best of the first few.
+
+    Returns:
+        sums (n,) and choices (n, C).
+    """
+    sums, picks = np.zeros(1), np.zeros((1, 0), dtype=np.intp)
+    for cost in costs:
+        total = (sums[:, None] + cost).ravel()
+        best = np.argsort(total, kind='stable')[:count]
+        before, last = np.divmod(best, len(cost))
+        sums, picks = total[best], np.column_stack([picks[before], last])
+    return sums, picks

@@ -1,0 +1,433 @@
+"""The tracker on short motions whose poses are known: joints as keypoints, and rendered images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import Body
+from hmt_ros.body.procedural_motion import procedural_motion
+from hmt_ros.body.viewpoint import Viewpoint
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
+from hmt_ros.image.observation import Keypoints, Observation
+from hmt_ros.image.renderer import render_frames
+from hmt_ros.image.scene import Scene
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.tracking import Status, Subject, Tracker, TrackerSettings
+from hmt_ros.tracking.dynamics import DynamicsSettings
+
+OFF = TermSettings(0.0, 1.0, 1.0)
+ONLY_KEYPOINTS = LikelihoodSettings(
+    containment=OFF, coverage=OFF, edges=OFF, intensity=OFF, motion=OFF
+)
+FRAME = 100_000_000  # ns
+
+
+def keypoint_settings(**values) -> TrackerSettings:
+    return TrackerSettings(
+        **{'candidates': 8, 'likelihood': ONLY_KEYPOINTS, 'flesh_images': 0, **values}
+    )
+
+
+@pytest.fixture(scope='module')
+def black(camera) -> np.ndarray:
+    return np.zeros((camera.height, camera.width, 3), np.uint8)
+
+
+@pytest.fixture(scope='module')
+def subject(human32, motion, keypoints_of) -> Subject:
+    return Subject(0, keypoints_of(human32, motion[0]), dict(human32.segment_lengths))
+
+
+@pytest.fixture
+def mixture(motion) -> GaussianMixture:
+    """A start around the first pose: the truth, and another that is 60 cm away."""
+    means = np.stack([motion[0], motion[0]])
+    means[1, 0] += 0.6
+    return GaussianMixture(
+        np.array([0.6, 0.4]), means, np.tile(1e-2 * np.eye(motion.shape[1]), (2, 1, 1))
+    )
+
+
+@pytest.fixture(scope='module')
+def begun(human32, camera, black, motion, keypoints_of, subject) -> tuple[Body, GaussianMixture]:
+    """The person's body and the poses at the first image, from the subject."""
+    tracker = Tracker(human32, camera, keypoint_settings())
+    tracker.reset(subject)
+    posterior, _ = tracker.step(black, 0, keypoints_of(human32, motion[0], 1.0, 0))
+    return tracker.body, posterior
+
+
+@pytest.fixture(scope='module')
+def started(begun, camera):
+    """Function (seed, tracker settings) -> a tracker that starts from there."""
+
+    def make(seed=0, **values) -> Tracker:
+        body, posterior = begun
+        tracker = Tracker(body, camera, keypoint_settings(**values), seed=seed)
+        tracker.reset(posterior)
+        return tracker
+
+    return make
+
+
+@pytest.fixture(scope='module')
+def follow(human32, black, motion, keypoints_of, started):
+    """Function (tracker or its settings) -> mixtures and errors of the best mode, by keypoints."""
+
+    def run(frames=8, seed=0, body=human32, tracker=None, **values):
+        if tracker is None:
+            tracker = started(seed, **values)
+        mixtures, errors = [], []
+        for i in range(frames):
+            seen = keypoints_of(body, motion[i], 1.0, i)
+            mixtures.append(tracker.step(black, i * FRAME, seen))
+            errors.append(best_error(tracker.body, mixtures[-1][0], body, motion[i]))
+        return tracker, mixtures, np.array(errors)
+
+    return run
+
+
+def best_error(body, mixture, true_body, pose):
+    """Least mean distance of the joints, seen from the pelvis, from where they are, m."""
+    joints, truth = body.joint_positions(mixture.means), true_body.joint_positions(pose[None])
+    gaps = (joints - joints[:, :1]) - (truth - truth[:, :1])
+    return np.linalg.norm(gaps, axis=2).mean(1).min()
+
+
+def in_bytes(mixtures):
+    return [
+        array.tobytes()
+        for pair in mixtures
+        for m in pair
+        for array in (m.weights, m.means, m.covariances)
+    ]
+
+
+@pytest.mark.parametrize('proposals', ['kjs', 'css', 'ss'])
+@pytest.mark.parametrize('reweighting', ['ancestry', 'bhattacharyya'])
+def test_the_truth_is_among_the_modes(follow, proposals, reweighting):
+    tracker, mixtures, errors = follow(proposals=proposals, reweighting=reweighting, samples=64)
+    assert tracker.status is Status.TRACKING
+    assert errors.mean() < 0.045
+    assert errors.max() < 0.07
+    assert all(len(posterior) > 1 for posterior, _ in mixtures)
+
+
+def test_mixtures_are_normalised_sorted_and_within_limits(follow, human32):
+    _, mixtures, _ = follow(max_hypotheses=5)
+    for pair in mixtures:
+        for mixture in pair:
+            assert 1 <= len(mixture) <= 5
+            assert mixture.weights.sum() == pytest.approx(1.0, abs=1e-12)
+            assert (np.diff(mixture.weights) <= 0).all()
+            assert (mixture.means >= human32.lower).all()
+            assert (mixture.means <= human32.upper).all()
+            assert np.array_equal(mixture.covariances, mixture.covariances.transpose(0, 2, 1))
+            assert np.linalg.eigvalsh(mixture.covariances).min() > 0
+
+
+def test_modes_nearer_than_the_merge_distance_are_one(follow):
+    _, mixtures, errors = follow(4, hypothesis_merge_distance=1.0)
+    assert [len(posterior) for posterior, _ in mixtures] == [1] * 4
+    assert errors.max() < 0.07
+    _, mixtures, _ = follow(4, hypothesis_merge_distance=0.0)
+    assert min(len(posterior) for posterior, _ in mixtures) > 4
+
+
+def test_heaviest_modes_explain_the_joints(follow, camera, human32, motion, keypoints_of):
+    tracker, mixtures, _ = follow()
+    for i, (posterior, _) in enumerate(mixtures):
+        pixels = camera.project(tracker.body.joint_positions(posterior.means[:1]))[0]
+        error = pixels - keypoints_of(human32, motion[i], 1.0, i).pixels
+        assert np.sqrt((error**2).sum(1).mean()) < 3.0
+
+
+def test_weights_of_the_likelihood_are_those_of_the_image_alone(
+    follow, camera, human32, motion, keypoints_of
+):
+    """exp(-temperature * energy) at the modes of the posterior, normalised."""
+    tracker, mixtures, _ = follow(frames=4, temperature=0.4)
+    posterior, likelihood = mixtures[-1]
+    seen = Observation(keypoints=keypoints_of(human32, motion[3], 1.0, 3))
+    energies, _, _ = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).energy(
+        posterior.means, seen
+    )
+    weights = np.exp(-0.4 * (energies - energies.min()))
+    assert np.allclose(likelihood.weights, np.sort(weights / weights.sum())[::-1], atol=1e-12)
+
+
+def test_the_same_seed_and_images_give_identical_bytes(follow):
+    for proposals in ('kjs', 'css'):
+        _, first, _ = follow(4, seed=3, proposals=proposals)
+        _, second, _ = follow(4, seed=3, proposals=proposals)
+        assert in_bytes(first) == in_bytes(second)
+    _, other, _ = follow(4, seed=4, proposals='css')
+    assert in_bytes(first) != in_bytes(other)
+
+
+def test_other_body_sizes(follow, human32, camera, motion, keypoints_of):
+    """A child's lengths come with the subject; the model stays."""
+    child = human32.with_stature(1.3)
+    lengths = child.segment_lengths
+    subject = Subject(0, keypoints_of(child, motion[0]), lengths)
+    tracker = Tracker(human32, camera, keypoint_settings(), seed=1)
+    tracker.reset(subject)
+    _, first, errors = follow(4, body=child, tracker=tracker)
+    assert tracker.model is human32
+    found = tracker.body.segment_lengths
+    assert max(abs(found[name] - lengths[name]) for name in lengths) < 0.02
+    assert errors.max() < 0.06
+    again = Tracker(human32, camera, keypoint_settings(), seed=1)
+    again.reset(subject)
+    _, second, _ = follow(4, body=child, tracker=again)
+    assert in_bytes(first) == in_bytes(second)
+
+
+def test_reset_starts_over(follow):
+    tracker, first, _ = follow(4, proposals='css', seed=7)
+    tracker.reset()
+    assert tracker.status is Status.WAITING
+    with pytest.raises(ValueError, match='no track yet'):
+        _ = tracker.posterior
+    _, second, _ = follow(4, tracker=tracker)
+    assert in_bytes(first) == in_bytes(second)
+
+
+def test_waits_for_the_image_of_the_subject(human32, camera, black, subject, motion, keypoints_of):
+    tracker = Tracker(human32, camera, keypoint_settings())
+    assert tracker.step(black, 5) == (None, None)  # nobody said what to start from
+    tracker.reset(replace(subject, stamp_ns=3 * FRAME))
+    for i in range(3):
+        assert tracker.step(black, i * FRAME + 7) == (None, None)
+        assert tracker.status is Status.WAITING
+    assert tracker.background.frames == 4
+    seen = keypoints_of(human32, motion[0])
+    posterior, likelihood = tracker.step(black, 3 * FRAME + 7, seen)
+    assert tracker.status is Status.TRACKING
+    assert posterior.dimension == likelihood.dimension == human32.dimension
+    assert tracker.background.frames == 4
+
+
+def test_a_background_that_is_given_is_not_learned(human32, camera, black, subject):
+    background = BackgroundModel.from_image(black)
+    tracker = Tracker(human32, camera, keypoint_settings(), background)
+    tracker.reset(replace(subject, stamp_ns=FRAME))
+    tracker.step(black + 9, 0)
+    assert background.frames == 1
+
+
+def test_start_from_a_mixture(human32, camera, black, motion, keypoints_of, mixture):
+    """The image tells the components apart; the body stays as it is."""
+    tracker = Tracker(human32, camera, keypoint_settings())
+    tracker.reset(mixture)
+    assert tracker.status is Status.WAITING
+    posterior, _ = tracker.step(black, 0, keypoints_of(human32, motion[0]))
+    assert tracker.body is human32
+    assert np.abs(posterior.means[0] - motion[0]).max() < 0.3
+    assert np.abs(posterior.means[0, :3] - motion[0, :3]).max() < 0.05
+    assert posterior.weights[0] > 0.5
+    for i in range(1, 4):
+        posterior, _ = tracker.step(black, i * FRAME, keypoints_of(human32, motion[i], 1.0, i))
+        assert best_error(human32, posterior, human32, motion[i]) < 0.06
+
+
+def test_components_without_weight_start_too(human32, camera, black, motion, keypoints_of, mixture):
+    impossible = GaussianMixture(np.array([1.0, 0.0]), mixture.means, mixture.covariances)
+    tracker = Tracker(human32, camera, keypoint_settings())
+    tracker.reset(impossible)
+    posterior, _ = tracker.step(black, 0, keypoints_of(human32, motion[0]))
+    assert np.isfinite(posterior.weights).all()
+    assert posterior.weights.sum() == pytest.approx(1.0)
+    assert np.abs(posterior.means[0, :3] - motion[0, :3]).max() < 0.05
+
+
+def test_modes_move_on_where_nothing_is_seen(human32, camera, black, motion, keypoints_of):
+    """Keypoints of 10^5 px say nothing: modes go where their velocities take them, share kept."""
+    free = replace(ONLY_KEYPOINTS, prior_weight=0.0, self_intersection_sigma=np.inf)
+    settings = keypoint_settings(
+        likelihood=free, max_hypotheses=1, dynamics=DynamicsSettings(velocity_kept=0.8)
+    )
+    tracker = Tracker(human32, camera, settings)
+    pose = motion[0].copy()
+    start = GaussianMixture(np.ones(1), pose[None], 1e-4 * np.eye(len(pose))[None])
+    tracker.reset(start)
+    speed = 0.6  # m/s, across
+    for i in range(8):
+        pose[0] = motion[0, 0] + speed * i * 0.1
+        tracker.step(black, i * FRAME, keypoints_of(human32, pose, 0.5, i))
+    before = tracker.modes
+    assert before.velocities[0, 0] == pytest.approx(speed, abs=0.05)
+    seen = keypoints_of(human32, pose, 0.0)
+    covariances = np.tile(1e10 * np.eye(2), (len(seen.names), 1, 1))
+    faint = Keypoints(seen.names, seen.pixels, covariances, seen.confidences)
+    posterior, _ = tracker.step(black, 8 * FRAME, faint)
+    wanted = before.poses[0] + 0.8 * 0.1 * before.velocities[0]
+    wanted = np.clip(wanted, human32.lower, human32.upper)
+    assert np.abs(posterior.means[0] - wanted).max() < 1e-4
+    # At rest after the same, a random walk stays.
+    settings = keypoint_settings(
+        likelihood=free, max_hypotheses=1, dynamics=DynamicsSettings(model='random_walk')
+    )
+    still = Tracker(human32, camera, settings)
+    still.reset(start)
+    for i in range(3):
+        posterior, _ = still.step(black, i * FRAME, faint)
+    assert np.abs(posterior.means[0] - motion[0]).max() < 1e-4
+
+
+def test_without_keypoints_and_background_it_still_runs(human32, camera, motion, subject):
+    """Edges and texture of noise: poses stay near, weights are weights."""
+    rng = np.random.default_rng(0)
+    settings = TrackerSettings(candidates=8, max_hypotheses=4)
+    tracker = Tracker(human32, camera, settings)
+    tracker.reset(subject)
+    for i in range(4):
+        image = rng.integers(0, 255, (camera.height, camera.width, 3), dtype=np.uint8)
+        pair = tracker.step(image, i * FRAME)
+        for mixture in pair:
+            assert mixture.weights.sum() == pytest.approx(1.0)
+            assert np.linalg.eigvalsh(mixture.covariances).min() > 0
+    assert tracker.background.frames == 0
+    assert best_error(tracker.body, pair[0], human32, motion[3]) < 0.3
+
+
+def jumped(motion):
+    """Another pose, turned and two steps aside."""
+    pose = motion[11].copy()
+    pose[0] += 0.9
+    pose[3] += 2.5
+    return pose
+
+
+def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion, keypoints_of):
+    tracker = started(surprise=1e9, lost_images=2)
+    other = jumped(motion)
+    seen, misfits, errors = [], [], []
+    for i in range(8):
+        pose = motion[i] if i < 3 else other
+        posterior, _ = tracker.step(black, i * FRAME, keypoints_of(human32, pose, 1.0, i))
+        seen.append(tracker.status)
+        misfits.append(tracker.misfit)
+        errors.append(best_error(tracker.body, posterior, human32, pose))
+    tracking, lost = Status.TRACKING, Status.LOST
+    assert seen == [tracking] * 4 + [lost] + [tracking] * 3
+    assert max(misfits[:3]) < 0.1
+    assert min(misfits[3:5]) > tracker.settings.lost_misfit
+    assert max(misfits[5:]) < 0.1
+    assert min(errors[3:5]) > 0.2
+    assert max(errors[5:]) < 0.06
+    # The place too, not only the posture.
+    assert np.abs(posterior.means[0, :3] - other[:3]).max() < 0.2
+
+
+def test_surprising_images_are_searched_again(human32, started, black, motion, keypoints_of):
+    """With rounds of search the same jump is found at once, or an image later."""
+    evaluations, quiet = {}, {}
+    for rounds in (1, 3):
+        tracker = started(rounds=rounds)
+        for i in range(6):
+            pose = motion[i] if i < 3 else jumped(motion)
+            posterior, _ = tracker.step(black, i * FRAME, keypoints_of(human32, pose, 1.0, i))
+            evaluations[rounds, i] = tracker.evaluations
+            if i == 2:  # nothing surprises until here
+                quiet[rounds] = in_bytes([(posterior,)])
+    assert quiet[1] == quiet[3]
+    assert evaluations[3, 2] == evaluations[1, 2] > 0
+    assert evaluations[3, 3] > 1.5 * evaluations[1, 3]
+    assert best_error(tracker.body, posterior, human32, pose) < 0.06
+
+
+def test_one_bad_image_is_forgiven(human32, started, black, motion, keypoints_of):
+    tracker = started(lost_images=2)
+    rng = np.random.default_rng(0)
+    for i in range(6):
+        seen = keypoints_of(human32, motion[i], 1.0, i)
+        if i == 3:
+            anywhere = rng.uniform(0, 240, seen.pixels.shape)
+            seen = Keypoints(seen.names, anywhere, seen.covariances, seen.confidences)
+        posterior, _ = tracker.step(black, i * FRAME, seen)
+        assert tracker.status is Status.TRACKING
+        assert (tracker.misfit > 0.35) == (i == 3)
+    assert best_error(tracker.body, posterior, human32, motion[5]) < 0.07
+
+
+def test_joints_that_were_not_seen_do_not_count(follow, human32, motion, keypoints_of, black):
+    tracker, _, _ = follow(4)
+    seen = keypoints_of(human32, motion[4], 1.0, 4)
+    pixels = seen.pixels.copy()
+    pixels[[seen.names.index(x) for x in ('left_hand', 'right_hand', 'head')]] = np.nan
+    hidden = Keypoints(seen.names, pixels, seen.covariances, seen.confidences)
+    posterior, _ = tracker.step(black, 4 * FRAME, hidden)
+    assert tracker.misfit == 0.0
+    assert best_error(tracker.body, posterior, human32, motion[4]) < 0.07
+
+
+def test_bad_images_are_refused_and_change_nothing(follow, human32, black, motion, keypoints_of):
+    tracker, first, _ = follow(3)
+    with pytest.raises(ValueError, match=r'images of \(240, 320\), saw \(120, 320\)'):
+        tracker.step(black[::2], 3 * FRAME)
+    for stamp in (2 * FRAME, FRAME):
+        with pytest.raises(ValueError, match=f'stamps must increase, saw {stamp} after'):
+            tracker.step(black, stamp, keypoints_of(human32, motion[3]))
+    again, second, _ = follow(3)
+    assert in_bytes(first) == in_bytes(second)
+    seen = keypoints_of(human32, motion[3], 1.0, 3)
+    pairs = [t.step(black, 3 * FRAME, seen) for t in (tracker, again)]
+    assert in_bytes(pairs[:1]) == in_bytes(pairs[1:])
+
+
+def test_starts_of_another_dimension_are_refused(human32, camera):
+    tracker = Tracker(human32, camera)
+    wrong = GaussianMixture(np.ones(1), np.zeros((1, 34)), np.eye(34)[None])
+    with pytest.raises(ValueError, match='human32 has 32 dimensions, saw 34'):
+        tracker.reset(wrong)
+
+
+@pytest.mark.parametrize(
+    ('values', 'said'),
+    [
+        ({'proposals': 'magic'}, r"proposals must be one of .*kjs.* saw 'magic'"),
+        ({'reweighting': 'none'}, r"reweighting must be one of .*ancestry.* saw 'none'"),
+        ({'vote': 'loud'}, r"vote must be one of .*trace.* saw 'loud'"),
+        ({'max_hypotheses': 0}, '1 <= max_hypotheses <= candidates, saw 0 and 16'),
+        ({'candidates': 4}, '1 <= max_hypotheses <= candidates, saw 8 and 4'),
+        ({'jump_probability': 0.0}, r'jump_probability must lie in \(0, 1\), saw 0.0'),
+        ({'jump_probability': 1.0}, r'jump_probability must lie in \(0, 1\), saw 1.0'),
+    ],
+)
+def test_settings_that_are_refused(values, said):
+    with pytest.raises(ValueError, match=said):
+        TrackerSettings(**values)
+
+
+@pytest.fixture(scope='module')
+def film(human32, camera):
+    """Poses, images and the empty scene of a person who walks."""
+    view = Viewpoint(distance=3.2)
+    poses = procedural_motion('walk', human32, 0.6, 10.0, 3, viewpoint=view)
+    scene = Scene(viewpoint=view, seed=2)
+    images = [frame.image for frame in render_frames(human32, poses, camera, scene)]
+    return poses, images, np.rint(scene.background(camera)).astype(np.uint8)
+
+
+def test_images_alone(film, human32, camera, keypoints_of):
+    """After the first image nothing but pixels; twice, with identical bytes."""
+    poses, images, empty = film
+    runs = []
+    for _ in range(2):
+        settings = TrackerSettings(candidates=8, max_hypotheses=4, flesh_images=2)
+        tracker = Tracker(human32, camera, settings, BackgroundModel.from_image(empty), seed=5)
+        tracker.reset(Subject(0, keypoints_of(human32, poses[0]), dict(human32.segment_lengths)))
+        runs.append([tracker.step(image, i * FRAME) for i, image in enumerate(images)])
+        assert tracker.status is Status.TRACKING
+        assert tracker.misfit < 0.2
+    errors = [
+        best_error(tracker.body, posterior, human32, pose)
+        for (posterior, _), pose in zip(runs[0], poses)
+    ]
+    assert max(errors) < 0.08
+    assert in_bytes(runs[0]) == in_bytes(runs[1])
