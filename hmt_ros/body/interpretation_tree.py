@@ -20,10 +20,11 @@ seen from the frame before its rotations:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
@@ -34,6 +35,7 @@ from hmt_ros.body.skeleton import Skeleton
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
+TURN = 2.0 * np.pi
 # Two solutions nearer than this are one: the ray touches the sphere, m.
 TOUCHING = 1e-6
 # Sine of an elbow or knee angle below which the segments count as straight: their twist is free.
@@ -64,24 +66,20 @@ def enumerate_flips(
     del camera
     names = [chains] if isinstance(chains, str) else list(chains)
     skeleton = body.skeleton
-    q = np.array(poses, dtype=np.float64, ndmin=2)
+    q = np.array(poses, dtype=np.float64, ndmin=2, order='C')
     frames = forward(skeleton, q)
-    links = [_links(skeleton, name) for name in names]
-    dofs = [[j for link in chain for j in link.dofs] for chain in links]
-    flat = [j for own in dofs for j in own]
-    if len(set(flat)) < len(flat):
+    links = [_chain(skeleton, name) for name in names]
+    segments = [s for chain in links for s in chain.segments.tolist()]
+    if len(set(segments)) < len(segments):
         raise ValueError(f'chains {names} share segments, their trees can not be multiplied')
-    n = len(q)
     trees = [_leaves(frames, q, chain) for chain in links]
-    mask = np.ones((n,) + (1,) * len(trees), dtype=bool)
-    for i, (_, valid) in enumerate(trees):
-        shape = [n] + [1] * len(trees)
-        shape[i + 1] = len(valid)
-        mask = mask & valid.T.reshape(shape)
+    mask = np.ones(len(q), dtype=np.bool_)
+    for _, valid in trees:
+        mask = mask[..., None] & valid.reshape(len(q), *(1,) * (mask.ndim - 1), -1)
     parents, *choices = np.nonzero(mask)
     result = q[parents]
-    for own, (angles, _), choice in zip(dofs, trees, choices, strict=True):
-        result[:, own] = angles[choice, :, parents]
+    for chain, (angles, _), choice in zip(links, trees, choices, strict=True):
+        result[:, chain.dofs] = angles[parents, choice]
     return result, parents
 
 
@@ -115,54 +113,64 @@ def rehang_chain(
         KeyError, ValueError: as `enumerate_flips`.
     """
     skeleton = body.skeleton
-    links = _links(skeleton, chain)
-    new = np.array(new_poses, dtype=np.float64, ndmin=2)
+    links = _chain(skeleton, chain)
+    new = np.array(new_poses, dtype=np.float64, ndmin=2, order='C')
     seen = forward(skeleton, poses)
-    ends = links if image_of is None else _links(skeleton, image_of)
-    if len(ends) != len(links):
+    ends = links if image_of is None else _chain(skeleton, image_of)
+    if len(ends.lengths) != len(links.lengths):
         raise ValueError(f'chains {chain} and {image_of} differ in their number of segments')
-    targets = [seen.origins[k.segment] - k.length * seen.columns[k.segment, 2] for k in ends]
-    frames = forward(skeleton, new)
-    positions, valid = _positions(frames, links, targets, slack)
-    angles, reachable = _joint_angles(frames, new, links, positions)
-    parents, choice = np.nonzero((valid & reachable).T)
+    angles, valid = _grown(forward(skeleton, new), new, links, _ends(seen, ends), slack)
+    parents, choice = np.nonzero(valid)
     result = new[parents]
-    own = [j for link in links for j in link.dofs]
-    result[:, own] = angles[choice, :, parents]
+    result[:, links.dofs] = angles[parents, choice]
     return result, parents
 
 
 def flip_counts(body: Body, poses: ArrayLike, chain: str) -> Index:
     """Number of leaves (N,) that the tree of one chain has at each pose."""
-    q = np.array(poses, dtype=np.float64, ndmin=2)
-    _, valid = _leaves(forward(body.skeleton, q), q, _links(body.skeleton, chain))
-    counts: Index = valid.sum(0)
+    q = np.array(poses, dtype=np.float64, ndmin=2, order='C')
+    _, valid = _leaves(forward(body.skeleton, q), q, _chain(body.skeleton, chain))
+    counts: Index = valid.sum(1)
     return counts
 
 
-@dataclass(frozen=True, eq=False)
-class _Link:
-    """One segment of a chain: 'spherical' (x y z), 'hinge' (x) or 'end effector' (x y)."""
+class _Chain(NamedTuple):
+    """The links of a chain as the compiled code reads them.
 
-    segment: int
+    A link is spherical (x y z), a hinge (x) or an end effector (x y): 3, 1 or 2 degrees of freedom.
+
+    Attributes:
+        segments: (K,) one a link.
+        parent: segment that the chain hangs on.
+        mounts: (K, 3, 3) as the skeleton's.
+        mounted: (K,) whether the mount turns at all.
+        lengths: (K,) from joint to joint, m.
+        first_dofs: (K + 1,) where in `dofs` those of a link start.
+        dofs: (D,) of all links.
+        lower, upper: (D,) limits.
+        sides: (K, 2) which of the two solutions for its angles a link's limits admit.
+    """
+
+    segments: NDArray[np.int64]
     parent: int
-    mount: Array
-    length: float
-    dofs: tuple[int, ...]
+    mounts: Array
+    mounted: NDArray[np.bool_]
+    lengths: Array
+    first_dofs: NDArray[np.int64]
+    dofs: NDArray[np.int64]
     lower: Array
     upper: Array
-
-    @property
-    def kind(self) -> str:
-        return {3: 'spherical', 1: 'hinge', 2: 'end effector'}[len(self.dofs)]
+    sides: NDArray[np.bool_]
 
 
 @lru_cache(maxsize=256)
-def _links(skeleton: Skeleton, name: str) -> tuple[_Link, ...]:
+def _chain(skeleton: Skeleton, name: str) -> _Chain:
     if name not in skeleton.chains:
         raise KeyError(f'{skeleton.name} has no chain {name!r}; it has {sorted(skeleton.chains)}')
     segments = skeleton.chains[name]
-    result: list[_Link] = []
+    lengths: list[float] = []
+    sides: list[list[bool]] = []
+    after_spherical = False
     for k, s in enumerate(segments):
         dofs = skeleton.segment_dofs[s]
         axes = ''.join('xyz'[skeleton.dof_axes[j]] for j in dofs)
@@ -173,220 +181,282 @@ def _links(skeleton: Skeleton, name: str) -> tuple[_Link, ...]:
         else:
             end = next((x for x in skeleton.joint_offsets[ends] if np.any(x)), np.zeros(3))
         straight = np.allclose(end[:2], 0.0) and end[2] < 0
-        after_spherical = bool(result) and result[-1].kind == 'spherical'
         in_line = np.array_equal(skeleton.mounts[s], np.eye(3))
-        fits = axes in ('xyz', 'xy') or (axes == 'x' and after_spherical and in_line)
+        hinge = axes == 'x' and after_spherical and in_line
         follows = k == 0 or skeleton.parents[s] == segments[k - 1]
-        if not (rotations and straight and fits and follows and skeleton.parents[s] >= 0):
+        fits = (axes in ('xyz', 'xy') or hinge) and follows and skeleton.parents[s] >= 0
+        if not (rotations and straight and fits):
             raise ValueError(
                 f'chain {name} of {skeleton.name} has no closed form at segment '
                 f'{skeleton.segment_names[s]} (rotations {axes!r}); '
                 'use iterative inverse kinematics'
             )
-        own = list(dofs)
-        result.append(
-            _Link(
-                s,
-                skeleton.parents[s],
-                skeleton.mounts[s],
-                float(-end[2]),
-                dofs,
-                skeleton.lower[own],
-                skeleton.upper[own],
+        after_spherical = axes == 'xyz'
+        lengths.append(float(-end[2]))
+        # The two solutions differ in the sign of sin e, or in that of cos b.
+        bend = dofs[0] if hinge else dofs[1]
+        sides.append(_signs(skeleton.lower[bend], skeleton.upper[bend], hinge))
+        if not any(sides[-1]):
+            raise ValueError(
+                f'{skeleton.dof_names[bend]} of {skeleton.name} has limits that no angle satisfies'
             )
-        )
-    return tuple(result)
+    which = list(segments)
+    own = [j for s in segments for j in skeleton.segment_dofs[s]]
+    counts = [len(skeleton.segment_dofs[s]) for s in segments]
+    return _Chain(
+        np.array(which, dtype=np.int64),
+        int(skeleton.parents[segments[0]]),
+        skeleton.mounts[which],
+        np.array([not np.array_equal(mount, np.eye(3)) for mount in skeleton.mounts[which]]),
+        np.array(lengths),
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        np.array(own, dtype=np.int64),
+        skeleton.lower[own],
+        skeleton.upper[own],
+        np.array(sides),
+    )
 
 
-def _leaves(
-    frames: Frames, poses: Array, links: tuple[_Link, ...]
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Angles (leaves, chain dofs, N) and validity (leaves, N); leaf 0 is the given pose."""
-    targets = [frames.origins[k.segment] - k.length * frames.columns[k.segment, 2] for k in links]
-    positions, valid = _positions(frames, links, targets)
-    angles, reachable = _joint_angles(frames, poses, links, positions)
-    valid &= reachable
-    valid[0] = True
-    own = [j for link in links for j in link.dofs]
-    angles[0] = poses[:, own].T
+def _signs(lower: float, upper: float, sine: bool) -> list[bool]:
+    """Whether angles within the limits give the sine, or the cosine, a sign: first +, then -."""
+    samples = np.linspace(lower, min(upper, lower + TURN), 721)
+    values = np.sin(samples) if sine else np.cos(samples)
+    return [bool(np.any(values > 1e-6)), bool(np.any(values < -1e-6))]
+
+
+def _leaves(frames: Frames, poses: Array, chain: _Chain) -> tuple[Array, NDArray[np.bool_]]:
+    """Angles (N, leaves, chain dofs) and validity (N, leaves); leaf 0 is the given pose."""
+    angles, valid = _grown(frames, poses, chain, _ends(frames, chain), 0.0)
+    valid[:, 0] = True
+    angles[:, 0] = poses[:, chain.dofs]
     return angles, valid
 
 
-def _positions(
-    frames: Frames, links: tuple[_Link, ...], targets: list[Array], slack: float = 0.0
-) -> tuple[list[Array], NDArray[np.bool_]]:
-    """Joint positions after 0, 1, ... links, (2^k, 3, N) each, and which of the last exist.
+def _ends(frames: Frames, chain: _Chain) -> Array:
+    """Where the links of a chain end, (K, 3, N)."""
+    lengths = chain.lengths[:, None, None]
+    ends: Array = frames.origins[chain.segments] - lengths * frames.columns[chain.segments, 2]
+    return ends
+
+
+def _grown(
+    frames: Frames, poses: Array, chain: _Chain, targets: Array, slack: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Leaves of the trees of one chain.
 
     Args:
         frames: where the chain starts.
-        links: of the chain.
-        targets: (3, N) points on the rays of the joints; without slack those of the given pose,
+        poses: (N, d) of the frames; the angles nearest to theirs are taken.
+        chain: the links.
+        targets: (K, 3, N) points on the rays of the joints; without slack those of the given pose,
             whose own positions come out first.
         slack: a ray that misses its sphere by less touches it, m.
+
+    Returns:
+        angles (N, 2^K, D), undefined where there is no leaf, and where there is one (N, 2^K).
     """
-    start = frames.origins[links[0].segment]
-    result = [start[None]]
-    valid = np.ones((1, frames.count), dtype=bool)
-    given = start
-    for link, target in zip(links, targets, strict=True):
-        distance = np.sqrt((target * target).sum(0))
-        ray = target / distance
-        # The given pose takes the far solution where its joint lies beyond the foot of the parent.
-        own_sign = np.where(distance >= (ray * given).sum(0), 1.0, -1.0)
-        parent = result[-1]
-        along = (parent * ray).sum(1)
-        discriminant = along * along - (parent * parent).sum(1) + link.length**2
-        root = np.sqrt(np.maximum(discriminant, 0.0))
-        s = np.stack([along + own_sign * root, along - own_sign * root], axis=1)
-        near_enough = discriminant >= link.length**2 - (link.length + slack) ** 2
-        hit = near_enough[:, None] & (s > 0) & valid[:, None]
-        hit[:, 1] &= root > 0.5 * TOUCHING
-        if slack == 0:
-            # The given pose itself stays, however the rounding of its discriminant turns out.
-            s[0, 0] = distance
-            hit[0, 0] = True
-        points = s[:, :, None] * ray
-        if slack > 0:
-            # A joint put on the nearest point of a ray that misses keeps the length of its link.
-            away = points - parent[:, None]
-            away *= link.length / np.maximum(np.sqrt((away * away).sum(2)), 1e-9)[:, :, None]
-            points = parent[:, None] + away
-        result.append(points.reshape(-1, 3, frames.count))
-        valid = hit.reshape(-1, frames.count)
-        given = target
-    return result, valid
-
-
-def _joint_angles(
-    frames: Frames, poses: Array, links: tuple[_Link, ...], positions: list[Array]
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Joint angles (leaves, dofs, N) that put the joints where they are, nearest the given pose."""
-    leaves, n = len(positions[-1]), frames.count
-    columns = frames.columns[links[0].parent][None]  # (leaves or 1, 3, 3, N)
-    angles = np.empty((leaves, sum(len(link.dofs) for link in links), n))
-    valid = np.ones((leaves, n), dtype=bool)
-    at = 0
-    for k, link in enumerate(links):
-        z = (positions[k].repeat(2, axis=0) - positions[k + 1]) / link.length
-        if not np.array_equal(link.mount, np.eye(3)):
-            columns = np.einsum('lixn,ij->ljxn', columns, link.mount)
-        count = len(z)
-        columns = np.broadcast_to(columns, (max(len(columns), 1), 3, 3, n))
-        if len(columns) < count:
-            columns = columns.repeat(count // len(columns), axis=0)
-        v = (columns * z[:, None]).sum(2)  # (leaves so far, 3, N)
-        given = poses[:, list(link.dofs)].T
-        solution: tuple[Array, ...]
-        if link.kind == 'hinge':
-            previous = links[k - 1]
-            last = previous.dofs[2]
-            c, e, fits = _hinge(v, poses[:, last], given[0], previous, link)
-            # Until here the twist of the spherical joint was left out of the frame.
-            if k + 1 < len(links):
-                columns = _turn(_turn(columns, c, 2), e, 0)
-            repeat = leaves // count
-            angles[:, at - 1] = c.repeat(repeat, axis=0)
-            solution = (e,)
-        else:
-            a, b, fits = _two_angles(v, given, link)
-            if k + 1 < len(links):
-                columns = _turn(_turn(columns, a, 0), b, 1)
-            solution = (a, b)
-            if link.kind == 'spherical':
-                solution = (a, b, np.broadcast_to(given[2], a.shape))
-                followed = k + 1 < len(links) and links[k + 1].kind == 'hinge'
-                if k + 1 < len(links) and not followed:
-                    columns = _turn(columns, solution[2], 2)
-        repeat = leaves // count
-        for value in solution:
-            angles[:, at] = value.repeat(repeat, axis=0)
-            at += 1
-        valid &= fits.repeat(repeat, axis=0)
+    count = 2 ** len(chain.lengths)
+    angles = np.empty((len(poses), count, len(chain.dofs)))
+    valid = np.zeros((len(poses), count), dtype=np.bool_)
+    _grow(chain, frames.columns, frames.origins, poses, targets, float(slack), angles, valid)
     return angles, valid
 
 
-def _two_angles(v: Array, given: Array, link: _Link) -> tuple[Array, Array, NDArray[np.bool_]]:
+@njit(cache=True, nogil=True, error_model='numpy')
+def _grow(  # type: ignore[no-untyped-def]
+    chain, columns, origins, poses, targets, slack, angles, valid
+):
+    """Fills angles and validity, pose by pose, depth first: dead branches have no leaves to visit.
+
+    The bits of a leaf's number, highest first, say which of the two solutions each link takes.
+    """
+    count = len(chain.lengths)
+    leaves = 1 << count
+    rays, distances, signs = np.empty((count, 3)), np.empty(count), np.empty(count)
+    # Of the branch at hand: the joints, the frames that the links turn from, and the angles.
+    joints, frames = np.empty((count + 1, 3)), np.empty((count + 1, 3, 3))
+    given, found = np.empty(len(chain.dofs)), np.empty(len(chain.dofs))
+    for n in range(len(poses)):
+        for j in range(len(given)):
+            given[j] = poses[n, chain.dofs[j]]
+        for x in range(3):
+            joints[0, x] = origins[chain.segments[0], x, n]
+            for i in range(3):
+                frames[0, i, x] = columns[chain.parent, i, x, n]
+        p0, p1, p2 = joints[0, 0], joints[0, 1], joints[0, 2]
+        for k in range(count):
+            t0, t1, t2 = targets[k, 0, n], targets[k, 1, n], targets[k, 2, n]
+            distance = np.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+            r0, r1, r2 = t0 / distance, t1 / distance, t2 / distance
+            rays[k, 0], rays[k, 1], rays[k, 2], distances[k] = r0, r1, r2, distance
+            # The given pose takes the far solution where its joint lies beyond the foot of the
+            # parent.
+            signs[k] = 1.0 if distance >= r0 * p0 + r1 * p1 + r2 * p2 else -1.0
+            p0, p1, p2 = t0, t1, t2
+        leaf = k = 0
+        while leaf < leaves:
+            while k < count:
+                branch = leaf >> (count - 1 - k)
+                if not _put_joint(chain, k, branch, rays, distances, signs, slack, joints):
+                    break
+                if not _bend_joint(chain, k, joints, given, frames, found):
+                    break
+                k += 1
+            if k == count:
+                valid[n, leaf] = True
+                for j in range(len(found)):
+                    angles[n, leaf, j] = found[j]
+                k -= 1
+            # On to the second solution of the last link that has not yet had it.
+            leaf = ((leaf >> (count - 1 - k)) + 1) << (count - 1 - k)
+            k = count - 1
+            while k > 0 and not (leaf >> (count - 1 - k)) & 1:
+                k -= 1
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _put_joint(  # type: ignore[no-untyped-def]
+    chain, k, branch, rays, distances, signs, slack, joints
+):
+    """Places the end of link k onto its ray; False where it can not be there."""
+    p0, p1, p2 = joints[k, 0], joints[k, 1], joints[k, 2]
+    r0, r1, r2, length = rays[k, 0], rays[k, 1], rays[k, 2], chain.lengths[k]
+    if branch == 0 and slack == 0.0:
+        # The given pose itself stays, however the rounding of its discriminant turns out.
+        s = distances[k]
+    else:
+        along = p0 * r0 + p1 * r1 + p2 * r2
+        discriminant = along * along - (p0 * p0 + p1 * p1 + p2 * p2) + length * length
+        if not discriminant >= length * length - (length + slack) * (length + slack):
+            return False
+        root = np.sqrt(max(discriminant, 0.0))
+        s = along + signs[k] * root
+        if branch & 1:
+            if root <= 0.5 * TOUCHING:
+                return False
+            s = along - signs[k] * root
+        if not s > 0.0:
+            return False
+    x0, x1, x2 = s * r0, s * r1, s * r2
+    if slack > 0.0:
+        # A joint put on the nearest point of a ray that misses keeps the length of its link.
+        a0, a1, a2 = x0 - p0, x1 - p1, x2 - p2
+        scale = length / max(np.sqrt(a0 * a0 + a1 * a1 + a2 * a2), 1e-9)
+        x0, x1, x2 = p0 + scale * a0, p1 + scale * a1, p2 + scale * a2
+    joints[k + 1, 0], joints[k + 1, 1], joints[k + 1, 2] = x0, x1, x2
+    return True
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _bend_joint(chain, k, joints, given, frames, found):  # type: ignore[no-untyped-def]
+    """Angles that point link k at its joint, and the frame beyond; False where no limits allow."""
+    at = chain.first_dofs[k]
+    dofs = chain.first_dofs[k + 1] - at
+    inner = k + 1 < len(chain.lengths)
+    length = chain.lengths[k]
+    z0 = (joints[k, 0] - joints[k + 1, 0]) / length
+    z1 = (joints[k, 1] - joints[k + 1, 1]) / length
+    z2 = (joints[k, 2] - joints[k + 1, 2]) / length
+    # The frame beyond the mount is built where the next link looks for its own.
+    if chain.mounted[k]:
+        for i in range(3):
+            for x in range(3):
+                total = 0.0
+                for j in range(3):
+                    total += frames[k, j, x] * chain.mounts[k, j, i]
+                frames[k + 1, i, x] = total
+    else:
+        for i in range(3):
+            for x in range(3):
+                frames[k + 1, i, x] = frames[k, i, x]
+    frame = k + 1
+    v0 = frames[frame, 0, 0] * z0 + frames[frame, 0, 1] * z1 + frames[frame, 0, 2] * z2
+    v1 = frames[frame, 1, 0] * z0 + frames[frame, 1, 1] * z1 + frames[frame, 1, 2] * z2
+    v2 = frames[frame, 2, 0] * z0 + frames[frame, 2, 1] * z1 + frames[frame, 2, 2] * z2
+    if dofs == 1:
+        c, e, fits = _hinge(chain, k, v0, v1, v2, given)
+        # Until here the twist of the spherical joint was left out of the frame.
+        found[at - 1], found[at] = c, e
+        if inner and fits:
+            _turn(frames, frame, c, 2)
+            _turn(frames, frame, e, 0)
+        return fits
+    a, b, fits = _two_angles(chain, k, v0, v1, v2, given)
+    found[at], found[at + 1] = a, b
+    if inner and fits:
+        _turn(frames, frame, a, 0)
+        _turn(frames, frame, b, 1)
+    if dofs == 3:
+        found[at + 2] = given[at + 2]
+        if inner and fits and chain.first_dofs[k + 2] - chain.first_dofs[k + 1] != 1:
+            _turn(frames, frame, given[at + 2], 2)
+    return fits
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _two_angles(chain, k, v0, v1, v2, given):  # type: ignore[no-untyped-def]
     """a and b of v = (sin b, -sin a cos b, cos a cos b), within limits and nearest the given."""
-    b_first = np.arcsin(np.clip(v[:, 0], -1.0, 1.0))
-    best: tuple[Array, Array, NDArray[np.bool_]] | None = None
-    for b, side in ((b_first, 1.0), (np.pi - b_first, -1.0)):
-        if not _possible(float(link.lower[1]), float(link.upper[1]), np.cos, side):
+    i = chain.first_dofs[k]
+    j = i + 1
+    first = np.arcsin(min(max(v0, -1.0), 1.0))
+    free = np.sqrt(v1 * v1 + v2 * v2) < STRAIGHT
+    best_a, best_b, best_cost = given[i], given[j], np.inf
+    found = False
+    for solution in range(2):
+        if not chain.sides[k, solution]:
             continue
-        a = np.arctan2(-side * v[:, 1], side * v[:, 2])
+        side = 1.0 - 2.0 * solution
+        b = first if solution == 0 else np.pi - first
         # cos b = 0: the first angle has no effect on the segment; keep it.
-        a = np.where(np.hypot(v[:, 1], v[:, 2]) < STRAIGHT, given[0], a)
-        a, fits_a = _into_limits(a, link.lower[0], link.upper[0], given[0])
-        b, fits_b = _into_limits(b, link.lower[1], link.upper[1], given[1])
-        best = _nearer(best, (a, b, fits_a & fits_b), given[:2])
-    if best is None:
-        raise ValueError('a joint has limits that no angle satisfies')
-    return best
+        a = given[i] if free else np.arctan2(-side * v1, side * v2)
+        a, fits_a = _into_limits(a, chain.lower[i], chain.upper[i], given[i])
+        b, fits_b = _into_limits(b, chain.lower[j], chain.upper[j], given[j])
+        cost = (a - given[i]) ** 2 + (b - given[j]) ** 2
+        if fits_a and fits_b and cost < best_cost:
+            best_a, best_b, best_cost, found = a, b, cost, True
+    return best_a, best_b, found
 
 
-def _hinge(
-    w: Array, given_c: Array, given_e: Array, spherical: _Link, link: _Link
-) -> tuple[Array, Array, NDArray[np.bool_]]:
+@njit(cache=True, nogil=True, error_model='numpy')
+def _hinge(chain, k, w0, w1, w2, given):  # type: ignore[no-untyped-def]
     """c and e of w = (sin c sin e, -cos c sin e, cos e), within limits and nearest the given."""
-    bent = np.arccos(np.clip(w[:, 2], -1.0, 1.0))
-    across = np.hypot(w[:, 0], w[:, 1])
-    best: tuple[Array, Array, NDArray[np.bool_]] | None = None
-    for e, side in ((bent, 1.0), (-bent, -1.0)):
-        if not _possible(float(link.lower[0]), float(link.upper[0]), np.sin, side):
+    j = chain.first_dofs[k]
+    i = j - 1
+    bent = np.arccos(min(max(w2, -1.0), 1.0))
+    free = np.sqrt(w0 * w0 + w1 * w1) < STRAIGHT
+    best_c, best_e, best_cost = given[i], given[j], np.inf
+    found = False
+    for solution in range(2):
+        if not chain.sides[k, solution]:
             continue
-        c = np.arctan2(side * w[:, 0], -side * w[:, 1])
-        c = np.where(across < STRAIGHT, given_c, c)
-        c, fits_c = _into_limits(c, spherical.lower[2], spherical.upper[2], given_c)
-        e, fits_e = _into_limits(e, link.lower[0], link.upper[0], given_e)
-        best = _nearer(best, (c, e, fits_c & fits_e), np.stack([given_c, given_e]))
-    if best is None:
-        raise ValueError('a joint has limits that no angle satisfies')
-    return best
+        side = 1.0 - 2.0 * solution
+        c = given[i] if free else np.arctan2(side * w0, -side * w1)
+        c, fits_c = _into_limits(c, chain.lower[i], chain.upper[i], given[i])
+        e, fits_e = _into_limits(side * bent, chain.lower[j], chain.upper[j], given[j])
+        cost = (c - given[i]) ** 2 + (e - given[j]) ** 2
+        if fits_c and fits_e and cost < best_cost:
+            best_c, best_e, best_cost, found = c, e, cost, True
+    return best_c, best_e, found
 
 
-@lru_cache(maxsize=1024)
-def _possible(lower: float, upper: float, function: np.ufunc, side: float) -> bool:
-    """Whether an angle within the limits gives the function (sin or cos) this sign."""
-    samples = np.linspace(lower, min(upper, lower + 2 * np.pi), 721)
-    return bool(np.any(side * function(samples) > 1e-6))
-
-
-def _into_limits(
-    angle: Array, lower: float, upper: float, given: Array
-) -> tuple[Array, NDArray[np.bool_]]:
+@njit(cache=True, nogil=True, error_model='numpy')
+def _into_limits(angle, lower, upper, given):  # type: ignore[no-untyped-def]
     """The angle plus the multiple of 2 pi that fits the limits; if several, nearest the given."""
-    turn = 2 * np.pi
-    shifted = angle + turn * np.round((given - angle) / turn)
-    shifted = np.where(shifted < lower - LIMIT_TOLERANCE, shifted + turn, shifted)
-    shifted = np.where(shifted > upper + LIMIT_TOLERANCE, shifted - turn, shifted)
-    fits = (shifted >= lower - LIMIT_TOLERANCE) & (shifted <= upper + LIMIT_TOLERANCE)
-    return np.clip(shifted, lower, upper), fits
+    shifted = angle + TURN * np.rint((given - angle) / TURN)
+    if shifted < lower - LIMIT_TOLERANCE:
+        shifted += TURN
+    if shifted > upper + LIMIT_TOLERANCE:
+        shifted -= TURN
+    fits = lower - LIMIT_TOLERANCE <= shifted <= upper + LIMIT_TOLERANCE
+    return min(max(shifted, lower), upper), fits
 
 
-def _nearer(
-    best: tuple[Array, Array, NDArray[np.bool_]] | None,
-    other: tuple[Array, Array, NDArray[np.bool_]],
-    given: Array,
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Of two solutions the one that fits the limits, else the one nearer the given angles."""
-    if best is None:
-        return other
-    here, there = (
-        np.where(fits, 0.0, 1e6) + (x - given[0]) ** 2 + (y - given[1]) ** 2
-        for x, y, fits in (best, other)
-    )
-    first = here <= there
-    return (
-        np.where(first, best[0], other[0]),
-        np.where(first, best[1], other[1]),
-        np.where(first, best[2], other[2]),
-    )
-
-
-def _turn(columns: Array, angle: Array, axis: int) -> Array:
-    """Frames (leaves, 3, 3, N) turned about one of their own axes by angles (leaves, N)."""
+@njit(cache=True, nogil=True, error_model='numpy')
+def _turn(frames, k, angle, axis):  # type: ignore[no-untyped-def]
+    """Turns frame k of (K, 3, 3) about one of its own axes."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
-    cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    result = columns.copy()
-    result[:, i] = cos * columns[:, i] + sin * columns[:, j]
-    result[:, j] = cos * columns[:, j] - sin * columns[:, i]
-    return result
+    cos, sin = np.cos(angle), np.sin(angle)
+    for x in range(3):
+        a, b = frames[k, i, x], frames[k, j, x]
+        frames[k, i, x] = cos * a + sin * b
+        frames[k, j, x] = cos * b - sin * a

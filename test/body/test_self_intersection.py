@@ -210,3 +210,12 @@ def test_one_part_overlaps_nothing(small, random_poses):
     assert (gradient.shape, hessian.shape) == ((3, 32), (3, 32, 32))
     assert not gradient.any()
     assert not hessian.any()
+
+
+def test_a_skeleton_without_flesh_costs_nothing(small, random_poses):
+    bare = replace(small, shapes=(), widths=())
+    value, gradient, hessian = energy_of(bare, random_poses(small, 3, 8))
+    assert np.array_equal(value, np.zeros(3))
+    assert (gradient.shape, hessian.shape) == ((3, 32), (3, 32, 32))
+    assert not gradient.any()
+    assert not hessian.any()

@@ -82,9 +82,7 @@ def test_a_lens_bends_the_pixels(shot, poses, intensity):
     fisheye = Camera(
         c.fx, c.fy, c.cx, c.cy, c.width, c.height, (0.02, -0.01, 0.003, 0.001), 'equidistant'
     )
-    textures = capture_textures(
-        shot.body, fisheye, forward(shot.body.skeleton, poses), intensity
-    )
+    textures = capture_textures(shot.body, fisheye, forward(shot.body.skeleton, poses), intensity)
     segments, local, pixels, _ = used(textures, 0)
     places = in_space(shot.body, poses[0], segments, local)
     assert np.abs(fisheye.project(places) - pixels).max() < 1e-9

@@ -107,8 +107,8 @@ def test_every_heading(human32, camera, keypoints_of, walk, turn):
     assert error.min() < 0.05
 
 
-@pytest.mark.parametrize('stature', [1.5])
-def test_a_stature_stands_for_unknown_lengths(human32, camera, keypoints_of, walk, stature):
+def test_a_stature_stands_for_unknown_lengths(human32, camera, keypoints_of, walk):
+    stature = 1.5
     person = human32.with_stature(stature)
     subject = Subject(0, exact(keypoints_of, person, walk[0]), {}, stature)
     start = start_from_keypoints(human32, camera, subject)

@@ -64,8 +64,7 @@ def test_choice_is_near_the_best_of_all_subsets(seed):
     first = int(np.argmax(weights))
     base = objective(joints, weights, [first])
     best = min(
-        objective(joints, weights, [first, *more])
-        for more in itertools.combinations(range(10), 3)
+        objective(joints, weights, [first, *more]) for more in itertools.combinations(range(10), 3)
     )
     found = objective(joints, weights, list(kept.chosen))
     assert best <= found + 1e-15
@@ -181,9 +180,7 @@ def test_modes_that_did_not_move_keep_their_weights():
     weights = np.array([0.3, 0.25, 0.2, 0.15, 0.07, 0.03])
     mixture = GaussianMixture(weights, means, covariances)
     shuffled = np.array([4, 2, 0, 5, 1, 3])
-    found = inherited_log_weights(
-        means[shuffled], covariances[shuffled], np.arange(6), mixture
-    )
+    found = inherited_log_weights(means[shuffled], covariances[shuffled], np.arange(6), mixture)
     assert np.allclose(np.exp(found), weights[shuffled], rtol=1e-12)
 
 

@@ -41,9 +41,7 @@ def test_a_whole_file(body, tmp_path):
     assert isinstance(subject, Subject)
     assert subject.stamp_ns == 1700000000123456789
     assert subject.keypoints.names == ('head', 'neck', 'left_hip', 'right_hip')
-    assert np.array_equal(
-        subject.keypoints.pixels, [[150, 20.5], [151, 40], [160, 110], [-3, 111]]
-    )
+    assert np.array_equal(subject.keypoints.pixels, [[150, 20.5], [151, 40], [160, 110], [-3, 111]])
     assert np.allclose(subject.keypoints.covariances, 6.25 * np.eye(2), rtol=1e-15)
     assert np.array_equal(subject.keypoints.confidences, np.ones(4))
     assert subject.segment_lengths == {'thigh': 0.4, 'shin': 0.39}
