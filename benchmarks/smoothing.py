@@ -269,7 +269,8 @@ def relations(times: int) -> dict[str, Any]:
     at = np.tile(np.arange(times), len(starts))
     flat = starts.reshape(-1, starts.shape[2])
     before = likelihood.energy(flat, at, Curvature.NONE)[0].reshape(len(starts), -1).sum(1)
-    found = MixtureSmoother(sequence.dynamics, sequence.lower, sequence.upper).smooth(
+    # The weights of VMS to begin with: the heights of the optima.
+    found = MixtureSmoother(sequence.dynamics, sequence.lower, sequence.upper, start='peak').smooth(
         sequence.mixtures
     )
     trace = found.free_energy

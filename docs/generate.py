@@ -3,6 +3,7 @@
     python docs/generate.py parameters     the table of parameters in nodes.md
     python docs/generate.py flips          times in flips.md
     python docs/generate.py kernels        times in likelihood.md
+    python docs/generate.py smoothing      exactness and speed in smoothing.md (minutes)
     python docs/generate.py tracking       accuracy and speed in tracking.md (minutes)
 
 Such a part stands between `<!-- begin NAME -->` and `<!-- end -->`.
@@ -24,6 +25,7 @@ PAGES = {
     'parameters': 'nodes.md',
     'flips': 'flips.md',
     'kernels': 'likelihood.md',
+    'smoothing': 'smoothing.md',
     'tracking': 'tracking.md',
 }
 
@@ -57,9 +59,10 @@ def part(name: str) -> str:
     """The content of a part."""
     if name == 'parameters':
         return parameter_table()
-    from benchmarks import flips, kernels, tracking
+    from benchmarks import flips, kernels, smoothing, tracking
 
-    return {'flips': flips, 'kernels': kernels, 'tracking': tracking}[name].page()
+    pages = {'flips': flips, 'kernels': kernels, 'smoothing': smoothing, 'tracking': tracking}
+    return pages[name].page()
 
 
 def parameter_table() -> str:

@@ -45,6 +45,8 @@ def self_intersection_energy(
 ) -> tuple[Array, Array, Array]:
     """Energy (N,), gradient (N, d) and Gauss-Newton Hessian (N, d, d) of overlapping parts.
 
+    The derivatives are those of the distance: that an elliptic cross-section turns is left out.
+
     Args:
         body: whose parts may not overlap; neighbours along the skeleton are left out.
         frames: of N poses.

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton
 
 Array = NDArray[np.float64]
@@ -48,28 +48,37 @@ def flip_torso(body: Body, poses: ArrayLike) -> tuple[Array, Index]:
     pelvis, neck, left_hip, right_hip, left_shoulder, right_shoulder = torso
     hips, shoulders = right_hip - left_hip, right_shoulder - left_shoulder
     up = neck - pelvis
-    result, parents = [], []
-    for turn_hips, lean, turn_shoulders in itertools.product((False, True), repeat=3):
-        if not (turn_hips or lean or turn_shoulders):
-            continue
-        if len(trunk) < 2 and (lean or turn_shoulders != turn_hips):
-            continue
-        wanted_hips = _turned(hips, pelvis) if turn_hips else hips
-        wanted_up = _leaned(pelvis, neck) if lean else up
-        wanted_shoulders = _turned(shoulders, neck) if turn_shoulders else shoulders
-        change = np.abs(wanted_hips[2] - hips[2]) * turn_hips
-        change = np.maximum(change, np.abs(wanted_up[2] - up[2]))
-        change = np.maximum(change, np.abs(wanted_shoulders[2] - shoulders[2]))
-        new = q.copy()
-        fits = change > SIGNIFICANT
-        if turn_hips:
-            fits &= _turn_root(skeleton, frames, root, wanted_hips, new)
-        if len(trunk) >= 2:
-            fits &= _turn_trunk(skeleton, trunk, wanted_up, wanted_shoulders, new)
-        result.append(new[fits])
-        parents.append(np.flatnonzero(fits))
-    order = np.argsort(np.concatenate(parents), kind='stable')
-    return np.concatenate(result)[order], np.concatenate(parents)[order]
+    # All F flips of all poses at once: a batch of N F, pose by pose.
+    turn_hips, lean, turn_shoulders = np.array(_flips(len(trunk))).T
+    wanted_hips = _chosen(turn_hips, _turned(hips, pelvis), hips)
+    wanted_up = _chosen(lean, _leaned(pelvis, neck), up)
+    wanted_shoulders = _chosen(turn_shoulders, _turned(shoulders, neck), shoulders)
+    parents = np.repeat(np.arange(len(q)), len(lean))
+    change = np.abs(wanted_hips[2] - hips[2, parents])
+    change = np.maximum(change, np.abs(wanted_up[2] - up[2, parents]))
+    change = np.maximum(change, np.abs(wanted_shoulders[2] - shoulders[2, parents]))
+    result = q[parents]
+    fits = change > SIGNIFICANT
+    turned = np.flatnonzero(np.tile(turn_hips, len(q)))
+    new = result[turned]
+    z = frames.columns[0, 2][:, parents[turned]]
+    fits[turned] &= _turn_root(skeleton, z, root, wanted_hips[:, turned], new)
+    result[turned] = new
+    if len(trunk) >= 2:
+        fits &= _turn_trunk(skeleton, trunk, wanted_up, wanted_shoulders, result)
+    return result[fits], parents[fits]
+
+
+def _flips(trunk_dofs: int) -> list[tuple[bool, bool, bool]]:
+    """Whether the hips turn, the torso leans and the shoulders turn, in all ways there are."""
+    return [
+        (turn_hips, lean, turn_shoulders)
+        for turn_hips, lean, turn_shoulders in itertools.product((False, True), repeat=3)
+        if (turn_hips or lean or turn_shoulders)
+        # Without a twist the shoulders turn with the hips.
+        and (trunk_dofs >= 3 or turn_shoulders == turn_hips)
+        and (trunk_dofs >= 2 or not lean)
+    ]
 
 
 def _root_dofs(skeleton: Skeleton) -> tuple[int, ...] | None:
@@ -88,6 +97,12 @@ def _trunk_dofs(skeleton: Skeleton) -> tuple[int, ...] | None:
     return own if axes in ('', 'xy', 'xyz') else None
 
 
+def _chosen(flips: NDArray[np.bool_], flipped: Array, given: Array) -> Array:
+    """Vectors (3, N F), pose by pose: those of (3, N) that some of the flips (F,) change."""
+    result: Array = np.where(flips, flipped[:, :, None], given[:, :, None]).reshape(3, -1)
+    return result
+
+
 def _turned(line: Array, at: Array) -> Array:
     """A line (3, N) with its component along the ray to a point reversed."""
     ray = at / np.sqrt((at * at).sum(0))
@@ -104,11 +119,10 @@ def _leaned(start: Array, end: Array) -> Array:
 
 
 def _turn_root(
-    skeleton: Skeleton, frames: Frames, dofs: tuple[int, ...], hips: Array, poses: Array
+    skeleton: Skeleton, z: Array, dofs: tuple[int, ...], hips: Array, poses: Array
 ) -> NDArray[np.bool_]:
-    """Turns the root so that its x axis follows the hips and its z axis stays as near as it can."""
+    """Turns the root: its x axis follows the hips, its z axis stays as near to z as it can."""
     x = hips / np.sqrt((hips * hips).sum(0))
-    z = frames.columns[0, 2]
     z = z - (z * x).sum(0) * x
     z = z / np.maximum(np.sqrt((z * z).sum(0)), 1e-9)
     y = np.cross(z, x, axis=0)

@@ -149,14 +149,21 @@ def _steps(
     x: Array, gradient: Array, hessian: Array, lower: Array, upper: Array, lam: Array, metric: Array
 ) -> tuple[Array, Array]:
     """Damped Newton steps, projected onto the box, and the decrease that the model predicts."""
-    step = np.empty_like(x)
-    for i in range(len(x)):
-        step[i], lam[i] = _box_step(
-            gradient[i], hessian[i], lower[i] - x[i], upper[i] - x[i], lam[i], metric
-        )
+    low, high = lower - x, upper - x
+    resting = _resting(x, gradient, lower, upper)
+    step = -gradient
+    damped = hessian.copy()
+    damped.reshape(len(x), -1)[:, :: x.shape[1] + 1] += lam[:, None] * metric
+    # Most steps stay inside the box; only the others need an active set.
+    inside = np.logical_not(resting.any(axis=1))
+    for i in np.flatnonzero(inside):
+        _, step[i], info = dposv(damped[i], step[i], overwrite_a=True)
+        inside[i] = info == 0
+    inside &= ((step >= low) & (step <= high)).all(1)
+    for i in np.flatnonzero(~inside):
+        step[i], lam[i] = _box_step(gradient[i], hessian[i], low[i], high[i], lam[i], metric)
     curvature = np.einsum('ni,nij,nj->n', step, hessian, step)
     predicted = -(np.einsum('ni,ni->n', gradient, step) + 0.5 * curvature)
-    resting = _resting(x, gradient, lower, upper)
     for k in np.flatnonzero(predicted <= 0):
         downhill = np.where(resting[k], 0.0, -gradient[k])
         step[k], predicted[k] = _gradient_step(

@@ -104,6 +104,8 @@ def _choose(joints, weights, count, same, cap):  # type: ignore[no-untyped-def]
             best = int(np.argmax(weights))
         else:
             for c in range(n):
+                if nearest[c] == 0.0:
+                    continue  # the same as one that is kept
                 gain = 0.0
                 for i in range(n):
                     if distance[i, c] < nearest[i]:

@@ -16,6 +16,7 @@ from hmt_ros.image.observation import Keypoints
 Array = NDArray[np.float64]
 
 LARGEST_FILE = 1_000_000  # bytes
+LARGEST_PIXEL = 1e5
 KEYS = ('stamp_ns', 'sigma_px', 'keypoints', 'segment_lengths_m', 'stature_m')
 
 
@@ -56,10 +57,14 @@ def read_subject(path: str | Path, body: Body) -> Subject:
             raise SubjectError(
                 f'{path}: {path.stat().st_size} bytes, a subject file is far smaller'
             )
-        content = yaml.safe_load(path.read_text('utf-8'))
+        text = path.read_text('utf-8')
     except OSError as fault:
         raise SubjectError(f'{path}: can not be read ({fault.strerror})') from fault
-    except (yaml.YAMLError, UnicodeDecodeError) as fault:
+    except UnicodeDecodeError as fault:
+        raise SubjectError(f'{path}: not YAML ({fault})') from fault
+    try:
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as fault:
         raise SubjectError(f'{path}: not YAML ({" ".join(str(fault).split())})') from fault
     try:
         return parse_subject(content, body)
@@ -121,7 +126,8 @@ def _pixel(name: str, value: Any) -> tuple[float, float]:
     if (
         isinstance(value, (list, tuple))
         and len(value) == 2
-        and all(isinstance(x, (int, float)) and np.isfinite(x) for x in value)
+        and all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in value)
+        and all(abs(x) < LARGEST_PIXEL for x in value)
     ):
         return float(value[0]), float(value[1])
     raise SubjectError(f'keypoint {name} must be [u, v] in pixels, saw {value!r}')

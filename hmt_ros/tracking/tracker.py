@@ -57,6 +57,8 @@ REWEIGHTINGS = ('ancestry', 'bhattacharyya')
 UNEXPLAINED = 4.0
 # Keypoints from which a lost track starts anew.
 FEWEST_KEYPOINTS = 6
+# Largest standard deviation of a mode: where an image shows nothing, rad or m.
+WIDEST = 2.0
 # How far the usual energy follows that of the last image.
 USUAL_GAIN = 0.1
 PAIRS = (('left_arm', 'right_arm'), ('left_leg', 'right_leg'))
@@ -151,6 +153,13 @@ class TrackerSettings:
                 f'wanted 1 <= max_hypotheses <= candidates, saw {self.max_hypotheses} and '
                 f'{self.candidates}'
             )
+        least = {'samples': 1, 'rounds': 1, 'iterations': 1, 'base_iterations': 1, 'lost_images': 1}
+        least |= {'combinations': 1, 'alternatives': 1, 'temperature': 0, 'exploration': 0}
+        for name, bound in least.items():
+            if not getattr(self, name) >= bound:
+                raise ValueError(f'{name} must be at least {bound}, saw {getattr(self, name)}')
+        if not self.tails > 0:
+            raise ValueError(f'tails must be positive, saw {self.tails}')
         if not 0 < self.jump_probability < 1:
             raise ValueError(f'jump_probability must lie in (0, 1), saw {self.jump_probability}')
 
@@ -501,7 +510,17 @@ class Tracker:
         energy = self._posterior_energy(
             observation, c.parents, c.centres, precisions, c.textures, c.texture_rows
         )
-        return self._minimise(energy, c.poses, self.settings.iterations)
+        solved = self._minimise(energy, c.poses, self.settings.iterations)
+        # The Student prior is as sharp as its covariance on average, not at its centre.
+        own = precisions[c.parents]
+        shrink = self._student_shrinkage(solved.x - c.centres, own)
+        return replace(solved, hessian=solved.hessian - (shrink - 1.0)[:, None, None] * own)
+
+    def _student_shrinkage(self, offset: Array, precisions: Array) -> Array:
+        """Curvature of the Student prior over that of the Gaussian with the same covariance."""
+        nu, d = self.settings.tails, self.body.dimension
+        distance = np.einsum('ni,nij,nj->n', offset, precisions, offset)
+        return np.asarray((nu + d) / (nu + distance), dtype=np.float64)
 
     def _search_around(
         self,
@@ -1053,12 +1072,14 @@ def _resting(poses: Array, gradient: Array, body: Body) -> NDArray[np.bool_]:
 def _covariances(hessians: Array, free: NDArray[np.bool_]) -> Array:
     """Inverse Hessians on the free variables.
 
-    A variable at its limit has a deviation of 3 degrees.
+    A variable at its limit has a deviation of 3 degrees, and none one above `WIDEST`.
     """
     h = hessians.copy()
     rows, dofs = np.nonzero(~free)
     h[rows, dofs, :] = 0.0
     h[rows, :, dofs] = 0.0
     h[rows, dofs, dofs] = 0.05**-2.0
+    diagonal = np.arange(h.shape[1])
+    h[:, diagonal, diagonal] += WIDEST**-2.0
     result = np.linalg.inv(0.5 * (h + h.transpose(0, 2, 1)))
     return 0.5 * (result + result.transpose(0, 2, 1))

@@ -211,3 +211,13 @@ def test_bodies_without_a_torso_have_no_flips(twisting):
     flips, parents = flip_torso(replace(twisting, skeleton=renamed), turned_people(twisting, 3, 8))
     assert flips.shape == (0, twisting.dimension)
     assert parents.shape == (0,)
+
+
+def test_flips_of_a_torso_that_does_not_twist_are_distinct():
+    body = load_body('human34')
+    pose = np.zeros((1, 34))
+    pose[0, 2], pose[0, 3], pose[0, 6] = 3.0, 0.5, -0.3
+    flips, _ = flip_torso(body, pose)
+    everything = np.concatenate([pose, flips])
+    gaps = np.abs(everything[:, None] - everything[None]).max(2)
+    assert gaps[~np.eye(len(everything), dtype=bool)].min() > 1e-6

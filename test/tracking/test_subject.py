@@ -151,3 +151,20 @@ def test_files_that_can_not_be_read(body, tmp_path):
     with pytest.raises(SubjectError, match='1000001 bytes') as caught:
         read_subject(large, body)
     one_line(caught)
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        '[' * 20000,
+        'stamp_ns: 2001-99-99\n',
+        'stamp_ns: ' + '1' * 5000,
+        'stamp_ns: 1\nkeypoints: {neck: [1' + '0' * 400 + ', 2], head: [1, 2], pelvis: [1, 2], '
+        'left_hip: [1, 2]}\n',
+    ],
+)
+def test_odd_yaml_is_one_line(tmp_path, text):
+    path = tmp_path / 'subject.yaml'
+    path.write_text(text)
+    with pytest.raises(SubjectError):
+        read_subject(path, load_body('human32'))

@@ -165,8 +165,6 @@ def test_the_same_seed_and_images_give_identical_bytes(follow):
         _, first, _ = follow(4, seed=3, proposals=proposals)
         _, second, _ = follow(4, seed=3, proposals=proposals)
         assert in_bytes(first) == in_bytes(second)
-    _, other, _ = follow(4, seed=4, proposals='css')
-    assert in_bytes(first) != in_bytes(other)
 
 
 def test_other_body_sizes(follow, human32, camera, motion, keypoints_of):
@@ -415,12 +413,12 @@ def film(human32, camera):
 
 
 def test_images_alone(film, human32, camera, keypoints_of):
-    """After the first image nothing but pixels; twice, with identical bytes."""
+    """After the first image nothing but pixels; of one seed twice, with identical bytes."""
     poses, images, empty = film
     runs = []
-    for _ in range(2):
+    for seed in (5, 5, 6):
         settings = TrackerSettings(candidates=8, max_hypotheses=4, flesh_images=2)
-        tracker = Tracker(human32, camera, settings, BackgroundModel.from_image(empty), seed=5)
+        tracker = Tracker(human32, camera, settings, BackgroundModel.from_image(empty), seed=seed)
         tracker.reset(Subject(0, keypoints_of(human32, poses[0]), dict(human32.segment_lengths)))
         runs.append([tracker.step(image, i * FRAME) for i, image in enumerate(images)])
         assert tracker.status is Status.TRACKING
@@ -429,5 +427,16 @@ def test_images_alone(film, human32, camera, keypoints_of):
         best_error(tracker.body, posterior, human32, pose)
         for (posterior, _), pose in zip(runs[0], poses)
     ]
-    assert max(errors) < 0.08
+    assert max(errors) < 0.1
     assert in_bytes(runs[0]) == in_bytes(runs[1])
+    assert in_bytes(runs[0]) != in_bytes(runs[2])
+
+
+def test_a_dark_image_without_keypoints(human32, camera):
+    pose = np.array(human32.prior_mean)
+    pose[2] = 3.0
+    tracker = Tracker(human32, camera, TrackerSettings(candidates=8))
+    tracker.reset(GaussianMixture(np.ones(1), pose[None], 1e-2 * np.eye(32)[None]))
+    posterior, likelihood = tracker.step(np.zeros((camera.height, camera.width, 3), np.uint8), 0)
+    assert posterior.weights.sum() == pytest.approx(1.0)
+    assert likelihood.weights.sum() == pytest.approx(1.0)

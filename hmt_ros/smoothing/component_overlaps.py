@@ -1,0 +1,164 @@
+"""The log density of a mixture over trajectories at samples of its own components, with gradients.
+
+    q(X) = sum_j a_j N(X; M_j, s_j^2 P_j^-1),  P_j = L_j L_j'
+
+L_j' is read column by column from the band. Most components are far from each other, and two that
+are
+need not be compared: of the samples of i, those that j is responsible for have at most the
+    probability
+
+    E_i[a_j q_j / (a_i q_i + a_j q_j)] <= (a_j / a_i)^(1/2) / 2 int (q_i q_j)^(1/2)
+
+and the overlap of two trajectories is at most that of their poses at any one time, for Gaussians at
+most exp(-1/4 D'(C_i + C_j)^-1 D). Pairs below exp(-30) are left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Logarithms of overlaps and of densities that make no difference.
+NEGLIGIBLE = 30.0
+
+
+@njit(cache=True, nogil=True, fastmath={'reassoc', 'contract', 'nsz'})
+def add_overlaps(
+    own: int,
+    samples: Array,
+    noise: Array,
+    log_weights: Array,
+    log_scales: Array,
+    means: Array,
+    inflation: Array,
+    bands: Array,
+    near: NDArray[np.bool_],
+    share: float,
+    log_density: Array,
+    gradient: Array,
+    mean_gradient: Array,
+    inflation_gradient: Array,
+    weight_gradient: Array,
+    band_gradient: Array,
+) -> None:
+    """Adds what the samples of one component tell of log q.
+
+    Args:
+        own: which component the samples are from.
+        samples, noise: (S, D) M + s L'^-1 z, and z, with D = T n.
+        log_weights: (M,) log a_j.
+        log_scales: (M,) log |P_j|^(1/2) - D log s_j - D log(2 pi) / 2.
+        means: (M, D).
+        inflation: (M,) s_j.
+        bands: (M, D, width + 1) L_j: [c, r - c] = L[r, c].
+        near: (M,) components that may overlap with `own`.
+        share: weight of a sample in the sums over samples below.
+        log_density: (S,) log q, written.
+        gradient: (S, D) of log q with regard to the sample, written.
+        mean_gradient, inflation_gradient, weight_gradient: (M, D), (M,), (M,); the derivatives of
+            the sum of log q with regard to means, log s and log a at fixed samples are added.
+        band_gradient: (M, D, width + 1), likewise with regard to L, without log |L|; or empty.
+    """
+    count, total = samples.shape
+    components, width = len(means), bands.shape[2]
+    white = np.empty((components, total))
+    delta = np.empty(total + width)
+    delta[total:] = 0.0
+    squares = np.empty(components)
+    logs = np.empty(components)
+    pull = np.empty(total)
+    for s in range(count):
+        best = -np.inf
+        for order in range(components):
+            j = own if order == 0 else (order - 1 if order <= own else order)
+            log = log_weights[j] + log_scales[j]
+            square = 0.0
+            if j == own:
+                for c in range(total):
+                    white[j, c] = noise[s, c]
+                    square += noise[s, c] * noise[s, c]
+                log -= 0.5 * square
+            else:
+                if not near[j]:
+                    logs[j] = -np.inf
+                    continue
+                inverse = 1.0 / inflation[j]
+                for c in range(total):
+                    delta[c] = (samples[s, c] - means[j, c]) * inverse
+                for c in range(total):
+                    y = 0.0
+                    for b in range(width):
+                        y += bands[j, c, b] * delta[c + b]
+                    white[j, c] = y
+                    square += y * y
+                log -= 0.5 * square
+            squares[j] = square
+            logs[j] = log
+            best = max(best, log)
+        density = 0.0
+        for j in range(components):
+            if logs[j] > best - 40.0:
+                logs[j] = np.exp(logs[j] - best)
+                density += logs[j]
+            else:
+                logs[j] = 0.0
+        log_density[s] = best + np.log(density)
+        gradient[s] = 0.0
+        for j in range(components):
+            responsibility = logs[j] / density
+            if responsibility < 1e-15:
+                continue
+            # P (x - M) / s^2 = L (L' (x - M) / s) / s
+            pull[:] = 0.0
+            for c in range(total):
+                y = white[j, c]
+                last = min(width, total - c)
+                for b in range(last):
+                    pull[c + b] += y * bands[j, c, b]
+            factor = responsibility / inflation[j]
+            for c in range(total):
+                move = factor * pull[c]
+                gradient[s, c] -= move
+                mean_gradient[j, c] += share * move
+            if len(band_gradient):
+                for c in range(total):
+                    delta[c] = (samples[s, c] - means[j, c]) / inflation[j]
+                for c in range(total):
+                    y = share * responsibility * white[j, c]
+                    for b in range(min(width, total - c)):
+                        band_gradient[j, c, b] -= y * delta[c + b]
+            inflation_gradient[j] += share * responsibility * (squares[j] - total)
+            weight_gradient[j] += share * responsibility
+
+
+@njit(cache=True, nogil=True)
+def pair_distances(
+    means: Array, covariances: Array, scales: Array, pairs: NDArray[np.int64]
+) -> Array:
+    """(m_i - m_j)' (s_i C_i + s_j C_j)^-1 (m_i - m_j), shape (P,), of pairs (P, 2)."""
+    n = means.shape[1]
+    f = np.empty((n, n))
+    white = np.empty(n)
+    result = np.zeros(len(pairs))
+    for p in range(len(pairs)):
+        i, j = pairs[p]
+        for a in range(n):
+            for b in range(a + 1):
+                f[a, b] = scales[i] * covariances[i, a, b] + scales[j] * covariances[j, a, b]
+            for b in range(a):
+                total = f[a, b]
+                for k in range(b):
+                    total -= f[a, k] * f[b, k]
+                f[a, b] = total * f[b, b]
+            total = f[a, a]
+            offset = means[i, a] - means[j, a]
+            for k in range(a):
+                total -= f[a, k] * f[a, k]
+                offset -= f[a, k] * white[k]
+            f[a, a] = 1.0 / np.sqrt(total)
+            white[a] = offset * f[a, a]
+            result[p] += white[a] * white[a]
+    return result

@@ -1,0 +1,366 @@
+"""The network of likelihood modes: nodes are modes, links are transitions between them (VMS 4).
+
+    node  p(r_t | m_i)  = int p(r_t | x) m_i(x) dx           = sum_j w_j N(mu_i; mu_j, S_i + S_j)
+    link  p(m_j | m_i)  = int int m_j(y) p(y | x) m_i(x)     = N(mu_j; A mu_i, S_j + A S_i A' + Q)
+
+in closed form for Gaussian modes and linear dynamics, by sampling for Student modes and dynamics of
+any other form. Where the state has velocities, the link integrates over what is known of them at
+first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+from scipy.stats import multivariate_t
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.smoothing.dynamics import LinearGaussianDynamics
+from hmt_ros.smoothing.likelihood import check_mixtures
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# Pairs whose covariances are factorised side by side.
+LANES = 4
+# How many parts the pairs are split into; fixed, so that no result depends on the machine.
+PARTS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class EmbeddedNetwork:
+    """Layers of nodes, each connected with the next one.
+
+    Attributes:
+        nodes: T arrays (K_t,), log node values.
+        links: T-1 arrays (K_t, K_{t+1}), log link values.
+    """
+
+    nodes: tuple[Array, ...]
+    links: tuple[Array, ...]
+
+    @property
+    def times(self) -> int:
+        """T."""
+        return len(self.nodes)
+
+    def log_value(self, path: NDArray[np.intp]) -> float:
+        """Sum of the log values along a path (T,)."""
+        total = sum(float(nodes[k]) for nodes, k in zip(self.nodes, path))
+        return total + sum(
+            float(links[i, j]) for links, i, j in zip(self.links, path[:-1], path[1:])
+        )
+
+
+def embedded_network(
+    mixtures: Sequence[GaussianMixture],
+    dynamics: LinearGaussianDynamics,
+    intervals: Array,
+    first: GaussianMixture | None = None,
+) -> EmbeddedNetwork:
+    """The network of Gaussian modes, in closed form.
+
+    Args:
+        mixtures: T mixtures over the pose.
+        dynamics: of the state.
+        intervals: (T-1,) s; (T,) with `first`.
+        first: a density of the state (n variables) at a time before the mixtures; its components
+            are the first layer of nodes.
+
+    Raises:
+        ValueError: mixtures that can not be smoothed.
+    """
+    if first is not None:
+        return _with_first(first, mixtures, dynamics, intervals)
+    check_mixtures(mixtures, factorise=False)
+    d, n = dynamics.dimension, dynamics.state_dimension
+    begin = np.concatenate([[0], np.cumsum([len(mixture) for mixture in mixtures])])
+    means = np.concatenate([mixture.means for mixture in mixtures])
+    covariances = np.concatenate([mixture.covariances for mixture in mixtures])
+    velocity = _velocity_covariance(dynamics)
+    different, which = np.unique(intervals, return_inverse=True)
+
+    # Where every mode is expected at the next time, and how widely.
+    predicted, spread = np.empty_like(means), np.empty_like(covariances)
+    for i, interval in enumerate(different):
+        a, q = dynamics.transition(float(interval))
+        own, other = a[:d, :d], a[:d, d:]
+        noise = q[:d, :d] + other @ velocity @ other.T if n > d else q
+        at: Any = slice(0, begin[-2])
+        if len(different) > 1:
+            at = np.repeat(which == i, np.diff(begin[:-1])).nonzero()[0]
+        if np.array_equal(own, np.eye(d)):
+            predicted[at] = means[at]
+            spread[at] = covariances[at] + noise
+        else:
+            predicted[at] = means[at] @ own.T
+            spread[at] = own @ covariances[at] @ own.T + noise
+
+    # All pairs in one go: the modes of a time with each other, and with those of the next time.
+    within = [_pairs_within(len(mixture)) for mixture in mixtures]
+    node_pairs = np.concatenate([begin[t] + pairs for t, pairs in enumerate(within)], axis=1).T
+    across = [_pairs_across(len(a), len(b)) for a, b in pairwise(mixtures)]
+    link_pairs = np.concatenate(
+        [begin[t : t + 2, None] + pairs for t, pairs in enumerate(across)]
+        or [np.zeros((2, 0), dtype=np.int64)],
+        axis=1,
+    ).T
+    node_values = pair_log_densities(means, covariances, means, covariances, node_pairs)
+    link_values = pair_log_densities(predicted, spread, means, covariances, link_pairs)
+    if not np.isfinite(node_values).all():
+        # A factorisation has failed: the check says where.
+        check_mixtures(mixtures)
+
+    nodes, links = [], []
+    done = 0
+    for mixture, (row, column) in zip(mixtures, within):
+        log = np.empty((len(mixture), len(mixture)))
+        log[row, column] = log[column, row] = node_values[done : done + len(row)]
+        done += len(row)
+        # scipy's logsumexp, without what it spends on axes and signs.
+        top = log.max(1, keepdims=True)
+        nodes.append(np.log(np.exp(log - top) @ mixture.weights) + top[:, 0])
+    done = 0
+    for left, right in pairwise(mixtures):
+        size = len(left) * len(right)
+        links.append(link_values[done : done + size].reshape(len(left), len(right)))
+        done += size
+    return EmbeddedNetwork(tuple(nodes), tuple(links))
+
+
+@lru_cache(maxsize=256)
+def _pairs_within(count: int) -> Index:
+    return np.array(np.triu_indices(count), dtype=np.int64)
+
+
+@lru_cache(maxsize=256)
+def _pairs_across(before: int, after: int) -> Index:
+    return np.indices((before, after)).reshape(2, -1)
+
+
+def _with_first(
+    first: GaussianMixture,
+    mixtures: Sequence[GaussianMixture],
+    dynamics: LinearGaussianDynamics,
+    intervals: Array,
+) -> EmbeddedNetwork:
+    """The network with a layer of components of the state before the modes."""
+    pairs = np.indices((len(first), len(first))).reshape(2, -1).T
+    own = pair_log_densities(first.means, first.covariances, first.means, first.covariances, pairs)
+    with np.errstate(divide='ignore'):
+        log_weights = np.log(first.weights)
+    nodes = logsumexp(own.reshape(len(first), -1) + log_weights, axis=1)
+    if len(mixtures) == 0:
+        return EmbeddedNetwork((nodes,), ())
+    rest = embedded_network(mixtures, dynamics, intervals[1:])
+    d = dynamics.dimension
+    a, q = dynamics.transition(float(intervals[0]))
+    pairs = np.indices((len(first), len(mixtures[0]))).reshape(2, -1).T
+    spread = (a @ first.covariances @ a.T + q)[:, :d, :d]
+    links = pair_log_densities(
+        (first.means @ a.T)[:, :d], spread, mixtures[0].means, mixtures[0].covariances, pairs
+    )
+    return EmbeddedNetwork(
+        (nodes, *rest.nodes), (links.reshape(len(first), len(mixtures[0])), *rest.links)
+    )
+
+
+def sampled_network(
+    mixtures: Sequence[GaussianMixture],
+    move: Callable[[Array, float], Array],
+    noise: Callable[[float], Array],
+    intervals: Array,
+    *,
+    degrees_of_freedom: Sequence[Array] | None = None,
+    samples: int = 256,
+    seed: int = 0,
+) -> EmbeddedNetwork:
+    """The network of Gaussian or Student modes under p(y | x) = N(y; move(x, dt), noise(dt)).
+
+    Samples are drawn from the mode that a value starts from and, for Student modes, from the scales
+    of the mode that it leads to; what is left is Gaussian and integrated exactly.
+
+    Args:
+        mixtures: T mixtures; of Student modes the covariances are the scale matrices.
+        move: maps poses (N, d) and an interval to poses (N, d).
+        noise: maps an interval to a covariance (d, d).
+        intervals: (T-1,) s.
+        degrees_of_freedom: T arrays (K_t,) of the modes; 0: Gaussian. None: all Gaussian.
+        samples: per mode.
+        seed: of the samples.
+
+    Raises:
+        ValueError: mixtures that can not be smoothed.
+    """
+    check_mixtures(mixtures)
+    rng = np.random.default_rng(seed)
+    freedom = degrees_of_freedom or [np.zeros(len(mixture)) for mixture in mixtures]
+    drawn, scales = [], []
+    for mixture, nu in zip(mixtures, freedom):
+        d = mixture.dimension
+        u = np.ones((len(mixture), samples))
+        for k in np.flatnonzero(nu > 0):
+            u[k] = rng.chisquare(nu[k], samples) / nu[k]
+        z = rng.standard_normal((len(mixture), samples, d))
+        x = mixture.means[:, None] + z @ mixture.cholesky().swapaxes(1, 2) / np.sqrt(u)[..., None]
+        drawn.append(x)
+        # Scales of their own for the mode at the other end.
+        v = np.ones((len(mixture), samples))
+        for k in np.flatnonzero(nu > 0):
+            v[k] = rng.chisquare(nu[k], samples) / nu[k]
+        scales.append(v)
+    nodes, links = [], []
+    zero = np.zeros((mixtures[0].dimension,) * 2)
+    for mixture, nu, x in zip(mixtures, freedom, drawn):
+        k, d = mixture.means.shape
+        each = np.empty((k, k, samples))
+        for j in range(k):
+            flat = x.reshape(-1, d)
+            each[:, j] = _log_mode(mixture, j, float(nu[j]), flat).reshape(k, samples)
+        with np.errstate(divide='ignore'):
+            total = logsumexp(each + np.log(mixture.weights)[None, :, None], axis=1)
+        nodes.append(logsumexp(total, axis=1) - np.log(samples))
+    for t, interval in enumerate(intervals):
+        a, b = mixtures[t], mixtures[t + 1]
+        q = np.asarray(noise(float(interval)), dtype=np.float64)
+        moved = move(drawn[t].reshape(-1, a.dimension), float(interval))
+        log = np.empty((len(a), len(b)))
+        for j in range(len(b)):
+            v = np.tile(scales[t + 1][j], len(a))
+            if freedom[t + 1][j] > 0:
+                covariances = b.covariances[j] / v[:, None, None] + q
+                which = np.arange(len(moved))
+            else:
+                covariances = (b.covariances[j] + q)[None]
+                which = np.zeros(len(moved), dtype=np.int64)
+            pairs = np.stack([which, np.arange(len(moved))], axis=1)
+            centre = np.broadcast_to(b.means[j], (len(covariances), b.dimension))
+            each = pair_log_densities(
+                centre, covariances, moved, np.broadcast_to(zero, (len(moved), *zero.shape)), pairs
+            )
+            log[:, j] = logsumexp(each.reshape(len(a), samples), axis=1) - np.log(samples)
+        links.append(log)
+    return EmbeddedNetwork(tuple(nodes), tuple(links))
+
+
+def pair_log_densities(
+    means_a: Array, covariances_a: Array, means_b: Array, covariances_b: Array, pairs: Index
+) -> Array:
+    """log N(a_i; b_j, A_i + B_j), shape (P,), of pairs (P, 2) of indices i, j."""
+    result = np.empty(len(pairs))
+    a, big_a, b, big_b = (
+        np.ascontiguousarray(x, dtype=np.float64)
+        for x in (means_a, covariances_a, means_b, covariances_b)
+    )
+    pairs = np.ascontiguousarray(pairs, dtype=np.int64)
+    edges = np.linspace(0, len(pairs), PARTS + 1).astype(int)
+
+    def work(part: int) -> None:
+        at = slice(edges[part], edges[part + 1])
+        _pair_log_densities(a, big_a, b, big_b, pairs[at], result[at])
+
+    list(_threads().map(work, range(PARTS)))
+    return result
+
+
+@lru_cache(maxsize=1)
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(2, thread_name_prefix='smoothing')
+
+
+def _velocity_covariance(dynamics: LinearGaussianDynamics) -> Array:
+    d = dynamics.dimension
+    return np.asarray(np.linalg.inv(dynamics.initial_precision[d:, d:]), dtype=np.float64)
+
+
+def _log_mode(mixture: GaussianMixture, k: int, freedom: float, x: Array) -> Array:
+    """log density (N,) of one Gaussian (freedom 0) or Student mode."""
+    if freedom == 0:
+        return mixture[k].component_log_densities(x)[:, 0]
+    result: Array = np.atleast_1d(
+        multivariate_t.logpdf(x, mixture.means[k], mixture.covariances[k], df=freedom)
+    )
+    return result
+
+
+@njit(cache=True, nogil=True, fastmath={'contract', 'nsz'})
+def _pair_log_densities(
+    means_a: Array,
+    covariances_a: Array,
+    means_b: Array,
+    covariances_b: Array,
+    pairs: Index,
+    result: Array,
+) -> None:
+    """Cholesky factors and forward substitution of four pairs at a time, two columns at a time.
+
+    The last row of each factor is the offset: what becomes of it is the whitened offset.
+    """
+    d = means_a.shape[1]
+    f = np.empty((d + 1, d, LANES))
+    for first in range(0, len(pairs), LANES):
+        count = min(LANES, len(pairs) - first)
+        for lane in range(LANES):
+            i, j = pairs[first + min(lane, count - 1)]
+            for a in range(d):
+                f[d, a, lane] = means_a[i, a] - means_b[j, a]
+                for b in range(a + 1):
+                    f[a, b, lane] = covariances_a[i, a, b] + covariances_b[j, a, b]
+        for i in range(d + 1):
+            j = 0
+            while j + 1 < i:
+                p0, p1, p2, p3 = f[i, j, 0], f[i, j, 1], f[i, j, 2], f[i, j, 3]
+                q0, q1, q2, q3 = f[i, j + 1, 0], f[i, j + 1, 1], f[i, j + 1, 2], f[i, j + 1, 3]
+                for k in range(j):
+                    x0, x1, x2, x3 = f[i, k, 0], f[i, k, 1], f[i, k, 2], f[i, k, 3]
+                    p0 -= x0 * f[j, k, 0]
+                    p1 -= x1 * f[j, k, 1]
+                    p2 -= x2 * f[j, k, 2]
+                    p3 -= x3 * f[j, k, 3]
+                    q0 -= x0 * f[j + 1, k, 0]
+                    q1 -= x1 * f[j + 1, k, 1]
+                    q2 -= x2 * f[j + 1, k, 2]
+                    q3 -= x3 * f[j + 1, k, 3]
+                # The diagonal holds inverses.
+                p0 *= f[j, j, 0]
+                p1 *= f[j, j, 1]
+                p2 *= f[j, j, 2]
+                p3 *= f[j, j, 3]
+                f[i, j, 0], f[i, j, 1], f[i, j, 2], f[i, j, 3] = p0, p1, p2, p3
+                f[i, j + 1, 0] = (q0 - p0 * f[j + 1, j, 0]) * f[j + 1, j + 1, 0]
+                f[i, j + 1, 1] = (q1 - p1 * f[j + 1, j, 1]) * f[j + 1, j + 1, 1]
+                f[i, j + 1, 2] = (q2 - p2 * f[j + 1, j, 2]) * f[j + 1, j + 1, 2]
+                f[i, j + 1, 3] = (q3 - p3 * f[j + 1, j, 3]) * f[j + 1, j + 1, 3]
+                j += 2
+            if j < i:
+                for lane in range(LANES):
+                    total = f[i, j, lane]
+                    for k in range(j):
+                        total -= f[i, k, lane] * f[j, k, lane]
+                    f[i, j, lane] = total * f[j, j, lane]
+            if i == d:
+                break
+            s0, s1, s2, s3 = f[i, i, 0], f[i, i, 1], f[i, i, 2], f[i, i, 3]
+            for k in range(i):
+                s0 -= f[i, k, 0] * f[i, k, 0]
+                s1 -= f[i, k, 1] * f[i, k, 1]
+                s2 -= f[i, k, 2] * f[i, k, 2]
+                s3 -= f[i, k, 3] * f[i, k, 3]
+            f[i, i, 0] = 1.0 / np.sqrt(s0)
+            f[i, i, 1] = 1.0 / np.sqrt(s1)
+            f[i, i, 2] = 1.0 / np.sqrt(s2)
+            f[i, i, 3] = 1.0 / np.sqrt(s3)
+        for lane in range(count):
+            total = d * np.log(2 * np.pi)
+            for a in range(d):
+                total += f[d, a, lane] ** 2 - 2.0 * np.log(f[a, a, lane])
+            result[first + lane] = -0.5 * total

@@ -1,0 +1,47 @@
+"""The images of a window as the observations of a smoother (VMS 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.image.likelihood import ImageLikelihood
+from hmt_ros.image.observation import Observation
+from hmt_ros.smoothing.likelihood import Curvature
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSequence:
+    """p(r_t | x_t) of the images themselves, the likelihood that the tracker minimises.
+
+    Attributes:
+        likelihood: the terms and the soft prior.
+        observations: of the T images.
+    """
+
+    likelihood: ImageLikelihood
+    observations: Sequence[Observation]
+
+    @property
+    def times(self) -> int:
+        """T."""
+        return len(self.observations)
+
+    def energy(
+        self, poses: Array, times: Index, curvature: Curvature
+    ) -> tuple[Array, Array, Array | None]:
+        """See `SequenceLikelihood`; the Hessian is that of Gauss-Newton."""
+        n, d = poses.shape
+        value, gradient, hessian = np.empty(n), np.empty((n, d)), np.empty((n, d, d))
+        for t in np.unique(times):
+            at = times == t
+            value[at], gradient[at], hessian[at] = self.likelihood.energy(
+                poses[at], self.observations[t]
+            )
+        return value, gradient, hessian if curvature else None

@@ -1,0 +1,321 @@
+"""What a smoother knows of the observations: -log p(r_t | x_t), its gradient and its curvature.
+
+Either the mixtures that a filter made, `MixtureLikelihood`, or the images themselves,
+`ImageSequence`, or any other object with the method of `SequenceLikelihood` (VMS 5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dtrtri
+
+from hmt_ros.inference import GaussianMixture
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# Modes whose density is below exp(-60) of the greatest are left out: less than rounding.
+NEGLIGIBLE = 60.0
+
+
+class Curvature(IntEnum):
+    """Which second derivatives are wanted."""
+
+    NONE = 0
+    POSITIVE = 1  # positive semi-definite: Gauss-Newton, or that of a majorising quadratic
+    EXACT = 2  # indefinite between modes
+
+
+class SequenceLikelihood(Protocol):
+    """-log p(r_t | x_t) of all times t < T of a sequence."""
+
+    @property
+    def times(self) -> int:
+        """T."""
+        ...
+
+    def energy(
+        self, poses: Array, times: Index, curvature: Curvature
+    ) -> tuple[Array, Array, Array | None]:
+        """Value (N,), gradient (N, d) and Hessian (N, d, d) at poses (N, d) of times (N,).
+
+        The Hessian is None where none is wanted; of a likelihood that knows no exact one it is
+        positive semi-definite always.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureLikelihood:
+    """p(r_t | x_t) = sum_k w_k N(x_t; m_k, S_k), the mixtures as a filter sends them.
+
+    With y_k = W_k (x - m_k), S_k^-1 = W_k' W_k, responsibilities r_k and u_k = W_k' y_k, the
+    gradient of -log p is u = sum_k r_k u_k and its Hessian sum_k r_k S_k^-1 - (sum_k r_k u_k u_k' -
+    u u'). Without what is in brackets it belongs to the quadratic that expectation-maximisation
+    minimises, which lies above -log p: a full step never ascends.
+
+    Attributes:
+        first: (T+1,) the modes of time t are first[t] .. first[t+1] - 1.
+        log_scales: (K,) log w_k - log |2 pi S_k| / 2.
+        means: (K, d).
+        whiteners: (K, d, d) W_k, lower triangular.
+        precisions: (K, d, d).
+    """
+
+    first: NDArray[np.int64]
+    log_scales: Array
+    means: Array
+    whiteners: Array
+    precisions: Array
+
+    @classmethod
+    def of(cls, mixtures: Sequence[GaussianMixture]) -> MixtureLikelihood:
+        """The likelihood of a sequence of mixtures; modes without weight are left out.
+
+        Raises:
+            ValueError: a mixture without modes or weight, of another dimension, or with a
+                covariance that is not positive definite.
+        """
+        check_mixtures(mixtures)
+        kept = [mixture[mixture.weights > 0] for mixture in mixtures]
+        first = np.concatenate([[0], np.cumsum([len(mixture) for mixture in kept])])
+        factors = np.concatenate([mixture.cholesky() for mixture in kept])
+        whiteners = np.array([dtrtri(factor, lower=1)[0] for factor in factors])
+        d = whiteners.shape[1]
+        log_norms = np.log(np.diagonal(whiteners, axis1=1, axis2=2)).sum(1)
+        weights = np.concatenate([mixture.weights for mixture in kept])
+        return cls(
+            first.astype(np.int64),
+            np.log(weights) + log_norms - 0.5 * d * np.log(2 * np.pi),
+            np.concatenate([mixture.means for mixture in kept]),
+            np.tril(whiteners),
+            whiteners.swapaxes(1, 2) @ whiteners,
+        )
+
+    @property
+    def times(self) -> int:
+        """T."""
+        return len(self.first) - 1
+
+    def modes_of(self, path: Index) -> tuple[Array, Array, Array]:
+        """log scales (T,), means (T, d) and precisions (T, d, d) of the modes along a path (T,)."""
+        at = self.first[:-1] + path
+        return self.log_scales[at], self.means[at], self.precisions[at]
+
+    def energy(
+        self, poses: Array, times: Index, curvature: Curvature
+    ) -> tuple[Array, Array, Array | None]:
+        """See `SequenceLikelihood`."""
+        n, d = poses.shape
+        value, gradient = np.empty(n), np.empty((n, d))
+        hessian = np.empty((n if curvature else 0, d, d))
+        add_mixture_energy(
+            np.ascontiguousarray(poses),
+            times.astype(np.int64),
+            self.first,
+            self.log_scales,
+            self.means,
+            self.whiteners,
+            self.precisions,
+            int(curvature),
+            value,
+            gradient,
+            hessian,
+        )
+        return value, gradient, hessian if curvature else None
+
+
+@dataclass(frozen=True, eq=False)
+class WindowLikelihood:
+    """A density of the first state, and mixtures over the poses of the later ones.
+
+    Attributes:
+        first: over the n variables of the state, one time.
+        later: over the d variables of the pose, T-1 times; None: T = 1.
+    """
+
+    first: MixtureLikelihood
+    later: MixtureLikelihood | None
+
+    @property
+    def times(self) -> int:
+        """T."""
+        return 1 + (0 if self.later is None else self.later.times)
+
+    def modes_of(self, path: Index) -> tuple[Array, Array, Array]:
+        """As for `MixtureLikelihood`, over n variables."""
+        log, mean, precision = self.first.modes_of(path[:1])
+        if self.later is None:
+            return log, mean, precision
+        rest = self.later.modes_of(path[1:])
+        n, (count, d) = mean.shape[1], rest[1].shape
+        means, precisions = np.zeros((count, n)), np.zeros((count, n, n))
+        means[:, :d], precisions[:, :d, :d] = rest[1:]
+        return (
+            np.concatenate([log, rest[0]]),
+            np.concatenate([mean, means]),
+            np.concatenate([precision, precisions]),
+        )
+
+    def energy(
+        self, poses: Array, times: Index, curvature: Curvature
+    ) -> tuple[Array, Array, Array | None]:
+        """See `SequenceLikelihood`; what it calls poses are states here."""
+        count, n = poses.shape
+        value, gradient = np.zeros(count), np.zeros((count, n))
+        hessian = np.zeros((count, n, n)) if curvature else None
+        at = np.flatnonzero(times == 0)
+        value[at], gradient[at], second = self.first.energy(poses[at], times[at], curvature)
+        if hessian is not None:
+            hessian[at] = second
+        if self.later is not None:
+            at = np.flatnonzero(times > 0)
+            d = self.later.means.shape[1]
+            value[at], gradient[at, :d], second = self.later.energy(
+                poses[at, :d], times[at] - 1, curvature
+            )
+            if hessian is not None:
+                hessian[at, :d, :d] = second
+        return value, gradient, hessian
+
+
+def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = True) -> None:
+    """Checks that the mixtures of a window can be smoothed.
+
+    Args:
+        mixtures: one for each time.
+        factorise: whether covariances are checked to be positive definite.
+
+    Raises:
+        ValueError: what is wrong, and at which place.
+    """
+    if len(mixtures) == 0:
+        raise ValueError('no mixtures to smooth; wanted one for each time')
+    for t, mixture in enumerate(mixtures):
+        if len(mixture) == 0 or not mixture.weights.sum() > 0:
+            raise ValueError(
+                f'mixture {t} of {len(mixtures)} has no modes with weight; leave out times without '
+                'observation and give stamps instead'
+            )
+        if mixture.dimension != mixtures[0].dimension:
+            raise ValueError(
+                f'mixture {t} has {mixture.dimension} variables, those before '
+                f'{mixtures[0].dimension}'
+            )
+        if not factorise:
+            continue
+        try:
+            mixture.cholesky()
+        except ValueError as error:
+            raise ValueError(f'mixture {t} of {len(mixtures)}: {error}') from None
+
+
+@njit(cache=True, nogil=True, fastmath={'reassoc', 'contract', 'nsz', 'arcp'})
+def add_mixture_energy(
+    poses: Array,
+    times: NDArray[np.int64],
+    first: NDArray[np.int64],
+    log_scales: Array,
+    means: Array,
+    whiteners: Array,
+    precisions: Array,
+    curvature: int,
+    value: Array,
+    gradient: Array,
+    hessian: Array,
+) -> None:
+    """Writes value (N,), gradient (N, d) and, if wanted, Hessian (N, d, d) at poses (N, d)."""
+    d = poses.shape[1]
+    most = 0
+    for t in range(len(first) - 1):
+        most = max(most, first[t + 1] - first[t])
+    white = np.empty((most, d))
+    pull = np.empty((most, d))
+    logs = np.empty(most)
+    near = np.empty(most)
+    delta = np.empty(d)
+    for i in range(len(poses)):
+        start, count = first[times[i]], first[times[i] + 1] - first[times[i]]
+        # The mode that explains the pose, roughly: the others are given up early against it.
+        leading = 0
+        for k in range(count):
+            mode = start + k
+            total = 0.0
+            for a in range(d):
+                offset = poses[i, a] - means[mode, a]
+                total += offset * offset * precisions[mode, a, a]
+            near[k] = log_scales[mode] - 0.5 * total / d
+            if near[k] > near[leading]:
+                leading = k
+        best = -np.inf
+        for order in range(count):
+            k = leading if order == 0 else (order - 1 if order <= leading else order)
+            mode = start + k
+            for a in range(d):
+                delta[a] = poses[i, a] - means[mode, a]
+            log = log_scales[mode]
+            floor = best - NEGLIGIBLE
+            for a in range(d):
+                total = 0.0
+                for b in range(a + 1):
+                    total += whiteners[mode, a, b] * delta[b]
+                white[k, a] = total
+                log -= 0.5 * total * total
+                if log < floor:
+                    log = -np.inf
+                    break
+            logs[k] = log
+            best = max(best, log)
+        total = 0.0
+        for k in range(count):
+            if logs[k] > best - NEGLIGIBLE:
+                logs[k] = np.exp(logs[k] - best)
+                total += logs[k]
+            else:
+                logs[k] = 0.0
+        value[i] = -(best + np.log(total))
+        gradient[i] = 0.0
+        for k in range(count):
+            logs[k] /= total
+            if logs[k] == 0.0:
+                continue
+            mode = start + k
+            pull[k] = 0.0
+            for a in range(d):
+                factor = white[k, a]
+                for b in range(a + 1):
+                    pull[k, b] += factor * whiteners[mode, a, b]
+            for a in range(d):
+                gradient[i, a] += logs[k] * pull[k, a]
+        if curvature == 0:
+            continue
+        opened = False
+        for k in range(count):
+            if logs[k] == 0.0:
+                continue
+            mode = start + k
+            share = logs[k]
+            if opened:
+                for a in range(d):
+                    for b in range(d):
+                        hessian[i, a, b] += share * precisions[mode, a, b]
+            else:
+                for a in range(d):
+                    for b in range(d):
+                        hessian[i, a, b] = share * precisions[mode, a, b]
+                opened = True
+        if curvature == 2:
+            for k in range(count):
+                if logs[k] == 0.0 or logs[k] == 1.0:
+                    continue
+                for a in range(d):
+                    one = logs[k] * (pull[k, a] - gradient[i, a])
+                    for b in range(d):
+                        hessian[i, a, b] -= one * (pull[k, b] - gradient[i, b])

@@ -1,0 +1,297 @@
+"""Variational mixture smoothing: from mixtures per time to one over trajectories (VMS fig. 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import logsumexp
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.block_tridiagonal import BlockCholesky
+from hmt_ros.smoothing.dynamics import LinearGaussianDynamics, TrajectoryPrior
+from hmt_ros.smoothing.likelihood import Curvature, SequenceLikelihood, check_mixtures
+from hmt_ros.smoothing.mode_sequence import ModeSequence
+from hmt_ros.smoothing.path_gaussians import path_gaussians
+from hmt_ros.smoothing.paths import Paths
+from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
+from hmt_ros.smoothing.trajectory_refinement import limits_of_states, refine
+from hmt_ros.smoothing.variational_mixture import (
+    ADAPTABLE,
+    VariationalMixture,
+    laplace_masses,
+    laplace_weights,
+    minimise_free_energy,
+    peak_weights,
+)
+
+Array = NDArray[np.float64]
+
+# Noise values that the descent of the free energy holds: few samples where the state is large.
+SAMPLE_BUDGET = 400_000
+# Components lighter than this, against the heaviest, do not take part in the descent.
+LEAST_SHARE = 1e-6
+# A path whose Gaussian lies within so many standard deviations of an optimum says nothing new.
+SAME_DISTANCE = 0.3
+# Modes closer than so many standard deviations are merged, as alternatives to the optima.
+MERGE_DISTANCES = (1.75, 2.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Components before the free energy is minimised.
+
+    Attributes:
+        weights: (M,).
+        states: (M, T, n).
+        factors: of the precisions.
+    """
+
+    weights: Array
+    states: Array
+    factors: tuple[BlockCholesky, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureSmoother:
+    """Smooths sequences of mixtures.
+
+    Attributes:
+        dynamics: of the state.
+        lower, upper: (d,) limits of the pose at every time; None: none.
+        max_trajectories: components of the result at most.
+        adapt: what the descent of the free energy changes: some of 'weights', 'means', 'inflation',
+            'covariances'; empty: nothing.
+        start: 'laplace' weighs optima by their mass, 'peak' by their height, as VMS does.
+        max_iterations: of the descent of the free energy.
+
+    Raises:
+        ValueError: settings out of range.
+    """
+
+    dynamics: LinearGaussianDynamics
+    lower: ArrayLike | None = None
+    upper: ArrayLike | None = None
+    max_trajectories: int = 64
+    adapt: Sequence[str] = ('weights', 'means', 'inflation')
+    start: str = 'laplace'
+    max_iterations: int = 15
+
+    def __post_init__(self) -> None:
+        if self.max_trajectories < 1:
+            raise ValueError(f'max_trajectories must be at least 1, saw {self.max_trajectories}')
+        wrong = [name for name in self.adapt if name not in ADAPTABLE]
+        if wrong:
+            raise ValueError(f'adapt: no {wrong[0]!r}, wanted some of {ADAPTABLE}')
+        if self.start not in ('laplace', 'peak'):
+            raise ValueError(f"start must be 'laplace' or 'peak', saw {self.start!r}")
+        self._limits()
+
+    def smooth(
+        self,
+        mixtures: Sequence[GaussianMixture],
+        seed: int = 0,
+        *,
+        stamps_ns: Sequence[int] | None = None,
+        observation: SequenceLikelihood | None = None,
+    ) -> TrajectoryMixture:
+        """The mixture over trajectories given likelihood mixtures, one for each time.
+
+        Args:
+            mixtures: T likelihoods over the pose; weights need not sum to 1.
+            seed: of all randomness.
+            stamps_ns: (T,) times, increasing; None: one `dynamics.step` apart.
+            observation: what stands for the likelihood in refinement and free energy, the images
+                themselves for example; the mixtures then give the starts. None: the mixtures.
+
+        Raises:
+            ValueError: mixtures or stamps that can not be smoothed; the message says which.
+        """
+        check_mixtures(mixtures)
+        if mixtures[0].dimension != self.dynamics.dimension:
+            raise ValueError(
+                f'mixtures have {mixtures[0].dimension} variables, the dynamics '
+                f'{self.dynamics.dimension}'
+            )
+        intervals = intervals_of(stamps_ns, len(mixtures), self.dynamics.step)
+        kept = tuple(mixture[mixture.weights > 0] for mixture in mixtures)
+        sequence = ModeSequence(kept, self.dynamics, intervals)
+        if observation is not None and observation.times != len(mixtures):
+            raise ValueError(f'{observation.times} observations for {len(mixtures)} mixtures')
+        return self.smooth_sequence(sequence, seed, stamps_ns, observation)
+
+    def smooth_sequence(
+        self,
+        sequence: ModeSequence,
+        seed: int = 0,
+        stamps_ns: Sequence[int] | None = None,
+        observation: SequenceLikelihood | None = None,
+    ) -> TrajectoryMixture:
+        """As `smooth`, of what was checked."""
+        likelihood = sequence.likelihood if observation is None else observation
+        sets = [self.optima(sequence, likelihood)]
+        if observation is None:
+            sets += self.merged_paths(sequence)
+        best = sets[0]
+        if len(sets) > 1:
+            energies = [
+                self._descended(one, sequence.prior, likelihood, seed, 0).fresh[0] for one in sets
+            ]
+            best = sets[int(np.argmin(energies))]
+        return self._fitted(best, sequence.prior, likelihood, seed, stamps_ns)
+
+    def optima(self, sequence: ModeSequence, likelihood: SequenceLikelihood) -> Candidates:
+        """Distinct optima, found from the paths, and paths beside them if they are few."""
+        low, high = self._limits()
+        prior, paths = sequence.prior, sequence.paths(self.max_trajectories)
+        d = prior.dimension
+        starts = sequence.states(paths)
+        # What the others share with the best path is refined once.
+        best = refine(starts[:1], prior, likelihood, low[:d], high[:d])
+        shared = paths.nodes == paths.nodes[0]
+        starts = np.where(shared[:, :, None], best.states, starts)
+        refined = refine(starts, prior, likelihood, low[:d], high[:d])
+        refined = refined.without_duplicates()
+        if self.start == 'laplace':
+            weights = laplace_weights(refined.energies, refined.factors)
+        else:
+            weights = peak_weights(refined.energies)
+        result = Candidates(weights, refined.states, refined.factors)
+        room = self.max_trajectories - len(refined)
+        if room == 0 or len(refined) == len(paths) or likelihood is not sequence.likelihood:
+            return result
+        # Modes that overlap share an optimum, which one Gaussian describes badly.
+        beside = path_gaussians(paths.nodes, prior, sequence.likelihood)
+        distinct = [
+            i
+            for i in range(len(paths))
+            if all(
+                np.square(factor.whiten(beside.states[i] - state)).sum() > SAME_DISTANCE**2
+                for factor, state in zip(refined.factors, refined.states)
+            )
+        ][:room]
+        masses = laplace_masses(refined.energies, refined.factors)
+        log = np.concatenate([masses, beside.log_weights[distinct]])
+        return Candidates(
+            np.exp(log - logsumexp(log)),
+            np.concatenate([refined.states, np.clip(beside.states[distinct], low, high)]),
+            refined.factors + tuple(beside.factors[i] for i in distinct),
+        )
+
+    def merged_paths(self, sequence: ModeSequence) -> list[Candidates]:
+        """Gaussians of paths through modes that were merged, for each distance that merges some."""
+        result = []
+        count = sum(len(mixture) for mixture in sequence.mixtures)
+        for distance in MERGE_DISTANCES:
+            merged = sequence.merged(distance)
+            left = sum(len(mixture) for mixture in merged.mixtures)
+            if left < count:
+                result.append(self._on_paths(merged, merged.paths(self.max_trajectories)))
+                count = left
+        return result
+
+    def _on_paths(self, sequence: ModeSequence, paths: Paths) -> Candidates:
+        low, high = self._limits()
+        found = path_gaussians(paths.nodes, sequence.prior, sequence.likelihood)
+        weights = np.exp(found.log_weights - logsumexp(found.log_weights))
+        return Candidates(weights, np.clip(found.states, low, high), found.factors)
+
+    def _descended(
+        self,
+        candidates: Candidates,
+        prior: TrajectoryPrior,
+        likelihood: SequenceLikelihood,
+        seed: int,
+        max_iterations: int,
+    ) -> VariationalMixture:
+        """Descent over the components that count; the others stay what they are."""
+        low, high = self._limits()
+        heavy = candidates.weights > LEAST_SHARE * candidates.weights.max()
+        states = candidates.states[heavy]
+        samples = int(np.clip(SAMPLE_BUDGET // states.size // 2 * 2, 4, 32))
+        found = minimise_free_energy(
+            candidates.weights[heavy],
+            states,
+            tuple(candidates.factors[i] for i in np.flatnonzero(heavy)),
+            prior,
+            likelihood,
+            adapt=self.adapt,
+            low=low,
+            high=high,
+            samples=samples,
+            seed=seed,
+            max_iterations=max_iterations,
+        )
+        if heavy.all():
+            return found
+        weights, means = candidates.weights.copy(), candidates.states.copy()
+        inflation, factors = np.ones(len(weights)), list(candidates.factors)
+        weights[heavy] = weights[heavy].sum() * found.weights
+        means[heavy], inflation[heavy] = found.states, found.inflation
+        for i, factor in zip(np.flatnonzero(heavy), found.factors):
+            factors[i] = factor
+        return replace(
+            found, weights=weights, states=means, inflation=inflation, factors=tuple(factors)
+        )
+
+    def _fitted(
+        self,
+        candidates: Candidates,
+        prior: TrajectoryPrior,
+        likelihood: SequenceLikelihood,
+        seed: int,
+        stamps_ns: Sequence[int] | None,
+    ) -> TrajectoryMixture:
+        """The mixture that is closest to the posterior, from the candidates on."""
+        iterations = self.max_iterations if self.adapt else 0
+        found = self._descended(candidates, prior, likelihood, seed, iterations)
+        low, high = self._limits()
+        count, times, _ = candidates.states.shape
+        order = np.argsort(-found.weights, kind='stable')
+        energies, _ = prior.energy(found.states)
+        at = np.tile(np.arange(times), count)
+        poses = found.states[:, :, : prior.dimension].reshape(-1, prior.dimension)
+        observed = likelihood.energy(poses, at, Curvature.NONE)[0].reshape(count, times).sum(1)
+        d = self.dynamics.dimension
+        return TrajectoryMixture(
+            weights=found.weights[order],
+            states=found.states[order],
+            factors=tuple(found.factors[i] for i in order),
+            inflation=found.inflation[order],
+            log_joint=-(energies + observed)[order],
+            free_energy=found.free_energy,
+            dimension=d,
+            stamps_ns=None if stamps_ns is None else tuple(int(stamp) for stamp in stamps_ns),
+            identities=tuple(range(count)),
+            free_energy_fresh=found.fresh,
+            lower=low[:d],
+            upper=high[:d],
+        )
+
+    def _limits(self) -> tuple[Array, Array]:
+        return limits_of_states(
+            -np.inf if self.lower is None else self.lower,
+            np.inf if self.upper is None else self.upper,
+            self.dynamics.dimension,
+            self.dynamics.state_dimension,
+        )
+
+
+def intervals_of(stamps_ns: Sequence[int] | None, times: int, step: float) -> Array:
+    """Intervals (T-1,) in seconds.
+
+    Raises:
+        ValueError: another number of stamps, or stamps that do not increase.
+    """
+    if stamps_ns is None:
+        return np.full(times - 1, step)
+    if len(stamps_ns) != times:
+        raise ValueError(f'{len(stamps_ns)} stamps for {times} mixtures')
+    stamps = [int(stamp) for stamp in stamps_ns]
+    for before, after in pairwise(stamps):
+        if after <= before:
+            raise ValueError(f'stamps must increase, saw {after} ns after {before} ns')
+    return np.array([after - before for before, after in pairwise(stamps)]) * 1e-9

@@ -1,0 +1,130 @@
+"""The modes of a sequence of mixtures under a dynamical model: what paths are made of (VMS 4).
+
+Modes that overlap are one explanation of the observation rather than two. Where they are merged
+into one Gaussian with their mean and covariance, a path stands for all paths through the modes that
+it merged, and few trajectories cover what many would have to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.smoothing.component_overlaps import pair_distances
+from hmt_ros.smoothing.dynamics import LinearGaussianDynamics, TrajectoryPrior
+from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, embedded_network
+from hmt_ros.smoothing.likelihood import MixtureLikelihood, WindowLikelihood
+from hmt_ros.smoothing.paths import Paths, diverse_subset, k_best_paths
+
+Array = NDArray[np.float64]
+
+# Candidates for each path that is chosen.
+CANDIDATES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class ModeSequence:
+    """Mixtures at T times.
+
+    Attributes:
+        mixtures: over the d variables of the pose, T of them; T-1 where `first` is given.
+        dynamics: of the state, n variables.
+        intervals: (T-1,) s.
+        first: a density of the first state, over n variables, in the place of a likelihood.
+    """
+
+    mixtures: tuple[GaussianMixture, ...]
+    dynamics: LinearGaussianDynamics
+    intervals: Array
+    first: GaussianMixture | None = None
+
+    @property
+    def layers(self) -> tuple[GaussianMixture, ...]:
+        """The mixtures at all T times."""
+        return self.mixtures if self.first is None else (self.first, *self.mixtures)
+
+    @cached_property
+    def likelihood(self) -> MixtureLikelihood | WindowLikelihood:
+        """-log of the mixtures."""
+        if self.first is None:
+            return MixtureLikelihood.of(self.mixtures)
+        later = MixtureLikelihood.of(self.mixtures) if self.mixtures else None
+        return WindowLikelihood(MixtureLikelihood.of([self.first]), later)
+
+    @cached_property
+    def prior(self) -> TrajectoryPrior:
+        """Of the states; with `first`, all variables of the state count as observed."""
+        if self.first is None:
+            return self.dynamics.prior(self.intervals)
+        prior = self.dynamics.prior(self.intervals, initial=False)
+        return replace(prior, dimension=self.dynamics.state_dimension)
+
+    @cached_property
+    def network(self) -> EmbeddedNetwork:
+        """The embedded network."""
+        return embedded_network(self.mixtures, self.dynamics, self.intervals, self.first)
+
+    def paths(self, count: int) -> Paths:
+        """At most `count` paths that are probable and differ from each other.
+
+        The best of each pair of ends; where that makes less, further ones of the same pairs.
+        """
+        pairs = len(self.network.nodes[0]) * len(self.network.nodes[-1])
+        per_pair = 1 if pairs >= count else -(-CANDIDATES * count // pairs)
+        return diverse_subset(k_best_paths(self.network, per_pair), count)
+
+    def states(self, paths: Paths) -> Array:
+        """States (P, T, n) along the modes of paths; velocities are differences of neighbours."""
+        d, n = self.dynamics.dimension, self.dynamics.state_dimension
+        layers = self.layers
+        result = np.zeros((len(paths), len(layers), n))
+        for t, mixture in enumerate(layers):
+            result[:, t, :d] = mixture.means[paths.nodes[:, t], :d]
+        if n == 2 * d and len(layers) > 1:
+            edges = np.concatenate([[0.0], np.cumsum(self.intervals)])
+            result[:, :, d:] = np.gradient(result[:, :, :d], edges, axis=1)
+        if self.first is not None:
+            result[:, 0] = self.first.means[paths.nodes[:, 0]]
+        return result
+
+    def merged(self, distance: float) -> ModeSequence:
+        """The sequence with modes merged that are closer than so many standard deviations."""
+        return replace(self, mixtures=tuple(merge_close_modes(self.mixtures, distance)))
+
+
+def merge_close_modes(
+    mixtures: Sequence[GaussianMixture], distance: float
+) -> list[GaussianMixture]:
+    """The mixtures with modes merged, the closest first, until none are closer than a distance.
+
+    Args:
+        mixtures: weights, mean and covariance of each are kept.
+        distance: between means, in standard deviations of the average of two covariances.
+    """
+    return [_merged(mixture, distance) for mixture in mixtures]
+
+
+def _merged(mixture: GaussianMixture, distance: float) -> GaussianMixture:
+    while len(mixture) > 1:
+        i, j = np.triu_indices(len(mixture), 1)
+        scales = np.full(len(mixture), 0.5)
+        pairs = np.stack([i, j], axis=1)
+        squares = pair_distances(
+            np.array(mixture.means), np.array(mixture.covariances), scales, pairs
+        )
+        closest = int(np.argmin(squares))
+        if squares[closest] >= distance**2:
+            break
+        both = mixture[pairs[closest]]
+        rest = mixture[[k for k in range(len(mixture)) if k not in pairs[closest]]]
+        mixture = GaussianMixture(
+            np.append(rest.weights, both.weights.sum()),
+            np.concatenate([rest.means, both.mean()[None]]),
+            np.concatenate([rest.covariances, both.covariance()[None]]),
+        )
+    return mixture

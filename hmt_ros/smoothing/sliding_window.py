@@ -1,0 +1,293 @@
+"""Smoothing while observations arrive: a window of fixed lag.
+
+The window holds the newest poses. What came before it is a density of its first state, a mixture
+that
+is filtered in closed form: every component is predicted by the dynamics and multiplied with every
+mode of the likelihood. The window is smoothed with that density in the place of the first
+likelihood, so that a new image costs the same however long the sequence is. A pose is final once so
+many later ones have been seen as the lag says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.special import logsumexp
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.smoothing.dynamics import LinearGaussianDynamics
+from hmt_ros.smoothing.embedded_network import pair_log_densities
+from hmt_ros.smoothing.likelihood import check_mixtures
+from hmt_ros.smoothing.mixture_smoother import MixtureSmoother, intervals_of
+from hmt_ros.smoothing.mode_sequence import ModeSequence
+from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
+
+Array = NDArray[np.float64]
+
+# Components with a share below exp(-25) are given up, and those are merged whose means lie within
+# this many standard deviations, and whose sizes are alike.
+NEGLIGIBLE = 25.0
+MERGE_DISTANCE = 0.6
+MERGE_LOG_DETERMINANT = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class FinalPose:
+    """The density of a pose that will not be revised.
+
+    Attributes:
+        stamp_ns: its time.
+        mixture: its marginal, a component for each trajectory of the window.
+    """
+
+    stamp_ns: int
+    mixture: GaussianMixture
+
+
+@dataclass(frozen=True, eq=False)
+class WindowUpdate:
+    """What a new observation changes.
+
+    Attributes:
+        trajectories: the mixture over the poses in the window.
+        final: poses that have become final, oldest first.
+    """
+
+    trajectories: TrajectoryMixture
+    final: tuple[FinalPose, ...]
+
+
+class SlidingWindow:
+    """Smooths likelihood mixtures as they arrive.
+
+    Keeps the window's mixtures, the density of the state at its beginning, and the trajectories
+    found last. The same observations in the same order give the same numbers.
+
+    Args:
+        smoother: how a window is smoothed.
+        fixed_lag: how many later poses are seen before a pose is final.
+        seed: of all randomness.
+
+    Raises:
+        ValueError: a lag that is negative.
+    """
+
+    def __init__(self, smoother: MixtureSmoother, fixed_lag: int = 12, seed: int = 0) -> None:
+        if fixed_lag < 0:
+            raise ValueError(f'fixed_lag must not be negative, saw {fixed_lag}')
+        self.smoother, self.fixed_lag, self.seed = smoother, fixed_lag, seed
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets everything; the next observation is the first."""
+        self._stamps: list[int] = []
+        self._mixtures: list[GaussianMixture] = []
+        self._first: GaussianMixture | None = None
+        self._last: TrajectoryMixture | None = None
+        self._next_identity = 0
+
+    @property
+    def stamps_ns(self) -> tuple[int, ...]:
+        """Times of the poses in the window."""
+        return tuple(self._stamps)
+
+    def step(self, stamp_ns: int, mixture: GaussianMixture) -> WindowUpdate:
+        """Takes the likelihood of the next pose.
+
+        Args:
+            stamp_ns: its time, after that of the one before.
+            mixture: its likelihood; weights need not sum to 1.
+
+        Raises:
+            ValueError: a mixture that can not be smoothed, or a stamp that does not increase; the
+                window is as it was.
+        """
+        dynamics = self.smoother.dynamics
+        check_mixtures([mixture])
+        if mixture.dimension != dynamics.dimension:
+            raise ValueError(
+                f'the mixture has {mixture.dimension} variables, the dynamics {dynamics.dimension}'
+            )
+        if self._stamps and stamp_ns <= self._stamps[-1]:
+            raise ValueError(
+                f'stamps must increase, saw {stamp_ns} ns after {self._stamps[-1]} ns; reset the '
+                'window to go back'
+            )
+        mixture = mixture[mixture.weights > 0]
+        if self._first is None:
+            self._first = first_state(mixture, dynamics)
+        self._stamps.append(int(stamp_ns))
+        self._mixtures.append(mixture)
+        if len(self._stamps) > self.fixed_lag + 1:
+            self._advance()
+        found = self._smooth()
+        final: tuple[FinalPose, ...] = ()
+        if len(self._stamps) == self.fixed_lag + 1:
+            found = replace(found, final_until_ns=self._stamps[0])
+            final = (FinalPose(self._stamps[0], found.marginal(0)),)
+        self._last = found
+        return WindowUpdate(found, final)
+
+    def finish(self) -> tuple[FinalPose, ...]:
+        """The poses that are still open, as final as they will be, and forgets everything."""
+        last = self._last
+        if last is None or last.stamps_ns is None:
+            return ()
+        until = last.final_until_ns
+        result = tuple(
+            FinalPose(stamp, last.marginal(t))
+            for t, stamp in enumerate(last.stamps_ns)
+            if until is None or stamp > until
+        )
+        self.reset()
+        return result
+
+    def _advance(self) -> None:
+        """Takes the oldest pose out: the density of the state moves on to the next one."""
+        assert self._first is not None
+        interval = (self._stamps[1] - self._stamps[0]) * 1e-9
+        followed = None
+        if self._last is not None and self._last.times > 1:
+            followed = (self._last.weights, self._last.states[:, 1])
+        self._first = filtered_state(
+            self._first,
+            self._mixtures[1],
+            self.smoother.dynamics,
+            interval,
+            self.smoother.max_trajectories,
+            followed,
+        )
+        del self._stamps[0], self._mixtures[0]
+
+    def _smooth(self) -> TrajectoryMixture:
+        assert self._first is not None
+        smoother, dynamics = self.smoother, self.smoother.dynamics
+        intervals = intervals_of(self._stamps, len(self._stamps), dynamics.step)
+        sequence = ModeSequence(tuple(self._mixtures[1:]), dynamics, intervals, self._first)
+        found = smoother.smooth_sequence(sequence, self.seed, self._stamps)
+        return replace(found, identities=self._identities(found))
+
+    def _identities(self, found: TrajectoryMixture) -> tuple[int, ...]:
+        """Numbers of the trajectories: of the nearest one before if it is near, or new ones."""
+        numbers = np.full(len(found), -1)
+        last = self._last
+        if last is not None and last.stamps_ns is not None:
+            common = [stamp for stamp in self._stamps if stamp in last.stamps_ns]
+            if common:
+                now = found.means[:, : len(common)]
+                before = last.means[:, -len(common) :]
+                deviation = np.sqrt(
+                    np.einsum(
+                        'm,mtii->ti', last.weights, last.marginal_covariances[:, -len(common) :]
+                    )
+                )
+                scaled = ((now[:, None] - before[None]) / deviation) ** 2
+                distance = scaled.mean((2, 3))
+                rows, columns = linear_sum_assignment(np.minimum(distance, 1e6))
+                near = distance[rows, columns] < 1.0
+                numbers[rows[near]] = np.array(last.identities)[columns[near]]
+        for i in np.flatnonzero(numbers < 0):
+            numbers[i] = self._next_identity
+            self._next_identity += 1
+        return tuple(int(number) for number in numbers)
+
+
+def first_state(mixture: GaussianMixture, dynamics: LinearGaussianDynamics) -> GaussianMixture:
+    """The density of the first state: its likelihood times what the dynamics know of it."""
+    n, d = dynamics.state_dimension, dynamics.dimension
+    precisions = np.zeros((len(mixture), n, n))
+    precisions[:, :d, :d] = np.linalg.inv(mixture.covariances)
+    pull = np.zeros((len(mixture), n))
+    pull[:, :d] = np.einsum('kij,kj->ki', precisions[:, :d, :d], mixture.means)
+    pull += dynamics.initial_precision @ dynamics.initial_mean
+    covariances = np.linalg.inv(precisions + dynamics.initial_precision)
+    covariances = 0.5 * (covariances + covariances.swapaxes(1, 2))
+    means = np.einsum('kij,kj->ki', covariances, pull)
+    log = np.log(mixture.weights)
+    known = dynamics.initial_precision[:d, :d]
+    if known.any():
+        spread = np.asarray(np.linalg.inv(known), dtype=np.float64)
+        pairs = np.stack([np.arange(len(mixture)), np.zeros(len(mixture), dtype=int)], axis=1)
+        log = log + pair_log_densities(
+            mixture.means, mixture.covariances, dynamics.initial_mean[None, :d], spread[None], pairs
+        )
+    return GaussianMixture(np.exp(log - logsumexp(log)), means, covariances)
+
+
+def filtered_state(
+    state: GaussianMixture,
+    mixture: GaussianMixture,
+    dynamics: LinearGaussianDynamics,
+    interval: float,
+    count: int,
+    followed: tuple[Array, Array] | None = None,
+) -> GaussianMixture:
+    """The density of the next state given its likelihood, with at most `count` components.
+
+        N(x; A m_i, A S_i A' + Q) N(C x; mu_k, S_k) w_i w_k, for all pairs i, k
+
+    Pairs that tell the same are merged. Of the others those are kept that the trajectories of the
+    window follow, and then the heaviest.
+
+    Args:
+        state: before.
+        mixture: the likelihood of the pose.
+        dynamics: of the state.
+        interval: s.
+        count: components at most.
+        followed: weights (M,) of trajectories and their states (M, n) at the new time.
+    """
+    d, n = dynamics.dimension, dynamics.state_dimension
+    a, q = dynamics.transition(interval)
+    means = state.means @ a.T
+    covariances = a @ state.covariances @ a.T + q
+    pairs = np.indices((len(state), len(mixture))).reshape(2, -1).T
+    log = pair_log_densities(
+        means[:, :d], covariances[:, :d, :d], mixture.means, mixture.covariances, pairs
+    )
+    log += np.log(state.weights)[pairs[:, 0]] + np.log(mixture.weights)[pairs[:, 1]]
+    order = np.argsort(-log, kind='stable')[: 4 * count]
+    order = order[log[order] > log[order[0]] - NEGLIGIBLE]
+    i, k = pairs[order].T
+    gain = np.linalg.solve(
+        covariances[i][:, :d, :d] + mixture.covariances[k], covariances[i][:, :d, :]
+    ).swapaxes(1, 2)
+    fused = means[i] + np.einsum('pij,pj->pi', gain, mixture.means[k] - means[i][:, :d])
+    # Joseph's form keeps them positive definite.
+    keep = np.eye(n) - np.concatenate([gain, np.zeros((len(i), n, n - d))], axis=2)
+    spread = keep @ covariances[i] @ keep.swapaxes(1, 2)
+    spread += gain @ mixture.covariances[k] @ gain.swapaxes(1, 2)
+    weights = np.exp(log[order] - logsumexp(log[order]))
+    found = _merged(GaussianMixture(weights, fused, 0.5 * (spread + spread.swapaxes(1, 2))))
+    if len(found) <= count:
+        return found.normalised()
+    score = found.weights.copy()
+    if followed is not None:
+        each = found.component_log_densities(followed[1])
+        share = np.exp(each - logsumexp(each, axis=1, keepdims=True))
+        score += followed[0] @ share
+    chosen = np.sort(np.argsort(-score, kind='stable')[:count])
+    return found[chosen].normalised()
+
+
+def _merged(mixture: GaussianMixture) -> GaussianMixture:
+    """Components that tell nearly the same become one with their mean and covariance."""
+    whiteners = np.linalg.inv(mixture.cholesky())
+    log_det = -2.0 * np.log(np.diagonal(whiteners, axis1=1, axis2=2)).sum(1)
+    left = np.ones(len(mixture), dtype=bool)
+    parts = []
+    for i in range(len(mixture)):
+        if not left[i]:
+            continue
+        at = np.flatnonzero(left)
+        white = (mixture.means[at] - mixture.means[i]) @ whiteners[i].T
+        near = (white * white).sum(1) < MERGE_DISTANCE**2
+        near &= np.abs(log_det[at] - log_det[i]) < MERGE_LOG_DETERMINANT
+        group = mixture[at[near]]
+        parts.append((group.weights.sum(), group.mean(), group.covariance()))
+        left[at[near]] = False
+    weights, means, covariances = zip(*parts)
+    return GaussianMixture(np.array(weights), np.array(means), np.array(covariances))

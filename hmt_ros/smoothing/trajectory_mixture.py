@@ -1,0 +1,251 @@
+"""A mixture of Gaussians over trajectories: what smoothing returns (VMS 6).
+
+    q(X) = sum_i a_i N(X; M_i, s_i^2 P_i^-1)
+
+Every component is a Gaussian Markov process with block-tridiagonal precision P_i, so that
+densities, samples and marginals cost O(T) and no (T d, T d) covariance exists. Where the state has
+velocities, they are integrated out of everything that is returned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import logsumexp
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.block_tridiagonal import BlockCholesky, BlockTridiagonal
+
+Array = NDArray[np.float64]
+
+
+class TrajectoryContent(Protocol):
+    """What a message says of a mixture over trajectories."""
+
+    weights: Array
+    means: Array
+    marginal_covariances: Array | None
+    log_joint: Array
+    inflation: Array
+    stamps_ns: tuple[int, ...]
+    final_until_ns: int
+    free_energy: Array
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryMixture:
+    """M trajectories of T poses with d variables, heaviest first.
+
+    Attributes:
+        weights: (M,) sum to 1.
+        states: (M, T, n) means; the first d of the n variables are the pose.
+        factors: M Cholesky factors of the precisions P_i, without inflation.
+        inflation: (M,) s_i, factor on standard deviations.
+        log_joint: (M,) log p(M_i, R) at the means.
+        free_energy: (I,) per iteration, nats, on the samples of the descent.
+        dimension: d.
+        stamps_ns: (T,) times; None: not known.
+        final_until_ns: poses at or before this time will not be revised.
+        identities: (M,) numbers that trajectories keep from window to window.
+        free_energy_fresh: on samples that the descent has not seen, and its standard error.
+        lower, upper: (d,) limits; samples beyond them are projected onto them.
+
+    Raises:
+        ValueError: shapes that contradict each other, weights that do not sum to 1.
+    """
+
+    weights: Array
+    states: Array
+    factors: tuple[BlockCholesky, ...]
+    inflation: Array
+    log_joint: Array
+    free_energy: Array
+    dimension: int
+    stamps_ns: tuple[int, ...] | None = None
+    final_until_ns: int | None = None
+    identities: tuple[int, ...] = ()
+    free_energy_fresh: tuple[float, float] = (np.nan, np.nan)
+    lower: Array | float = -np.inf
+    upper: Array | float = np.inf
+
+    def __post_init__(self) -> None:
+        m, times, n = self.states.shape
+        if not (
+            self.weights.shape == self.inflation.shape == self.log_joint.shape == (m,)
+            and len(self.factors) == m > 0
+            and all((factor.times, factor.size) == (times, n) for factor in self.factors)
+        ):
+            raise ValueError(
+                f'trajectories: weights {self.weights.shape}, states {self.states.shape} and '
+                f'{len(self.factors)} factors do not fit'
+            )
+        if not abs(self.weights.sum() - 1.0) < 1e-6 or (self.weights < 0).any():
+            raise ValueError(f'trajectories: weights sum to {self.weights.sum()}, wanted 1')
+        if self.stamps_ns is not None and len(self.stamps_ns) != times:
+            raise ValueError(f'trajectories: {len(self.stamps_ns)} stamps for {times} poses')
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    @property
+    def times(self) -> int:
+        """T."""
+        return int(self.states.shape[1])
+
+    @property
+    def means(self) -> Array:
+        """Means of the poses, (M, T, d)."""
+        return self.states[:, :, : self.dimension]
+
+    @cached_property
+    def marginal_covariances(self) -> Array:
+        """Covariances of each pose in each component, inflation included, (M, T, d, d)."""
+        d = self.dimension
+        result = np.empty((len(self), self.times, d, d))
+        for i, (factor, scale) in enumerate(zip(self.factors, self.inflation)):
+            result[i] = scale**2 * factor.inverse_blocks()[0][:, :d, :d]
+        return result
+
+    def neighbour_covariances(self, component: int) -> Array:
+        """Cov(x_{t+1}, x_t) in a component, inflation included, (T-1, d, d)."""
+        d = self.dimension
+        both = self.factors[component].inverse_blocks()[1][:, :d, :d]
+        result: Array = self.inflation[component] ** 2 * both
+        return result
+
+    def marginal(self, t: int) -> GaussianMixture:
+        """The density of the pose at index t, a component for each trajectory."""
+        return GaussianMixture(self.weights, self.means[:, t], self.marginal_covariances[:, t])
+
+    def sample(self, n: int, rng: np.random.Generator) -> Array:
+        """Draws trajectories (n, T, d), projected onto the limits."""
+        owners = rng.choice(len(self), size=n, p=self.weights / self.weights.sum())
+        noise = rng.standard_normal((n, *self.states.shape[1:]))
+        result = np.empty((n, self.times, self.dimension))
+        for i in np.unique(owners):
+            mine = owners == i
+            moves = self.inflation[i] * self.factors[i].solve_transposed(noise[mine])
+            result[mine] = (self.states[i] + moves)[:, :, : self.dimension]
+        return np.clip(result, self.lower, self.upper)
+
+    def log_density(self, trajectories: ArrayLike) -> Array:
+        """log q(X), shape (n,), of trajectories X (n, T, d).
+
+        Raises:
+            ValueError: trajectories of another shape.
+        """
+        x = np.asarray(trajectories, dtype=np.float64)
+        if x.ndim != 3 or x.shape[1:] != (self.times, self.dimension):
+            raise ValueError(
+                f'trajectories have shape {x.shape}, wanted (n, {self.times}, {self.dimension})'
+            )
+        each = np.empty((len(x), len(self)))
+        for i in range(len(self)):
+            each[:, i] = self._component_log_density(i, x)
+        with np.errstate(divide='ignore'):
+            result: Array = logsumexp(each + np.log(self.weights), axis=1)
+        return result
+
+    def _component_log_density(self, i: int, x: Array) -> Array:
+        """log N(X; M_i, s_i^2 S_i) (n,) with velocities integrated out.
+
+        q(x) = q(x, v*) (2 pi)^(D/2) |P_vv|^(-1/2) at the most probable velocities v* given x.
+        """
+        factor, scale, d = self.factors[i], float(self.inflation[i]), self.dimension
+        n = factor.size
+        offset = np.zeros((len(x), self.times, n))
+        offset[:, :, :d] = (x - self.means[i]) / scale
+        log = 0.5 * factor.log_determinant
+        if n > d:
+            diagonal, lower = _precision_blocks(factor)
+            hidden = BlockTridiagonal(diagonal[:, d:, d:], lower[:, d:, d:]).cholesky()
+            pull = BlockTridiagonal(diagonal, lower).product(offset)[:, :, d:]
+            offset[:, :, d:] = -hidden.solve(pull)
+            log -= 0.5 * hidden.log_determinant
+        white = factor.whiten(offset)
+        log -= self.times * d * (np.log(scale) + 0.5 * np.log(2 * np.pi))
+        result: Array = log - 0.5 * np.einsum('stn,stn->s', white, white)
+        return result
+
+    def expectation(
+        self, function: Callable[[Array], Array], n: int, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Mean of f over n samples, and its standard error.
+
+        Args:
+            function: maps trajectories (n, T, d) to values (n, ...).
+            n: samples.
+            rng: source of the samples.
+        """
+        values = np.asarray(function(self.sample(n, rng)))
+        return values.mean(0), values.std(0, ddof=1) / np.sqrt(n)
+
+    def mean(self) -> Array:
+        """Expected poses, (T, d)."""
+        result: Array = np.einsum('m,mtd->td', self.weights, self.means)
+        return result
+
+    def message_content(self) -> dict[str, Any]:
+        """What a message needs besides names and frame: see `msg_tools.trajectory_mixtures`.
+
+        Raises:
+            ValueError: the stamps are not known.
+        """
+        if self.stamps_ns is None:
+            raise ValueError('trajectories without stamps can not become a message')
+        before = self.stamps_ns[0] - 1
+        return {
+            'weights': self.weights,
+            'means': self.means,
+            'marginal_covariances': self.marginal_covariances,
+            'log_joint': self.log_joint,
+            'inflation': self.inflation,
+            'stamps_ns': self.stamps_ns,
+            'final_until_ns': before if self.final_until_ns is None else self.final_until_ns,
+            'free_energy': self.free_energy,
+        }
+
+    @classmethod
+    def from_message_content(cls, content: TrajectoryContent) -> TrajectoryMixture:
+        """The mixture that a message tells of.
+
+        A message has the marginals of each component and nothing of how neighbouring poses vary
+        together, so that they are independent in what is returned.
+
+        Raises:
+            ValueError: a message without covariances, or with one that is not positive definite.
+        """
+        if content.marginal_covariances is None:
+            raise ValueError('a message without covariances says no density of trajectories')
+        m, times, d = content.means.shape
+        scale = content.inflation[:, None, None, None]
+        factors = []
+        for covariances in content.marginal_covariances / scale**2:
+            precision = np.linalg.inv(covariances)
+            uncoupled = BlockTridiagonal(precision, np.zeros((times - 1, d, d)))
+            factors.append(uncoupled.cholesky())
+        return cls(
+            weights=np.array(content.weights),
+            states=np.array(content.means),
+            factors=tuple(factors),
+            inflation=np.array(content.inflation),
+            log_joint=np.array(content.log_joint),
+            free_energy=np.array(content.free_energy),
+            dimension=d,
+            stamps_ns=tuple(content.stamps_ns),
+            final_until_ns=content.final_until_ns,
+            identities=tuple(range(m)),
+        )
+
+
+def _precision_blocks(factor: BlockCholesky) -> tuple[Array, Array]:
+    """D_t and E_t of P = L L'."""
+    own, below = factor.blocks
+    diagonal = own @ own.swapaxes(1, 2)
+    diagonal[1:] += below @ below.swapaxes(1, 2)
+    return diagonal, below @ own[:-1].swapaxes(1, 2)

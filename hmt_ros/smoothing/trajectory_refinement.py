@@ -1,0 +1,381 @@
+"""Trajectories of locally greatest posterior probability (VMS 5).
+
+    E(X) = -log p(x_1) - sum log p(x_t | x_{t-1}) - sum log p(r_t | x_t),   lower <= x_t <= upper
+
+is minimised from many starts by damped Newton steps on the block-tridiagonal system. The Hessian of
+an
+observation is indefinite between modes: where the matrix can not be factorised, the step is made
+with the positive part of the curvature, and where that does not descend either, the damping grows.
+Variables that rest on a limit with a gradient pushing outwards are held there; a step that crosses
+limits is projected onto the box.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg.blas import dsbmv
+from scipy.linalg.lapack import dpbtrs
+
+from hmt_ros.inference import Status
+from hmt_ros.inference.block_tridiagonal import (
+    BlockCholesky,
+    NotPositiveDefiniteError,
+    factorise_band,
+)
+from hmt_ros.smoothing.dynamics import TrajectoryPrior
+from hmt_ros.smoothing.likelihood import Curvature, SequenceLikelihood
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+FIRST_DAMPING = 1e-4
+DAMPING_LIMIT = 1e10
+# Of the positive Hessian in a step, where the exact one is indefinite.
+SHARES = (0.125, 0.25, 0.5, 0.75)
+# Doubles in the Hessians of the observations that are held at once.
+HESSIAN_BUDGET = 800_000
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedTrajectories:
+    """Optima of the energy of trajectories, one for each start.
+
+    Attributes:
+        states: (M, T, n).
+        energies: (M,) E, nats.
+        observation_energies: (M,) the part of the observations, - sum log p(r_t | x_t).
+        free: (M, T, n) variables that do not rest on a limit.
+        status: (M,) of `Status`.
+        iterations: (M,) evaluations after the first.
+        factors: M Cholesky factors of the precision there. Of a variable that rests on a limit it
+            is that of the slope: the density falls off as exp(-g distance), which has variance 1 /
+            g^2.
+        starts: (M,) which start each of them came from.
+    """
+
+    states: Array
+    energies: Array
+    observation_energies: Array
+    free: NDArray[np.bool_]
+    status: NDArray[np.int8]
+    iterations: NDArray[np.int32]
+    factors: tuple[BlockCholesky, ...]
+    starts: Index
+
+    def __len__(self) -> int:
+        return len(self.energies)
+
+    def __getitem__(self, index: Index) -> RefinedTrajectories:
+        """Some of them, in the order of the index."""
+        return RefinedTrajectories(
+            self.states[index],
+            self.energies[index],
+            self.observation_energies[index],
+            self.free[index],
+            self.status[index],
+            self.iterations[index],
+            tuple(self.factors[i] for i in index),
+            self.starts[index],
+        )
+
+    def without_duplicates(self, distance: float = 0.1) -> RefinedTrajectories:
+        """Distinct optima, the most probable first.
+
+        Two optima are the same when their energies and their states, in standard deviations of the
+        more probable one, differ by less than a distance.
+        """
+        order = np.argsort(self.energies, kind='stable')
+        kept: list[int] = []
+        for i in order:
+            same = False
+            for j in reversed(kept):
+                if self.energies[i] - self.energies[j] > distance:
+                    break
+                offset = self.factors[j].whiten(self.states[i] - self.states[j])
+                if (offset * offset).sum() < distance**2:
+                    same = True
+                    break
+            if not same:
+                kept.append(int(i))
+        return self[np.array(kept, dtype=np.intp)]
+
+
+def refine(
+    starts: Array,
+    prior: TrajectoryPrior,
+    likelihood: SequenceLikelihood,
+    lower: ArrayLike = -np.inf,
+    upper: ArrayLike = np.inf,
+    *,
+    max_iterations: int = 60,
+    tolerance: float = 1e-6,
+) -> RefinedTrajectories:
+    """Minimises the energy from M starts (M, T, n).
+
+    Args:
+        starts: projected onto the box.
+        prior: of the states.
+        likelihood: of the first d variables of each state.
+        lower, upper: (d,) limits at every time, or scalars.
+        max_iterations: evaluations per trajectory after the first one.
+        tolerance: converged when a step is predicted to gain less than this, nats.
+    """
+    starts = np.asarray(starts, dtype=np.float64)
+    _, times, n = starts.shape
+    share = max(1, HESSIAN_BUDGET // (times * n * n))
+    parts = []
+    for at in range(0, len(starts), share):
+        problem = _Problem(prior, likelihood, starts[at : at + share], lower, upper)
+        problem.minimise(max_iterations, tolerance)
+        parts.append(problem.result(at))
+    return RefinedTrajectories(
+        np.concatenate([part.states for part in parts]),
+        np.concatenate([part.energies for part in parts]),
+        np.concatenate([part.observation_energies for part in parts]),
+        np.concatenate([part.free for part in parts]),
+        np.concatenate([part.status for part in parts]),
+        np.concatenate([part.iterations for part in parts]),
+        tuple(factor for part in parts for factor in part.factors),
+        np.concatenate([part.starts for part in parts]),
+    )
+
+
+class _Problem:
+    """The minimisation of some trajectories at once: where they are, and how each one steps."""
+
+    def __init__(
+        self,
+        prior: TrajectoryPrior,
+        likelihood: SequenceLikelihood,
+        starts: Array,
+        lower: ArrayLike,
+        upper: ArrayLike,
+    ) -> None:
+        count, self.times, self.size = starts.shape
+        self.prior, self.likelihood = prior, likelihood
+        self.low, self.high = limits_of_states(lower, upper, prior.dimension, self.size)
+        self.bounded = bool(np.isfinite(self.low).any() or np.isfinite(self.high).any())
+        self.width = prior.precision.bandwidth
+        self.band = prior.precision.band()
+        self.lam = np.full(count, FIRST_DAMPING)
+        self.growth = np.full(count, 2.0)
+        self.exact = np.ones(count, dtype=bool)
+        self.status = np.full(count, Status.ITERATION_LIMIT, dtype=np.int8)
+        self.iterations = np.zeros(count, dtype=np.int32)
+        self.states = np.clip(starts, self.low, self.high)
+        self.energy, self.observed, self.gradient, self.hessian = self._evaluate(
+            self.states, Curvature.EXACT
+        )
+        self.status[~np.isfinite(self.energy)] = Status.NOT_FINITE
+
+    def minimise(self, max_iterations: int, tolerance: float) -> None:
+        """Steps until every trajectory has converged, or may not go on."""
+        active = np.flatnonzero(self.status == Status.ITERATION_LIMIT)
+        for _ in range(max_iterations + 1):
+            step, predicted = self._steps(active)
+            done = predicted < tolerance
+            self.status[active[done]] = Status.CONVERGED
+            active, step, predicted = active[~done], step[~done], predicted[~done]
+            over = self.iterations[active] >= max_iterations
+            active, step, predicted = active[~over], step[~over], predicted[~over]
+            if len(active) == 0:
+                break
+            trial = np.clip(self.states[active] + step, self.low, self.high)
+            found = self._evaluate(trial, Curvature.EXACT)
+            self.iterations[active] += 1
+            decrease = self.energy[active] - found[0]
+            ratio = np.where(np.isfinite(decrease), decrease, -np.inf) / predicted
+            better = ratio > 1e-3
+
+            rows = active[better]
+            self.states[rows] = trial[better]
+            for name, value in zip(('energy', 'observed', 'gradient', 'hessian'), found):
+                getattr(self, name)[rows] = value[better]
+            gain = 1.0 - (2.0 * np.minimum(ratio[better], 2.0) - 1.0) ** 3
+            self.lam[rows] *= np.maximum(0.1, gain)
+            self.growth[rows] = 2.0
+            self.exact[rows] = True
+
+            rows = active[~better]
+            again = self.exact[rows]
+            self.exact[rows] = False
+            rows = rows[~again]
+            self.lam[rows] = np.maximum(self.lam[rows], FIRST_DAMPING) * self.growth[rows]
+            self.growth[rows] *= 2.0
+            stalled = rows[self.lam[rows] > DAMPING_LIMIT]
+            self.status[stalled] = Status.STALLED
+            active = active[self.status[active] == Status.ITERATION_LIMIT]
+
+    def result(self, offset: int) -> RefinedTrajectories:
+        """The optima; `offset` is the index of the first start."""
+        everyone = np.arange(len(self.states))
+        resting = self._resting(everyone)
+        # The density beyond a limit is zero and falls off inside as exp(-g distance).
+        slope = np.where(resting, self.gradient, 0.0) ** 2
+        factors = [self._factor(self.hessian[i], slope[i]) for i in everyone]
+        failed = np.array([i for i in everyone if factors[i] is None], dtype=np.intp)
+        if len(failed):
+            positive = self._evaluate(self.states[failed], Curvature.POSITIVE)[3]
+            for i, hessian in zip(failed, positive):
+                factors[i] = self._positive_factor(hessian, slope[i])
+        return RefinedTrajectories(
+            self.states,
+            self.energy,
+            self.observed,
+            ~resting,
+            self.status,
+            self.iterations,
+            tuple(factor for factor in factors if factor is not None),
+            everyone + offset,
+        )
+
+    def _evaluate(self, states: Array, curvature: Curvature) -> tuple[Array, Array, Array, Array]:
+        """Energy, that of the observations, gradient (M, T, n), Hessians (M, T, d, d)."""
+        m, d = len(states), self.prior.dimension
+        at = np.tile(np.arange(self.times), m)
+        poses = states[:, :, :d].reshape(-1, d)
+        value, slope, hessian = self.likelihood.energy(poses, at, curvature)
+        assert hessian is not None
+        observed = value.reshape(m, self.times).sum(1)
+        energy = observed + self.prior.constant
+        gradient = np.empty((m, self.times, self.size))
+        information = self.prior.information.reshape(-1)
+        for i in range(m):
+            flat = states[i].reshape(-1)
+            product = dsbmv(self.width, 1.0, self.band.T, flat, lower=1)
+            energy[i] += flat @ (0.5 * product - information)
+            gradient[i] = (product - information).reshape(self.times, self.size)
+        gradient[:, :, :d] += slope.reshape(m, self.times, d)
+        return energy, observed, gradient, hessian.reshape(m, self.times, d, d)
+
+    def _resting(self, which: Index) -> NDArray[np.bool_]:
+        """Variables on a limit with a gradient that pushes them outwards."""
+        states, gradient = self.states[which], self.gradient[which]
+        result: NDArray[np.bool_] = ((states <= self.low) & (gradient > 0)) | (
+            (states >= self.high) & (gradient < 0)
+        )
+        return result
+
+    def _steps(self, active: Index) -> tuple[Array, Array]:
+        """Damped steps (M, T, n), projected onto the box, and the decrease that is predicted."""
+        step = np.zeros((len(active), self.times, self.size))
+        predicted = np.zeros(len(active))
+        resting = self._resting(active)
+        failed = []
+        for row, i in enumerate(active):
+            if not self.exact[i] or not self._step(i, self.hessian[i], resting[row], step[row]):
+                failed.append(row)
+        if failed:
+            positive = self._evaluate(self.states[active[failed]], Curvature.POSITIVE)[3]
+            for row, hessian in zip(failed, positive):
+                i = active[row]
+                # Indefinite: as little of the positive Hessian as makes it positive definite.
+                if self.exact[i] and any(
+                    self._step(
+                        i,
+                        (1.0 - share) * self.hessian[i] + share * hessian,
+                        resting[row],
+                        step[row],
+                    )
+                    for share in SHARES
+                ):
+                    continue
+                self.exact[i] = False
+                while not self._step(i, hessian, resting[row], step[row]):
+                    self.lam[i] *= 4.0
+        for row, i in enumerate(active):
+            move = np.clip(self.states[i] + step[row], self.low, self.high) - self.states[i]
+            slope = float(np.vdot(self.gradient[i], move))
+            damping = self.lam[i] * float(np.vdot(move * self._metric(self.hessian[i]), move))
+            predicted[row] = -0.5 * slope + 0.5 * damping if slope < 0 else 0.0
+            step[row] = move
+        return step, predicted
+
+    def _step(self, i: int, hessian: Array, resting: NDArray[np.bool_], step: Array) -> bool:
+        """Writes the step of a trajectory; False where the matrix is not positive definite."""
+        extra = self.lam[i] * self._metric(hessian)
+        held = resting if self.bounded and resting.any() else None
+        factor = self._factor(hessian, extra, held)
+        if factor is None:
+            return False
+        right = -self.gradient[i]
+        if held is not None:
+            right = np.where(held, 0.0, right)
+        solution, _ = dpbtrs(factor.band, right.reshape(-1, 1), lower=1, overwrite_b=1)
+        step[:] = solution.reshape(step.shape)
+        return True
+
+    def _metric(self, hessian: Array) -> Array:
+        """Diagonal (T, n) in which steps are measured."""
+        d = self.prior.dimension
+        metric = np.diagonal(self.prior.precision.diagonal, axis1=1, axis2=2).copy()
+        metric[:, :d] += np.maximum(np.diagonal(hessian, axis1=1, axis2=2), 0.0)
+        return metric
+
+    def _factor(
+        self, hessian: Array, extra: Array, held: NDArray[np.bool_] | None = None
+    ) -> BlockCholesky | None:
+        """Factor of the prior's precision + Hessians (T, d, d) + a diagonal (T, n), or None."""
+        columns = self.band.copy()
+        add_diagonal(columns, hessian, self.size)
+        columns[:, 0] += extra.reshape(-1)
+        if held is not None:
+            hold(columns, np.flatnonzero(held))
+        try:
+            return factorise_band(columns.T, self.times, self.size)
+        except NotPositiveDefiniteError:
+            return None
+
+    def _positive_factor(self, hessian: Array, extra: Array) -> BlockCholesky:
+        """As `_factor`, with what it takes to make the matrix positive definite."""
+        shift = 0.0
+        while True:
+            factor = self._factor(hessian, extra + shift * self._metric(hessian))
+            if factor is not None:
+                return factor
+            shift = max(4.0 * shift, 1e-9)
+
+
+def limits_of_states(
+    lower: ArrayLike, upper: ArrayLike, dimension: int, size: int
+) -> tuple[Array, Array]:
+    """Limits (n,) of the states from those (d,) of the poses; velocities have none.
+
+    Raises:
+        ValueError: limits of another dimension, or a lower one above the upper one.
+    """
+    low, high = np.full((2, size), [[-np.inf], [np.inf]])
+    for name, limits, given in (('lower', low, lower), ('upper', high, upper)):
+        value = np.asarray(given, dtype=np.float64)
+        if value.shape not in ((), (dimension,)):
+            raise ValueError(f'{name} limits have shape {value.shape}, wanted ({dimension},)')
+        limits[:dimension] = value
+    if not (low <= high).all():
+        i = int(np.argmin(low <= high))
+        raise ValueError(f'limits of variable {i}: lower {low[i]} is above upper {high[i]}')
+    return low, high
+
+
+@njit(cache=True, nogil=True)
+def add_diagonal(columns: Array, blocks: Array, n: int) -> None:
+    """Adds blocks (T, d, d) to the leading parts of diagonal blocks in a band (T n, width + 1)."""
+    times, d, _ = blocks.shape
+    for t in range(times):
+        for b in range(d):
+            for a in range(b, d):
+                columns[t * n + b, a - b] += blocks[t, b, a]
+
+
+@njit(cache=True, nogil=True)
+def hold(columns: Array, held: NDArray[np.int64]) -> None:
+    """Takes variables out of a system in band storage: their rows and columns become those of I."""
+    width = columns.shape[1] - 1
+    for j in held:
+        columns[j] = 0.0
+        for b in range(1, min(width, j) + 1):
+            columns[j - b, b] = 0.0
+        columns[j, 0] = 1.0

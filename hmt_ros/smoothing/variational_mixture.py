@@ -1,0 +1,434 @@
+"""The mixture over trajectories that is closest to the posterior (VMS 6).
+
+    q = sum_i a_i N(M_i, s_i^2 S_i),    F(q) = E_q[log q(X) - log p(X, R)] = KL(q || p(X | R)) - log
+    p(R)
+
+F is minimised over proportions a (softmax), means M, inflations s (log), or whole covariances
+through their block Cholesky factors. The expectation is over X = M_i + s_i L_i'^-1 z with the same
+antithetic noise z throughout, so that the sampled F is a smooth function with exact gradients and
+its descent is repeatable; what is reported besides comes from fresh samples, with a standard error.
+Variables are
+scaled by the curvature that F would have, were the posterior q: means by L_i sqrt(a_i), log s_i by
+sqrt(2 D a_i).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import logsumexp
+
+from hmt_ros.inference.block_tridiagonal import BlockCholesky, add_band_product
+from hmt_ros.smoothing.component_overlaps import NEGLIGIBLE, add_overlaps, pair_distances
+from hmt_ros.smoothing.dynamics import TrajectoryPrior
+from hmt_ros.smoothing.likelihood import Curvature, SequenceLikelihood
+
+Array = NDArray[np.float64]
+
+ADAPTABLE = ('weights', 'means', 'inflation', 'covariances')
+# Components are split into so many parts, whatever the machine: sums keep their order.
+PARTS = 4
+# Iterations in a row that may pass without a gain on samples that the descent does not see.
+PATIENCE = 3
+# Least proportion that scales the variables of a component.
+LEAST_WEIGHT = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class VariationalMixture:
+    """A mixture over trajectories of states, and how it was found.
+
+    Attributes:
+        weights: (M,) a_i.
+        states: (M, T, n) M_i.
+        inflation: (M,) s_i.
+        factors: M factors of the precisions S_i^-1, without inflation.
+        free_energy: (I,) at the start and after each iteration, nats, on the samples of the
+            descent.
+        fresh: F on samples that were not used, and its standard error.
+    """
+
+    weights: Array
+    states: Array
+    inflation: Array
+    factors: tuple[BlockCholesky, ...]
+    free_energy: Array
+    fresh: tuple[float, float]
+
+
+def laplace_weights(energies: Array, factors: Sequence[BlockCholesky]) -> Array:
+    """Proportions a_i from p(M_i, R) |S_i|^(1/2), the mass of each optimum."""
+    log = laplace_masses(energies, factors)
+    result: Array = np.exp(log - logsumexp(log))
+    return result
+
+
+def laplace_masses(energies: Array, factors: Sequence[BlockCholesky]) -> Array:
+    """log (M,) of the integrals of p(X, R) around optima, as if it were Gaussian there."""
+    size = factors[0].times * factors[0].size
+    determinants = np.array([factor.log_determinant for factor in factors])
+    result: Array = -energies - 0.5 * determinants + 0.5 * size * np.log(2 * np.pi)
+    return result
+
+
+def peak_weights(energies: Array) -> Array:
+    """Proportions a_i from the height p(M_i, R) of each optimum, those of VMS."""
+    result: Array = np.exp(-energies - logsumexp(-energies))
+    return result
+
+
+def minimise_free_energy(
+    weights: Array,
+    states: Array,
+    factors: Sequence[BlockCholesky],
+    prior: TrajectoryPrior,
+    likelihood: SequenceLikelihood,
+    *,
+    adapt: Sequence[str] = ('weights', 'means', 'inflation'),
+    low: Array | float = -np.inf,
+    high: Array | float = np.inf,
+    samples: int = 8,
+    seed: int = 0,
+    max_iterations: int = 15,
+    tolerance: float = 1e-4,
+) -> VariationalMixture:
+    """Descends from a mixture of M components with inflation 1.
+
+    Args:
+        weights: (M,) proportions.
+        states: (M, T, n) means.
+        factors: of the precisions.
+        prior, likelihood: what -log p(X, R) is made of.
+        adapt: some of 'weights', 'means', 'inflation', 'covariances'.
+        low, high: (n,) limits of the means.
+        samples: per component, an even number.
+        seed: of the samples.
+        max_iterations: of L-BFGS; 0 evaluates only.
+        tolerance: ends when an iteration gains less, nats.
+
+    Raises:
+        ValueError: something to adapt that does not exist, an odd number of samples.
+    """
+    wrong = [name for name in adapt if name not in ADAPTABLE]
+    if wrong:
+        raise ValueError(f'adapt: no {wrong[0]!r}, wanted some of {ADAPTABLE}')
+    if samples < 2 or samples % 2:
+        raise ValueError(f'samples must be an even number from 2 up, saw {samples}')
+    size = states.shape[1] * states.shape[2]
+    rng = np.random.default_rng(seed)
+    descent, choice = (matched(antithetic(rng, len(weights), samples, size)) for _ in range(2))
+    fresh = antithetic(rng, len(weights), samples, size)
+    objective = FreeEnergy(weights, states, factors, prior, likelihood, adapt, low, high, descent)
+    x = np.zeros(objective.parameters)
+    trace = np.array([objective(x)[0]])
+    if max_iterations > 0 and len(x):
+        x, trace = _descend(objective, choice, trace[0], max_iterations, tolerance)
+    mixture = objective.mixture(x)
+    a, means, inflation, found = mixture
+    each = objective.sampled(mixture, fresh)
+    # Antithetic pairs are one observation each.
+    pairs = each.reshape(len(a), -1, 2).mean(2)
+    error = np.nan
+    if pairs.shape[1] > 1:
+        error = float(np.sqrt((a**2 * pairs.var(1, ddof=1) / pairs.shape[1]).sum()))
+    return VariationalMixture(
+        a,
+        means.reshape(states.shape),
+        inflation,
+        tuple(found),
+        trace,
+        (float(a @ each.mean(1)), error),
+    )
+
+
+def antithetic(rng: np.random.Generator, components: int, samples: int, size: int) -> Array:
+    """White noise (M, S, D) in pairs z, -z."""
+    half = rng.standard_normal((components, samples // 2, 1, size))
+    return np.concatenate([half, -half], axis=2).reshape(components, samples, size)
+
+
+def matched(noise: Array) -> Array:
+    """Noise (M, S, D) scaled to the variance that it should have, for each component.
+
+    What is known of the noise need not be estimated from it: with few samples an inflation would
+    follow their chance variance.
+    """
+    result: Array = noise / np.sqrt((noise * noise).mean((1, 2), keepdims=True))
+    return result
+
+
+def _descend(
+    objective: FreeEnergy, choice: Array, start: float, max_iterations: int, tolerance: float
+) -> tuple[Array, Array]:
+    """L-BFGS from 0: the best iterate, and the values after each iteration up to it.
+
+    With few samples the descent ends up fitting their noise. The iterate is kept that has the least
+    F on other samples, and the descent ends when F no longer falls on those.
+    """
+    iterates = [np.zeros(objective.parameters)]
+    trace = [start]
+    held_out = [_free_energy(objective, iterates[0], choice)]
+    last = (start, iterates[0])
+
+    def function(x: Array) -> tuple[float, Array]:
+        nonlocal last
+        value, gradient = objective(x)
+        last = (value, x.copy())
+        return value, gradient
+
+    def record(x: Array) -> None:
+        value = last[0] if np.array_equal(last[1], x) else objective(x)[0]
+        if value > trace[-1]:
+            raise StopIteration
+        gained = trace[-1] - value
+        trace.append(value)
+        held_out.append(_free_energy(objective, x, choice))
+        iterates.append(x.copy())
+        # Two iterates are held: the best so far, and the last.
+        for i in range(len(iterates) - 1):
+            if i != int(np.argmin(held_out)):
+                iterates[i] = iterates[0][:0]
+        if gained < tolerance or len(held_out) - 1 - int(np.argmin(held_out)) >= PATIENCE:
+            raise StopIteration
+
+    minimize(
+        function,
+        iterates[0].copy(),
+        jac=True,
+        method='L-BFGS-B',
+        callback=record,
+        options={'maxiter': max_iterations, 'maxcor': 8, 'maxfun': 3 * max_iterations},
+    )
+    best = int(np.argmin(held_out))
+    return iterates[best], np.array(trace[: best + 1])
+
+
+def _free_energy(objective: FreeEnergy, x: Array, noise: Array) -> float:
+    mixture = objective.mixture(x)
+    return float(mixture[0] @ objective.sampled(mixture, noise).mean(1))
+
+
+Mixture = tuple[Array, Array, Array, Sequence[BlockCholesky]]
+
+
+class FreeEnergy:
+    """F on fixed samples as a function of unconstrained numbers, 0 at the start."""
+
+    def __init__(
+        self,
+        weights: Array,
+        states: Array,
+        factors: Sequence[BlockCholesky],
+        prior: TrajectoryPrior,
+        likelihood: SequenceLikelihood,
+        adapt: Sequence[str],
+        low: Array | float,
+        high: Array | float,
+        noise: Array,
+    ) -> None:
+        self.count, self.times, self.size = states.shape
+        self.total = self.times * self.size
+        self.prior, self.likelihood, self.noise = prior, likelihood, noise
+        self.band = prior.precision.band()
+        self.start = states.reshape(self.count, -1)
+        self.log_weights = np.log(np.maximum(weights, 1e-300))
+        self.factors = list(factors)
+        self.low = np.tile(np.broadcast_to(low, (self.size,)), self.times)
+        self.high = np.tile(np.broadcast_to(high, (self.size,)), self.times)
+        held = np.sqrt(np.maximum(weights, LEAST_WEIGHT))
+        self.scale = held
+        self.spread = held * np.sqrt(2.0 * self.total)
+        self.adapt = tuple(name for name in ADAPTABLE if name in adapt)
+        width = max(factor.width for factor in factors) + 1
+        sizes = {
+            'weights': self.count,
+            'means': self.count * self.total,
+            'inflation': self.count,
+            'covariances': self.count * self.total * width,
+        }
+        self.slices: dict[str, slice] = {}
+        at = 0
+        for name in self.adapt:
+            self.slices[name] = slice(at, at + sizes[name])
+            at += sizes[name]
+        self.parameters = at
+        self.bands = np.stack([factor.band.T for factor in factors])
+        self.inside = np.ones((self.total, width), dtype=bool)
+        for b in range(width):
+            self.inside[self.total - b :, b] = False
+        self.marginals = np.concatenate([factor.inverse_blocks()[0] for factor in factors])
+        self.roots = np.stack([factor.solve_transposed(z) for factor, z in zip(factors, noise)])
+
+    def mixture(self, x: Array) -> Mixture:
+        """Proportions (M,), means (M, D), inflations (M,) and factors."""
+        log = self.log_weights
+        if 'weights' in self.slices:
+            log = log + x[self.slices['weights']] / self.scale
+        means = self.start
+        if 'means' in self.slices:
+            moves = x[self.slices['means']].reshape(self.count, -1) / self.scale[:, None]
+            moves = np.stack([f.solve_transposed(move) for f, move in zip(self.factors, moves)])
+            means = np.clip(means + moves, self.low, self.high)
+        inflation = np.ones(self.count)
+        if 'inflation' in self.slices:
+            inflation = np.exp(np.clip(x[self.slices['inflation']] / self.spread, -3.0, 3.0))
+        factors: Sequence[BlockCholesky] = self.factors
+        if 'covariances' in self.slices:
+            factors = self._factors(x[self.slices['covariances']])
+        return np.exp(log - logsumexp(log)), means, inflation, factors
+
+    def _factors(self, x: Array) -> list[BlockCholesky]:
+        """L with the diagonal times exp(.), and the rest moved in units of its row's diagonal."""
+        given = x.reshape(self.bands.shape) / self.scale[:, None, None]
+        result = []
+        for band, change in zip(self.bands, given):
+            new = band + np.where(self.inside, change * self._row_scale(band), 0.0)
+            new[:, 0] = band[:, 0] * np.exp(change[:, 0])
+            result.append(BlockCholesky(new.T, self.times, self.size))
+        return result
+
+    def _row_scale(self, band: Array) -> Array:
+        """L[r, r] at the place of L[r, c]."""
+        diagonal = np.concatenate([band[:, 0], np.ones(band.shape[1])])
+        return np.lib.stride_tricks.sliding_window_view(diagonal, band.shape[1])[: len(band)]
+
+    def sampled(self, mixture: Mixture, noise: Array) -> Array:
+        """log q(X) - log p(X, R) at samples of each component, (M, S), with noise (M, S, D)."""
+        roots = np.stack([f.solve_transposed(z) for f, z in zip(mixture[3], noise)])
+        return self._evaluate(mixture, noise, roots)[0]
+
+    def __call__(self, x: Array) -> tuple[float, Array]:
+        """F and its gradient."""
+        mixture = self.mixture(x)
+        weights, means, inflation, factors = mixture
+        roots = self.roots
+        if 'covariances' in self.slices:
+            roots = np.stack([f.solve_transposed(z) for f, z in zip(factors, self.noise)])
+        each, slope, parts = self._evaluate(mixture, self.noise, roots)
+        mean_gradient, inflation_gradient, weight_gradient, band_gradient = parts
+        value = float(weights @ each.mean(1))
+        gradient = np.empty(self.parameters)
+        share = weights / each.shape[1]
+        if 'weights' in self.slices:
+            log = weights * each.mean(1) + weight_gradient
+            gradient[self.slices['weights']] = (log - weights * log.sum()) / self.scale
+        if 'means' in self.slices:
+            down = mean_gradient + share[:, None] * slope.sum(1)
+            down[(means <= self.low) | (means >= self.high)] = 0.0
+            down = np.stack([f.solve_lower(g) for f, g in zip(self.factors, down)])
+            gradient[self.slices['means']] = (down / self.scale[:, None]).reshape(-1)
+        if 'inflation' in self.slices:
+            along = np.einsum('msd,msd->m', slope, roots) * inflation
+            gradient[self.slices['inflation']] = (inflation_gradient + share * along) / self.spread
+        if 'covariances' in self.slices:
+            gradient[self.slices['covariances']] = self._band_gradient(
+                mixture, roots, share[:, None, None] * slope, weight_gradient, band_gradient
+            ).reshape(-1)
+        return value, gradient
+
+    def _band_gradient(
+        self, mixture: Mixture, roots: Array, slope: Array, mass: Array, direct: Array
+    ) -> Array:
+        """Gradient (M, D, width + 1) with regard to what moves the factors.
+
+        A sample X = M + s u, u = L'^-1 z, moves by -s L'^-1 dL' u.
+        """
+        result = direct
+        for i, (factor, u, g) in enumerate(zip(mixture[3], roots, slope)):
+            back = factor.solve_lower(g)
+            for b in range(result.shape[2]):
+                moved = u[:, b:] * back[:, : self.total - b]
+                result[i, : self.total - b, b] -= mixture[2][i] * moved.sum(0)
+            result[i, :, 0] += mass[i] / factor.band[0]
+            scale = self._row_scale(self.bands[i]).copy()
+            scale[:, 0] = factor.band[0]
+            result[i] *= np.where(self.inside, scale, 0.0)
+        return result / self.scale[:, None, None]
+
+    def _evaluate(
+        self, mixture: Mixture, noise: Array, roots: Array
+    ) -> tuple[Array, Array, tuple[Array, ...]]:
+        """log q - log p at samples (M, S), its gradient, and those of log q at fixed samples."""
+        weights, means, inflation, factors = mixture
+        count, samples, total = noise.shape
+        bands = self.bands
+        whole = 'covariances' in self.slices
+        if whole:
+            bands = np.stack([factor.band.T for factor in factors])
+        log_scales = 0.5 * np.array([factor.log_determinant for factor in factors]) - total * (
+            np.log(inflation) + 0.5 * np.log(2 * np.pi)
+        )
+        log_weights = np.log(np.maximum(weights, 1e-300))
+        near = self._near(means, inflation)
+        each = np.empty((count, samples))
+        slope = np.empty((count, samples, total))
+        edges = np.linspace(0, count, PARTS + 1).astype(int)
+        sums = [
+            (
+                np.zeros((count, total)),
+                np.zeros(count),
+                np.zeros(count),
+                np.zeros(bands.shape if whole else (0, 0, 0)),
+            )
+            for _ in range(PARTS)
+        ]
+
+        def work(part: int) -> None:
+            for i in range(edges[part], edges[part + 1]):
+                points = means[i] + inflation[i] * roots[i]
+                add_overlaps(
+                    i, points, noise[i], log_weights, log_scales, means, inflation, bands,
+                    near[i], weights[i] / samples, each[i], slope[i], *sums[part],
+                )  # fmt: skip
+                energy, pull = self._energy(points)
+                each[i] += energy
+                slope[i] += pull
+
+        list(_threads().map(work, range(PARTS)))
+        return each, slope, tuple(sum(column[1:], start=column[0]) for column in zip(*sums))
+
+    def _energy(self, points: Array) -> tuple[Array, Array]:
+        """-log p(X, R) (S,) and its gradient (S, D) at trajectories (S, D)."""
+        s, d = len(points), self.prior.dimension
+        gradient = np.zeros_like(points)
+        add_band_product(self.band, points, gradient)
+        information = self.prior.information.reshape(-1)
+        value = np.einsum('sd,sd->s', points, 0.5 * gradient - information) + self.prior.constant
+        gradient -= information
+        poses = points.reshape(s * self.times, self.size)[:, :d]
+        at = np.tile(np.arange(self.times), s)
+        observed, slope, _ = self.likelihood.energy(poses, at, Curvature.NONE)
+        gradient.reshape(s * self.times, self.size)[:, :d] += slope
+        return value + observed.reshape(s, self.times).sum(1), gradient
+
+    def _near(self, means: Array, inflation: Array) -> NDArray[np.bool_]:
+        """(M, M) which components may overlap, by their marginals where they are farthest apart."""
+        if 'covariances' in self.slices:
+            return np.ones((self.count, self.count), dtype=bool)
+        i, j = np.triu_indices(self.count, 1)
+        if len(i) == 0:
+            return np.ones((1, 1), dtype=bool)
+        metric = self.bands[:, :, 0] ** 2
+        farthest = np.empty((self.count, self.count), dtype=np.int64)
+        for k in range(self.count):
+            square = (means - means[k]) ** 2 * metric
+            farthest[k] = square.reshape(self.count, self.times, self.size).sum(2).argmax(1)
+        at = farthest[i, j]
+        poses = means.reshape(-1, self.size)
+        pairs = np.stack([i, j], axis=1) * self.times + at[:, None]
+        scales = np.repeat(inflation**2, self.times)
+        distances = pair_distances(poses, self.marginals, scales, pairs)
+        near = np.ones((self.count, self.count), dtype=bool)
+        near[i, j] = near[j, i] = 0.25 * distances < NEGLIGIBLE
+        return near
+
+
+@lru_cache(maxsize=1)
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(2, thread_name_prefix='smoothing')

@@ -1,0 +1,83 @@
+"""Small sequences with posteriors that are known exactly."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.smoothing import LinearGaussianDynamics
+
+Modes = Callable[..., list[GaussianMixture]]
+
+
+def make_modes(radius: float, seed: int = 0, times: int = 5, k: int = 3, d: int = 2):
+    """Mixtures of K modes on a circle, wandering a little."""
+    rng = np.random.default_rng(seed)
+    angle = 2 * np.pi * np.arange(k) / k
+    centres = np.zeros((k, d))
+    centres[:, 0] = radius * np.cos(angle)
+    centres[:, -1] += radius * np.sin(angle) if d > 1 else 0.0
+    result = []
+    for _ in range(times):
+        factors = 0.4 * rng.normal(size=(k, d, d))
+        covariances = factors @ factors.swapaxes(1, 2) + 0.3 * np.eye(d)
+        means = centres + 0.3 * rng.normal(size=(k, d))
+        result.append(GaussianMixture(rng.dirichlet(np.full(k, 4.0)) * 1.7, means, covariances))
+    return result
+
+
+def make_exact(
+    mixtures: list[GaussianMixture], dynamics: LinearGaussianDynamics, intervals: np.ndarray
+) -> tuple[float, list[GaussianMixture]]:
+    """log p(R) and exact marginals of first-order dynamics, all paths enumerated, densely."""
+    times, d = len(mixtures), mixtures[0].dimension
+    prior = dynamics.prior(intervals)
+    dense = np.zeros((times, d, times, d))
+    for t in range(times):
+        dense[t, :, t] = prior.precision.diagonal[t]
+    for t, block in enumerate(prior.precision.lower):
+        dense[t + 1, :, t], dense[t, :, t + 1] = block, block.T
+    logs, means, covariances = [], [], []
+    for path in itertools.product(*(range(len(m)) for m in mixtures)):
+        precision, pull, log = dense.copy(), prior.information.copy(), -prior.constant
+        for t, (mixture, k) in enumerate(zip(mixtures, path)):
+            inverse = np.linalg.inv(mixture.covariances[k])
+            precision[t, :, t] += inverse
+            pull[t] += inverse @ mixture.means[k]
+            log += np.log(mixture.weights[k])
+            log -= 0.5 * mixture.means[k] @ inverse @ mixture.means[k]
+            log -= 0.5 * np.linalg.slogdet(2 * np.pi * mixture.covariances[k])[1]
+        covariance = np.linalg.inv(precision.reshape(times * d, -1))
+        mean = covariance @ pull.reshape(-1)
+        log += 0.5 * mean @ pull.reshape(-1) + 0.5 * np.linalg.slogdet(2 * np.pi * covariance)[1]
+        logs.append(log)
+        means.append(mean.reshape(times, d))
+        covariances.append(covariance.reshape(times, d, times, d))
+    weights = np.exp(np.array(logs) - logsumexp(logs))
+    marginals = [
+        GaussianMixture(
+            weights, np.array([m[t] for m in means]), np.array([c[t, :, t] for c in covariances])
+        )
+        for t in range(times)
+    ]
+    return float(logsumexp(logs)), marginals
+
+
+@pytest.fixture
+def modes() -> Modes:
+    return make_modes
+
+
+@pytest.fixture
+def exact():
+    return make_exact
+
+
+@pytest.fixture
+def walk() -> LinearGaussianDynamics:
+    return LinearGaussianDynamics.random_walk([1.0, 2.0])

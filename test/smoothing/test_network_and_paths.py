@@ -1,0 +1,170 @@
+"""The embedded network against quadrature and sampling, its paths against enumeration."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal, multivariate_t
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.smoothing import LinearGaussianDynamics
+from hmt_ros.smoothing.embedded_network import embedded_network, sampled_network
+from hmt_ros.smoothing.mode_sequence import ModeSequence, merge_close_modes
+from hmt_ros.smoothing.paths import (
+    diverse_subset,
+    k_best_paths,
+    most_probable_paths,
+    node_probabilities,
+    visiting_probabilities,
+)
+
+INTERVALS = np.array([0.5, 1.0, 0.5, 1.0])
+
+
+@pytest.fixture
+def network(modes, walk):
+    return embedded_network(modes(2.0), walk, INTERVALS)
+
+
+@pytest.fixture
+def every_path(network):
+    paths = [np.array(p) for p in itertools.product(range(3), repeat=5)]
+    return paths, np.array([network.log_value(p) for p in paths])
+
+
+@pytest.mark.parametrize('d', [1, 2, 5])
+def test_values_in_closed_form(modes, d):
+    mixtures = modes(2.0, d=d, times=3, k=4)
+    dynamics = LinearGaussianDynamics.discrete(0.9 * np.eye(d) + 0.02, np.eye(d))
+    network = embedded_network(mixtures, dynamics, np.ones(2))
+    for mixture, values in zip(mixtures, network.nodes):
+        for i, value in enumerate(values):
+            each = [
+                w * multivariate_normal(m, s + mixture.covariances[i]).pdf(mixture.means[i])
+                for w, m, s in zip(mixture.weights, mixture.means, mixture.covariances)
+            ]
+            assert value == pytest.approx(np.log(sum(each)))
+    a, q = dynamics.transition(1.0)
+    before, after = mixtures[:2]
+    for i, j in itertools.product(range(4), repeat=2):
+        spread = after.covariances[j] + a @ before.covariances[i] @ a.T + q
+        expected = multivariate_normal(a @ before.means[i], spread).logpdf(after.means[j])
+        assert network.links[0][i, j] == pytest.approx(expected)
+
+
+def test_sampled_values_meet_those_in_closed_form(modes, walk):
+    mixtures = modes(1.0)
+    exact = embedded_network(mixtures, walk, INTERVALS)
+    found = sampled_network(
+        mixtures, lambda x, dt: x, lambda dt: walk.transition(dt)[1], INTERVALS, samples=4000
+    )
+    for a, b in zip((*found.nodes, *found.links), (*exact.nodes, *exact.links)):
+        np.testing.assert_allclose(a, b, atol=0.08)
+
+
+def test_student_modes_against_quadrature():
+    one = GaussianMixture([2.0], [[0.3]], [[[0.5]]])
+    two = GaussianMixture([1.0], [[1.5]], [[[0.7]]])
+    found = sampled_network(
+        [one, two], lambda x, dt: np.sin(x), lambda dt: np.array([[0.2]]), np.ones(1),
+        degrees_of_freedom=[np.array([3.0]), np.array([4.0])], samples=40_000,
+    )  # fmt: skip
+    x = np.linspace(-60, 60, 6001)
+    step = x[1] - x[0]
+    p = multivariate_t.pdf(x, [0.3], [[0.5]], df=3)
+    r = multivariate_t.pdf(x, [1.5], [[0.7]], df=4)
+    assert found.nodes[0][0] == pytest.approx(np.log(2 * (p * p).sum() * step), abs=0.02)
+    move = np.exp(-0.5 * (x[None] - np.sin(x)[:, None]) ** 2 / 0.2) / np.sqrt(2 * np.pi * 0.2)
+    assert found.links[0][0, 0] == pytest.approx(np.log(p @ move @ r * step**2), abs=0.02)
+
+
+def test_most_probable_paths_are_those_of_enumeration(network, every_path):
+    paths, values = every_path
+    found = most_probable_paths(network)
+    assert len(found) == 9
+    assert (np.diff(found.log_values) <= 0).all()
+    for nodes, value in zip(found.nodes, found.log_values):
+        same = [v for p, v in zip(paths, values) if (p[0], p[-1]) == (nodes[0], nodes[-1])]
+        assert value == pytest.approx(max(same))
+        assert network.log_value(nodes) == pytest.approx(value)
+
+
+def test_k_best_paths_are_those_of_enumeration(network, every_path):
+    paths, values = every_path
+    found = k_best_paths(network, 4)
+    assert len(found) == 36
+    for ends in itertools.product(range(3), repeat=2):
+        same = sorted((v for p, v in zip(paths, values) if (p[0], p[-1]) == ends), reverse=True)
+        mine = (found.nodes[:, 0] == ends[0]) & (found.nodes[:, -1] == ends[1])
+        np.testing.assert_allclose(found.log_values[mine], same[:4])
+    everything = k_best_paths(network, 1000)
+    np.testing.assert_allclose(everything.log_values, np.sort(values)[::-1])
+    assert len(np.unique(everything.nodes, axis=0)) == 243
+    with pytest.raises(ValueError, match='k must be'):
+        k_best_paths(network, 0)
+
+
+def test_visiting_probabilities(network, every_path):
+    paths, values = every_path
+    everything = k_best_paths(network, 27)
+    for t, table in enumerate(visiting_probabilities(network, everything)):
+        np.testing.assert_allclose(table.sum(1), 1.0)
+        for source, k in itertools.product(range(3), repeat=2):
+            of = [v for p, v in zip(paths, values) if p[0] == source]
+            through = [v for p, v in zip(paths, values) if p[0] == source and p[t] == k]
+            expected = np.exp(logsumexp(through) - logsumexp(of)) if through else 0.0
+            assert table[source, k] == pytest.approx(expected)
+
+
+def test_node_probabilities_are_sums_over_all_paths(network, every_path):
+    paths, values = every_path
+    weights = np.exp(values - logsumexp(values))
+    for t, found in enumerate(node_probabilities(network)):
+        expected = [sum(w for p, w in zip(paths, weights) if p[t] == k) for k in range(3)]
+        np.testing.assert_allclose(found, expected)
+
+
+def test_a_diverse_subset_differs_more_than_the_best_paths(network):
+    paths = k_best_paths(network, 27)
+    best, diverse = diverse_subset(paths, 12, penalty=0.0), diverse_subset(paths, 12, penalty=5.0)
+    np.testing.assert_allclose(best.log_values, np.sort(paths.log_values)[::-1][:12])
+    assert diverse.log_values[0] == paths.log_values.max()
+    assert len(np.unique(diverse.nodes, axis=0)) == 12
+
+    def agreement(nodes):
+        return (nodes[:, None] == nodes[None]).mean()
+
+    assert agreement(diverse.nodes) < agreement(best.nodes) - 0.02
+    assert len(diverse_subset(paths, 1000)) == 243
+
+
+def test_one_time_and_one_mode(walk):
+    one = GaussianMixture([3.0], [[1.0, 2.0]], [np.eye(2)])
+    network = embedded_network([one], walk, np.zeros(0))
+    assert most_probable_paths(network).nodes.tolist() == [[0]]
+
+
+def test_merging_keeps_the_moments_and_leaves_no_close_pair(modes):
+    for mixture, found in zip(modes(0.6, k=6), merge_close_modes(modes(0.6, k=6), 2.0)):
+        assert len(found) < len(mixture)
+        assert found.weights.sum() == pytest.approx(mixture.weights.sum())
+        np.testing.assert_allclose(found.mean(), mixture.mean())
+        np.testing.assert_allclose(found.covariance(), mixture.covariance())
+        for i, j in itertools.combinations(range(len(found)), 2):
+            offset = found.means[i] - found.means[j]
+            middle = 0.5 * (found.covariances[i] + found.covariances[j])
+            assert offset @ np.linalg.solve(middle, offset) >= 4.0
+
+
+def test_a_first_state_is_a_layer_of_its_own(modes, walk):
+    mixtures = modes(2.0, times=3)
+    sequence = ModeSequence(tuple(mixtures[1:]), walk, np.ones(2), mixtures[0])
+    whole = ModeSequence(tuple(mixtures), walk, np.ones(2))
+    for a, b in zip(sequence.network.links, whole.network.links):
+        np.testing.assert_allclose(a, b)
+    paths = sequence.paths(5)
+    np.testing.assert_allclose(sequence.states(paths), whole.states(paths))
+    assert sequence.likelihood.times == whole.likelihood.times == 3

@@ -1,0 +1,150 @@
+"""The sliding window: exact filtering, marginals, identities, cost and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother, SlidingWindow
+from hmt_ros.smoothing.sliding_window import filtered_state, first_state
+
+FAST = LinearGaussianDynamics.constant_velocity([2.0, 2.0], 1.0)
+
+
+def divergence(exact: GaussianMixture, found: GaussianMixture) -> float:
+    x = exact.sample(1500, np.random.default_rng(0))
+    return float((exact.log_density(x) - found.log_density(x)).mean())
+
+
+def run(window: SlidingWindow, mixtures, step=10**9):
+    updates = [window.step(t * step, mixture) for t, mixture in enumerate(mixtures)]
+    final = [pose for update in updates for pose in update.final]
+    return updates, [*final, *window.finish()]
+
+
+@pytest.mark.parametrize('radius', [3.0, 1.0])
+def test_filtering_is_exact_where_nothing_is_given_up(modes, walk, exact, radius):
+    mixtures = modes(radius, times=4)
+    state = first_state(mixtures[0], walk)
+    for mixture in mixtures[1:]:
+        state = filtered_state(state, mixture, walk, 1.0, 81)
+    _, marginals = exact(mixtures, walk, np.ones(3))
+    np.testing.assert_allclose(state.mean(), marginals[-1].mean(), atol=1e-3)
+    np.testing.assert_allclose(state.covariance(), marginals[-1].covariance(), atol=5e-3)
+    assert abs(divergence(marginals[-1], state)) < 0.01
+
+
+def test_the_first_state_knows_what_the_dynamics_know():
+    one = GaussianMixture([1.0], [[1.0]], [[[2.0]]])
+    dynamics = LinearGaussianDynamics.random_walk(
+        [1.0], initial_mean=[0.0], initial_covariance=[[2.0]]
+    )
+    state = first_state(one, dynamics)
+    np.testing.assert_allclose(state.means, [[0.5]])
+    np.testing.assert_allclose(state.covariances, [[[1.0]]])
+    moving = first_state(GaussianMixture([1.0], [[1.0, 2.0]], [np.eye(2)]), FAST)
+    np.testing.assert_allclose(moving.covariances[0], np.eye(4))
+
+
+def test_final_marginals_are_those_given_what_the_lag_saw(modes, walk, exact):
+    mixtures = modes(1.2, times=6)
+    _, final = run(SlidingWindow(MixtureSmoother(walk), fixed_lag=2), mixtures)
+    assert [pose.stamp_ns for pose in final] == [t * 10**9 for t in range(6)]
+    for t, pose in enumerate(final):
+        seen = mixtures[: t + 3]
+        _, marginals = exact(seen, walk, np.ones(len(seen) - 1))
+        assert divergence(marginals[t], pose.mixture) < 0.1
+
+
+def test_a_window_that_is_not_full_is_the_whole_sequence(modes, walk):
+    mixtures = modes(3.0, times=4)
+    window = SlidingWindow(MixtureSmoother(walk, max_trajectories=12), fixed_lag=10)
+    updates, final = run(window, mixtures)
+    assert all(update.final == () for update in updates)
+    whole = MixtureSmoother(walk, max_trajectories=12).smooth(mixtures)
+    np.testing.assert_allclose(updates[-1].trajectories.means, whole.means, atol=1e-5)
+    assert len(final) == 4
+    assert window.stamps_ns == ()
+    assert window.finish() == ()
+
+
+def test_what_is_final_is_not_revised_and_the_window_does_not_grow(modes):
+    mixtures = modes(2.0, times=9)
+    window = SlidingWindow(MixtureSmoother(FAST, max_trajectories=8), fixed_lag=3)
+    until = -1
+    for t, mixture in enumerate(mixtures):
+        update = window.step(t * 10**8, mixture)
+        found = update.trajectories
+        assert found.times == min(t + 1, 4)
+        assert found.stamps_ns == window.stamps_ns
+        for pose in update.final:
+            assert pose.stamp_ns > until
+            until = pose.stamp_ns
+        assert found.final_until_ns == (until if until >= 0 else None)
+        assert found.stamps_ns[0] >= until
+        assert len(found) <= 16
+
+
+def test_hypotheses_keep_their_identity(modes, walk):
+    """Two modes far apart: two trajectories, that are followed over many windows."""
+    rng = np.random.default_rng(0)
+    window = SlidingWindow(MixtureSmoother(walk, max_trajectories=2), fixed_lag=3)
+    seen = []
+    for t in range(10):
+        means = [[-30.0, 0.0], [30.0, 0.1 * t]]
+        order = rng.permutation(2)
+        mixture = GaussianMixture([0.5, 0.5], np.array(means)[order], [np.eye(2)] * 2)
+        found = window.step(t * 10**9, mixture).trajectories
+        left = int(np.argmin(found.means[:, -1, 0]))
+        seen.append((found.identities[left], len(found)))
+    assert len(set(seen[2:])) == 1
+
+
+def test_gaps_are_bridged_by_the_dynamics(modes, walk, exact):
+    mixtures = modes(1.2, times=4)
+    stamps = np.array([0, 1, 9, 10]) * 10**9
+    window = SlidingWindow(MixtureSmoother(walk), fixed_lag=5)
+    for stamp, mixture in zip(stamps, mixtures):
+        update = window.step(int(stamp), mixture)
+    _, marginals = exact(mixtures, walk, np.diff(stamps) * 1e-9)
+    for t, marginal in enumerate(marginals):
+        assert divergence(marginal, update.trajectories.marginal(t)) < 0.1
+
+
+def test_the_same_observations_give_the_same_numbers(modes, walk):
+    window = SlidingWindow(MixtureSmoother(walk, max_trajectories=8), fixed_lag=2, seed=3)
+    one, _ = run(window, modes(1.0))
+    again, _ = run(window, modes(1.0))
+    for a, b in zip(one, again):
+        np.testing.assert_array_equal(a.trajectories.states, b.trajectories.states)
+        np.testing.assert_array_equal(a.trajectories.weights, b.trajectories.weights)
+        assert a.trajectories.identities == b.trajectories.identities
+
+
+def test_lag_zero_is_a_filter(modes, walk, exact):
+    mixtures = modes(3.0, times=4)
+    updates, final = run(SlidingWindow(MixtureSmoother(walk), fixed_lag=0), mixtures)
+    assert all(len(update.final) == 1 for update in updates)
+    _, marginals = exact(mixtures, walk, np.ones(3))
+    assert divergence(marginals[-1], final[-1].mixture) < 0.02
+
+
+def test_bad_input_leaves_the_window_as_it_was(modes, walk):
+    mixtures = modes(2.0)
+    window = SlidingWindow(MixtureSmoother(walk, max_trajectories=4), fixed_lag=2)
+    window.step(5, mixtures[0])
+    empty = GaussianMixture(np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    wide = GaussianMixture([1.0], [[0.0] * 3], [np.eye(3)])
+    for stamp, mixture, message in (
+        (5, mixtures[1], 'stamps must increase, saw 5 ns after 5 ns'),
+        (4, mixtures[1], 'stamps must increase'),
+        (6, empty, 'no modes'),
+        (6, wide, 'the dynamics 2'),
+    ):
+        with pytest.raises(ValueError, match=message):
+            window.step(stamp, mixture)
+    assert window.stamps_ns == (5,)
+    assert window.step(6, mixtures[1]).trajectories.times == 2
+    with pytest.raises(ValueError, match='fixed_lag'):
+        SlidingWindow(MixtureSmoother(walk), fixed_lag=-1)
