@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Box = tuple[int, int, int, int]
 
 # Learning rate at which nothing is learned; at 0 the KNN model would replace its samples at once.
 FROZEN = 1e-7
@@ -84,10 +85,15 @@ class BackgroundModel:
         self.frames += 1
         self._model.apply(image, learningRate=1.0 / self.frames)
 
-    def silhouette(self, image: Image) -> Mask:
+    def silhouette(self, image: Image, region: Box | None = None) -> Mask:
         """Foreground (H, W) of an image: the largest piece and what is near it, without shadow.
 
         Empty where nothing differs from the background. The model does not change.
+
+        Args:
+            image: (H, W, 3) uint8.
+            region: x and y of the first and of the last pixel but one, where the person can be;
+                others may walk elsewhere.
 
         Raises:
             ValueError: no background was learned, or the image has another size.
@@ -97,9 +103,16 @@ class BackgroundModel:
         self._check(image)
         raw = self._model.apply(image, learningRate=FROZEN)
         mask = (raw == 255).astype(np.uint8)
-        mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-        return _pieces_of_one_person(np.asarray(mask, dtype=np.uint8), self.settings)
+        result = np.zeros(mask.shape, dtype=np.bool_)
+        left, top, right, bottom = region or (0, 0, mask.shape[1], mask.shape[0])
+        part = np.ascontiguousarray(mask[top:bottom, left:right])
+        if part.size:
+            opened = cv2.morphologyEx(part, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+            closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+            result[top:bottom, left:right] = _pieces_of_one_person(
+                np.asarray(closed, dtype=np.uint8), self.settings
+            )
+        return result
 
     def _check(self, image: Image) -> None:
         # OpenCV would silently begin a new model.

@@ -59,6 +59,8 @@ UNEXPLAINED = 4.0
 FEWEST_KEYPOINTS = 6
 # Largest standard deviation of a mode: where an image shows nothing, rad or m.
 WIDEST = 2.0
+# Around all joints of all modes, as a fraction of their extent: where the silhouette may be.
+REGION_MARGIN = 0.3
 # How far the usual energy follows that of the last image.
 USUAL_GAIN = 0.1
 PAIRS = (('left_arm', 'right_arm'), ('left_leg', 'right_leg'))
@@ -970,11 +972,30 @@ class Tracker:
             )
             if needed
         ]
-        silhouette = self.background.silhouette(image) if shape and self.background.frames else None
+        silhouette = None
+        if shape and self.background.frames:
+            silhouette = self.background.silhouette(image, self._region())
         return observe(
             image, silhouette, keypoints, self.settings.observation,
             last_image=self._last_image, wanted=wanted,
         )  # fmt: skip
+
+    def _region(self) -> tuple[int, int, int, int] | None:
+        """Where the person can be in the next image; None: anywhere."""
+        if self._modes is None or self.status is Status.LOST:
+            return None
+        pixels = self.camera.project(self.body.joint_positions(self._modes.poses)).reshape(-1, 2)
+        pixels = pixels[np.isfinite(pixels).all(1)]
+        if len(pixels) == 0:
+            return None
+        low, high = pixels.min(0), pixels.max(0)
+        margin = REGION_MARGIN * max(float((high - low).max()), 1.0)
+        size = (self.camera.width, self.camera.height)
+        left, top = (int(x) for x in np.clip(np.floor(low - margin), 0, size))
+        right, bottom = (int(x) for x in np.clip(np.ceil(high + margin), 0, size))
+        if right - left < 2 or bottom - top < 2:
+            return None
+        return left, top, right, bottom
 
     def _energy(
         self, poses: Array, observation: Observation, textures: Textures | None, which: Index | None

@@ -110,6 +110,20 @@ def test_an_image_of_another_size_is_refused_and_changes_nothing(scene, method):
     assert before.sum() > 1700
 
 
+def test_other_people_outside_the_region(scene):
+    background = BackgroundModel.from_image(scene)
+    image = scene.copy()
+    image[40:80, 20:40] = (10, 240, 30)
+    image[20:110, 100:150] = (10, 240, 30)  # somebody larger
+    region = (10, 30, 60, 90)
+    found = background.silhouette(image, region)
+    assert found[41:79, 21:39].all()
+    assert not found[:, 60:].any()
+    assert background.silhouette(image)[30:100, 105:145].all()
+    assert background.silhouette(image, (0, 0, 160, 120)).sum() > found.sum()
+    assert not background.silhouette(image, (50, 0, 90, 120)).any()
+
+
 def test_unknown_method_is_refused():
     with pytest.raises(ValueError, match="'median'"):
         BackgroundSettings(method='median')
