@@ -75,7 +75,7 @@ def enumerate_flips(
     trees = [_leaves(frames, q, chain) for chain in links]
     mask = np.ones(len(q), dtype=np.bool_)
     for _, valid in trees:
-        mask = mask[..., None] & valid.reshape(len(q), *(1,) * (mask.ndim - 1), -1)
+        mask = mask[..., None] & valid.reshape(len(q), *(1,) * (mask.ndim - 1), valid.shape[1])
     parents, *choices = np.nonzero(mask)
     result = q[parents]
     for chain, (angles, _), choice in zip(links, trees, choices, strict=True):
@@ -115,7 +115,7 @@ def rehang_chain(
     skeleton = body.skeleton
     links = _chain(skeleton, chain)
     new = np.array(new_poses, dtype=np.float64, ndmin=2, order='C')
-    seen = forward(skeleton, poses)
+    seen = forward(skeleton, np.array(poses, dtype=np.float64, ndmin=2))
     ends = links if image_of is None else _chain(skeleton, image_of)
     if len(ends.lengths) != len(links.lengths):
         raise ValueError(f'chains {chain} and {image_of} differ in their number of segments')
@@ -226,7 +226,7 @@ def _signs(lower: float, upper: float, sine: bool) -> list[bool]:
 
 def _leaves(frames: Frames, poses: Array, chain: _Chain) -> tuple[Array, NDArray[np.bool_]]:
     """Angles (N, leaves, chain dofs) and validity (N, leaves); leaf 0 is the given pose."""
-    angles, valid = _grown(frames, poses, chain, _ends(frames, chain), 0.0)
+    angles, valid = _grown(frames, poses, chain, _ends(frames, chain), 0.0, given_stays=True)
     valid[:, 0] = True
     angles[:, 0] = poses[:, chain.dofs]
     return angles, valid
@@ -240,7 +240,13 @@ def _ends(frames: Frames, chain: _Chain) -> Array:
 
 
 def _grown(
-    frames: Frames, poses: Array, chain: _Chain, targets: Array, slack: float
+    frames: Frames,
+    poses: Array,
+    chain: _Chain,
+    targets: Array,
+    slack: float,
+    *,
+    given_stays: bool = False,
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Leaves of the trees of one chain.
 
@@ -248,9 +254,9 @@ def _grown(
         frames: where the chain starts.
         poses: (N, d) of the frames; the angles nearest to theirs are taken.
         chain: the links.
-        targets: (K, 3, N) points on the rays of the joints; without slack those of the given pose,
-            whose own positions come out first.
+        targets: (K, 3, N) points on the rays of the joints.
         slack: a ray that misses its sphere by less touches it, m.
+        given_stays: the targets are joints of the given pose, which comes out first.
 
     Returns:
         angles (N, 2^K, D), undefined where there is no leaf, and where there is one (N, 2^K).
@@ -258,13 +264,16 @@ def _grown(
     count = 2 ** len(chain.lengths)
     angles = np.empty((len(poses), count, len(chain.dofs)))
     valid = np.zeros((len(poses), count), dtype=np.bool_)
-    _grow(chain, frames.columns, frames.origins, poses, targets, float(slack), angles, valid)
+    _grow(
+        chain, frames.columns, frames.origins, poses, targets, float(slack), given_stays, angles,
+        valid,
+    )  # fmt: skip
     return angles, valid
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def _grow(  # type: ignore[no-untyped-def]
-    chain, columns, origins, poses, targets, slack, angles, valid
+    chain, columns, origins, poses, targets, slack, given_stays, angles, valid
 ):
     """Fills angles and validity, pose by pose, depth first: dead branches have no leaves to visit.
 
@@ -297,7 +306,8 @@ def _grow(  # type: ignore[no-untyped-def]
         while leaf < leaves:
             while k < count:
                 branch = leaf >> (count - 1 - k)
-                if not _put_joint(chain, k, branch, rays, distances, signs, slack, joints):
+                stays = given_stays and branch == 0
+                if not _put_joint(chain, k, branch, stays, rays, distances, signs, slack, joints):
                     break
                 if not _bend_joint(chain, k, joints, given, frames, found):
                     break
@@ -314,14 +324,14 @@ def _grow(  # type: ignore[no-untyped-def]
                 k -= 1
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def _put_joint(  # type: ignore[no-untyped-def]
-    chain, k, branch, rays, distances, signs, slack, joints
+    chain, k, branch, stays, rays, distances, signs, slack, joints
 ):
     """Places the end of link k onto its ray; False where it can not be there."""
     p0, p1, p2 = joints[k, 0], joints[k, 1], joints[k, 2]
     r0, r1, r2, length = rays[k, 0], rays[k, 1], rays[k, 2], chain.lengths[k]
-    if branch == 0 and slack == 0.0:
+    if stays:
         # The given pose itself stays, however the rounding of its discriminant turns out.
         s = distances[k]
     else:
@@ -347,7 +357,7 @@ def _put_joint(  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def _bend_joint(chain, k, joints, given, frames, found):  # type: ignore[no-untyped-def]
     """Angles that point link k at its joint, and the frame beyond; False where no limits allow."""
     at = chain.first_dofs[k]
@@ -393,7 +403,7 @@ def _bend_joint(chain, k, joints, given, frames, found):  # type: ignore[no-unty
     return fits
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def _two_angles(chain, k, v0, v1, v2, given):  # type: ignore[no-untyped-def]
     """a and b of v = (sin b, -sin a cos b, cos a cos b), within limits and nearest the given."""
     i = chain.first_dofs[k]
@@ -407,17 +417,19 @@ def _two_angles(chain, k, v0, v1, v2, given):  # type: ignore[no-untyped-def]
             continue
         side = 1.0 - 2.0 * solution
         b = first if solution == 0 else np.pi - first
+        b, fits = _into_limits(b, chain.lower[j], chain.upper[j], given[j])
+        if not fits:
+            continue
         # cos b = 0: the first angle has no effect on the segment; keep it.
         a = given[i] if free else np.arctan2(-side * v1, side * v2)
-        a, fits_a = _into_limits(a, chain.lower[i], chain.upper[i], given[i])
-        b, fits_b = _into_limits(b, chain.lower[j], chain.upper[j], given[j])
+        a, fits = _into_limits(a, chain.lower[i], chain.upper[i], given[i])
         cost = (a - given[i]) ** 2 + (b - given[j]) ** 2
-        if fits_a and fits_b and cost < best_cost:
+        if fits and cost < best_cost:
             best_a, best_b, best_cost, found = a, b, cost, True
     return best_a, best_b, found
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def _hinge(chain, k, w0, w1, w2, given):  # type: ignore[no-untyped-def]
     """c and e of w = (sin c sin e, -cos c sin e, cos e), within limits and nearest the given."""
     j = chain.first_dofs[k]
@@ -430,11 +442,13 @@ def _hinge(chain, k, w0, w1, w2, given):  # type: ignore[no-untyped-def]
         if not chain.sides[k, solution]:
             continue
         side = 1.0 - 2.0 * solution
+        e, fits = _into_limits(side * bent, chain.lower[j], chain.upper[j], given[j])
+        if not fits:
+            continue
         c = given[i] if free else np.arctan2(side * w0, -side * w1)
-        c, fits_c = _into_limits(c, chain.lower[i], chain.upper[i], given[i])
-        e, fits_e = _into_limits(side * bent, chain.lower[j], chain.upper[j], given[j])
+        c, fits = _into_limits(c, chain.lower[i], chain.upper[i], given[i])
         cost = (c - given[i]) ** 2 + (e - given[j]) ** 2
-        if fits_c and fits_e and cost < best_cost:
+        if fits and cost < best_cost:
             best_c, best_e, best_cost, found = c, e, cost, True
     return best_c, best_e, found
 
@@ -451,7 +465,7 @@ def _into_limits(angle, lower, upper, given):  # type: ignore[no-untyped-def]
     return min(max(shifted, lower), upper), fits
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def _turn(frames, k, angle, axis):  # type: ignore[no-untyped-def]
     """Turns frame k of (K, 3, 3) about one of its own axes."""
     i, j = (axis + 1) % 3, (axis + 2) % 3

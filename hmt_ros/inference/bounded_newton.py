@@ -100,20 +100,23 @@ def minimise(
     for _ in range(max_iterations):
         if len(active) == 0:
             break
+        start, low, high = x[active], lower[active], upper[active]
         step, predicted = _steps(
-            x[active], gradient[active], hessian[active], lower[active], upper[active],
-            lam[active], metric,
-        )  # fmt: skip
+            start, gradient[active], hessian[active], low, high, lam[active], metric
+        )
         done = predicted < tolerance
-        status[active[done]] = Status.CONVERGED
-        active, step, predicted = active[~done], step[~done], predicted[~done]
-        if len(active) == 0:
-            break
+        if done.any():
+            status[active[done]] = Status.CONVERGED
+            active = active[~done]
+            if len(active) == 0:
+                break
+            start, low, high = start[~done], low[~done], high[~done]
+            step, predicted = step[~done], predicted[~done]
 
-        trial = np.clip(x[active] + step, lower[active], upper[active])
+        trial = np.minimum(np.maximum(start + step, low), high)
         # Rounding must not leave a variable a hair away from the limit it was put on.
-        trial = np.where(step <= lower[active] - x[active], lower[active], trial)
-        trial = np.where(step >= upper[active] - x[active], upper[active], trial)
+        trial = np.where(step <= low - start, low, trial)
+        trial = np.where(step >= high - start, high, trial)
         new_value, new_gradient, new_hessian = objective(trial, active)
         iterations[active] += 1
         decrease = value[active] - new_value

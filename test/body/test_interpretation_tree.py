@@ -399,3 +399,22 @@ def test_limbs_take_the_image_of_others(small, random_poses, chain, other):
     expected = [leaves_by_recursion(s, b[1:], lengths) for s, b in zip(start, seen)]
     assert np.array_equal(np.bincount(parents, minlength=60), [len(x) for x in expected])
     assert len(hung) > 10
+
+
+def test_no_poses_have_no_flips():
+    leaves, parents = enumerate_flips(load_body('human32'), None, np.empty((0, 32)), 'left_arm')
+    assert leaves.shape == (0, 32)
+    assert parents.shape == (0,)
+
+
+def test_no_slack_means_none():
+    body = load_body('human32')
+    pose = np.array(body.prior_mean)[None]
+    pose[0, 2] = 3.0
+    new = pose.copy()
+    new[0, 3] += 0.2
+    hung, _ = rehang_chain(body, pose, new, 'left_arm', slack=0.0)
+    which = body.skeleton.joint_index(['left_elbow', 'left_wrist', 'left_hand'])
+    seen, found = (body.joint_positions(x)[:, which] for x in (pose, hung))
+    sines = np.linalg.norm(np.cross(found, seen), axis=2) / 9.0
+    assert sines.max(initial=0.0) < 1e-9
