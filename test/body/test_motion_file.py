@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hmt_ros.body.bvh import read_bvh
+from hmt_ros.body import load_body
 from hmt_ros.body.motion_file import (
     WORLD_FROM_FILE,
     Motion,
@@ -208,6 +209,13 @@ def test_an_amc_finds_its_skeleton_elsewhere(rod, tmp_path):
     with pytest.raises(FileNotFoundError, match=r'needs its skeleton: no rod\.asf beside it'):
         read_motion(folder / 'rod.amc')
     assert len(read_motion(folder / 'rod.amc', skeleton=tmp_path / 'rod.asf')) == 2
+
+
+def test_motion_files_are_bodies_to_load(rod):
+    by_name = load_body(rod)
+    assert by_name.joint_names == read_skeleton(rod).joint_names
+    assert load_body(rod.with_suffix('.asf')).dof_names == by_name.dof_names
+    assert not by_name.flesh.parts
 
 
 def test_equal_limits_hold_a_joint_almost_still(rod):
