@@ -3,14 +3,14 @@
     q(X) = sum_j a_j N(X; M_j, s_j^2 P_j^-1),  P_j = L_j L_j'
 
 L_j' is read column by column from the band. Most components are far from each other, and two that
-are
-need not be compared: of the samples of i, those that j is responsible for have at most the
-    probability
+are need not be compared: of the samples of i, those that j is responsible for have at most the
+probability
 
     E_i[a_j q_j / (a_i q_i + a_j q_j)] <= (a_j / a_i)^(1/2) / 2 int (q_i q_j)^(1/2)
 
 and the overlap of two trajectories is at most that of their poses at any one time, for Gaussians at
-most exp(-1/4 D'(C_i + C_j)^-1 D). Pairs below exp(-30) are left out.
+most exp(-1/4 D'(C_i + C_j)^-1 D). Pairs below exp(-30) are left out. Of the others the distance is
+summed up from the time on at which they are farthest apart, until it tells enough.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ Array = NDArray[np.float64]
 
 # Logarithms of overlaps and of densities that make no difference.
 NEGLIGIBLE = 30.0
+NEGLIGIBLE_DENSITY = 40.0
+# Columns between two looks at whether a component still counts.
+STRIDE = 32
 
 
 @njit(cache=True, nogil=True, fastmath={'reassoc', 'contract', 'nsz'})
@@ -36,6 +39,8 @@ def add_overlaps(
     inflation: Array,
     bands: Array,
     near: NDArray[np.bool_],
+    begin: NDArray[np.int64],
+    derivatives: bool,
     share: float,
     log_density: Array,
     gradient: Array,
@@ -55,6 +60,8 @@ def add_overlaps(
         inflation: (M,) s_j.
         bands: (M, D, width + 1) L_j: [c, r - c] = L[r, c].
         near: (M,) components that may overlap with `own`.
+        begin: (M,) column at which the comparison with each begins.
+        derivatives: whether they are wanted; else only `log_density` is written.
         share: weight of a sample in the sums over samples below.
         log_density: (S,) log q, written.
         gradient: (S, D) of log q with regard to the sample, written.
@@ -88,24 +95,31 @@ def add_overlaps(
                 inverse = 1.0 / inflation[j]
                 for c in range(total):
                     delta[c] = (samples[s, c] - means[j, c]) * inverse
-                for c in range(total):
+                for i in range(total):
+                    c = begin[j] + i
+                    if c >= total:
+                        c -= total
                     y = 0.0
                     for b in range(width):
                         y += bands[j, c, b] * delta[c + b]
                     white[j, c] = y
                     square += y * y
+                    if i % STRIDE == 0 and log - 0.5 * square < best - NEGLIGIBLE_DENSITY:
+                        break
                 log -= 0.5 * square
             squares[j] = square
             logs[j] = log
             best = max(best, log)
         density = 0.0
         for j in range(components):
-            if logs[j] > best - 40.0:
+            if logs[j] > best - NEGLIGIBLE_DENSITY:
                 logs[j] = np.exp(logs[j] - best)
                 density += logs[j]
             else:
                 logs[j] = 0.0
         log_density[s] = best + np.log(density)
+        if not derivatives:
+            continue
         gradient[s] = 0.0
         for j in range(components):
             responsibility = logs[j] / density

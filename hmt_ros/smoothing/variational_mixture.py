@@ -126,9 +126,10 @@ def minimise_free_energy(
     fresh = antithetic(rng, len(weights), samples, size)
     objective = FreeEnergy(weights, states, factors, prior, likelihood, adapt, low, high, descent)
     x = np.zeros(objective.parameters)
-    trace = np.array([objective(x)[0]])
     if max_iterations > 0 and len(x):
-        x, trace = _descend(objective, choice, trace[0], max_iterations, tolerance)
+        x, trace = _descend(objective, choice, max_iterations, tolerance)
+    else:
+        trace = np.array([_free_energy(objective, x, descent)])
     mixture = objective.mixture(x)
     a, means, inflation, found = mixture
     each = objective.sampled(mixture, fresh)
@@ -164,7 +165,7 @@ def matched(noise: Array) -> Array:
 
 
 def _descend(
-    objective: FreeEnergy, choice: Array, start: float, max_iterations: int, tolerance: float
+    objective: FreeEnergy, choice: Array, max_iterations: int, tolerance: float
 ) -> tuple[Array, Array]:
     """L-BFGS from 0: the best iterate, and the values after each iteration up to it.
 
@@ -172,13 +173,15 @@ def _descend(
     F on other samples, and the descent ends when F no longer falls on those.
     """
     iterates = [np.zeros(objective.parameters)]
-    trace = [start]
+    first = objective(iterates[0])
+    trace = [first[0]]
     held_out = [_free_energy(objective, iterates[0], choice)]
-    last = (start, iterates[0])
+    last = (first[0], iterates[0])
 
     def function(x: Array) -> tuple[float, Array]:
         nonlocal last
-        value, gradient = objective(x)
+        # Where the descent begins has been evaluated.
+        value, gradient = objective(x) if x.any() else first
         last = (value, x.copy())
         return value, gradient
 
@@ -301,7 +304,7 @@ class FreeEnergy:
     def sampled(self, mixture: Mixture, noise: Array) -> Array:
         """log q(X) - log p(X, R) at samples of each component, (M, S), with noise (M, S, D)."""
         roots = np.stack([f.solve_transposed(z) for f, z in zip(mixture[3], noise)])
-        return self._evaluate(mixture, noise, roots)[0]
+        return self._evaluate(mixture, noise, roots, derivatives=False)[0]
 
     def __call__(self, x: Array) -> tuple[float, Array]:
         """F and its gradient."""
@@ -352,7 +355,7 @@ class FreeEnergy:
         return result / self.scale[:, None, None]
 
     def _evaluate(
-        self, mixture: Mixture, noise: Array, roots: Array
+        self, mixture: Mixture, noise: Array, roots: Array, *, derivatives: bool = True
     ) -> tuple[Array, Array, tuple[Array, ...]]:
         """log q - log p at samples (M, S), its gradient, and those of log q at fixed samples."""
         weights, means, inflation, factors = mixture
@@ -365,7 +368,7 @@ class FreeEnergy:
             np.log(inflation) + 0.5 * np.log(2 * np.pi)
         )
         log_weights = np.log(np.maximum(weights, 1e-300))
-        near = self._near(means, inflation)
+        near, farthest = self._near(means, inflation)
         each = np.empty((count, samples))
         slope = np.empty((count, samples, total))
         edges = np.linspace(0, count, PARTS + 1).astype(int)
@@ -384,11 +387,12 @@ class FreeEnergy:
                 points = means[i] + inflation[i] * roots[i]
                 add_overlaps(
                     i, points, noise[i], log_weights, log_scales, means, inflation, bands,
-                    near[i], weights[i] / samples, each[i], slope[i], *sums[part],
+                    near[i], self.size * farthest[i], derivatives, weights[i] / samples, each[i], slope[i], *sums[part],
                 )  # fmt: skip
                 energy, pull = self._energy(points)
                 each[i] += energy
-                slope[i] += pull
+                if derivatives:
+                    slope[i] += pull
 
         list(_threads().map(work, range(PARTS)))
         return each, slope, tuple(sum(column[1:], start=column[0]) for column in zip(*sums))
@@ -407,26 +411,27 @@ class FreeEnergy:
         gradient.reshape(s * self.times, self.size)[:, :d] += slope
         return value + observed.reshape(s, self.times).sum(1), gradient
 
-    def _near(self, means: Array, inflation: Array) -> NDArray[np.bool_]:
-        """(M, M) which components may overlap, by their marginals where they are farthest apart."""
-        if 'covariances' in self.slices:
-            return np.ones((self.count, self.count), dtype=bool)
-        i, j = np.triu_indices(self.count, 1)
-        if len(i) == 0:
-            return np.ones((1, 1), dtype=bool)
+    def _near(self, means: Array, inflation: Array) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+        """(M, M) which components may overlap, by their marginals where they are farthest apart.
+
+        And when that is, (M, M).
+        """
+        near = np.ones((self.count, self.count), dtype=bool)
         metric = self.bands[:, :, 0] ** 2
         farthest = np.empty((self.count, self.count), dtype=np.int64)
         for k in range(self.count):
             square = (means - means[k]) ** 2 * metric
             farthest[k] = square.reshape(self.count, self.times, self.size).sum(2).argmax(1)
+        i, j = np.triu_indices(self.count, 1)
+        if 'covariances' in self.slices or len(i) == 0:
+            return near, farthest
         at = farthest[i, j]
         poses = means.reshape(-1, self.size)
         pairs = np.stack([i, j], axis=1) * self.times + at[:, None]
         scales = np.repeat(inflation**2, self.times)
         distances = pair_distances(poses, self.marginals, scales, pairs)
-        near = np.ones((self.count, self.count), dtype=bool)
         near[i, j] = near[j, i] = 0.25 * distances < NEGLIGIBLE
-        return near
+        return near, farthest
 
 
 @lru_cache(maxsize=1)

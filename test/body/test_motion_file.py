@@ -10,8 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hmt_ros.body.bvh import read_bvh
 from hmt_ros.body import load_body
+from hmt_ros.body.bvh import read_bvh
 from hmt_ros.body.motion_file import (
     WORLD_FROM_FILE,
     Motion,
