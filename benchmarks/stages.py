@@ -9,6 +9,7 @@ from typing import Any
 
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.tracking import tracker as tracker_module
+from hmt_ros.tracking.kinematic_jumps import KinematicJumps
 from hmt_ros.tracking.tracker import Tracker
 
 # Part of the tracker -> name of the stage; time in a part that another part calls is its own.
@@ -17,10 +18,10 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (tracker_module, 'observe', 'observation'),
     (Tracker, '_begin', 'start of the track'),
     (Tracker, '_follow_motion', 'motion'),
-    (Tracker, '_jumps', 'combinations'),
+    (KinematicJumps, 'propose', 'combinations'),
     (Tracker, '_samples', 'samples'),
-    (Tracker, '_search', 'chain search'),
-    (Tracker, '_rate', 'rating'),
+    (KinematicJumps, '_search', 'chain search'),
+    (KinematicJumps, '_rate', 'rating'),
     (Tracker, '_minimise', 'candidates'),
     (Tracker, '_keep', 'keeping'),
     (Tracker, '_fit_flesh', 'flesh'),

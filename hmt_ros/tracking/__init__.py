@@ -1,6 +1,7 @@
 """The filter: proposals and mixture density propagation over images (KJS)."""
 
 from hmt_ros.tracking.subject import Subject, SubjectError, read_subject
-from hmt_ros.tracking.tracker import Status, Tracker, TrackerSettings
+from hmt_ros.tracking.tracker import Status, Tracker
+from hmt_ros.tracking.tracker_settings import TrackerSettings
 
 __all__ = ['Status', 'Subject', 'SubjectError', 'Tracker', 'TrackerSettings', 'read_subject']

@@ -3,56 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.interpretation_tree import enumerate_flips, rehang_chain
 from hmt_ros.body.kinematics import Frames, forward
-from hmt_ros.body.torso_flips import flip_torso
 from hmt_ros.image.background import BackgroundModel
-from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
-from hmt_ros.image.observation import Keypoints, Observation, ObservationSettings, observe
-from hmt_ros.image.texture import Textures, capture_textures, with_swapped_sides
+from hmt_ros.image.likelihood import ImageLikelihood, TermSettings
+from hmt_ros.image.observation import Keypoints, Observation, observe
+from hmt_ros.image.texture import Textures, capture_textures
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.chain_product import (
-    Alternatives,
-    best_combinations,
-    distinct_alternatives,
+from hmt_ros.tracking.candidates import (
+    Candidates,
+    joined_candidates,
+    joined_minima,
+    relative_joints,
+    some_minima,
 )
-from hmt_ros.tracking.chain_search import ChainSearch, ChainSearchSettings
-from hmt_ros.tracking.dynamics import DynamicsSettings, predict, update_velocities
+from hmt_ros.tracking.dynamics import predict, update_velocities
 from hmt_ros.tracking.flesh_fitting import FleshFit
 from hmt_ros.tracking.initialisation import (
     poses_from_keypoints,
     poses_from_outline,
     start_from_keypoints,
 )
-from hmt_ros.tracking.proposals import (
-    PROPOSALS,
-    VOTES,
-    chain_dofs,
-    chain_votes,
-    covariance_scaled_samples,
-    spherical_samples,
-)
+from hmt_ros.tracking.kinematic_jumps import KinematicJumps
+from hmt_ros.tracking.proposals import covariance_scaled_samples, spherical_samples
 from hmt_ros.tracking.pruning import choose_hypotheses, inherited_log_weights
 from hmt_ros.tracking.subject import Subject
+from hmt_ros.tracking.tracker_settings import TrackerSettings
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Image = NDArray[np.uint8]
 
-# Groups of modes with a trunk of their own whose products are rated.
-MOST_GROUPS = 3
-REWEIGHTINGS = ('ancestry', 'bhattacharyya')
 # An outline or a keypoint further away than this from where it should be is unexplained, in sigmas.
 UNEXPLAINED = 4.0
 # Keypoints from which a lost track starts anew.
@@ -63,10 +53,6 @@ WIDEST = 2.0
 REGION_MARGIN = 0.3
 # How far the usual energy follows that of the last image.
 USUAL_GAIN = 0.1
-PAIRS = (('left_arm', 'right_arm'), ('left_leg', 'right_leg'))
-SIBLINGS = {a: b for pair in PAIRS for a, b in (pair, pair[::-1])}
-TRUNK = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
-CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
 
 
 class Status(Enum):
@@ -75,95 +61,6 @@ class Status(Enum):
     WAITING = 'waiting'  # for the image that the subject's joints were seen in
     TRACKING = 'tracking'
     LOST = 'lost'
-
-
-@dataclass(frozen=True)
-class TrackerSettings:
-    """How poses are tracked.
-
-    Attributes:
-        max_hypotheses: modes that are kept, K.
-        hypothesis_merge_distance: mean distance of the joints below which two modes are one, m.
-        proposals: 'kjs' (covariance-scaled samples and kinematic jumps), 'css' or 'ss' (samples
-            alone).
-        candidates: hypotheses that are optimised fully an image.
-        combinations: combinations of chain alternatives that are rated an image.
-        alternatives: configurations of a chain that are rated.
-        samples: samples an image of 'css' and 'ss'.
-        sample_scale: their stretch; 0: Cauchy tails.
-        reweighting: what the images before say of a new mode: 'ancestry', the weight of the mode it
-            comes from and of its jumps, or 'bhattacharyya', the weight of the nearest mode before
-            (KJS 5.1).
-        exploration: power of the weights when candidates are chosen; below 1 favours unlikely ones.
-        vote: how chains are chosen for search: 'trace', 'eigenvalue' or 'uniform'.
-        searched_chains: chains searched in an image.
-        surprise: an image whose least energy exceeds the usual one by this is searched again.
-        rounds: of search in such an image at most.
-        jump_probability: of a flip of one chain from one image to the next.
-        base_iterations, iterations: Newton steps on the predictions and on the candidates.
-        temperature: factor on the image's energy in a mode's weight; below 1 because neighbouring
-            measurements err together.
-        image_trust: factor on the curvature of the image's energy, keypoints apart, in a mode's
-            covariance; below 1 because shapes, shadows and clothes are not the model's.
-        tails: degrees of freedom of the Student distribution around a prediction.
-        least_log_weight: no kept mode's weight falls below this.
-        flesh_images: images from which the widths of the flesh are estimated; 0: the model's.
-        lost_misfit: share of the outline, or of the keypoints, that no mode explains, above which
-            an image counts as lost.
-        lost_images: so many in a row start the track anew.
-        dynamics, likelihood, observation, search: settings of the parts.
-    """
-
-    max_hypotheses: int = 8
-    hypothesis_merge_distance: float = 0.02
-    proposals: str = 'kjs'
-    candidates: int = 16
-    combinations: int = 96
-    alternatives: int = 10
-    samples: int = 256
-    sample_scale: float = 2.0
-    reweighting: str = 'ancestry'
-    exploration: float = 0.5
-    vote: str = 'trace'
-    searched_chains: int = 4
-    surprise: float = 6.0
-    rounds: int = 3
-    jump_probability: float = 0.1
-    base_iterations: int = 6
-    iterations: int = 6
-    temperature: float = 0.3
-    image_trust: float = 0.05
-    tails: float = 8.0
-    least_log_weight: float = -10.0
-    flesh_images: int = 15
-    lost_misfit: float = 0.35
-    lost_images: int = 5
-    dynamics: DynamicsSettings = field(default_factory=DynamicsSettings)
-    likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
-    observation: ObservationSettings = field(default_factory=ObservationSettings)
-    search: ChainSearchSettings = field(default_factory=ChainSearchSettings)
-
-    def __post_init__(self) -> None:
-        if self.proposals not in PROPOSALS:
-            raise ValueError(f'proposals must be one of {PROPOSALS}, saw {self.proposals!r}')
-        if self.reweighting not in REWEIGHTINGS:
-            raise ValueError(f'reweighting must be one of {REWEIGHTINGS}, saw {self.reweighting!r}')
-        if self.vote not in VOTES:
-            raise ValueError(f'vote must be one of {VOTES}, saw {self.vote!r}')
-        if self.max_hypotheses < 1 or self.candidates < self.max_hypotheses:
-            raise ValueError(
-                f'wanted 1 <= max_hypotheses <= candidates, saw {self.max_hypotheses} and '
-                f'{self.candidates}'
-            )
-        least = {'samples': 1, 'rounds': 1, 'iterations': 1, 'base_iterations': 1, 'lost_images': 1}
-        least |= {'combinations': 1, 'alternatives': 1, 'temperature': 0, 'exploration': 0}
-        for name, bound in least.items():
-            if not getattr(self, name) >= bound:
-                raise ValueError(f'{name} must be at least {bound}, saw {getattr(self, name)}')
-        if not self.tails > 0:
-            raise ValueError(f'tails must be positive, saw {self.tails}')
-        if not 0 < self.jump_probability < 1:
-            raise ValueError(f'jump_probability must lie in (0, 1), saw {self.jump_probability}')
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,50 +84,6 @@ class Modes:
     log_weights: Array
     log_likelihoods: Array
     textures: Textures | None
-
-
-@dataclass(frozen=True, eq=False)
-class _Product:
-    """A trunk, configurations of each limb, and what they cost.
-
-    Attributes:
-        modes, members, log_weights: (G, d), (G,), (G,) of the modes with this trunk.
-        alternatives: one entry a chain.
-        changes: energy change that each alternative makes alone.
-        energy: of the first mode.
-        row: of the textures.
-    """
-
-    modes: Array
-    members: Index
-    log_weights: Array
-    alternatives: list[Alternatives]
-    changes: list[Array]
-    energy: float
-    row: int
-
-
-@dataclass(frozen=True, eq=False)
-class _Candidates:
-    """Poses to be optimised.
-
-    Attributes:
-        poses: (N, d).
-        parents: (N,) the mode that each comes from.
-        log_priors: (N,) log probability given the modes before.
-        centres: (N, d) where each is expected.
-        jumped: (N, d) what did not move there.
-        textures: of the last image.
-        texture_rows: (N,) row of the textures that each carries.
-    """
-
-    poses: Array
-    parents: Index
-    log_priors: Array
-    centres: Array
-    jumped: NDArray[np.bool_]
-    textures: Textures | None
-    texture_rows: Index
 
 
 class Tracker:
@@ -455,7 +308,7 @@ class Tracker:
 
     def _use_body(self, body: Body) -> None:
         self.body = body
-        for name in ('_likelihood', '_motion_likelihood', '_searches'):
+        for name in ('_likelihood', '_motion_likelihood', '_jumps'):
             self.__dict__.pop(name, None)
 
     # One image after another.
@@ -475,9 +328,9 @@ class Tracker:
             s.base_iterations,
         )
         still = np.zeros(moved.shape, dtype=np.bool_)
-        sources = _Candidates(moved, everyone, m.log_weights, moved, still, m.textures, everyone)
+        sources = Candidates(moved, everyone, m.log_weights, moved, still, m.textures, everyone)
         if s.proposals == 'kjs':
-            candidates = self._jumps(base, sources, covariances, observation)
+            candidates = self._jumps.propose(base, sources, covariances, observation, self._rng)
         else:
             candidates = self._samples(base, sources, covariances, observation)
         solved = self._solve(candidates, precisions, observation)
@@ -487,9 +340,9 @@ class Tracker:
             base, sources = self._search_around(
                 solved, candidates, covariances, precisions, observation
             )
-            more = self._jumps(base, sources, covariances, observation)
-            solved = _joined_minima(solved, self._solve(more, precisions, observation))
-            candidates = _joined_candidates(candidates, more)
+            more = self._jumps.propose(base, sources, covariances, observation, self._rng)
+            solved = joined_minima(solved, self._solve(more, precisions, observation))
+            candidates = joined_candidates(candidates, more)
         self._learn_usual_energy(float(solved.value.min()))
         parents = candidates.parents
         velocities = update_velocities(
@@ -506,7 +359,7 @@ class Tracker:
         self._fit_flesh(observation)
 
     def _solve(
-        self, candidates: _Candidates, precisions: Array, observation: Observation
+        self, candidates: Candidates, precisions: Array, observation: Observation
     ) -> Minimum:
         c = candidates
         energy = self._posterior_energy(
@@ -527,11 +380,11 @@ class Tracker:
     def _search_around(
         self,
         solved: Minimum,
-        candidates: _Candidates,
+        candidates: Candidates,
         covariances: Array,
         precisions: Array,
         observation: Observation,
-    ) -> tuple[Minimum, _Candidates]:
+    ) -> tuple[Minimum, Candidates]:
         """What a further round of jumps starts from: the best optima, and what was sampled nearby.
 
         Jumps change limbs; a trunk that was predicted badly needs covariance-scaled samples.
@@ -548,7 +401,7 @@ class Tracker:
         value = self._value(drawn, observation, c.textures, rows)
         drawn = drawn[np.argsort(value, kind='stable')[: s.max_hypotheses]]
         n = len(drawn)
-        sampled = _Candidates(
+        sampled = Candidates(
             drawn,
             np.full(n, c.parents[lead[0]]),
             np.full(n, c.log_priors[lead[0]] + np.log(s.jump_probability)),
@@ -558,11 +411,11 @@ class Tracker:
             rows[:n],
         )
         found = self._solve(sampled, precisions, observation)
-        kept = _Candidates(
+        kept = Candidates(
             c.poses[best], c.parents[best], c.log_priors[best], c.centres[best], c.jumped[best],
             c.textures, c.texture_rows[best],
         )  # fmt: skip
-        return _joined_minima(_some_minima(solved, best), found), _joined_candidates(kept, sampled)
+        return joined_minima(some_minima(solved, best), found), joined_candidates(kept, sampled)
 
     def _learn_usual_energy(self, energy: float) -> None:
         usual = self._usual_energy
@@ -598,96 +451,9 @@ class Tracker:
 
         return self._minimise(energy, predicted, 5).x
 
-    def _jumps(
-        self, base: Minimum, sources: _Candidates, covariances: Array, observation: Observation
-    ) -> _Candidates:
-        """Candidates of kinematic jump sampling, from optima and how each of them came about."""
-        s, textures = self.settings, sources.textures
-        everything: list[tuple[Array, Index, Array, Array, Index]] = []
-        for group in self._groups(base)[:MOST_GROUPS]:
-            lead = int(group[0])
-            pose, lead_row = base.x[lead], int(sources.texture_rows[lead])
-            found = self._search(
-                pose, covariances[sources.parents[lead]], observation, textures, lead_row
-            )
-            log_weights = sources.log_priors[group]
-            alternatives = [
-                self._alternatives(base.x[group], chain, found.get(chain))
-                for chain in CHAINS
-                if chain in self.body.chains
-            ]
-            changes, energy = self._rate(pose, alternatives, observation, textures, lead_row)
-            products = [
-                _Product(base.x[group], group, log_weights, alternatives, changes, energy, lead_row)
-            ]
-            weight = np.array([np.logaddexp.reduce(log_weights) + np.log(s.jump_probability)])
-            for pair in PAIRS:
-                if not set(pair) <= set(self.body.chains):
-                    continue
-                swapped = self._swap(pose, pair)
-                if swapped is None:
-                    continue
-                row = lead_row
-                if textures is not None:
-                    row = len(textures.counts)
-                    textures = with_swapped_sides(
-                        textures, lead_row, *(self.body.skeleton.chains[chain] for chain in pair)
-                    )
-                rated, energy = self._rate(swapped[0], swapped[1], observation, textures, row)
-                choices, joined = [], []
-                for chain, change in zip(alternatives, changes, strict=True):
-                    if chain.chain in pair:
-                        i = pair.index(chain.chain)
-                        choices.append(swapped[1][i])
-                        joined.append(rated[i])
-                    else:
-                        choices.append(Alternatives(chain.chain, chain.angles, chain.penalties[:1]))
-                        joined.append(change)
-                products.append(
-                    _Product(swapped[0][None], group[:1], weight, choices, joined, energy, row)
-                )
-            for flipped, hung in self._torso_flips(pose, [a.chain for a in alternatives]):
-                changes, energy = self._rate(flipped, hung, observation, textures, lead_row)
-                products.append(
-                    _Product(flipped[None], group[:1], weight, hung, changes, energy, lead_row)
-                )
-            for product in products:
-                combined = best_combinations(
-                    self.body, product.modes, product.log_weights, product.energy,
-                    product.alternatives, product.changes, s.temperature, s.combinations,
-                )  # fmt: skip
-                members = product.members[combined.parents]
-                rows = np.full(len(members), product.row)
-                if product.row == lead_row:
-                    rows = sources.texture_rows[members]
-                everything.append(
-                    (combined.poses, members, combined.log_priors, combined.energies, rows)
-                )
-        poses, members, log_priors, energies, rows = (
-            np.concatenate([part[i] for part in everything]) for i in range(5)
-        )
-        kept = choose_hypotheses(
-            self._relative_joints(poses),
-            s.exploration * (log_priors - s.temperature * energies),
-            s.candidates,
-            same=s.hypothesis_merge_distance,
-        ).chosen
-        poses, members = poses[kept], members[kept]
-        # A chain that jumped is expected where it landed, the rest where it was predicted.
-        changed = np.abs(poses - base.x[members]) > 1e-9
-        return _Candidates(
-            poses,
-            sources.parents[members],
-            log_priors[kept],
-            np.where(changed, poses, sources.centres[members]),
-            changed | sources.jumped[members],
-            textures,
-            rows[kept],
-        )
-
     def _samples(
-        self, base: Minimum, sources: _Candidates, covariances: Array, observation: Observation
-    ) -> _Candidates:
+        self, base: Minimum, sources: Candidates, covariances: Array, observation: Observation
+    ) -> Candidates:
         """Candidates of covariance-scaled or spherical sampling."""
         s, m = self.settings, self.modes
         draw = covariance_scaled_samples if s.proposals == 'css' else spherical_samples
@@ -699,142 +465,16 @@ class Tracker:
         parents = np.concatenate([np.arange(k), np.repeat(np.arange(k), each)])
         energies = self._value(poses, observation, m.textures, parents)
         kept = choose_hypotheses(
-            self._relative_joints(poses),
+            relative_joints(self.body, poses),
             m.log_weights[parents] - s.temperature * energies,
             s.candidates,
             same=s.hypothesis_merge_distance,
         ).chosen
         parents = parents[kept]
-        return _Candidates(
+        return Candidates(
             poses[kept], parents, m.log_weights[parents], moved[parents],
             np.zeros((len(parents), self.body.dimension), dtype=np.bool_), m.textures, parents,
         )  # fmt: skip
-
-    def _groups(self, base: Minimum) -> list[Index]:
-        """Modes with nearly the same trunk, each group with its best mode first."""
-        names = [name for name in TRUNK if name in self.body.joint_names]
-        which = self.body.skeleton.joint_index(names)
-        trunk = self.body.joint_positions(base.x)[:, which]
-        left = list(np.argsort(base.value, kind='stable'))
-        groups = []
-        while left:
-            gaps = np.linalg.norm(trunk[left] - trunk[left[0]], axis=2).max(1)
-            near = gaps < 0.06
-            groups.append(np.array([i for i, ok in zip(left, near) if ok], dtype=np.intp))
-            left = [i for i, ok in zip(left, near) if not ok]
-        return groups
-
-    def _search(
-        self,
-        pose: Array,
-        covariance: Array,
-        observation: Observation,
-        textures: Textures | None,
-        row: int,
-    ) -> dict[str, Array]:
-        """Configurations of some chains, chosen by vote, that fit the image."""
-        shape = observation.distance is not None or observation.edges is not None
-        names = list(self._searches) if shape else []
-        count = min(self.settings.searched_chains, len(names))
-        if count == 0:
-            return {}
-        votes = chain_votes(self.body, covariance[None], names, self.settings.vote)[0]
-        chosen = self._rng.choice(len(names), size=count, replace=False, p=votes)
-        result = {}
-        for i in sorted(chosen):
-            search = self._searches[names[i]]
-            result[names[i]] = search.find(pose, covariance, observation, textures, row, self._rng)
-            own = self.settings.search
-            self.evaluations += own.samples + own.refined * own.iterations
-        return result
-
-    def _alternatives(self, modes: Array, chain: str, found: Array | None) -> Alternatives:
-        """Configurations of a chain in a group: the modes' own, what was found, and all flips."""
-        s = self.settings
-        own = chain_dofs(self.body, chain)
-        jump = -np.log(s.jump_probability)
-        angles, penalties = [modes[:, own]], [np.where(np.eye(len(modes)) > 0, 0.0, jump)]
-        if found is not None:
-            angles.append(found)
-            penalties.append(np.full((len(modes), len(found)), jump))
-        if chain in SIBLINGS:
-            # Limbs that cross in the image are easily taken for each other.
-            swapped, _ = rehang_chain(
-                self.body, modes[:1], modes[:1], chain, image_of=SIBLINGS[chain]
-            )
-            angles.append(swapped[:, own])
-            penalties.append(np.full((len(modes), len(swapped)), jump))
-        sources = np.concatenate(angles)
-        poses = np.repeat(modes[:1], len(sources), axis=0)
-        poses[:, own] = sources
-        flips, parents = enumerate_flips(self.body, self.camera, poses, chain)
-        first = np.concatenate([[True], parents[1:] != parents[:-1]])
-        flips, parents = flips[~first], parents[~first]
-        angles.append(flips[:, own])
-        penalties.append(np.full((len(modes), len(flips)), jump))
-        return distinct_alternatives(
-            self.body, modes[0], chain, np.concatenate(angles), np.concatenate(penalties, axis=1),
-            apart=0.08, most=s.alternatives,
-        )  # fmt: skip
-
-    def _torso_flips(
-        self, pose: Array, chains: list[str]
-    ) -> list[tuple[Array, list[Alternatives]]]:
-        """The pose with its torso flipped, and its limbs in all ways that keep their image."""
-        result = []
-        for flipped in flip_torso(self.body, pose[None])[0]:
-            base, alternatives = flipped.copy(), []
-            for chain in chains:
-                own = chain_dofs(self.body, chain)
-                hung, _ = rehang_chain(self.body, pose[None], flipped[None], chain)
-                angles = hung[:, own] if len(hung) else flipped[None, own]
-                base[own] = angles[0]
-                distinct = distinct_alternatives(
-                    self.body, flipped, chain, angles, np.zeros((1, len(angles))),
-                    apart=0.08, most=self.settings.alternatives,
-                )  # fmt: skip
-                alternatives.append(distinct)
-            result.append((base, alternatives))
-        return result
-
-    def _swap(self, pose: Array, pair: tuple[str, str]) -> tuple[Array, list[Alternatives]] | None:
-        """The pose with two limbs each on the other's image, in all ways; None if they reach not.
-
-        Limbs that cross in the image are easily taken for each other, and one alone that changes
-        sides leaves its own place empty.
-        """
-        base, alternatives = pose.copy(), []
-        for chain, sibling in (pair, pair[::-1]):
-            own = chain_dofs(self.body, chain)
-            hung, _ = rehang_chain(self.body, pose[None], pose[None], chain, image_of=sibling)
-            if len(hung) == 0:
-                return None
-            base[own] = hung[0, own]
-            distinct = distinct_alternatives(
-                self.body, pose, chain, hung[:, own], np.zeros((1, len(hung))),
-                apart=0.08, most=self.settings.alternatives,
-            )  # fmt: skip
-            alternatives.append(distinct)
-        return base, alternatives
-
-    def _rate(
-        self,
-        pose: Array,
-        alternatives: list[Alternatives],
-        observation: Observation,
-        textures: Textures | None,
-        row: int,
-    ) -> tuple[list[Array], float]:
-        """Energy change that each alternative makes alone, and the energy of the pose itself."""
-        poses = [pose[None]]
-        for chain in alternatives:
-            block = np.repeat(pose[None], len(chain.angles), axis=0)
-            block[:, chain_dofs(self.body, chain.chain)] = chain.angles
-            poses.append(block)
-        everything = np.concatenate(poses)
-        value = self._value(everything, observation, textures, np.full(len(everything), row))
-        ends = np.cumsum([1] + [len(c.angles) for c in alternatives])
-        return [value[a:b] - value[0] for a, b in pairwise(ends)], float(value[0])
 
     def _keep(
         self,
@@ -854,7 +494,7 @@ class Tracker:
             raise ValueError('no hypothesis has a finite energy')
         log_weights = log_priors[usable] - s.temperature * solved.value[usable]
         kept = choose_hypotheses(
-            self._relative_joints(solved.x[usable]),
+            relative_joints(self.body, solved.x[usable]),
             log_weights,
             s.max_hypotheses,
             same=s.hypothesis_merge_distance,
@@ -943,13 +583,11 @@ class Tracker:
         return ImageLikelihood(self.body, self.camera, only_motion)
 
     @cached_property
-    def _searches(self) -> dict[str, ChainSearch]:
-        s = self.settings
-        return {
-            chain: ChainSearch(self.body, self.camera, s.likelihood, chain, s.search)
-            for chain in CHAINS[:4]
-            if chain in self.body.chains
-        }
+    def _jumps(self) -> KinematicJumps:
+        return KinematicJumps(self.body, self.camera, self.settings, self._value, self._count)
+
+    def _count(self, evaluations: int) -> None:
+        self.evaluations += evaluations
 
     @cached_property
     def _rates(self) -> Array:
@@ -1051,33 +689,10 @@ class Tracker:
             damping=1.0, max_iterations=iterations, tolerance=0.02,
         )  # fmt: skip
 
-    def _relative_joints(self, poses: Array) -> Array:
-        joints = self.body.joint_positions(poses)
-        return joints - joints[:, :1]
-
 
 def _shows_shape(observation: Observation) -> bool:
     maps = (observation.distance, observation.edges, observation.flow, observation.intensity)
     return any(m is not None for m in maps)
-
-
-def _some_minima(minima: Minimum, which: Index) -> Minimum:
-    return Minimum(*(getattr(minima, f.name)[which] for f in fields(Minimum)))
-
-
-def _joined_minima(a: Minimum, b: Minimum) -> Minimum:
-    return Minimum(
-        *(np.concatenate([getattr(a, f.name), getattr(b, f.name)]) for f in fields(Minimum))
-    )
-
-
-def _joined_candidates(a: _Candidates, b: _Candidates) -> _Candidates:
-    """Both; the textures of the second contain those of the first."""
-    joined = {
-        name: np.concatenate([getattr(a, name), getattr(b, name)])
-        for name in ('poses', 'parents', 'log_priors', 'centres', 'jumped', 'texture_rows')
-    }
-    return _Candidates(textures=b.textures, **joined)
 
 
 def _inverses(matrices: Array) -> Array:

@@ -1,0 +1,308 @@
+"""Kinematic jump sampling: other configurations of the limbs and of the trunk (KJS 3, 4).
+
+For each trunk that the modes have, every limb has alternatives: those of the modes, all their
+flips, and what a search of the image found. Combinations of alternatives are rated on the trunk as
+it is, with limbs exchanged that were taken for each other, and with the torso flipped; the best
+that stand for all become candidates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.interpretation_tree import enumerate_flips, rehang_chain
+from hmt_ros.body.torso_flips import flip_torso
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.texture import Textures, with_swapped_sides
+from hmt_ros.inference.bounded_newton import Minimum
+from hmt_ros.tracking.candidates import Candidates, relative_joints
+from hmt_ros.tracking.chain_product import Alternatives, best_combinations, distinct_alternatives
+from hmt_ros.tracking.chain_search import ChainSearch
+from hmt_ros.tracking.proposals import chain_dofs, chain_votes
+from hmt_ros.tracking.pruning import choose_hypotheses
+from hmt_ros.tracking.tracker_settings import TrackerSettings
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# Groups of modes with a trunk of their own whose products are rated.
+MOST_GROUPS = 3
+TRUNK = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
+CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
+PAIRS = (('left_arm', 'right_arm'), ('left_leg', 'right_leg'))
+SIBLINGS = {a: b for pair in PAIRS for a, b in (pair, pair[::-1])}
+
+
+@dataclass(frozen=True, eq=False)
+class _Product:
+    """A trunk, configurations of each limb, and what they cost.
+
+    Attributes:
+        modes, members, log_weights: (G, d), (G,), (G,) of the modes with this trunk.
+        alternatives: one entry a chain.
+        changes: energy change that each alternative makes alone.
+        energy: of the first mode.
+        row: of the textures.
+    """
+
+    modes: Array
+    members: Index
+    log_weights: Array
+    alternatives: list[Alternatives]
+    changes: list[Array]
+    energy: float
+    row: int
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicJumps:
+    """Proposes poses far from those that are known, which fit the image as well.
+
+    Attributes:
+        body, camera: who is seen by what.
+        settings: of the tracker.
+        evaluate: energies (N,) of poses (N, d) in an image, with textures and their rows (N,).
+        count: told how many evaluations were made besides.
+    """
+
+    body: Body
+    camera: Camera
+    settings: TrackerSettings
+    evaluate: Callable[[Array, Observation, Textures | None, Index], Array]
+    count: Callable[[int], None]
+
+    @cached_property
+    def _searches(self) -> dict[str, ChainSearch]:
+        s = self.settings
+        return {
+            chain: ChainSearch(self.body, self.camera, s.likelihood, chain, s.search)
+            for chain in CHAINS[:4]
+            if chain in self.body.chains
+        }
+
+    def propose(
+        self,
+        base: Minimum,
+        sources: Candidates,
+        covariances: Array,
+        observation: Observation,
+        rng: np.random.Generator,
+    ) -> Candidates:
+        """Candidates of kinematic jump sampling, from optima and how each of them came about."""
+        s, textures = self.settings, sources.textures
+        everything: list[tuple[Array, Index, Array, Array, Index]] = []
+        for group in self._groups(base)[:MOST_GROUPS]:
+            lead = int(group[0])
+            pose, lead_row = base.x[lead], int(sources.texture_rows[lead])
+            found = self._search(
+                pose, covariances[sources.parents[lead]], observation, textures, lead_row, rng
+            )
+            log_weights = sources.log_priors[group]
+            alternatives = [
+                self._alternatives(base.x[group], chain, found.get(chain))
+                for chain in CHAINS
+                if chain in self.body.chains
+            ]
+            changes, energy = self._rate(pose, alternatives, observation, textures, lead_row)
+            products = [
+                _Product(base.x[group], group, log_weights, alternatives, changes, energy, lead_row)
+            ]
+            weight = np.array([np.logaddexp.reduce(log_weights) + np.log(s.jump_probability)])
+            for pair in PAIRS:
+                if not set(pair) <= set(self.body.chains):
+                    continue
+                swapped = self._swap(pose, pair)
+                if swapped is None:
+                    continue
+                row = lead_row
+                if textures is not None:
+                    row = len(textures.counts)
+                    textures = with_swapped_sides(
+                        textures, lead_row, *(self.body.skeleton.chains[chain] for chain in pair)
+                    )
+                rated, energy = self._rate(swapped[0], swapped[1], observation, textures, row)
+                choices, joined = [], []
+                for chain, change in zip(alternatives, changes, strict=True):
+                    if chain.chain in pair:
+                        i = pair.index(chain.chain)
+                        choices.append(swapped[1][i])
+                        joined.append(rated[i])
+                    else:
+                        choices.append(Alternatives(chain.chain, chain.angles, chain.penalties[:1]))
+                        joined.append(change)
+                products.append(
+                    _Product(swapped[0][None], group[:1], weight, choices, joined, energy, row)
+                )
+            for flipped, hung in self._torso_flips(pose, [a.chain for a in alternatives]):
+                changes, energy = self._rate(flipped, hung, observation, textures, lead_row)
+                products.append(
+                    _Product(flipped[None], group[:1], weight, hung, changes, energy, lead_row)
+                )
+            for product in products:
+                combined = best_combinations(
+                    self.body, product.modes, product.log_weights, product.energy,
+                    product.alternatives, product.changes, s.temperature, s.combinations,
+                )  # fmt: skip
+                members = product.members[combined.parents]
+                rows = np.full(len(members), product.row)
+                if product.row == lead_row:
+                    rows = sources.texture_rows[members]
+                everything.append(
+                    (combined.poses, members, combined.log_priors, combined.energies, rows)
+                )
+        poses, members, log_priors, energies, rows = (
+            np.concatenate([part[i] for part in everything]) for i in range(5)
+        )
+        kept = choose_hypotheses(
+            relative_joints(self.body, poses),
+            s.exploration * (log_priors - s.temperature * energies),
+            s.candidates,
+            same=s.hypothesis_merge_distance,
+        ).chosen
+        poses, members = poses[kept], members[kept]
+        # A chain that jumped is expected where it landed, the rest where it was predicted.
+        changed = np.abs(poses - base.x[members]) > 1e-9
+        return Candidates(
+            poses,
+            sources.parents[members],
+            log_priors[kept],
+            np.where(changed, poses, sources.centres[members]),
+            changed | sources.jumped[members],
+            textures,
+            rows[kept],
+        )
+
+    def _groups(self, base: Minimum) -> list[Index]:
+        """Modes with nearly the same trunk, each group with its best mode first."""
+        names = [name for name in TRUNK if name in self.body.joint_names]
+        which = self.body.skeleton.joint_index(names)
+        trunk = self.body.joint_positions(base.x)[:, which]
+        left = list(np.argsort(base.value, kind='stable'))
+        groups = []
+        while left:
+            gaps = np.linalg.norm(trunk[left] - trunk[left[0]], axis=2).max(1)
+            near = gaps < 0.06
+            groups.append(np.array([i for i, ok in zip(left, near) if ok], dtype=np.intp))
+            left = [i for i, ok in zip(left, near) if not ok]
+        return groups
+
+    def _search(
+        self,
+        pose: Array,
+        covariance: Array,
+        observation: Observation,
+        textures: Textures | None,
+        row: int,
+        rng: np.random.Generator,
+    ) -> dict[str, Array]:
+        """Configurations of some chains, chosen by vote, that fit the image."""
+        shape = observation.distance is not None or observation.edges is not None
+        names = list(self._searches) if shape else []
+        count = min(self.settings.searched_chains, len(names))
+        if count == 0:
+            return {}
+        votes = chain_votes(self.body, covariance[None], names, self.settings.vote)[0]
+        chosen = rng.choice(len(names), size=count, replace=False, p=votes)
+        result = {}
+        for i in sorted(chosen):
+            search = self._searches[names[i]]
+            result[names[i]] = search.find(pose, covariance, observation, textures, row, rng)
+            own = self.settings.search
+            self.count(own.samples + own.refined * own.iterations)
+        return result
+
+    def _alternatives(self, modes: Array, chain: str, found: Array | None) -> Alternatives:
+        """Configurations of a chain in a group: the modes' own, what was found, and all flips."""
+        s = self.settings
+        own = chain_dofs(self.body, chain)
+        jump = -np.log(s.jump_probability)
+        angles, penalties = [modes[:, own]], [np.where(np.eye(len(modes)) > 0, 0.0, jump)]
+        if found is not None:
+            angles.append(found)
+            penalties.append(np.full((len(modes), len(found)), jump))
+        if chain in SIBLINGS:
+            # Limbs that cross in the image are easily taken for each other.
+            swapped, _ = rehang_chain(
+                self.body, modes[:1], modes[:1], chain, image_of=SIBLINGS[chain]
+            )
+            angles.append(swapped[:, own])
+            penalties.append(np.full((len(modes), len(swapped)), jump))
+        sources = np.concatenate(angles)
+        poses = np.repeat(modes[:1], len(sources), axis=0)
+        poses[:, own] = sources
+        flips, parents = enumerate_flips(self.body, self.camera, poses, chain)
+        first = np.concatenate([[True], parents[1:] != parents[:-1]])
+        flips, parents = flips[~first], parents[~first]
+        angles.append(flips[:, own])
+        penalties.append(np.full((len(modes), len(flips)), jump))
+        return distinct_alternatives(
+            self.body, modes[0], chain, np.concatenate(angles), np.concatenate(penalties, axis=1),
+            apart=0.08, most=s.alternatives,
+        )  # fmt: skip
+
+    def _torso_flips(
+        self, pose: Array, chains: list[str]
+    ) -> list[tuple[Array, list[Alternatives]]]:
+        """The pose with its torso flipped, and its limbs in all ways that keep their image."""
+        result = []
+        for flipped in flip_torso(self.body, pose[None])[0]:
+            base, alternatives = flipped.copy(), []
+            for chain in chains:
+                own = chain_dofs(self.body, chain)
+                hung, _ = rehang_chain(self.body, pose[None], flipped[None], chain)
+                angles = hung[:, own] if len(hung) else flipped[None, own]
+                base[own] = angles[0]
+                distinct = distinct_alternatives(
+                    self.body, flipped, chain, angles, np.zeros((1, len(angles))),
+                    apart=0.08, most=self.settings.alternatives,
+                )  # fmt: skip
+                alternatives.append(distinct)
+            result.append((base, alternatives))
+        return result
+
+    def _swap(self, pose: Array, pair: tuple[str, str]) -> tuple[Array, list[Alternatives]] | None:
+        """The pose with two limbs each on the other's image, in all ways; None if they reach not.
+
+        Limbs that cross in the image are easily taken for each other, and one alone that changes
+        sides leaves its own place empty.
+        """
+        base, alternatives = pose.copy(), []
+        for chain, sibling in (pair, pair[::-1]):
+            own = chain_dofs(self.body, chain)
+            hung, _ = rehang_chain(self.body, pose[None], pose[None], chain, image_of=sibling)
+            if len(hung) == 0:
+                return None
+            base[own] = hung[0, own]
+            distinct = distinct_alternatives(
+                self.body, pose, chain, hung[:, own], np.zeros((1, len(hung))),
+                apart=0.08, most=self.settings.alternatives,
+            )  # fmt: skip
+            alternatives.append(distinct)
+        return base, alternatives
+
+    def _rate(
+        self,
+        pose: Array,
+        alternatives: list[Alternatives],
+        observation: Observation,
+        textures: Textures | None,
+        row: int,
+    ) -> tuple[list[Array], float]:
+        """Energy change that each alternative makes alone, and the energy of the pose itself."""
+        poses = [pose[None]]
+        for chain in alternatives:
+            block = np.repeat(pose[None], len(chain.angles), axis=0)
+            block[:, chain_dofs(self.body, chain.chain)] = chain.angles
+            poses.append(block)
+        everything = np.concatenate(poses)
+        value = self.evaluate(everything, observation, textures, np.full(len(everything), row))
+        ends = np.cumsum([1] + [len(c.angles) for c in alternatives])
+        return [value[a:b] - value[0] for a, b in pairwise(ends)], float(value[0])
