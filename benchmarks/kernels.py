@@ -1,4 +1,4 @@
-"""kernels: the compiled likelihood and pruning against vectorised numpy that computes the same."""
+"""kernels: what is compiled against vectorised numpy that computes the same."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import numpy_likelihood, numpy_pruning
+from benchmarks import numpy_flips, numpy_likelihood, numpy_pruning, numpy_self_intersection
 from benchmarks.clips import rounded, table
 from benchmarks.machine import best_time, description, on_machine
 from hmt_ros.body import Camera, load_body
+from hmt_ros.body.interpretation_tree import enumerate_flips
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.procedural_motion import procedural_motion
+from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.body.viewpoint import Viewpoint
 from hmt_ros.image import likelihood as likelihood_module
 from hmt_ros.image.likelihood import ImageLikelihood, TermSettings
@@ -73,7 +75,12 @@ def measure(seconds: float = 1.0) -> dict[str, Any]:
     """Times and differences: all image terms with derivatives, and the choice of hypotheses."""
     return {
         'machine': description(),
-        'cases': [*_likelihoods(seconds), *_choices(seconds)],
+        'cases': [
+            *_likelihoods(seconds),
+            *_choices(seconds),
+            *_flips(seconds),
+            *_overlaps(seconds),
+        ],
     }
 
 
@@ -132,6 +139,44 @@ def _choices(seconds: float) -> Iterator[dict[str, Any]]:
         slow = best_time(partial(numpy_pruning.choose, joints, weights, 16), seconds=seconds)
         fast = best_time(partial(choose_hypotheses, joints, log_weights, 16), seconds=seconds)
         yield _case('choice of hypotheses', batch, slow, fast, None, 0.0 if same else np.inf)
+
+
+def _flips(seconds: float) -> Iterator[dict[str, Any]]:
+    body = load_body('human37')
+    for batch in (1, 128):
+        poses = _any_poses(batch)
+        found, _ = enumerate_flips(body, None, poses, 'left_arm')
+        wanted, _ = numpy_flips.enumerate_flips(body, None, poses, 'left_arm')
+        difference = float(np.abs(found - wanted).max()) if len(found) == len(wanted) else np.inf
+        slow = partial(numpy_flips.enumerate_flips, body, None, poses, 'left_arm')
+        fast = partial(enumerate_flips, body, None, poses, 'left_arm')
+        yield _case(
+            'flips of an arm', batch, best_time(slow, seconds=seconds),
+            best_time(fast, seconds=seconds), None, difference,
+        )  # fmt: skip
+
+
+def _overlaps(seconds: float) -> Iterator[dict[str, Any]]:
+    body = load_body('human37')
+    for batch in (8, 128):
+        frames = forward(body.skeleton, _any_poses(batch))
+        slow = partial(numpy_self_intersection.self_intersection_energy, body, frames)
+        fast = partial(self_intersection_energy, body, frames)
+        pairs = zip(fast(), slow(), strict=True)
+        difference = max(float(np.abs(a - b).max() / max(np.abs(b).max(), 1e-9)) for a, b in pairs)
+        yield _case(
+            'self-intersection', batch, best_time(slow, seconds=seconds),
+            best_time(fast, seconds=seconds), None, difference,
+        )  # fmt: skip
+
+
+def _any_poses(count: int) -> Any:
+    body = load_body('human37')
+    rng = np.random.default_rng(1)
+    spread = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 0.0)
+    poses = body.prior_mean + spread * rng.normal(size=(count, body.dimension))
+    poses[:, :3] = [0.0, 0.0, 4.0]
+    return np.clip(poses, body.lower, body.upper)
 
 
 def _case(
