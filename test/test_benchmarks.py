@@ -61,7 +61,7 @@ def test_the_tree_that_is_timed_has_1024_leaves(body):
 
 def test_compiled_and_vectorised_code_compute_the_same():
     result = kernels.measure(seconds=0.0)
-    assert len(result['cases']) == 5
+    assert len(result['cases']) >= 9
     for case in result['cases']:
         assert case['difference'] < 1e-9, case
         assert case['numpy_ms'] > 0
