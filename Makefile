@@ -33,7 +33,7 @@ demo:
 
 test:
 	@$(WORKSPACE) ros test build
-	@$(SOURCED) python -m pytest -n $(TEST_PROCESSES) --dist loadgroup --cov --cov-report term $(ARGS)
+	@$(SOURCED) python -m pytest -n $(TEST_PROCESSES) --dist loadfile --cov --cov-report term $(ARGS)
 
 lint:
 	@$(WORKSPACE) ros lint

@@ -37,8 +37,7 @@ def _reserve_ros_domain() -> tuple[int, socket.socket]:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    if hasattr(config, 'workerinput'):
-        return  # of pytest-xdist: it has the environment of the main process
+    # Every process its own, also those of pytest-xdist: in one domain every node sees every other.
     domain, config.stash[_domain_reservation] = _reserve_ros_domain()
     os.environ['ROS_DOMAIN_ID'] = str(domain)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -50,14 +49,7 @@ def pytest_unconfigure(config: pytest.Config) -> None:
         reservation.close()
 
 
-@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    sourced = 'AMENT_PREFIX_PATH' in os.environ
-    for item in items:
-        if item.get_closest_marker('ros') is None:
-            continue
-        # In one domain every node sees every other: one process runs all these tests, in turn.
-        item.add_marker(pytest.mark.xdist_group('ros'))
-        if not sourced:
-            reason = 'no ROS environment: "make test" or "source tools/environment.bash" first'
-            item.add_marker(pytest.mark.skip(reason=reason))
+def pytest_itemcollected(item: pytest.Item) -> None:
+    if item.get_closest_marker('ros') is not None and 'AMENT_PREFIX_PATH' not in os.environ:
+        reason = 'no ROS environment: "make test" or "source tools/environment.bash" first'
+        item.add_marker(pytest.mark.skip(reason=reason))
