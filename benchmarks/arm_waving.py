@@ -41,8 +41,20 @@ class Waving:
     upper: Array
 
 
-def waving(times: int = 47, seed: int = 0, flips: int = 3) -> Waving:
-    """The sequence with 2^flips modes at each of T times, 20 images a second."""
+def waving(
+    times: int = 47, seed: int = 0, flips: int = 3, *, reach: float = 1.1, alike: bool = False
+) -> Waving:
+    """The sequence with 2^flips modes at each of T times, 20 images a second.
+
+    Args:
+        times: T.
+        seed: of all randomness.
+        flips: segments that are ambiguous.
+        reach: how far the two answers of a segment are apart at most, rad; small: they overlap.
+        alike: errors of an image move its modes alike, as the reflections of a pose explain an
+            image equally well: no explanation of the sequence dominates. Else each mode has its
+            own.
+    """
     rng = np.random.default_rng(seed)
     t = np.arange(times) * STEP
     amplitude = np.where(np.arange(DOFS) < 12, rng.uniform(0.3, 0.9, DOFS), 0.05)
@@ -55,14 +67,17 @@ def waving(times: int = 47, seed: int = 0, flips: int = 3) -> Waving:
         directions[i, 4 * i : 4 * i + 4] = rng.normal(size=4)
         directions[i] /= np.linalg.norm(directions[i])
     turn = rng.uniform(0, 2 * np.pi, flips)
-    out = 1.1 * np.abs(np.sin(2 * np.pi * rng.uniform(0.15, 0.3, flips) * t[:, None] + turn))
+    out = reach * np.abs(np.sin(2 * np.pi * rng.uniform(0.15, 0.3, flips) * t[:, None] + turn))
     signs = np.array(list(itertools.product((0.0, 1.0), repeat=flips)))
     basis = np.linalg.qr(rng.normal(size=(DOFS, DOFS)))[0]
     mixtures = []
     for truth_t, out_t in zip(truth, out):
         centres = truth_t + (signs * out_t) @ directions
         means, covariances = [], []
+        shared = rng.bit_generator.state
         for centre in centres:
+            if alike:
+                rng.bit_generator.state = shared
             turned = np.linalg.qr(basis + 0.1 * rng.normal(size=(DOFS, DOFS)))[0]
             sigma = 0.01 * np.exp(np.linspace(0.0, np.log(70.0) / 1.0, DOFS)) ** 1.0
             covariances.append((turned * sigma**2) @ turned.T)

@@ -12,9 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import numpy_flips, numpy_likelihood, numpy_pruning, numpy_self_intersection
+from benchmarks import (
+    numpy_flips,
+    numpy_likelihood,
+    numpy_pruning,
+    numpy_self_intersection,
+    numpy_smoothing,
+)
+from benchmarks.arm_waving import waving
 from benchmarks.clips import rounded, table
 from benchmarks.machine import best_time, description, on_machine
+from benchmarks.smoothing_relations import CLOSE, layers_of
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.interpretation_tree import enumerate_flips
 from hmt_ros.body.kinematics import forward
@@ -27,6 +35,11 @@ from hmt_ros.image.observation import observe
 from hmt_ros.image.renderer import render_frames
 from hmt_ros.image.scene import Scene
 from hmt_ros.image.texture import capture_textures
+from hmt_ros.inference.block_tridiagonal import add_band_product
+from hmt_ros.smoothing import embedded_network as network_module
+from hmt_ros.smoothing.component_overlaps import add_overlaps
+from hmt_ros.smoothing.likelihood import Curvature
+from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.tracking.pruning import choose_hypotheses
 
 OFF = TermSettings(0.0, 1.0, 1.0)
@@ -72,7 +85,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
 
 
 def measure(seconds: float = 1.0) -> dict[str, Any]:
-    """Times and differences: all image terms with derivatives, and the choice of hypotheses."""
+    """Times and differences of the image's terms, the choice of hypotheses, and the smoother."""
     return {
         'machine': description(),
         'cases': [
@@ -80,6 +93,7 @@ def measure(seconds: float = 1.0) -> dict[str, Any]:
             *_choices(seconds),
             *_flips(seconds),
             *_overlaps(seconds),
+            *_smoothing(seconds),
         ],
     }
 
@@ -177,6 +191,95 @@ def _any_poses(count: int) -> Any:
     poses = body.prior_mean + spread * rng.normal(size=(count, body.dimension))
     poses[:, :3] = [0.0, 0.0, 4.0]
     return np.clip(poses, body.lower, body.upper)
+
+
+def _smoothing(seconds: float) -> Iterator[dict[str, Any]]:
+    """On the arm-waving sequence with modes that overlap, 8 images."""
+    sequence = waving(8, reach=CLOSE, alike=True)
+    layers = layers_of(sequence)
+    means = np.concatenate([mixture.means for mixture in layers.mixtures])
+    covariances = np.concatenate([mixture.covariances for mixture in layers.mixtures])
+    pairs = np.indices((len(means), 8)).reshape(2, -1).T.copy()
+    yield _smoothing_case(
+        'links of the network', len(pairs), seconds,
+        partial(_serial_links, means, covariances, pairs),
+        partial(numpy_smoothing.pair_log_densities, means, covariances, means, covariances, pairs),
+    )  # fmt: skip
+
+    starts = layers.states(layers.paths(64))
+    poses = starts.reshape(-1, starts.shape[2])
+    times = np.tile(np.arange(8), len(starts))
+    likelihood = layers.likelihood
+    ends = likelihood.first[1:-1]  # type: ignore[union-attr]
+    yield _smoothing_case(
+        'mixtures, gradient, Hessian', len(poses), seconds,
+        partial(likelihood.energy, poses, times, Curvature.EXACT),
+        partial(
+            numpy_smoothing.mixture_energy, list(layers.mixtures),
+            np.split(likelihood.whiteners, ends),  # type: ignore[union-attr]
+            np.split(likelihood.precisions, ends),  # type: ignore[union-attr]
+            poses, times,
+        ),
+    )  # fmt: skip
+
+    band = layers.prior.precision.band()
+    flat = starts.reshape(len(starts), -1)
+
+    def product() -> Any:
+        result = np.zeros_like(flat)
+        add_band_product(band, flat, result)
+        return result
+
+    yield _smoothing_case(
+        'product with a band', len(flat), seconds, product,
+        partial(numpy_smoothing.band_product, band, flat),
+    )  # fmt: skip
+
+    refined = refine(starts, layers.prior, likelihood)
+    some = refined.without_duplicates()[np.arange(8)]
+    centres = some.states.reshape(8, -1)
+    total = centres.shape[1]
+    bands = np.stack([factor.band.T for factor in some.factors])
+    scales = 0.5 * np.array([factor.log_determinant for factor in some.factors])
+    scales -= 0.5 * total * np.log(2 * np.pi)
+    log_weights = np.full(8, -np.log(8.0))
+    noise = np.random.default_rng(0).standard_normal((32, total))
+    samples = centres[0] + some.factors[0].solve_transposed(noise.reshape(32, 8, -1)).reshape(
+        32, -1
+    )
+
+    def overlaps() -> Any:
+        log, slope = np.empty(32), np.empty((32, total))
+        add_overlaps(
+            0, samples, noise, log_weights, scales, centres, np.ones(8), bands,
+            np.ones(8, dtype=np.bool_), np.zeros(8, dtype=np.int64), True, 1.0, log, slope,
+            np.zeros((8, total)), np.zeros(8), np.zeros(8), np.zeros((0, 0, 0)),
+        )  # fmt: skip
+        return log, slope
+
+    yield _smoothing_case(
+        'overlaps of trajectories', len(samples), seconds, overlaps,
+        partial(numpy_smoothing.log_overlaps, samples, log_weights, scales, centres, bands),
+    )  # fmt: skip
+
+
+def _serial_links(means: Any, covariances: Any, pairs: Any) -> Any:
+    result = np.empty(len(pairs))
+    network_module._pair_log_densities(means, covariances, means, covariances, pairs, result)
+    return result
+
+
+def _smoothing_case(
+    what: str, batch: int, seconds: float, compiled: Any, vectorised: Any
+) -> dict[str, Any]:
+    found, wanted = compiled(), vectorised()
+    if not isinstance(found, tuple):
+        found, wanted = (found,), (wanted,)
+    difference = max(
+        float(np.abs(a - b).max() / np.abs(b).max()) for a, b in zip(found, wanted, strict=True)
+    )
+    slow = best_time(vectorised, seconds=seconds)
+    return _case(what, batch, slow, best_time(compiled, seconds=seconds), None, difference)
 
 
 def _case(

@@ -1,4 +1,4 @@
-"""smoothing: exactness against known posteriors, speed and memory at the size of VMS, peers."""
+"""smoothing: exactness against known posteriors, speed, memory, peers, and clips with truth."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import argparse
 import json
 import multiprocessing
 import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.arm_waving import STEP, Waving, waving
+from benchmarks.arm_waving import STEP, waving
 from benchmarks.clips import rounded, table
 from benchmarks.exact_smoothing import (
     divergence,
@@ -21,15 +22,17 @@ from benchmarks.exact_smoothing import (
     particle_marginals,
 )
 from benchmarks.machine import best_time, description, on_machine, peak_memory
+from benchmarks.smoothing_clips import as_rows as rows_of_clips
+from benchmarks.smoothing_clips import clips
 from benchmarks.smoothing_peers import (
     RobustSequence,
     gtsam_missing,
     gtsam_trajectory,
     scipy_trajectory,
 )
+from benchmarks.smoothing_relations import relations
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
 from hmt_ros.smoothing.embedded_network import embedded_network
-from hmt_ros.smoothing.likelihood import Curvature, MixtureLikelihood
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.paths import most_probable_paths
 from hmt_ros.smoothing.trajectory_refinement import refine
@@ -38,6 +41,7 @@ from hmt_ros.smoothing.variational_mixture import laplace_weights, minimise_free
 Array = NDArray[np.float64]
 
 TIMES = 47
+PARTS = ('memory', 'exactness', 'grid', 'stages', 'peers', 'length', 'relations', 'clips')
 # Variances that a step of the random walk adds, against modes of unit size.
 WALKS = (1.0, 4.0, 16.0)
 
@@ -47,8 +51,12 @@ def main(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(prog='python -m benchmarks smoothing', description=__doc__)
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     parser.add_argument('--quick', action='store_true', help='fewer sequences and repetitions')
+    parser.add_argument(
+        '--only', nargs='+', choices=PARTS, default=PARTS, metavar='PART',
+        help=f'some of {", ".join(PARTS)}',
+    )  # fmt: skip
     options = parser.parse_args(argv)
-    result = measure(quick=options.quick)
+    result = measure(quick=options.quick, only=options.only)
     if options.json:
         print(json.dumps(rounded(result), indent=1))
         return 0
@@ -62,19 +70,20 @@ def page() -> str:
     return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
 
 
-def measure(*, quick: bool = False) -> dict[str, Any]:
-    """Everything; memory first, in a process of its own."""
-    memory = peak_memory_apart(12 if quick else TIMES)
-    return {
-        'machine': description(),
-        'peak_memory_mb': memory / 1e6,
-        'exactness': exactness(1 if quick else 4, WALKS[1:2] if quick else WALKS),
-        'grid': grid(1 if quick else 3, 20 if quick else 40),
-        'stages': stages(12 if quick else TIMES, 0.0 if quick else 3.0),
-        'peers': peers(12 if quick else TIMES, 0.0 if quick else 2.0),
-        'length': length(*((6, 12) if quick else (TIMES, 10 * TIMES))),
-        'relations': relations(12 if quick else TIMES),
+def measure(*, quick: bool = False, only: Sequence[str] = PARTS) -> dict[str, Any]:
+    """What was asked for; memory first, in a process of its own."""
+    times = 12 if quick else TIMES
+    parts: dict[str, Callable[[], Any]] = {
+        'memory': lambda: {'peak_mb': peak_memory_apart(times) / 1e6},
+        'exactness': lambda: exactness(1 if quick else 4, WALKS[1:2] if quick else WALKS),
+        'grid': lambda: grid(1 if quick else 3, 20 if quick else 40),
+        'stages': lambda: stages(times, 0.0 if quick else 3.0),
+        'peers': lambda: peers(times, 0.0 if quick else 2.0),
+        'length': lambda: length(*((6, 12) if quick else (TIMES, 10 * TIMES))),
+        'relations': lambda: relations(6 if quick else TIMES),
+        'clips': lambda: clips(quick),
     }
+    return {'machine': description(), **{name: parts[name]() for name in PARTS if name in only}}
 
 
 def peak_memory_apart(times: int) -> float:
@@ -258,100 +267,57 @@ def length(short: int, long: int) -> dict[str, Any]:
     }
 
 
-def relations(times: int) -> dict[str, Any]:
-    """What VMS reports of its sequence, on a synthetic one."""
-    sequence = waving(times)
-    intervals = np.full(times - 1, STEP)
-    layers = ModeSequence(tuple(sequence.mixtures), sequence.dynamics, intervals)
-    prior, likelihood = layers.prior, layers.likelihood
-    starts = layers.states(layers.paths(64))
-    refined = refine(starts, prior, likelihood, sequence.lower, sequence.upper)
-    at = np.tile(np.arange(times), len(starts))
-    flat = starts.reshape(-1, starts.shape[2])
-    before = likelihood.energy(flat, at, Curvature.NONE)[0].reshape(len(starts), -1).sum(1)
-    # The weights of VMS to begin with: the heights of the optima.
-    found = MixtureSmoother(sequence.dynamics, sequence.lower, sequence.upper, start='peak').smooth(
-        sequence.mixtures
-    )
-    trace = found.free_energy
-    return {
-        'eigenvalue_ratio': {
-            str(frames): eigenvalue_ratio(sequence, refined.states[0], frames)
-            for frames in (1, 8, times)
-        },
-        'difference_deg': float(np.degrees(np.abs(refined.states - starts).mean())),
-        'roughness_ratio': roughness(refined.states) / roughness(starts),
-        'log_likelihood_change': float(
-            np.mean((refined.observation_energies - before) / abs(before))
-        ),
-        'free_energy_start': float(trace[0]),
-        'free_energy_end': float(trace[-1]),
-        'share_of_fall_within_8': float(
-            (trace[0] - trace[min(8, len(trace) - 1)]) / max(trace[0] - trace[-1], 1e-12)
-        ),
-    }
-
-
-def eigenvalue_ratio(sequence: Waving, states: Array, frames: int) -> float:
-    """Largest over smallest eigenvalue of the Hessian of the first frames, at an optimum."""
-    likelihood = MixtureLikelihood.of(sequence.mixtures[:frames])
-    poses = states[:frames]
-    hessian = likelihood.energy(poses, np.arange(frames), Curvature.POSITIVE)[2]
-    assert hessian is not None
-    d = poses.shape[1]
-    precision = sequence.dynamics.prior(np.full(frames - 1, STEP)).precision
-    dense = np.zeros((frames, d, frames, d))
-    for t in range(frames):
-        dense[t, :, t] = precision.diagonal[t] + hessian[t]
-    for t, block in enumerate(precision.lower):
-        dense[t + 1, :, t], dense[t, :, t + 1] = block, block.T
-    values = np.linalg.eigvalsh(dense.reshape(frames * d, -1))
-    return float(values[-1] / values[0])
-
-
-def roughness(states: Array) -> float:
-    """Mean square of second differences."""
-    return float((np.diff(states, n=2, axis=1) ** 2).mean())
-
-
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """A table for people."""
+    """Tables for people."""
     rows = [['measure', 'value', 'wanted']]
     for kind, limit in (('separated', 0.02), ('overlapping', 0.1)):
-        entry = result['exactness'][kind]
-        rows.append(
+        if 'exactness' in result:
+            entry = result['exactness'][kind]
+            value = f'{entry["mean_kl"]:.4f} ({entry["particle_mean_kl"]:.4f}) nats'
+            what = f'KL from exact, {kind} (particle smoother, same time)'
+            rows.append([what, value, f'{limit}'])
+        if 'grid' in result:
+            value = f'{result["grid"][kind]["mean_kl"]:.4f} nats'
+            rows.append([f'KL from a grid, 40 times, {kind}', value, f'{limit}'])
+    if 'stages' in result:
+        stage = result['stages']
+        rows += [
+            ['network and paths', f'{stage["network_and_paths_ms"]:.1f} ms', '10'],
+            ['refinement of 64 trajectories', f'{stage["refinement_s"]:.2f} s', '1.2'],
+            ['most iterations', str(stage['most_iterations']), '20'],
+            ['variational refinement', f'{stage["variational_s"]:.2f} s', '1.5'],
+        ]
+    if 'memory' in result:
+        rows.append(['peak memory', f'{result["memory"]["peak_mb"]:.0f} MB', '400'])
+    if 'length' in result:
+        rows.append(['ten times the length costs', f'{result["length"]["ratio"]:.1f} times', '11'])
+    if 'peers' in result:
+        peer = result['peers']
+        gtsam = f'{peer["gtsam_ratio"]:.1f} times' if 'gtsam_ratio' in peer else peer['gtsam']
+        rows += [
+            ['one trajectory', f'{1e3 * peer["ours_s"]:.1f} ms', ''],
+            ['faster than scipy', f'{peer["scipy_ratio"]:.0f} times', '25'],
+            ['faster than GTSAM', gtsam, '2'],
+        ]
+    if 'relations' in result:
+        found = result['relations']
+        ratios = ', '.join(f'{k}: {v:.0f}' for k, v in found['eigenvalue_ratio'].items())
+        rows += [
+            ['eigenvalue ratio, by frames', ratios, 'falls'],
+            ['difference of paths and optima', f'{found["difference_deg"]:.1f} deg', ''],
+            ['roughness of optima over paths', f'{found["roughness_ratio"]:.2f}', 'below 1'],
+            ['change of -log likelihood', f'{100 * found["log_likelihood_change"]:+.1f} %', '10'],
             [
-                f'KL from exact, {kind} (particle smoother, same time)',
-                f'{entry["mean_kl"]:.4f} ({entry["particle_mean_kl"]:.4f}) nats',
-                f'{limit}',
-            ]
-        )
-        rows.append(
-            [
-                f'KL from a grid, 40 times, {kind}',
-                f'{result["grid"][kind]["mean_kl"]:.4f} nats',
-                f'{limit}',
-            ]
-        )
-    stage, peer, ratio = result['stages'], result['peers'], result['relations']['eigenvalue_ratio']
-    rows += [
-        ['network and paths', f'{stage["network_and_paths_ms"]:.1f} ms', '10'],
-        ['refinement of 64 trajectories', f'{stage["refinement_s"]:.2f} s', '1.2'],
-        ['most iterations', str(stage['most_iterations']), '20'],
-        ['variational refinement', f'{stage["variational_s"]:.2f} s', '1.5'],
-        ['peak memory', f'{result["peak_memory_mb"]:.0f} MB', '400'],
-        ['ten times the length costs', f'{result["length"]["ratio"]:.1f} times', '11'],
-        ['one trajectory', f'{1e3 * peer["ours_s"]:.1f} ms', ''],
-        ['faster than scipy', f'{peer["scipy_ratio"]:.0f} times', '25'],
-        [
-            'faster than GTSAM',
-            f'{peer["gtsam_ratio"]:.1f} times' if 'gtsam_ratio' in peer else peer['gtsam'],
-            '2',
-        ],
-        [
-            'eigenvalue ratio, by frames',
-            ', '.join(f'{k}: {v:.0f}' for k, v in ratio.items()),
-            'falls',
-        ],
-    ]
-    return table(rows, markdown=markdown)
+                'free energy falls by, in iterations',
+                f'{found["free_energy_fall"]:.2f} nats, {found["free_energy_iterations"]}',
+                '8',
+            ],
+        ]
+    parts = [table(rows, markdown=markdown)] if len(rows) > 1 else []
+    if 'clips' in result:
+        found = result['clips']
+        if isinstance(found, str):
+            parts.append(f'clips: {found}')
+        else:
+            parts.append(table(rows_of_clips(found), left=2, markdown=markdown))
+    return '\n\n'.join(parts)

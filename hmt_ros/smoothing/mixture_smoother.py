@@ -67,6 +67,12 @@ class MixtureSmoother:
             'covariances'; empty: nothing.
         start: 'laplace' weighs optima by their mass, 'peak' by their height, as VMS does.
         max_iterations: of the descent of the free energy.
+        through_modes: whether, besides the best paths between the ends, those through every single
+            mode are starts: more alternatives for each pose, fewer for the whole motion.
+        error_correlation: for how long the errors of observations persist, s; 0: they are
+            independent. Where they last, T images are less than T pieces of evidence: the result
+            is tempered by the share tanh(interval / (2 error_correlation)) that the mean of an
+            autoregressive error leaves (`TrajectoryMixture.tempered`).
 
     Raises:
         ValueError: settings out of range.
@@ -79,6 +85,8 @@ class MixtureSmoother:
     adapt: Sequence[str] = ('weights', 'means', 'inflation')
     start: str = 'laplace'
     max_iterations: int = 15
+    through_modes: bool = False
+    error_correlation: float = 0.0
 
     def __post_init__(self) -> None:
         if self.max_trajectories < 1:
@@ -88,6 +96,8 @@ class MixtureSmoother:
             raise ValueError(f'adapt: no {wrong[0]!r}, wanted some of {ADAPTABLE}')
         if self.start not in ('laplace', 'peak'):
             raise ValueError(f"start must be 'laplace' or 'peak', saw {self.start!r}")
+        if not self.error_correlation >= 0:
+            raise ValueError(f'error_correlation must be 0 s or more, saw {self.error_correlation}')
         self._limits()
 
     def smooth(
@@ -141,12 +151,23 @@ class MixtureSmoother:
                 self._descended(one, sequence.prior, likelihood, seed, 0).fresh[0] for one in sets
             ]
             best = sets[int(np.argmin(energies))]
-        return self._fitted(best, sequence.prior, likelihood, seed, stamps_ns)
+        found = self._fitted(best, sequence.prior, likelihood, seed, stamps_ns)
+        return self.as_evidence(found, sequence.intervals)
+
+    def as_evidence(self, found: TrajectoryMixture, intervals: Array) -> TrajectoryMixture:
+        """Tempered as `error_correlation` says, with intervals (T-1,) in seconds."""
+        if self.error_correlation == 0 or len(intervals) == 0:
+            return found
+        return found.tempered(float(np.tanh(0.5 * intervals.mean() / self.error_correlation)))
+
+    def paths(self, sequence: ModeSequence) -> Paths:
+        """The paths that trajectories start from."""
+        return sequence.paths(self.max_trajectories, through_modes=self.through_modes)
 
     def optima(self, sequence: ModeSequence, likelihood: SequenceLikelihood) -> Candidates:
         """Distinct optima, found from the paths, and paths beside them if they are few."""
         low, high = self._limits()
-        prior, paths = sequence.prior, sequence.paths(self.max_trajectories)
+        prior, paths = sequence.prior, self.paths(sequence)
         d = prior.dimension
         starts = sequence.states(paths)
         # What the others share with the best path is refined once.
@@ -189,7 +210,7 @@ class MixtureSmoother:
             merged = sequence.merged(distance)
             left = sum(len(mixture) for mixture in merged.mixtures)
             if left < count:
-                result.append(self._on_paths(merged, merged.paths(self.max_trajectories)))
+                result.append(self._on_paths(merged, self.paths(merged)))
                 count = left
         return result
 

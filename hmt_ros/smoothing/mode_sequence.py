@@ -19,7 +19,13 @@ from hmt_ros.smoothing.component_overlaps import pair_distances
 from hmt_ros.smoothing.dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, embedded_network
 from hmt_ros.smoothing.likelihood import MixtureLikelihood, WindowLikelihood
-from hmt_ros.smoothing.paths import Paths, diverse_subset, k_best_paths
+from hmt_ros.smoothing.paths import (
+    Paths,
+    distinct_paths,
+    diverse_subset,
+    k_best_paths,
+    paths_through_nodes,
+)
 
 Array = NDArray[np.float64]
 
@@ -69,14 +75,24 @@ class ModeSequence:
         """The embedded network."""
         return embedded_network(self.mixtures, self.dynamics, self.intervals, self.first)
 
-    def paths(self, count: int) -> Paths:
+    def paths(self, count: int, *, through_modes: bool = False) -> Paths:
         """At most `count` paths that are probable and differ from each other.
 
-        The best of each pair of ends; where that makes less, further ones of the same pairs.
+        The best of each pair of ends; where that makes less, further ones of the same pairs. With
+        `through_modes` the best path through every single mode is a candidate too.
         """
         pairs = len(self.network.nodes[0]) * len(self.network.nodes[-1])
         per_pair = 1 if pairs >= count else -(-CANDIDATES * count // pairs)
-        return diverse_subset(k_best_paths(self.network, per_pair), count)
+        found = k_best_paths(self.network, per_pair)
+        if through_modes:
+            more = paths_through_nodes(self.network)
+            found = distinct_paths(
+                Paths(
+                    np.concatenate([found.nodes, more.nodes]),
+                    np.concatenate([found.log_values, more.log_values]),
+                )
+            )
+        return diverse_subset(found, count)
 
     def states(self, paths: Paths) -> Array:
         """States (P, T, n) along the modes of paths; velocities are differences of neighbours."""

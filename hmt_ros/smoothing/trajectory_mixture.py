@@ -10,7 +10,7 @@ velocities, they are integrated out of everything that is returned.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -189,6 +189,25 @@ class TrajectoryMixture:
         """Expected poses, (T, d)."""
         result: Array = np.einsum('m,mtd->td', self.weights, self.means)
         return result
+
+    def tempered(self, share: float) -> TrajectoryMixture:
+        """The mixture if only a share of the evidence counted.
+
+        Proportions a_i^share, and precisions that much smaller: of separate components these are
+        q^share. The trajectories and `free_energy` stay what they are.
+
+        Raises:
+            ValueError: a share that is not in (0, 1].
+        """
+        if not 0 < share <= 1:
+            raise ValueError(f'the share of the evidence must lie in (0, 1], saw {share}')
+        with np.errstate(divide='ignore'):
+            log = share * np.log(self.weights)
+        return replace(
+            self,
+            weights=np.exp(log - logsumexp(log)),
+            inflation=self.inflation / np.sqrt(share),
+        )
 
     def message_content(self) -> dict[str, Any]:
         """What a message needs besides names and frame: see `msg_tools.trajectory_mixtures`.

@@ -51,6 +51,8 @@ class VariationalMixture:
         factors: M factors of the precisions S_i^-1, without inflation.
         free_energy: (I,) at the start and after each iteration, nats, on the samples of the
             descent.
+        held_out: (J,) the same on the samples that choose the iterate, J >= I, as the descent goes
+            on for a while after the best one; empty where there was no descent.
         fresh: F on samples that were not used, and its standard error.
     """
 
@@ -59,6 +61,7 @@ class VariationalMixture:
     inflation: Array
     factors: tuple[BlockCholesky, ...]
     free_energy: Array
+    held_out: Array
     fresh: tuple[float, float]
 
 
@@ -127,9 +130,10 @@ def minimise_free_energy(
     objective = FreeEnergy(weights, states, factors, prior, likelihood, adapt, low, high, descent)
     x = np.zeros(objective.parameters)
     if max_iterations > 0 and len(x):
-        x, trace = _descend(objective, choice, max_iterations, tolerance)
+        x, trace, held_out = _descend(objective, choice, max_iterations, tolerance)
     else:
         trace = np.array([_free_energy(objective, x, descent)])
+        held_out = np.empty(0)
     mixture = objective.mixture(x)
     a, means, inflation, found = mixture
     each = objective.sampled(mixture, fresh)
@@ -144,6 +148,7 @@ def minimise_free_energy(
         inflation,
         tuple(found),
         trace,
+        held_out,
         (float(a @ each.mean(1)), error),
     )
 
@@ -166,8 +171,8 @@ def matched(noise: Array) -> Array:
 
 def _descend(
     objective: FreeEnergy, choice: Array, max_iterations: int, tolerance: float
-) -> tuple[Array, Array]:
-    """L-BFGS from 0: the best iterate, and the values after each iteration up to it.
+) -> tuple[Array, Array, Array]:
+    """L-BFGS from 0: the best iterate, the values up to it, and those on samples held out.
 
     With few samples the descent ends up fitting their noise. The iterate is kept that has the least
     F on other samples, and the descent ends when F no longer falls on those.
@@ -209,7 +214,7 @@ def _descend(
         options={'maxiter': max_iterations, 'maxcor': 8, 'maxfun': 3 * max_iterations},
     )
     best = int(np.argmin(held_out))
-    return iterates[best], np.array(trace[: best + 1])
+    return iterates[best], np.array(trace[: best + 1]), np.array(held_out)
 
 
 def _free_energy(objective: FreeEnergy, x: Array, noise: Array) -> float:
@@ -387,7 +392,8 @@ class FreeEnergy:
                 points = means[i] + inflation[i] * roots[i]
                 add_overlaps(
                     i, points, noise[i], log_weights, log_scales, means, inflation, bands,
-                    near[i], self.size * farthest[i], derivatives, weights[i] / samples, each[i], slope[i], *sums[part],
+                    near[i], self.size * farthest[i], derivatives, weights[i] / samples,
+                    each[i], slope[i], *sums[part],
                 )  # fmt: skip
                 energy, pull = self._energy(points)
                 each[i] += energy

@@ -209,3 +209,24 @@ def test_bad_settings_are_refused(walk, settings, message):
 def test_not_a_number_is_refused_where_it_comes_in():
     with pytest.raises(ValueError, match='not finite'):
         GaussianMixture([1.0], [[np.nan]], [[[1.0]]])
+
+
+def test_errors_that_last_leave_less_evidence(modes, walk):
+    mixtures = modes(4.0)
+    independent = MixtureSmoother(walk).smooth(mixtures)
+    found = MixtureSmoother(walk, error_correlation=2.0).smooth(mixtures)
+    share = np.tanh(0.25)
+    # The variance of the mean of an AR(1) error with rho = exp(-dt / tau) grows by
+    # (1 + rho) / (1 - rho).
+    rho = np.exp(-0.5)
+    assert share == pytest.approx((1 - rho) / (1 + rho))
+    np.testing.assert_allclose(
+        found.marginal_covariances, independent.marginal_covariances / share, rtol=1e-9
+    )
+    np.testing.assert_array_equal(found.means, independent.means)
+    log = share * np.log(independent.weights)
+    np.testing.assert_allclose(np.diff(np.log(found.weights)), np.diff(log), rtol=1e-6, atol=1e-9)
+    with pytest.raises(ValueError, match='error_correlation'):
+        MixtureSmoother(walk, error_correlation=-1.0)
+    with pytest.raises(ValueError, match='share of the evidence'):
+        independent.tempered(0.0)

@@ -18,6 +18,7 @@ from hmt_ros.smoothing.paths import (
     k_best_paths,
     most_probable_paths,
     node_probabilities,
+    paths_through_nodes,
     visiting_probabilities,
 )
 
@@ -168,3 +169,18 @@ def test_a_first_state_is_a_layer_of_its_own(modes, walk):
     paths = sequence.paths(5)
     np.testing.assert_allclose(sequence.states(paths), whole.states(paths))
     assert sequence.likelihood.times == whole.likelihood.times == 3
+
+
+def test_paths_through_every_node_are_the_best_that_visit_it(modes, walk):
+    network = embedded_network(modes(2.0, times=4), walk, np.ones(3))
+    every = list(itertools.product(range(3), repeat=4))
+    values = np.array([network.log_value(np.array(path)) for path in every])
+    found = paths_through_nodes(network)
+    assert len(np.unique(found.nodes, axis=0)) == len(found)
+    np.testing.assert_allclose(
+        found.log_values, [network.log_value(path) for path in found.nodes], rtol=1e-12
+    )
+    for t, k in itertools.product(range(4), range(3)):
+        visiting = np.array([path[t] == k for path in every])
+        best = found.log_values[found.nodes[:, t] == k].max()
+        assert best == pytest.approx(values[visiting].max())
