@@ -55,6 +55,7 @@ setup(
     entry_points={
         'console_scripts': [
             'filter_node = hmt_ros.nodes.filter_node:main',
+            'smoother_node = hmt_ros.nodes.smoother_node:main',
             'replay = hmt_ros.app.replay:main',
             'make-bag = hmt_ros.app.make_bag:main',
             'evaluate = hmt_ros.app.evaluate:main',

@@ -64,12 +64,7 @@ def skeleton_markers(
             f'markers: joint_positions has shape {positions.shape}, wanted '
             f'({len(heavy)}, {len(joint_names)}, 3)'
         )
-    index = {name: i for i, name in enumerate(joint_names)}
-    for edge in edges:
-        for name in edge:
-            if name not in index:
-                raise MessageError(f'markers: edge {edge} has the unknown joint {name!r}')
-    ends = [index[name] for edge in edges for name in edge]
+    ends = _ends(joint_names, edges)
     order = np.argsort(-heavy, kind='stable')[:ranks]
     header = header_message(messages, stamp_ns, frame_id)
 
@@ -90,11 +85,7 @@ def skeleton_markers(
             messages.create('geometry_msgs/msg/Point', x=x, y=y, z=z)
             for x, y, z in positions[mode].tolist()
         ]
-        red, green, blue = _OTHERS if rank else _FIRST
-        share = float(heavy[mode] / heavy[order[0]]) if heavy[order[0]] > 0 else 1.0
-        color = messages.create(
-            'std_msgs/msg/ColorRGBA', r=red, g=green, b=blue, a=_FAINTEST + (1 - _FAINTEST) * share
-        )
+        color = _color(messages, rank, heavy[mode], heavy[order[0]])
         markers.append(
             marker(
                 rank,
@@ -125,3 +116,111 @@ def skeleton_markers(
     for rank in range(len(order), ranks):
         markers.extend(marker(rank, key, action=_DELETE) for key in (_BONES, _JOINTS))
     return messages.create('visualization_msgs/msg/MarkerArray', markers=markers)
+
+
+def trajectory_markers(
+    messages: MessageFactory,
+    joint_positions: ArrayLike,
+    joint_names: Sequence[str],
+    traced: Sequence[str],
+    edges: Sequence[tuple[str, str]],
+    weights: ArrayLike,
+    stamp_ns: int,
+    frame_id: str,
+    *,
+    ranks: int,
+    namespace: str = 'trajectory',
+    line_width: float = 0.01,
+) -> Any:
+    """visualization_msgs/MarkerArray of M trajectories: the paths of some joints, the newest pose.
+
+    As `skeleton_markers`: a trajectory of rank k has the namespace `trajectory_k`, with the paths
+    as marker 0 and the newest pose as marker 1.
+
+    Args:
+        messages: factory of messages.
+        joint_positions: (M, T, J, 3) m, in the order of time.
+        joint_names: (J,).
+        traced: joints whose paths are drawn; those that are no joints are left out.
+        edges: bones, as the names of the joints that they join.
+        weights: (M,) of the trajectories, in any order.
+        stamp_ns, frame_id: of the header.
+        ranks: most trajectories that ever are shown; the lightest beyond are left out.
+        namespace: first part of the namespaces.
+        line_width: m.
+
+    Raises:
+        MessageError: arrays whose lengths contradict each other, an edge of an unknown joint.
+    """
+    positions = np.asarray(joint_positions, dtype=np.float64)
+    heavy = np.asarray(weights, dtype=np.float64)
+    if positions.ndim != 4 or (len(positions), *positions.shape[2:]) != (
+        len(heavy),
+        len(joint_names),
+        3,
+    ):
+        raise MessageError(
+            f'markers: joint_positions has shape {positions.shape}, wanted '
+            f'({len(heavy)}, T, {len(joint_names)}, 3)'
+        )
+    ends = _ends(joint_names, edges)
+    shown = [index for index, name in enumerate(joint_names) if name in traced]
+    header = header_message(messages, stamp_ns, frame_id)
+    order = np.argsort(-heavy, kind='stable')[:ranks]
+    markers = []
+    for rank, at in enumerate(order):
+        paths = positions[at][:, shown]
+        # Pairs of neighbouring positions, joint by joint.
+        pieces = np.stack([paths[:-1], paths[1:]], axis=1).transpose(2, 0, 1, 3).reshape(-1, 3)
+        color = _color(messages, rank, heavy[at], heavy[order[0]])
+        for key, points in ((0, pieces), (1, positions[at, -1][ends])):
+            markers.append(
+                messages.create(
+                    'visualization_msgs/msg/Marker',
+                    header=header,
+                    ns=f'{namespace}_{rank}',
+                    id=key,
+                    # One point alone is no line.
+                    action=_ADD if len(points) else _DELETE,
+                    type=_LINE_LIST,
+                    pose=messages.create('geometry_msgs/msg/Pose'),
+                    scale=messages.create('geometry_msgs/msg/Vector3', x=line_width),
+                    color=color,
+                    points=[
+                        messages.create('geometry_msgs/msg/Point', x=x, y=y, z=z)
+                        for x, y, z in points.tolist()
+                    ],
+                )
+            )
+    for rank in range(len(order), ranks):
+        markers.extend(
+            messages.create(
+                'visualization_msgs/msg/Marker',
+                header=header,
+                ns=f'{namespace}_{rank}',
+                id=key,
+                pose=messages.create('geometry_msgs/msg/Pose'),
+                action=_DELETE,
+            )
+            for key in (0, 1)
+        )
+    return messages.create('visualization_msgs/msg/MarkerArray', markers=markers)
+
+
+def _ends(joint_names: Sequence[str], edges: Sequence[tuple[str, str]]) -> list[int]:
+    """Indices of the joints at both ends of the bones, one after the other."""
+    index = {name: i for i, name in enumerate(joint_names)}
+    for edge in edges:
+        for name in edge:
+            if name not in index:
+                raise MessageError(f'markers: edge {edge} has the unknown joint {name!r}')
+    return [index[name] for edge in edges for name in edge]
+
+
+def _color(messages: MessageFactory, rank: int, weight: float, heaviest: float) -> Any:
+    """std_msgs/ColorRGBA of a rank, the lighter the fainter."""
+    red, green, blue = _OTHERS if rank else _FIRST
+    share = float(weight / heaviest) if heaviest > 0 else 1.0
+    return messages.create(
+        'std_msgs/msg/ColorRGBA', r=red, g=green, b=blue, a=_FAINTEST + (1 - _FAINTEST) * share
+    )

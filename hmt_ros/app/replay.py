@@ -1,8 +1,8 @@
-"""replay: tracks the person in a bag, offline or through the live node, into a new bag.
+"""replay: tracks and smooths the person in a bag, offline or through live nodes, into a new bag.
 
-Both ways give the same messages to the same object in the same order, and write what comes out in
+Both ways give the same messages to the same objects in the same order, and write what comes out in
 the order in which it came: the bags are the same, byte for byte. What stands in one is listed in
-`hmt_ros.nodes.track_messages`.
+`hmt_ros.nodes.track_messages` and `hmt_ros.nodes.smoothed_messages`.
 """
 
 from __future__ import annotations
@@ -10,36 +10,32 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn, TypeVar
 
 import yaml
 from tqdm import tqdm
 
-from hmt_ros.app.live_filter import LiveFilter
+from hmt_ros.app.played_track import FILTER, SMOOTHER, LiveTrack, OfflineTrack, PlayedTrack
 from hmt_ros.app.recorded_input import GROUND_TRUTH, RecordedInput, recorded_input
+from hmt_ros.nodes import smoothed_messages, track_messages
 from hmt_ros.nodes.declared_parameters import with_values
 from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.filter_session import (
-    CAMERA_INFO,
-    IMAGE,
-    KEYPOINTS,
-    FilterSession,
-    Handled,
-)
+from hmt_ros.nodes.filter_session import CAMERA_INFO, IMAGE, KEYPOINTS
+from hmt_ros.nodes.handled import Handled
 from hmt_ros.nodes.parameter_file import read_parameter_file
-from hmt_ros.nodes.track_messages import TOPICS
+from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.nodes.track_start import prepare_start
 from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
 from msg_tools.headers import header_message, time_ns
 
-NODE = 'filter_node'
+Settings = TypeVar('Settings')
 
 # What the bag and the command say, whatever a parameter file says.
 _DECIDED_HERE = ('image_transport', 'autostart')
+_OF_SMOOTHER = 'smoother.'
 # What every node has.
 _OF_ROS = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
 
@@ -53,8 +49,9 @@ A track starts from a subject file, which says where the joints of the person ar
   stature_m: 1.75                        # optional
 
 OUT gets the topics pose_mixture and likelihood_mixture (hmt_msgs/PoseMixture: weights, poses,
-covariances, joint positions), body, joint_states, /tf, markers and overlay/compressed, and the
-ground_truth of IN where it has one. It is written whole or not at all.
+covariances, joint positions), body, joint_states, /tf, markers and overlay/compressed; of the
+smoother smoothed_pose_mixture, trajectory_mixture, smoothed_joint_states and trajectory_markers;
+and the ground_truth of IN where it has one. It is written whole or not at all.
 
 examples:
   replay bags/reach -o out --subject bags/reach/subject.yaml --background bags/reach/background.png
@@ -63,13 +60,6 @@ examples:
 
 exit code: 0 done, 1 bad input (one line on stderr says which), 130 interrupted
 """
-
-
-class Filter(Protocol):
-    """Takes the messages of a bag, one after the other."""
-
-    def take(self, source: str, message: Any) -> Handled:
-        """Hands a message over and returns when all that it leads to is written."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -99,7 +89,8 @@ class _Parser(argparse.ArgumentParser):
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog='replay',
-        description='Tracks the person in a bag of images, into a new bag of mixtures over poses.',
+        description='Tracks and smooths the person in a bag of images, into a new bag of mixtures '
+        'over poses.',
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -114,7 +105,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         '--live',
         action='store_true',
-        help='through the real node, over DDS, one image at a time; the same bag comes out',
+        help='through the real nodes, over DDS, one image at a time; the same bag comes out',
+    )
+    parser.add_argument(
+        '--no-smoother', action='store_true', help='only track; the bag has no smoothed poses'
     )
     parser.add_argument(
         '--keep-going',
@@ -138,16 +132,21 @@ def _parser() -> argparse.ArgumentParser:
     settings = parser.add_argument_group('settings')
     settings.add_argument(
         '--config',
+        action='append',
+        default=[],
         type=Path,
         metavar='FILE',
-        help='parameter file of the node, such as hmt_ros/config/filter_node.yaml, which lists all',
+        help='parameter file, such as hmt_ros/config/filter_node.yaml, which lists all of the '
+        'filter; what is for the smoother stands in a section smoother_node. May be given several '
+        'times',
     )
     settings.add_argument(
         '--set',
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help='one parameter; may be given several times, and goes before --config',
+        help='one parameter of the filter, or smoother.NAME=VALUE; may be given several times, and '
+        'goes before --config',
     )
     settings.add_argument('--seed', type=int, metavar='N', help='of all that is random (0)')
 
@@ -179,45 +178,28 @@ def _replay(options: argparse.Namespace) -> str:
         if bag.damage is not None and not options.keep_going:
             raise BagError(f'{source} {bag.damage}')
         recorded = recorded_input(bag, options.image_topic, options.camera_info_topic)
-        parameters = _parameters(options, recorded)
+        parameters = _filter_parameters(options, recorded)
+        smoothing = None if options.no_smoother else _smoother_parameters(options)
         if not parameters.subject_file:
             raise ValueError(f'--subject FILE is needed to start a track; {_subject_hint(source)}')
         # What the parameters name is looked at before a node is started.
         subject = prepare_start(parameters).initial
         with BagWriter(target, overwrite=options.overwrite) as out:
-            for topic, published in TOPICS.items():
+            topics = dict(track_messages.TOPICS)
+            if smoothing is not None:
+                topics.update(smoothed_messages.TOPICS)
+            for topic, published in topics.items():
                 out.add_topic(topic, published.msgtype, latched=published.latched)
-            running: AbstractContextManager[Filter] = (
-                LiveFilter(parameters, out.write_serialised)
-                if options.live
-                else nullcontext(FilterSession(parameters, lambda x: out.write_serialised(*x)))
-            )
-            with running as person_filter:
-                count = _play(options, bag, recorded, parameters, person_filter, out)
+            way = LiveTrack if options.live else OfflineTrack
+            with way(parameters, smoothing, out.write_serialised) as track:
+                count = _play(options, bag, recorded, parameters, track, out)
             if not count.tracked:
                 raise ValueError(f'{source}: {_why_nothing(count, subject)}')
     return f'{target}: {count.tracked} of {count.images} images tracked'
 
 
-def _parameters(options: argparse.Namespace, recorded: RecordedInput) -> FilterParameters:
-    values: dict[str, Any] = {}
-    if options.config is not None:
-        values = {
-            name: value
-            for name, value in read_parameter_file(options.config, NODE).items()
-            if not name.startswith(_OF_ROS) and name not in _DECIDED_HERE
-        }
-    for text in options.set:
-        name, equals, value = text.partition('=')
-        if not equals or name in _DECIDED_HERE:
-            why = f'{name} is decided by replay' if equals else 'wanted NAME=VALUE'
-            raise ValueError(f'--set {text}: {why}')
-        try:
-            values[name] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
-            raise ValueError(f'--set {text}: {" ".join(str(error).split())}') from error
-        if values[name] is None:
-            values[name] = value
+def _filter_parameters(options: argparse.Namespace, recorded: RecordedInput) -> FilterParameters:
+    values = _given_values(options, FILTER)
     given = {
         'random_seed': options.seed,
         'body_model': options.body,
@@ -230,6 +212,45 @@ def _parameters(options: argparse.Namespace, recorded: RecordedInput) -> FilterP
     values.setdefault('use_keypoints', recorded.keypoints is not None)
     values['image_transport'] = recorded.transport
     return with_values(FilterParameters(), values)
+
+
+def _smoother_parameters(options: argparse.Namespace) -> SmootherParameters:
+    values = _given_values(options, SMOOTHER)
+    if options.seed is not None:
+        values['random_seed'] = options.seed
+    if options.body is not None:
+        # The name in the messages does not say where the file of the body is.
+        values['body_model'] = options.body
+    return with_values(SmootherParameters(), values)
+
+
+def _given_values(options: argparse.Namespace, node: str) -> dict[str, Any]:
+    """What --config and --set give a node, by name."""
+    values: dict[str, Any] = {}
+    for file in options.config:
+        # What stands for all nodes is the filter's: many names mean something else to the smoother.
+        read = read_parameter_file(file, node, by_name=node == SMOOTHER)
+        values.update(
+            (name, value)
+            for name, value in read.items()
+            if not name.startswith(_OF_ROS) and name not in _DECIDED_HERE
+        )
+    for text in options.set:
+        name, equals, value = text.partition('=')
+        of_smoother = name.startswith(_OF_SMOOTHER)
+        name = name.removeprefix(_OF_SMOOTHER)
+        if not equals or name in _DECIDED_HERE:
+            why = f'{name} is decided by replay' if equals else 'wanted NAME=VALUE'
+            raise ValueError(f'--set {text}: {why}')
+        if of_smoother != (node == SMOOTHER):
+            continue
+        try:
+            values[name] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ValueError(f'--set {text}: {" ".join(str(error).split())}') from error
+        if values[name] is None:
+            values[name] = value
+    return values
 
 
 def _subject_hint(bag: Path) -> str:
@@ -254,10 +275,10 @@ def _play(
     bag: BagReader,
     recorded: RecordedInput,
     parameters: FilterParameters,
-    person_filter: Filter,
+    track: PlayedTrack,
     out: BagWriter,
 ) -> _Count:
-    """Gives the filter what is in the bag; copies what is to be copied."""
+    """Gives the nodes what is in the bag; copies what is to be copied."""
     count = _Count()
     if not parameters.use_keypoints:
         recorded = replace(recorded, keypoints=None)
@@ -267,8 +288,7 @@ def _play(
         total=recorded.image.message_count, unit='image', desc=str(options.output), disable=hidden
     ) as bar:
 
-        def hand_over(source: str, message: Any) -> None:
-            handled = person_filter.take(source, message)
+        def judge(handled: Handled) -> None:
             count.tracked += sum(topic == 'pose_mixture' for topic, _ in handled.published)
             if handled.faults:
                 count.last_fault = handled.faults[-1]
@@ -284,14 +304,15 @@ def _play(
                 out.write(stored.topic, stored.log_time_ns, stored.message)
             if source == GROUND_TRUTH:
                 continue
-            hand_over(source, stored.message)
+            judge(track.take(source, stored.message))
             if source == IMAGE:
                 count.images += 1
                 count.last_stamp = time_ns(stored.message.header.stamp)
                 bar.update()
         if parameters.use_keypoints:
             # The last images need not wait any longer.
-            hand_over(KEYPOINTS, _nobody(count.last_stamp))
+            judge(track.take(KEYPOINTS, _nobody(count.last_stamp)))
+        judge(track.finish())
     return count
 
 

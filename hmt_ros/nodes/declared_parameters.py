@@ -27,11 +27,13 @@ FLAT = 'flat'  # fields of this field are parameters without a prefix
 
 AT_ONCE = 'at once'
 NEXT_TRACK = 'next track'
+NEXT_WINDOW = 'next window'
 NEXT_CONFIGURE = 'next configure'
 AT_LAUNCH = 'at launch'
 EFFECTS = {
     AT_ONCE: 'A new value takes effect at once.',
     NEXT_TRACK: 'A new value takes effect when the next track starts, after ~/reset for example.',
+    NEXT_WINDOW: 'A new value takes effect when the next window starts, after a jump in time say.',
     NEXT_CONFIGURE: 'A new value takes effect when the node is configured the next time.',
     AT_LAUNCH: 'Can only be set at launch.',
 }

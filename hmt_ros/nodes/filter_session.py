@@ -28,6 +28,7 @@ from hmt_ros.body import Body, Camera
 from hmt_ros.image.observation import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes.filter_parameters import FilterParameters
+from hmt_ros.nodes.handled import Handled, HandlingLog, Output
 from hmt_ros.nodes.track_messages import Presentation, TrackedImage, track_messages
 from hmt_ros.nodes.track_start import TrackStart, prepare_start
 from hmt_ros.tracking import Status, Subject, Tracker
@@ -45,40 +46,6 @@ FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a
 _SAME_MOMENT_NS = SECOND_NS // 5
 # Stamps of keypoints that are remembered.
 _REMEMBERED = 256
-
-
-class Output(NamedTuple):
-    """A message that is to be published.
-
-    Attributes:
-        topic: one of `track_messages.TOPICS`.
-        stamp_ns: of the image that it is about.
-        data: CDR bytes.
-    """
-
-    topic: str
-    stamp_ns: int
-    data: bytes
-
-
-@dataclass(frozen=True)
-class Handled:
-    """What became of a message.
-
-    Attributes:
-        source: `CAMERA_INFO`, `IMAGE` or `KEYPOINTS`.
-        stamp_ns: of the message.
-        faults: why it, or an image that waited for it, could not be used; empty: all was well.
-        warnings: what a person should be told: the first fault of each kind, a track that starts
-            anew.
-        published: (topic, stamp) of all messages that were published, in their order.
-    """
-
-    source: str
-    stamp_ns: int
-    faults: tuple[str, ...]
-    warnings: tuple[str, ...]
-    published: tuple[tuple[str, int], ...]
 
 
 @dataclass(frozen=True)
@@ -161,12 +128,7 @@ class FilterSession:
         self._newest_image: int | None = None
         self._weights = np.empty(0)
         self._images: Counter[str] = Counter()
-        self._faults: Counter[str] = Counter()
-        self._last_fault = ''
-        # Of the message that is being handled.
-        self._told: list[str] = []
-        self._warned: list[str] = []
-        self._published: list[tuple[str, int]] = []
+        self._log = HandlingLog()
         self.state = self._present_state()
 
     # What comes in.
@@ -178,7 +140,7 @@ class FilterSession:
             source: `CAMERA_INFO`, `IMAGE` or `KEYPOINTS`.
             message: sensor_msgs/CameraInfo, Image or CompressedImage, hmt_msgs/Keypoints2D.
         """
-        self._told, self._warned, self._published = [], [], []
+        self._log.begin()
         stamp = time_ns(message.header.stamp)
         if source == IMAGE:
             self._take_image(message, stamp)
@@ -188,14 +150,14 @@ class FilterSession:
             self._take_keypoints(message, stamp)
         self._track_what_is_ready()
         self.state = self._present_state()
-        return self._handled(source, stamp)
+        return self._log.handled(source, stamp)
 
     def refuse(self, source: str, text: str) -> Handled:
         """Counts a message that could not even be read."""
-        self._told, self._warned, self._published = [], [], []
-        self._fault('message', f'message of {source} can not be read: {text}')
+        self._log.begin()
+        self._log.fault('message', f'message of {source} can not be read: {text}')
         self.state = self._present_state()
-        return self._handled(source, 0)
+        return self._log.handled(source, 0)
 
     def count_dropped(self, images: int) -> None:
         """Counts images that were dropped before they came here, because the node was late."""
@@ -221,14 +183,14 @@ class FilterSession:
         try:
             camera = camera_from_info(message)
         except CameraInfoError as error:
-            self._fault('camera_info', str(error))
+            self._log.fault('camera_info', str(error))
             return
         self._camera_frame = str(message.header.frame_id)
         if camera == self._camera:
             return
         known, self._camera = self._camera, camera
         if known is not None:
-            self._note('calibration', 'camera_info changes: the track starts anew')
+            self._log.note('calibration', 'camera_info changes: the track starts anew')
             self._start_anew()
 
     def _take_keypoints(self, message: Any, stamp: int) -> None:
@@ -251,7 +213,7 @@ class FilterSession:
                     f'{text}: skipped; with reset_on_time_jump the track would start anew',
                 )
                 return
-            self._note('time jumps back', f'{text}: the track starts anew')
+            self._log.note('time jumps back', f'{text}: the track starts anew')
             self._track_all()
             self._keypoints.clear()
             self._newest_keypoints = -1
@@ -269,7 +231,7 @@ class FilterSession:
         try:
             self.restart()
         except ValueError as error:
-            self._fault('start', f'{error}; the track starts as the time before')
+            self._log.fault('start', f'{error}; the track starts as the time before')
             self.restart(self.start)
 
     def _keypoints_in(self, message: Any) -> Keypoints | None:
@@ -279,13 +241,13 @@ class FilterSession:
         try:
             content = keypoints_of(message, self.parameters.keypoint_sigma_px)
         except MessageError as error:
-            self._fault('keypoints', str(error))
+            self._log.fault('keypoints', str(error))
             return None
         joints = self.start.body.joint_names
         known = np.array([name in joints for name in content.names])
         if not known.all():
             strange = [name for name, ok in zip(content.names, known, strict=True) if not ok]
-            self._note('names of keypoints', f'keypoints {strange} are no joints of the body')
+            self._log.note('names of keypoints', f'keypoints {strange} are no joints of the body')
         use = np.flatnonzero(known & content.seen)
         if len(use) == 0:
             return None
@@ -306,13 +268,13 @@ class FilterSession:
             self._images['dropped'] += 1
             if self._camera is None:
                 # An uncalibrated camera_info has been told already.
-                self._fault(
+                self._log.fault(
                     'camera_info',
                     f'image of {dropped.stamp_ns} ns is dropped: it waited for a calibrated '
                     'camera_info',
                 )
             else:
-                self._fault(
+                self._log.fault(
                     'no keypoints',
                     f'image of {dropped.stamp_ns} ns is dropped: no keypoints of its stamp have '
                     f'come, and queue_size is {self.parameters.queue_size}',
@@ -370,7 +332,7 @@ class FilterSession:
         initial = self.start.initial
         if isinstance(initial, Subject) and stamp_ns - initial.stamp_ns > _SAME_MOMENT_NS:
             age = (stamp_ns - initial.stamp_ns) / SECOND_NS
-            self._note(
+            self._log.note(
                 'old start',
                 f'the joints that start the track were seen {age:.1f} s before its first image',
             )
@@ -404,7 +366,7 @@ class FilterSession:
         )
 
         def publish(topic: str, message: Any) -> None:
-            self._published.append((topic, waiting.stamp_ns))
+            self._log.published(topic, waiting.stamp_ns)
             self._publish_output(Output(topic, waiting.stamp_ns, serialise(message)))
 
         track_messages(self._messages, track, presentation, self._wanted, publish)
@@ -416,23 +378,7 @@ class FilterSession:
 
     def _skip(self, kind: str, text: str) -> None:
         self._images['skipped'] += 1
-        self._fault(kind, text)
-
-    def _fault(self, kind: str, text: str) -> None:
-        self._told.append(text)
-        self._note(kind, text)
-
-    def _note(self, kind: str, text: str) -> None:
-        """A warning about the first of a kind; the others are counted."""
-        self._faults[kind] += 1
-        self._last_fault = text
-        if self._faults[kind] == 1:
-            self._warned.append(text)
-
-    def _handled(self, source: str, stamp: int) -> Handled:
-        return Handled(
-            source, stamp, tuple(self._told), tuple(self._warned), tuple(self._published)
-        )
+        self._log.fault(kind, text)
 
     def _present_state(self) -> SessionState:
         tracker = self._tracker
@@ -451,8 +397,8 @@ class FilterSession:
             misfit=tracker.misfit if tracker is not None and tracked else math.nan,
             evaluations=tracker.evaluations if tracker is not None and tracked else 0,
             images=Counter(self._images),
-            faults=Counter(self._faults),
-            last_fault=self._last_fault,
+            faults=Counter(self._log.faults),
+            last_fault=self._log.last_fault,
         )
 
     def _wants(self) -> str:

@@ -29,18 +29,24 @@ def parameter_file_text(node: str, settings: Any) -> str:
         node: name of the node.
         settings: dataclass whose values are written.
     """
+    declared = declared_parameters(settings)
+    used = {parameter.effect for parameter in declared}
     lines = [
         f'# Parameters of {node}, with their defaults. A file needs only those that it changes:',
         '#',
         f'#     ros2 run hmt_ros {node} --ros-args --params-file FILE',
         '#',
         '# In square brackets: lowest and highest value, and when a new value takes effect:',
-        *(f'# "{name}": {text[0].lower()}{text[1:]}' for name, text in EFFECTS.items()),
-        '/**:',
+        *(
+            f'# "{name}": {text[0].lower()}{text[1:]}'
+            for name, text in EFFECTS.items()
+            if name in used
+        ),
+        f'/**/{node}:',
         f'  {_KEY}:',
     ]
     open_groups: list[str] = []
-    for parameter in declared_parameters(settings):
+    for parameter in declared:
         *groups, name = parameter.name.split('.')
         same = 0
         while open_groups[same : same + 1] == groups[same : same + 1] != []:
@@ -70,11 +76,16 @@ def yaml_scalar(value: Value) -> str:
     return text.removesuffix('\n...\n').strip()
 
 
-def read_parameter_file(path: str | Path, node: str) -> dict[str, Any]:
+def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -> dict[str, Any]:
     """Values by name, dots between groups, of the parameters that a file gives a node.
 
     Sections for other nodes are passed over; a file may also hold the parameters alone, without
     sections.
+
+    Args:
+        path: of the file.
+        node: its name.
+        by_name: whether only sections count that name the node, not those for all nodes.
 
     Raises:
         ParameterError: not such a file; one line that says why.
@@ -98,14 +109,15 @@ def read_parameter_file(path: str | Path, node: str) -> dict[str, Any]:
         if isinstance(value, dict) and _KEY in value
     }
     if not sections:
-        return dict(_flattened(document, '', path))
+        values = dict(_flattened(document, '', path))
+        return {} if by_name else values
     result: dict[str, Any] = {}
     for key in document:
         if str(key) not in sections:
             raise ParameterError(f'{path}: section {key!r} has no {_KEY}')
     # As in ROS, what stands for one node goes before what stands for all.
     for key in sorted(sections, key=lambda key: '*' not in key):
-        if key.rpartition('/')[2] in (node, '*', '**'):
+        if key.rpartition('/')[2] in ((node,) if by_name else (node, '*', '**')):
             result.update(_flattened(sections[key][_KEY] or {}, '', path))
     return result
 

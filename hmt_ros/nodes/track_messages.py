@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes.overlay import draw_modes
+from hmt_ros.nodes.published_topic import PublishedTopic
 from msg_tools import MessageFactory
 from msg_tools.bodies import message_of_body
 from msg_tools.images import compressed_image_message
@@ -26,18 +27,6 @@ from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_messa
 from msg_tools.transforms import transforms_message
 
 Array = NDArray[np.float64]
-
-
-class PublishedTopic(NamedTuple):
-    """A topic of the node.
-
-    Attributes:
-        msgtype: for example 'hmt_msgs/msg/PoseMixture'.
-        latched: late subscribers get the last message.
-    """
-
-    msgtype: str
-    latched: bool = False
 
 
 # In the order in which they are published.

@@ -15,21 +15,15 @@ MODELS = ('random_walk', 'constant_velocity')
 
 
 @dataclass(frozen=True)
-class DynamicsSettings:
-    """Motion model.
+class PoseRates:
+    """How fast poses may change.
 
     Attributes:
-        model: 'random_walk', or 'constant_velocity' with the velocity of the mode.
-        velocity_kept: share of the velocity that lasts from one image to the next; 1: all.
-        velocity_gain: how far the velocity follows the newest displacement, 0 to 1.
         translation: standard deviation of the root's position after one second, m.
         root, trunk, hip, knee, shoulder, elbow, neck, extremity: of the angles, rad after one
             second. Deviations grow with the square root of time.
     """
 
-    model: str = 'constant_velocity'
-    velocity_kept: float = 0.7
-    velocity_gain: float = 0.5
     translation: float = 0.25
     root: float = 1.4
     trunk: float = 1.2
@@ -39,13 +33,6 @@ class DynamicsSettings:
     elbow: float = 2.2
     neck: float = 0.7
     extremity: float = 1.2
-
-    def __post_init__(self) -> None:
-        if self.model not in MODELS:
-            raise ValueError(f'dynamics must be one of {MODELS}, saw {self.model!r}')
-        for name in ('velocity_kept', 'velocity_gain'):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f'{name} must lie in [0, 1], saw {getattr(self, name)}')
 
     def rates(self, skeleton: Skeleton) -> Array:
         """Variances (d,) that the degrees of freedom gain per second."""
@@ -69,6 +56,31 @@ class DynamicsSettings:
                 value = float(getattr(self, key))
                 return (0.25 * value) ** 2 if 'clavicle' in name else value**2
         return self.extremity**2
+
+
+@dataclass(frozen=True)
+class DynamicsSettings(PoseRates):
+    """Motion model.
+
+    Attributes:
+        model: 'random_walk', or 'constant_velocity' with the velocity of the mode.
+        velocity_kept: share of the velocity that lasts from one image to the next; 1: all.
+        velocity_gain: how far the velocity follows the newest displacement, 0 to 1.
+        translation: standard deviation of the root's position after one second, m.
+        root, trunk, hip, knee, shoulder, elbow, neck, extremity: of the angles, rad after one
+            second. Deviations grow with the square root of time.
+    """
+
+    model: str = 'constant_velocity'
+    velocity_kept: float = 0.7
+    velocity_gain: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.model not in MODELS:
+            raise ValueError(f'dynamics must be one of {MODELS}, saw {self.model!r}')
+        for name in ('velocity_kept', 'velocity_gain'):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f'{name} must lie in [0, 1], saw {getattr(self, name)}')
 
 
 def predict(

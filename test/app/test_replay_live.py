@@ -1,4 +1,4 @@
-"""replay --live: the real node gives the bag that the offline run gives, byte for byte."""
+"""replay --live: the real nodes give the bag that the offline run gives, byte for byte."""
 
 import os
 import socket
@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.app import live_filter
-from hmt_ros.app.live_filter import LiveFilter, LiveFilterError
+from hmt_ros.app import live_node
+from hmt_ros.app.live_node import LiveNodeError
+from hmt_ros.app.played_track import LiveTrack
 from hmt_ros.app.replay import main
 from hmt_ros.nodes.declared_parameters import with_values
 from hmt_ros.nodes.filter_parameters import FilterParameters
 from hmt_ros.nodes.filter_session import CAMERA_INFO, IMAGE, KEYPOINTS
+from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.headers import header_message, time_ns
 from msg_tools.images import decode_image, image_message
@@ -71,7 +73,8 @@ def test_same_mixtures_of_every_image(tmp_path, capsys):
     (offline, live), (one, other) = both_ways(bag, tmp_path, capsys)
     assert one == other
     assert one[0] == 0
-    for topic in ('pose_mixture', 'likelihood_mixture'):
+    mixtures = ('pose_mixture', 'likelihood_mixture', 'smoothed_pose_mixture', 'trajectory_mixture')
+    for topic in mixtures:
         assert len(messages(offline, topic)) == 3
         assert messages(offline, topic) == messages(live, topic)
     # And everything else.
@@ -102,6 +105,7 @@ def test_same_of_raw_images_with_keypoints_and_faults(tmp_path, capsys):
     entries.append(('image', entries[-1][1] + 10_000, again))
     bag = write(tmp_path / 'bag', sorted(entries, key=lambda entry: entry[1]))
     options = ['--keep-going', '--set', 'reset_on_time_jump=true', '--set', 'frame_prefix=x']
+    options += ['--set', 'smoother.reset_on_time_jump=true', '--set', 'smoother.fixed_lag=1']
     options += ['--set', 'max_hypotheses=2', '--set', 'candidates=3', '--set', 'combinations=4']
     (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
     assert one == other
@@ -110,6 +114,9 @@ def test_same_of_raw_images_with_keypoints_and_faults(tmp_path, capsys):
     assert 'has 480x180 pixels' in one[2]
     assert 'the track starts anew' in one[2]
     assert len(messages(offline, 'pose_mixture')) == 3
+    # The smoother goes back in time as the filter does.
+    smoothed = [stamp for stamp, _ in messages(offline, 'smoothed_pose_mixture')]
+    assert smoothed == [stamp for stamp, _ in messages(offline, 'likelihood_mixture')]
     assert content(offline) == content(live)
 
 
@@ -142,32 +149,33 @@ class Nobody:
 
 def test_node_that_is_silent_or_dies_is_told(parameters, monkeypatch):
     entries = {topic: message for topic, _, message in recorded(1)}
-    with LiveFilter(parameters, lambda *output: None) as running:
-        handled = running.take(CAMERA_INFO, entries['camera_info'])
+    with LiveTrack(parameters, None, lambda *output: None) as track:
+        running = track._filter
+        handled = track.take(CAMERA_INFO, entries['camera_info'])
         assert (handled.source, handled.faults, handled.published) == (CAMERA_INFO, (), ())
         with monkeypatch.context() as patch:
-            patch.setattr(live_filter, 'MESSAGE_SECONDS', 1.0)
+            patch.setattr(live_node, 'MESSAGE_SECONDS', 1.0)
             patch.setitem(running._publishers, KEYPOINTS, Nobody())
-            with pytest.raises(LiveFilterError, match='waited 1 s for an answer to a keypoints; '):
-                running.take(KEYPOINTS, entries['camera_info'])
+            with pytest.raises(LiveNodeError, match='waited 1 s for an answer to a keypoints; '):
+                track.take(KEYPOINTS, entries['camera_info'])
         running._process.kill()
-        with pytest.raises(LiveFilterError, match='the filter node ended with code -9: '):
-            running.take(IMAGE, entries['image/compressed'])
+        with pytest.raises(LiveNodeError, match='the filter node ended with code -9: '):
+            track.take(IMAGE, entries['image/compressed'])
         # It can not end well any more.
-        monkeypatch.setattr(running, '_stop_node', lambda: 0)
+        monkeypatch.setattr(running, 'stop', lambda: 0)
 
 
 def test_node_that_does_not_start_is_told(parameters, monkeypatch):
-    monkeypatch.setattr(live_filter.sys, 'executable', '/bin/false')
+    monkeypatch.setattr(live_node.sys, 'executable', '/bin/false')
     with (
-        pytest.raises(LiveFilterError, match='ended with code 1: it has said nothing'),
-        LiveFilter(parameters, lambda *output: None),
+        pytest.raises(LiveNodeError, match='ended with code 1: it has said nothing'),
+        LiveTrack(parameters, SmootherParameters(), lambda *output: None),
     ):
         raise AssertionError('it has started')
 
 
 def test_without_ros_it_is_one_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(live_filter.sys.modules, 'rclpy', None)
+    monkeypatch.setitem(live_node.sys.modules, 'rclpy', None)
     out = tmp_path / 'out'
     assert main([str(REACH), '-o', str(out), *PERSON, '--live']) == 1
     (line,) = capsys.readouterr().err.splitlines()
@@ -176,13 +184,13 @@ def test_without_ros_it_is_one_line(tmp_path, monkeypatch, capsys):
 
 
 def test_every_replay_has_a_domain_of_its_own():
-    with live_filter._reserved_domain() as one, live_filter._reserved_domain() as other:
+    with live_node.reserved_domain() as one, live_node.reserved_domain() as other:
         assert one != other
         assert 1 <= min(one, other) <= max(one, other) <= 100
         for domain in (one, other):
             with socket.socket() as taken, pytest.raises(OSError, match='in use'):
                 taken.bind(('', 32768 + domain))
-    with live_filter._reserved_domain() as again:
+    with live_node.reserved_domain() as again:
         assert again == one
 
 
@@ -190,7 +198,7 @@ def test_environment_is_left_as_it_was(monkeypatch):
     monkeypatch.setenv('ROS_DOMAIN_ID', '7')
     monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE', raising=False)
     before = dict(os.environ)
-    with live_filter._changed_environment(live_filter._environment(3)):
+    with live_node.changed_environment(live_node.environment(3)):
         assert os.environ['ROS_DOMAIN_ID'] == '3'
         assert os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
     assert dict(os.environ) == before

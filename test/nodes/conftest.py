@@ -1,7 +1,9 @@
-"""A tracker that costs nothing, and the messages of a small camera."""
+"""A tracker that costs nothing, messages of a camera and of a filter, and who talks to a node."""
 
 from __future__ import annotations
 
+import re
+import time
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
@@ -10,17 +12,21 @@ import cv2
 import numpy as np
 import pytest
 
-from hmt_ros.body import Camera, load_body
+from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes import track_start
 from hmt_ros.tracking import Status, Subject, TrackerSettings
 from msg_tools import RosbagsMessages
+from msg_tools.bodies import message_of_body
 from msg_tools.camera_info import camera_info_message
+from msg_tools.cdr import serialise
 from msg_tools.headers import header_message
 from msg_tools.images import compressed_image_message, image_message
+from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 FRAME_NS = 100_000_000
 START_NS = 1_700_000_000_000_000_000
+PATIENCE = 60.0  # s
 JOINTS = ('left_hip', 'right_hip', 'left_shoulder', 'right_shoulder', 'head')
 
 
@@ -146,3 +152,199 @@ def background_file(tmp_path):
     path = tmp_path / 'background.png'
     cv2.imwrite(str(path), np.full((48, 64, 3), 90, np.uint8))
     return path
+
+
+@dataclass
+class Likelihoods:
+    """Messages of a filter whose person raises an arm; ten mixtures of two modes a second."""
+
+    body: Body = field(default_factory=lambda: load_body('human37'))
+    messages: RosbagsMessages = field(default_factory=RosbagsMessages)
+
+    def stamp(self, index):
+        return START_NS + round(index * FRAME_NS)
+
+    def body_message(self, index=0, body=None):
+        body = self.body if body is None else body
+        return message_of_body(self.messages, body, self.stamp(index), 'lens')
+
+    def mixture(self, index):
+        """A mixture over poses; the second mode is an elbow that bends more."""
+        means = np.tile(self.body.prior_mean, (2, 1))
+        means[:, 2] = 4.0
+        moving = self.body.dof_names.index('left_elbow')
+        means[:, moving] = 0.5 + 0.05 * index
+        means[1, moving] += 0.8
+        covariances = np.tile(1e-3 * np.eye(self.body.dimension), (2, 1, 1))
+        return GaussianMixture(np.array([0.6, 0.4]), means, covariances)
+
+    def message(self, index, body=None, kind=MixtureKind.LIKELIHOOD):
+        body, mixture = self.body if body is None else body, self.mixture(index)
+        content = PoseMixture(
+            mixture=mixture,
+            body_model=body.name,
+            dof_names=body.dof_names,
+            joint_names=body.joint_names,
+            joint_positions=body.joint_positions(mixture.means),
+            kind=kind,
+            stamp_ns=self.stamp(index),
+            frame_id='lens',
+        )
+        return pose_mixture_message(self.messages, content)
+
+
+@pytest.fixture(scope='session')
+def likelihoods():
+    return Likelihoods()
+
+
+class World:
+    """A node, and somebody who talks to it, in a context of their own.
+
+    Args:
+        stderr: of the test.
+        kind: class of the node.
+        name: of the node.
+        inputs: class of the messages by topic.
+        values: of parameters.
+    """
+
+    def __init__(self, stderr, kind, name, inputs, **values):
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.parameter import Parameter
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+
+        self.name = name
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        for topic in inputs:
+            values[f'qos_overrides./{topic}.subscription.reliability'] = 'reliable'
+        overrides = [Parameter(name, value=value) for name, value in values.items()]
+        self.node = kind(context=self.context, parameter_overrides=overrides)
+        self.other = rclpy.create_node('other', context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.executor.add_node(self.other)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.publishers = {
+            topic: self.other.create_publisher(message, topic, latched if topic == 'body' else 100)
+            for topic, message in inputs.items()
+        }
+        self.handled, self.diagnostics = [], []
+        self.stderr, self.logged = stderr, ''
+        self.listen(DiagnosticStatus, f'{self.name}/handled', self.handled)
+        self.listen(DiagnosticArray, '/diagnostics', self.diagnostics)
+
+    def listen(self, kind, topic, into, qos=100):
+        def receive(message):
+            into.append(message)
+
+        return self.other.create_subscription(kind, topic, receive, qos)
+
+    def spin_until(self, done, what='it'):
+        end = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < end, f'waited in vain for {what}'
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def start(self):
+        self.node.start()
+        return self.connect()
+
+    def connect(self):
+        """Returns when both sides know all topics of each other."""
+        self.spin_until(
+            lambda: (
+                all(p.get_subscription_count() for p in self.publishers.values())
+                and self.other.count_publishers(f'{self.name}/handled') == 1
+                and self.node.count_subscribers(f'{self.name}/handled') == 1
+                and self.node._handled.get_subscription_count() == 1
+            )
+        )
+        return self
+
+    def send(self, source, message):
+        """Publishes a message; what became of it."""
+        count = len(self.handled)
+        self.publishers[source].publish(serialise(message))
+        self.spin_until(lambda: len(self.handled) > count, f'an answer to {source}')
+        return self.handled[-1]
+
+    def call(self, kind, service, **fields):
+        client = self.other.create_client(kind, f'{self.name}/{service}')
+        self.spin_until(client.service_is_ready, service)
+        future = client.call_async(kind.Request(**fields))
+        self.spin_until(future.done, f'an answer of {service}')
+        self.other.destroy_client(client)
+        return future.result()
+
+    def change_state(self, label):
+        from lifecycle_msgs.msg import Transition
+        from lifecycle_msgs.srv import ChangeState
+
+        number = getattr(Transition, f'TRANSITION_{label.upper()}')
+        return self.call(ChangeState, 'change_state', transition=Transition(id=number)).success
+
+    @property
+    def state(self):
+        from lifecycle_msgs.srv import GetState
+
+        return self.call(GetState, 'get_state').current_state.label
+
+    def set(self, **values):
+        """Sets parameters; the reasons why not."""
+        from rcl_interfaces.srv import SetParametersAtomically
+        from rclpy.parameter import Parameter
+
+        parameters = [
+            Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
+            for name, value in values.items()
+        ]
+        result = self.call(
+            SetParametersAtomically, 'set_parameters_atomically', parameters=parameters
+        ).result
+        return result.successful, result.reason
+
+    def warnings(self):
+        """Texts that the node has logged as warnings or worse.
+
+        From stderr: what contexts that have ended in this process leave behind may keep /rosout
+        of a node with the same name silent.
+        """
+        self.logged += self.stderr.readouterr().err
+        head = re.compile(rf'^\[(\w+)\] \[[0-9.]+\] \[{self.name}\]: ', re.MULTILINE)
+        lines = head.split(self.logged)
+        entries = zip(lines[1::2], lines[2::2], strict=True)
+        return [text.strip() for level, text in entries if level in ('WARN', 'ERROR', 'FATAL')]
+
+    def diagnosis(self):
+        """The newest diagnostics: level, message, values."""
+        count = len(self.diagnostics)
+        self.spin_until(lambda: len(self.diagnostics) > count, 'diagnostics')
+        (status,) = self.diagnostics[-1].status
+        return status.level[0], status.message, {v.key: v.value for v in status.values}
+
+    def close(self):
+        import rclpy
+
+        self.node.stop()
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.other.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+@pytest.fixture
+def world_of(capfd):
+    """Makes worlds, and ends them."""
+    worlds = []
+
+    def make(*arguments, **values):
+        worlds.append(World(capfd, *arguments, **values))
+        return worlds[-1]
+
+    yield make
+    for one in worlds:
+        one.close()

@@ -1,7 +1,6 @@
 """The node itself, over DDS; with a tracker that costs nothing."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -25,150 +24,20 @@ CONFIG = ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml'
 PATIENCE = 60.0  # s
 
 
-class World:
-    """A filter node, and somebody who talks to it, in a context of their own."""
-
-    def __init__(self, stderr, **values):
-        import rclpy
-        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-        from hmt_msgs.msg import Keypoints2D
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.parameter import Parameter
-        from sensor_msgs.msg import CameraInfo, Image
-
-        from hmt_ros.nodes.filter_node import FilterNode
-
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        for topic in ('/image', '/camera_info', '/keypoints'):
-            values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
-        overrides = [Parameter(name, value=value) for name, value in values.items()]
-        self.node = FilterNode(context=self.context, parameter_overrides=overrides)
-        self.other = rclpy.create_node('other', context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.executor.add_node(self.other)
-        self.publishers = {
-            'image': self.other.create_publisher(Image, 'image', 100),
-            'camera_info': self.other.create_publisher(CameraInfo, 'camera_info', 100),
-            'keypoints': self.other.create_publisher(Keypoints2D, 'keypoints', 100),
-        }
-        self.handled, self.diagnostics = [], []
-        self.stderr, self.logged = stderr, ''
-        self.listen(DiagnosticStatus, 'filter_node/handled', self.handled)
-        self.listen(DiagnosticArray, '/diagnostics', self.diagnostics)
-
-    def listen(self, kind, topic, into, qos=100):
-        def receive(message):
-            into.append(message)
-
-        return self.other.create_subscription(kind, topic, receive, qos)
-
-    def spin_until(self, done, what='it'):
-        end = time.monotonic() + PATIENCE
-        while not done():
-            assert time.monotonic() < end, f'waited in vain for {what}'
-            self.executor.spin_once(timeout_sec=0.05)
-
-    def start(self):
-        self.node.start()
-        return self.connect()
-
-    def connect(self):
-        """Returns when both sides know all topics of each other."""
-        self.spin_until(
-            lambda: (
-                all(p.get_subscription_count() for p in self.publishers.values())
-                and self.other.count_publishers('filter_node/handled') == 1
-                and self.node.count_subscribers('filter_node/handled') == 1
-                and self.node._handled.get_subscription_count() == 1
-            )
-        )
-        return self
-
-    def send(self, source, message):
-        """Publishes a message; what became of it."""
-        count = len(self.handled)
-        self.publishers[source].publish(serialise(message))
-        self.spin_until(lambda: len(self.handled) > count, f'an answer to {source}')
-        return self.handled[-1]
-
-    def call(self, kind, service, **fields):
-        client = self.other.create_client(kind, f'filter_node/{service}')
-        self.spin_until(client.service_is_ready, service)
-        future = client.call_async(kind.Request(**fields))
-        self.spin_until(future.done, f'an answer of {service}')
-        self.other.destroy_client(client)
-        return future.result()
-
-    def change_state(self, label):
-        from lifecycle_msgs.msg import Transition
-        from lifecycle_msgs.srv import ChangeState
-
-        number = getattr(Transition, f'TRANSITION_{label.upper()}')
-        return self.call(ChangeState, 'change_state', transition=Transition(id=number)).success
-
-    @property
-    def state(self):
-        from lifecycle_msgs.srv import GetState
-
-        return self.call(GetState, 'get_state').current_state.label
-
-    def set(self, **values):
-        """Sets parameters; the reasons why not."""
-        from rcl_interfaces.srv import SetParametersAtomically
-        from rclpy.parameter import Parameter
-
-        parameters = [
-            Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
-            for name, value in values.items()
-        ]
-        result = self.call(
-            SetParametersAtomically, 'set_parameters_atomically', parameters=parameters
-        ).result
-        return result.successful, result.reason
-
-    def warnings(self):
-        """Texts that the node has logged as warnings or worse.
-
-        From stderr: what contexts that have ended in this process leave behind may keep /rosout
-        of a node with the same name silent.
-        """
-        self.logged += self.stderr.readouterr().err
-        head = re.compile(r'^\[(\w+)\] \[[0-9.]+\] \[filter_node\]: ', re.MULTILINE)
-        lines = head.split(self.logged)
-        entries = zip(lines[1::2], lines[2::2], strict=True)
-        return [text.strip() for level, text in entries if level in ('WARN', 'ERROR', 'FATAL')]
-
-    def diagnosis(self):
-        """The newest diagnostics: level, message, values."""
-        count = len(self.diagnostics)
-        self.spin_until(lambda: len(self.diagnostics) > count, 'diagnostics')
-        (status,) = self.diagnostics[-1].status
-        return status.level[0], status.message, {v.key: v.value for v in status.values}
-
-    def close(self):
-        import rclpy
-
-        self.node.stop()
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self.other.destroy_node()
-        rclpy.shutdown(context=self.context)
-
-
 @pytest.fixture
-def world(stub_tracker, subject_file, capfd):
-    worlds = []
+def world(stub_tracker, subject_file, world_of):
+    from hmt_msgs.msg import Keypoints2D
+    from sensor_msgs.msg import CameraInfo, Image
+
+    from hmt_ros.nodes.filter_node import FilterNode
+
+    inputs = {'image': Image, 'camera_info': CameraInfo, 'keypoints': Keypoints2D}
 
     def make(**values):
         values.setdefault('subject_file', str(subject_file))
-        worlds.append(World(capfd, **values))
-        return worlds[-1]
+        return world_of(FilterNode, 'filter_node', inputs, **values)
 
-    yield make
-    for one in worlds:
-        one.close()
+    return make
 
 
 @pytest.fixture

@@ -1,0 +1,369 @@
+"""Real nodes in processes of their own, fed over DDS in lock step.
+
+Every message is published as it is in the bag; the next one follows when the node has told on
+`~/handled` what became of it and all that it published has arrived. Nothing is lost and nothing
+overtakes, so what comes out does not depend on how fast the machine is. The nodes run in a ROS
+domain that nobody else uses, on this machine only.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import hmt_ros
+from hmt_ros.nodes.declared_parameters import values_of
+from hmt_ros.nodes.handled import Handled
+from hmt_ros.nodes.parameter_file import yaml_scalar
+from hmt_ros.nodes.published_topic import PublishedTopic
+from msg_tools.cdr import canonical, deserialise, serialise
+
+# Generous: they end a replay that hangs. A node that ends is noticed at once.
+START_SECONDS = 120.0
+MESSAGE_SECONDS = 600.0  # the first image may have to wait until kernels are compiled
+STOP_SECONDS = 20.0
+
+
+class LiveNodeError(ValueError):
+    """A node did not start, or does not answer; one line."""
+
+
+class Player:
+    """Somebody in a ROS domain of their own who talks to nodes.
+
+    Args:
+        opened: closes what is opened here.
+
+    Raises:
+        LiveNodeError: there is no ROS.
+    """
+
+    def __init__(self, opened: ExitStack) -> None:
+        self.folder = Path(opened.enter_context(TemporaryDirectory(prefix='hmt_ros.')))
+        self.domain = opened.enter_context(reserved_domain())
+        try:
+            import rclpy
+            from diagnostic_msgs.msg import DiagnosticStatus
+            from hmt_msgs.msg import Body, Keypoints2D, PoseMixture, TrajectoryMixture
+            from rclpy.executors import SingleThreadedExecutor
+            from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+            from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
+            from tf2_msgs.msg import TFMessage
+            from visualization_msgs.msg import MarkerArray
+        except ImportError as error:
+            raise LiveNodeError(
+                f'--live needs a sourced ROS 2 workspace ({error}): source install/setup.bash'
+            ) from error
+        kinds = (
+            Body, CameraInfo, CompressedImage, DiagnosticStatus, Image, JointState, Keypoints2D,
+            MarkerArray, PoseMixture, TFMessage, TrajectoryMixture,
+        )  # fmt: skip
+        self.classes: dict[str, Any] = {
+            f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}': kind for kind in kinds
+        }
+        self.reliable = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+        self.latched = QoSProfile(
+            depth=1,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL,
+        )
+        context = rclpy.Context()
+        with changed_environment(environment(self.domain)):
+            rclpy.init(context=context, domain_id=self.domain)
+        opened.callback(rclpy.try_shutdown, context=context)
+        self.node = rclpy.create_node('replay', context=context)
+        opened.callback(self.node.destroy_node)
+        self.executor = SingleThreadedExecutor(context=context)
+        opened.callback(self.executor.shutdown)
+        self.executor.add_node(self.node)
+
+
+class LiveNode:
+    """A running node.
+
+    Args:
+        player: who talks to it.
+        opened: ends it.
+        name: of the node, 'filter_node' for example.
+        parameters: of the node.
+        inputs: topic and type by source, of what is published for it.
+        topics: that it publishes.
+        sensors: topics that it would take from sensors, which may lose data; a replay may not.
+        write: takes topic, stamp and bytes of all that the node publishes, in its order.
+
+    Raises:
+        LiveNodeError: the node does not start.
+    """
+
+    def __init__(
+        self,
+        player: Player,
+        opened: ExitStack,
+        name: str,
+        parameters: Any,
+        *,
+        inputs: Mapping[str, tuple[str, str]],
+        topics: Mapping[str, PublishedTopic],
+        sensors: tuple[str, ...] = (),
+        write: Callable[[str, int, bytes], None],
+    ) -> None:
+        self.name = name
+        self._player, self._topics, self._write = player, topics, write
+        self._arrived: dict[str, deque[bytes]] = {topic: deque() for topic in topics}
+        self._answers: deque[bytes] = deque()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._open_topics(inputs)
+        opened.callback(self.stop)
+        self._process = self._start(parameters, sensors)
+
+    def publish(self, source: str, message: Any) -> None:
+        """Hands a message over."""
+        self._publishers[source].publish(serialise(message))
+
+    def answer(self, source: str) -> Handled:
+        """Waits for what became of the next message, and writes what it led to.
+
+        Raises:
+            LiveNodeError: the node has ended, or does not answer.
+        """
+        handled = self._handled(
+            self._next(self._answers, MESSAGE_SECONDS, f'an answer to a {source}')
+        )
+        for topic, stamp in handled.published:
+            data = self._next(self._arrived[topic], START_SECONDS, f'{topic} of {stamp} ns')
+            # On its way a message may get bytes behind its end, up to a multiple of four.
+            self._write(topic, stamp, canonical(data, self._topics[topic].msgtype))
+        return handled
+
+    def deactivate(self) -> None:
+        """Has the node come to the end of what it does.
+
+        Raises:
+            LiveNodeError: it does not.
+        """
+        from lifecycle_msgs.msg import Transition
+        from lifecycle_msgs.srv import ChangeState
+
+        client = self._player.node.create_client(ChangeState, f'{self.name}/change_state')
+        self._wait(client.service_is_ready, START_SECONDS, 'its services')
+        transition = Transition(id=Transition.TRANSITION_DEACTIVATE)
+        future = client.call_async(ChangeState.Request(transition=transition))
+        self._wait(future.done, MESSAGE_SECONDS, 'its end')
+        if not future.result().success:
+            raise LiveNodeError(f'the {self.title} can not be deactivated: {self._last_words()}')
+
+    @property
+    def title(self) -> str:
+        """What one calls it."""
+        return self.name.replace('_', ' ')
+
+    def wait_until_active(self) -> None:
+        """Returns when the node is active and both sides know all topics of each other.
+
+        Raises:
+            LiveNodeError: it does not get active.
+        """
+        self._wait(self._state.service_is_ready, START_SECONDS, 'the node')
+        label = ''
+        end = time.monotonic() + START_SECONDS
+        while label != 'active':
+            if time.monotonic() > end:
+                raise LiveNodeError(f'the {self.title} is {label}: {self._last_words()}')
+            future = self._state.call_async(self._state_request)
+            self._wait(future.done, START_SECONDS, 'the state of the node')
+            label = future.result().current_state.label
+        publishers = self._publishers.values()
+        self._wait(
+            lambda: all(publisher.get_subscription_count() for publisher in publishers),
+            START_SECONDS,
+            'the subscriptions of the node',
+        )
+
+    def wait_for_subscribers(self, topics: tuple[str, ...], count: int) -> None:
+        """Returns when so many others, this player among them, listen to topics of the node.
+
+        Raises:
+            LiveNodeError: they do not.
+        """
+        node = self._player.node
+        self._wait(
+            lambda: all(node.count_subscribers(topic) >= count for topic in topics),
+            START_SECONDS,
+            f'who listens to {", ".join(topics)}',
+        )
+
+    def stop(self) -> int | None:
+        """Ends the node as the interrupt key would; its exit code."""
+        process = self._process
+        if process is None:
+            return None
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        try:
+            return process.wait(STOP_SECONDS)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            return process.wait()
+
+    def stop_well(self) -> None:
+        """Ends the node.
+
+        Raises:
+            LiveNodeError: it does not end as it should.
+        """
+        code = self.stop()
+        if code != 0:
+            raise LiveNodeError(f'the {self.title} ended with code {code}: {self._last_words()}')
+
+    def _start(self, parameters: Any, sensors: tuple[str, ...]) -> subprocess.Popen[bytes]:
+        values = {name: yaml_scalar(value) for name, value in values_of(parameters).items()}
+        for topic in sensors:
+            values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
+        lines = [f'    {name}: {text}' for name, text in values.items()]
+        file = self._player.folder / f'{self.name}.yaml'
+        file.write_text('\n'.join(['/**:', '  ros__parameters:', *lines, '']), encoding='utf-8')
+        sources = str(Path(hmt_ros.__file__).resolve().parents[1])
+        command = [sys.executable, '-m', f'hmt_ros.nodes.{self.name}']
+        with self._output.open('wb') as output:
+            return subprocess.Popen(
+                [*command, '--ros-args', '--params-file', str(file)],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={
+                    **os.environ,
+                    **environment(self._player.domain),
+                    'PYTHONPATH': os.pathsep.join(
+                        [sources, *filter(None, [os.environ.get('PYTHONPATH')])]
+                    ),
+                    'ROS_LOG_DIR': str(self._player.folder),
+                },
+                # The interrupt key is for this process; it stops the node itself.
+                start_new_session=True,
+            )
+
+    @property
+    def _output(self) -> Path:
+        return self._player.folder / f'{self.name}.output'
+
+    def _open_topics(self, inputs: Mapping[str, tuple[str, str]]) -> None:
+        from lifecycle_msgs.srv import GetState
+
+        player, node = self._player, self._player.node
+        self._publishers = {
+            source: node.create_publisher(player.classes[msgtype], topic, player.reliable)
+            for source, (topic, msgtype) in inputs.items()
+        }
+        for topic, published in self._topics.items():
+            node.create_subscription(
+                player.classes[published.msgtype],
+                topic,
+                _into(self._arrived[topic]),
+                player.latched if published.latched else player.reliable,
+                raw=True,
+            )
+        node.create_subscription(
+            player.classes['diagnostic_msgs/msg/DiagnosticStatus'],
+            f'{self.name}/handled',
+            _into(self._answers),
+            player.reliable,
+            raw=True,
+        )
+        # The last of all: discovery tells the node of the topics above before it tells of this.
+        self._state = node.create_client(GetState, f'{self.name}/get_state')
+        self._state_request = GetState.Request()
+
+    def _next(self, queue: deque[bytes], seconds: float, what: str) -> bytes:
+        self._wait(lambda: bool(queue), seconds, what)
+        return queue.popleft()
+
+    def _wait(self, done: Callable[[], bool], seconds: float, what: str) -> None:
+        end = time.monotonic() + seconds
+        while not done():
+            self._player.executor.spin_once(timeout_sec=0.1)
+            assert self._process is not None
+            code = self._process.poll()
+            if code is not None and not done():
+                raise LiveNodeError(
+                    f'the {self.title} ended with code {code}: {self._last_words()}'
+                )
+            if time.monotonic() > end:
+                raise LiveNodeError(
+                    f'the {self.title} is silent: waited {seconds:.0f} s for {what}; '
+                    f'{self._last_words()}'
+                )
+
+    def _last_words(self) -> str:
+        """The last line that the node has written."""
+        text = self._output.read_text('utf-8', 'replace')
+        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        return lines[-1] if lines else 'it has said nothing'
+
+    def _handled(self, data: bytes) -> Handled:
+        """What a message on ~/handled says."""
+        message = deserialise(data, 'diagnostic_msgs/msg/DiagnosticStatus')
+        pairs = [(str(value.key), str(value.value)) for value in message.values]
+        return Handled(
+            source=str(message.name),
+            stamp_ns=int(dict(pairs)['stamp']),
+            faults=tuple(text for key, text in pairs if key == 'fault'),
+            warnings=tuple(text for key, text in pairs if key == 'warning'),
+            published=tuple((key, int(text)) for key, text in pairs if key in self._topics),
+        )
+
+
+def _into(queue: deque[bytes]) -> Callable[[bytes], None]:
+    """A callback; rclpy wants one whose signature it can read."""
+
+    def receive(data: bytes) -> None:
+        queue.append(data)
+
+    return receive
+
+
+@contextmanager
+def reserved_domain() -> Iterator[int]:
+    """Number of a ROS domain that no other replay or test run on this machine uses.
+
+    A domain is taken while port 32768 + domain is bound, as ament's domain_coordinator does it.
+    """
+    for offset in range(100):
+        domain = 1 + (os.getpid() + offset) % 100
+        with socket.socket() as reservation:
+            try:
+                reservation.bind(('', 32768 + domain))
+            except OSError:
+                continue
+            yield domain
+            return
+    raise LiveNodeError('all ROS domains from 1 to 100 are in use')
+
+
+def environment(domain: int) -> dict[str, str]:
+    """What a process needs to be in a domain, on this machine only."""
+    return {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+
+
+@contextmanager
+def changed_environment(changes: dict[str, str]) -> Iterator[None]:
+    """This process with other environment variables for a while."""
+    before = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

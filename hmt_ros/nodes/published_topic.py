@@ -1,0 +1,17 @@
+"""A topic that a node publishes, by which bags and nodes are made alike."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class PublishedTopic(NamedTuple):
+    """A topic of a node.
+
+    Attributes:
+        msgtype: for example 'hmt_msgs/msg/PoseMixture'.
+        latched: late subscribers get the last message.
+    """
+
+    msgtype: str
+    latched: bool = False

@@ -1,0 +1,563 @@
+"""A lifecycle node around a session: messages in, messages out, one thread that estimates.
+
+The executor's thread only puts messages into a queue and answers services; one other thread
+estimates. Messages pass as bytes in both directions: what a bag or a wire holds is read and written
+by the same code as offline.
+
+`~/handled` (diagnostic_msgs/DiagnosticStatus) tells of every message that was taken in what became
+of it, after all that it led to has been published: `name` is its source, `message` why it was not
+used, `values` its stamp, faults, warnings, and then the topics and stamps that were published. A
+player that waits for it feeds the node in lock step.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from abc import abstractmethod
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import ParameterException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions
+
+from hmt_ros.nodes.declared_parameters import (
+    AT_LAUNCH,
+    EFFECTS,
+    DeclaredParameter,
+    declared_parameters,
+    with_values,
+)
+from hmt_ros.nodes.handled import Handled, Output
+from hmt_ros.nodes.input_queue import InputQueue, Waiting
+from hmt_ros.nodes.published_topic import PublishedTopic
+from msg_tools.cdr import deserialise
+
+RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+# Small messages that wait while an estimate is made.
+SMALL_QUEUE = 100
+
+_RESTART = 'restart'
+# What a last estimate may take at the end, s; kernels that are being compiled are not waited for.
+_LAST_ESTIMATE = 5.0
+
+
+class Session(Protocol):
+    """What a node holds: takes messages, publishes through the function that it was made with.
+
+    Attributes:
+        parameters: of the node, may be replaced.
+        state: for diagnostics, replaced with every message.
+    """
+
+    parameters: Any
+    state: Any
+
+    def take(self, source: str, message: Any) -> Handled:
+        """Handles a message."""
+
+    def refuse(self, source: str, text: str) -> Handled:
+        """Counts a message that could not even be read."""
+
+    def count_dropped(self, messages: int) -> None:
+        """Counts messages that were dropped before they came here."""
+
+    def restart(self, start: Any = None) -> None:
+        """Starts the estimate anew."""
+
+
+class Input(NamedTuple):
+    """A subscribed topic.
+
+    Attributes:
+        source: what the session calls it.
+        topic: its name.
+        kind: generated class.
+        msgtype: for example 'sensor_msgs/msg/Image'.
+        qos: of the subscription.
+    """
+
+    source: str
+    topic: str
+    kind: type
+    msgtype: str
+    qos: QoSProfile
+
+
+class SessionNode(LifecycleNode):
+    """What all nodes have in common; parameters are the fields of a settings dataclass.
+
+    Attributes:
+        TOPICS: that are published.
+        CLASSES: generated classes of their types.
+        COUNTED: the source whose messages are counted, and dropped when the node is late.
+        COUNTED_NAME: what one calls them.
+        DONE: what one calls those that were used.
+    """
+
+    TOPICS: ClassVar[Mapping[str, PublishedTopic]]
+    CLASSES: ClassVar[Mapping[str, type]]
+    COUNTED: ClassVar[str]
+    COUNTED_NAME: ClassVar[str]
+    DONE: ClassVar[str]
+
+    def __init__(self, name: str, defaults: Any, subject: str, **options: Any) -> None:
+        """See the class.
+
+        Args:
+            name: of the node.
+            defaults: settings with the default values.
+            subject: what the diagnostics are about.
+            options: of `rclpy.lifecycle.LifecycleNode`.
+        """
+        super().__init__(name, **options)
+        self._defaults, self._subject = defaults, subject
+        declared = declared_parameters(defaults)
+        self.declare_parameters('', [(p.name, p.default, _descriptor(p)) for p in declared])
+        names = [parameter.name for parameter in declared]
+        self._values = {name: self.get_parameter(name).value for name in names}
+        self._settings = with_values(defaults, self._values)
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+        self._refuse_impossible_transitions()
+        self._session: Any = None
+        self._queue: InputQueue | None = None
+        self._worker: threading.Thread | None = None
+        self._outputs: dict[str, Any] = {}
+        self._handled: Any = None
+        self._offered: list[Any] = []
+        self._inputs: list[Any] = []
+        self._types: dict[str, str] = {}
+        self._failure = ''
+        self._latencies: deque[float] = deque(maxlen=1000)
+        self._rates = Rates(self.COUNTED_NAME, self.DONE)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RELIABLE)
+        # With use_sim_time and nobody who tells the time, diagnostics are needed most.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self.create_timer(1.0, self._diagnose_period, clock=steady)
+
+    # What a node decides.
+
+    @abstractmethod
+    def _new_session(
+        self, publish: Callable[[Output], None], wanted: Callable[[str], bool]
+    ) -> Session:
+        """The session; ValueError: the settings name something that can not be used."""
+
+    @abstractmethod
+    def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
+        """Type, name and callback of the services."""
+
+    @abstractmethod
+    def _wanted_inputs(self) -> Iterable[Input]:
+        """The topics to subscribe to; the last is the one that gives the tempo."""
+
+    @abstractmethod
+    def _judgement(self, state: Any) -> tuple[bytes, str]:
+        """Level and message of the diagnostics of an active node."""
+
+    @abstractmethod
+    def _state_values(self, state: Any) -> list[tuple[str, str]]:
+        """Values of the diagnostics."""
+
+    @abstractmethod
+    def _counts(self, state: Any) -> Counter[str]:
+        """How many messages of `COUNTED` were 'received', 'dropped', and `DONE`."""
+
+    def _check_changed(self, settings: Any, changed: Mapping[str, Any]) -> None:
+        """Raises ValueError where new values name something that can not be used."""
+
+    def _finish(self, session: Any) -> None:
+        """What is still to be published when nothing more is listened to."""
+
+    # What it does with that.
+
+    def start(self) -> None:
+        """Configures and activates the node, unless it is to wait for its services."""
+        if not self._settings.autostart:
+            return
+        if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+    def stop(self, timeout: float | None = None) -> bool:
+        """Ends the thread that estimates, after its present message.
+
+        Returns:
+            Whether it has ended within `timeout` s.
+        """
+        if self._queue is not None:
+            self._queue.close()
+        if self._worker is not None:
+            self._worker.join(timeout)
+            if self._worker.is_alive():
+                return False
+        self._queue, self._worker = None, None
+        return True
+
+    # Lifecycle.
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Reads files, opens topics."""
+        try:
+            self._session = self._new_session(self._publish, self._is_wanted)
+        except ValueError as error:
+            self._failure = str(error)
+            self.get_logger().error(self._failure)
+            self._diagnose()
+            return TransitionCallbackReturn.FAILURE
+        self._failure = ''
+        for topic, published in self.TOPICS.items():
+            self._outputs[topic] = self.create_lifecycle_publisher(
+                self.CLASSES[published.msgtype], topic, LATCHED if published.latched else RELIABLE
+            )
+        self._handled = self.create_lifecycle_publisher(DiagnosticStatus, '~/handled', RELIABLE)
+        # While a service waits for something, the others of its group would wait with it.
+        group = ReentrantCallbackGroup()
+        self._offered = [
+            self.create_service(kind, name, callback, callback_group=group)
+            for kind, name, callback in self._offered_services()
+        ]
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Listens."""
+        assert self._session is not None
+        inputs = list(self._wanted_inputs())
+        limits = {one.source: SMALL_QUEUE for one in inputs}
+        limits[self.COUNTED] = self._settings.queue_size
+        self._queue = InputQueue(limits, counted=self.COUNTED)
+        result = super().on_activate(state)
+        self._types = {one.source: one.msgtype for one in inputs}
+        self._worker = threading.Thread(
+            target=self._work, args=(self._session, self._queue), name='estimate', daemon=True
+        )
+        self._worker.start()
+        for one in inputs:
+            self._subscribe(one)
+        topic = self._inputs[-1].topic_name
+        wants = self._session.state.wants
+        self.get_logger().info(f'{self.COUNTED_NAME} from {topic}; waits for {wants}')
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Listens no more."""
+        self._unsubscribe()
+        self.stop()
+        if self._session is not None:
+            self._finish(self._session)
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forgets the estimate, closes topics."""
+        self._close()
+        return super().on_cleanup(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """As cleanup, from any state."""
+        self._close()
+        return super().on_shutdown(state)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Back to the state before configuration."""
+        self._close()
+        return super().on_error(state)
+
+    def _subscribe(self, wanted: Input) -> None:
+        queue = self._queue
+        assert queue is not None
+
+        def receive(data: bytes) -> None:
+            queue.put(wanted.source, data, time.monotonic())
+
+        self._inputs.append(
+            self.create_subscription(
+                wanted.kind,
+                wanted.topic,
+                receive,
+                wanted.qos,
+                raw=True,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+        )
+
+    def _unsubscribe(self) -> None:
+        for subscription in self._inputs:
+            self.destroy_subscription(subscription)
+        self._inputs.clear()
+
+    def _close(self) -> None:
+        self._unsubscribe()
+        self.stop()
+        for publisher in [*self._outputs.values(), self._handled]:
+            if publisher is not None:
+                self.destroy_lifecycle_publisher(publisher)
+        self._outputs.clear()
+        self._handled = None
+        for service in self._offered:
+            self.destroy_service(service)
+        self._offered.clear()
+        self._session = None
+
+    def _refuse_impossible_transitions(self) -> None:
+        """A request for a transition that the state does not have must not end the node."""
+        service = self._service_change_state
+        change = service.callback
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return change(request, response)
+            except RuntimeError as error:
+                wanted = request.transition.label or request.transition.id
+                self.get_logger().warn(f'transition {wanted} is not possible: {first_line(error)}')
+                response.success = False
+                return response
+
+        service.callback = answer
+
+    # Parameters.
+
+    def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        changed = {p.name: p.value for p in parameters if p.name in self._values}
+        if not changed:
+            return SetParametersResult(successful=True)
+        try:
+            settings = with_values(self._defaults, {**self._values, **changed})
+            self._check_changed(settings, changed)
+        except ValueError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        self._values.update(changed)
+        self._settings = settings
+        if self._session is not None:
+            self._session.parameters = settings
+        if self._queue is not None:
+            self._queue.limit(self.COUNTED, settings.queue_size)
+        return SetParametersResult(successful=True)
+
+    def _restart_with(self, start: Any) -> bool:
+        """Has the session start anew once what has come before is handled; whether it will."""
+        if self._session is None or self._queue is None:
+            return False
+        self._queue.put(_RESTART, start, time.monotonic())
+        return True
+
+    # The thread that estimates.
+
+    def _work(self, session: Any, queue: InputQueue) -> None:
+        while (waiting := queue.get()) is not None:
+            before = session.state
+            try:
+                self._handle(session, waiting)
+            except Exception as error:  # noqa: BLE001
+                # A fault of ours. What comes next may not suffer from it.
+                self.get_logger().error(''.join(traceback.format_exception(error)))
+                session.restart(session.start)
+            after = session.state
+            if (after.status, after.faults.keys()) != (before.status, before.faults.keys()):
+                self._diagnose()
+
+    def _handle(self, session: Any, waiting: Waiting) -> None:
+        session.count_dropped(waiting.dropped)
+        done = self._counts(session.state)[self.DONE]
+        if waiting.source == _RESTART:
+            session.restart(waiting.content)
+            return
+        try:
+            message = deserialise(waiting.content, self._types[waiting.source])
+        except Exception as error:  # noqa: BLE001
+            # Bytes from outside meet generated code here, which does not say what it may raise.
+            handled = session.refuse(waiting.source, first_line(error))
+        else:
+            handled = session.take(waiting.source, message)
+        if self._counts(session.state)[self.DONE] > done:
+            self._latencies.append(time.monotonic() - waiting.arrival)
+        self._tell(handled)
+
+    def _tell(self, handled: Handled) -> None:
+        for text in handled.warnings:
+            self.get_logger().warn(f'{text} (more of the kind are counted in /diagnostics)')
+        if self._handled.get_subscription_count():
+            self._handled.publish(_handled_message(handled))
+
+    def _publish(self, output: Output) -> None:
+        self._outputs[output.topic].publish(output.data)
+
+    def _is_wanted(self, topic: str) -> bool:
+        return bool(self._outputs[topic].get_subscription_count())
+
+    # Diagnostics.
+
+    def _diagnose_period(self) -> None:
+        counts: Counter[str] = Counter()
+        if self._session is not None:
+            state = self._session.state
+            counts = Counter(self._counts(state))
+            counts['faults'] = state.faults.total()
+        latencies = [self._latencies.popleft() for _ in range(len(self._latencies))]
+        self._rates.next_period(counts, latencies)
+        self._diagnose()
+
+    def _diagnose(self) -> None:
+        label = self._state_machine.current_state[1]
+        state = self._session.state if self._session is not None else None
+        name = f'{self.get_fully_qualified_name().strip("/")}: {self._subject}'
+        status = DiagnosticStatus(name=name)
+        values = [('lifecycle', label)]
+        if self._failure:
+            status.level, status.message = DiagnosticStatus.ERROR, self._failure
+        elif state is None or label != 'active':
+            status.level, status.message = DiagnosticStatus.OK, label
+        else:
+            status.level, status.message = self._judgement(state)
+        if state is not None:
+            counts = self._counts(state)
+            values += [
+                ('status', state.status),
+                *(
+                    (f'{self.COUNTED_NAME} {what}', str(counts[what]))
+                    for what in ('received', self.DONE, 'skipped', 'dropped')
+                ),
+                *self._state_values(state),
+                *((f'faults: {kind}', str(count)) for kind, count in sorted(state.faults.items())),
+                ('last fault', state.last_fault),
+                *self._rates.values(),
+            ]
+        status.values = [KeyValue(key=key, value=value) for key, value in values]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+
+class Rates:
+    """What happened in the last period of diagnostics.
+
+    Args:
+        name: of what is counted.
+        done: what one calls those that were used.
+
+    Attributes:
+        dropped, faults: of the period.
+    """
+
+    def __init__(self, name: str, done: str) -> None:
+        self.dropped = 0
+        self.faults = 0
+        self._name, self._done = name, done
+        self._received = self._used = 0.0
+        self._latencies: list[float] = []
+        self._counts: Counter[str] = Counter()
+        self._began = time.monotonic()
+
+    def next_period(self, counts: Counter[str], latencies: list[float]) -> None:
+        """Ends a period.
+
+        Args:
+            counts: 'received', 'dropped', 'faults' and those used, of all time.
+            latencies: of the period, s.
+        """
+        now = time.monotonic()
+        # A node that was configured anew counts anew.
+        change = counts - self._counts
+        duration = max(now - self._began, 1e-3)
+        self._received = change['received'] / duration
+        self._used = change[self._done] / duration
+        self.dropped, self.faults = change['dropped'], change['faults']
+        self._latencies, self._counts, self._began = latencies, counts, now
+
+    def values(self) -> list[tuple[str, str]]:
+        """For diagnostics."""
+        known = self._latencies or [math.nan]
+        return [
+            (f'{self._name} received a second', f'{self._received:.1f}'),
+            (f'{self._name} {self._done} a second', f'{self._used:.1f}'),
+            ('latency, mean, ms', f'{1e3 * sum(known) / len(known):.1f}'),
+            ('latency, largest, ms', f'{1e3 * max(known):.1f}'),
+        ]
+
+
+def first_line(error: BaseException) -> str:
+    """The text of an error as one line."""
+    return ' '.join(str(error).split()) or type(error).__name__
+
+
+def run(name: str, make: Callable[[], SessionNode], args: list[str] | None = None) -> int:
+    """Runs a node until it is told to stop; 0, or 1 where it could not start."""
+    # The handlers of rclpy end the context under whatever is going on; ours let it come to its end.
+    stopped = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopped.set())
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        node = make()
+    except (ParameterException, ValueError, RuntimeError) as error:
+        sys.stderr.write(f'{name}: {first_line(error)}\n')
+        rclpy.try_shutdown()
+        return 1
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    node.start()
+    while not stopped.is_set():
+        # A signal does not wake who waits for messages.
+        executor.spin_once(timeout_sec=0.2)
+    if not node.stop(_LAST_ESTIMATE):
+        sys.stderr.flush()
+        os._exit(0)
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown()
+    return 0
+
+
+def _handled_message(handled: Handled) -> DiagnosticStatus:
+    values = [
+        ('stamp', handled.stamp_ns),
+        *(('fault', text) for text in handled.faults),
+        *(('warning', text) for text in handled.warnings),
+        *handled.published,
+    ]
+    return DiagnosticStatus(
+        level=DiagnosticStatus.WARN if handled.faults else DiagnosticStatus.OK,
+        name=handled.source,
+        message='; '.join(handled.faults),
+        values=[KeyValue(key=key, value=str(value)) for key, value in values],
+    )
+
+
+def _descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(
+        description=f'{parameter.description} {EFFECTS[parameter.effect]}',
+        read_only=parameter.effect == AT_LAUNCH,
+    )
+    if parameter.limits is not None:
+        low, high = parameter.limits
+        if isinstance(parameter.default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+        else:
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(low), to_value=float(high))
+            ]
+    return descriptor

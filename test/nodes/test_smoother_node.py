@@ -1,0 +1,274 @@
+"""The smoother node itself, over DDS."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from hmt_ros.nodes.declared_parameters import EFFECTS, declared_parameters
+from hmt_ros.nodes.parameter_file import read_parameter_file
+from hmt_ros.nodes.smoothed_messages import TOPICS
+from hmt_ros.nodes.smoother_parameters import SmootherParameters
+from hmt_ros.nodes.smoother_session import SmootherSession
+from msg_tools.cdr import serialise
+from msg_tools.headers import time_ns
+
+pytestmark = pytest.mark.ros
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = ROOT / 'hmt_ros' / 'config' / 'smoother_node.yaml'
+PATIENCE = 60.0  # s
+FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
+
+
+@pytest.fixture
+def world(world_of):
+    from hmt_msgs.msg import Body, PoseMixture
+
+    from hmt_ros.nodes.smoother_node import SmootherNode
+
+    inputs = {'body': Body, 'likelihood_mixture': PoseMixture}
+
+    def make(**values):
+        values = {'fixed_lag': 1, 'max_trajectories': 4, **values}
+        return world_of(SmootherNode, 'smoother_node', inputs, **values)
+
+    return make
+
+
+@pytest.fixture
+def running(world, likelihoods):
+    one = world().start()
+    one.send('body', likelihoods.body_message())
+    return one
+
+
+def values_of(handled, key):
+    return [value.value for value in handled.values if value.key == key]
+
+
+def published(handled):
+    return [value.key for value in handled.values if value.key in TOPICS]
+
+
+def listen_to_everything(one):
+    from hmt_msgs.msg import PoseMixture, TrajectoryMixture
+    from sensor_msgs.msg import JointState
+    from visualization_msgs.msg import MarkerArray
+
+    kinds = {
+        'trajectory_mixture': TrajectoryMixture,
+        'trajectory_markers': MarkerArray,
+        'smoothed_pose_mixture': PoseMixture,
+        'smoothed_joint_states': JointState,
+    }
+    found = {topic: [] for topic in kinds}
+    for topic, kind in kinds.items():
+        one.listen(kind, topic, found[topic])
+    one.spin_until(lambda: all(one.node._is_wanted(topic) for topic in kinds))
+    return found
+
+
+def test_mixtures_become_smoothed_poses(running, likelihoods):
+    found = listen_to_everything(running)
+    assert published(running.send('likelihood_mixture', likelihoods.message(0))) == [*TOPICS][:2]
+    handled = running.send('likelihood_mixture', likelihoods.message(1))
+    assert published(handled) == [*TOPICS]
+    stamps = [int(value.value) for value in handled.values if value.key in FINAL]
+    assert stamps == [likelihoods.stamp(0)] * 2
+    # The end of the stream.
+    assert running.change_state('deactivate')
+    running.spin_until(lambda: len(found['smoothed_joint_states']) == 2)
+    assert running.handled[-1].name == 'finish'
+    assert published(running.handled[-1]) == FINAL
+    poses = found['smoothed_pose_mixture']
+    assert [time_ns(m.header.stamp) for m in poses] == [likelihoods.stamp(i) for i in (0, 1)]
+    assert {m.kind for m in poses} == {3}
+    assert len(found['trajectory_mixture'][-1].stamps) == 2
+    assert len(found['trajectory_markers'][-1].markers) == 16
+    # A new window begins when it is activated again; the body is latched.
+    assert running.change_state('activate')
+    running.connect()
+    handled = running.send('likelihood_mixture', likelihoods.message(5))
+    assert values_of(handled, 'fault') == []
+    assert running.node._session.state.window == 1
+
+
+def test_parameters_are_those_of_the_file(running):
+    descriptors = {p.name: p for p in declared_parameters(SmootherParameters())}
+    assert sorted(read_parameter_file(CONFIG, 'smoother_node')) == sorted(descriptors)
+    for name, declared in descriptors.items():
+        assert running.node.has_parameter(name)
+        descriptor = running.node.describe_parameter(name)
+        assert descriptor.description == f'{declared.description} {EFFECTS[declared.effect]}'
+    for values, reason in (
+        ({'fixed_lag': -1}, 'out of range'),
+        ({'method': 'guess'}, "saw 'guess'"),
+        ({'body_model': 'nobody'}, "no body 'nobody'"),
+        ({'dynamics__knee': 0.0}, 'dynamics.knee must be positive'),
+        ({'autostart': False}, 'read-only'),
+    ):
+        good, why = running.set(**values)
+        assert not good
+        assert reason in why, why
+    assert running.set(queue_size=3, max_hypotheses=2) == (True, '')
+    assert running.node._session.parameters.max_hypotheses == 2
+    assert running.node._queue._limits['likelihood_mixture'] == 3
+
+
+def test_one_warning_for_each_kind_and_the_node_lives(running, likelihoods):
+    def without_components(index):
+        message = likelihoods.message(index)
+        message.components = []
+        return message
+
+    def of_another_order(index):
+        message = likelihoods.message(index)
+        message.dof_names = message.dof_names[::-1]
+        return message
+
+    running.send('likelihood_mixture', likelihoods.message(1))
+    for make, indices in (
+        (without_components, (2, 2)),
+        (of_another_order, (2, 2)),
+        (likelihoods.message, (1, 1)),
+        (likelihoods.message, (0, 0)),
+    ):
+        for index in indices:
+            handled = running.send('likelihood_mixture', make(index))
+            assert len(values_of(handled, 'fault')) == 1
+    assert values_of(running.send('likelihood_mixture', likelihoods.message(9)), 'fault') == []
+    wanted = ('no components', 'dof_names', 'wanted stamps that increase', 'reset_on_time_jump',
+              'no mixture for 0.80 s')  # fmt: skip
+    running.spin_until(lambda: len(running.warnings()) >= len(wanted))
+    for text, part in zip(running.warnings(), wanted, strict=True):
+        assert part in text
+    _, _, values = running.diagnosis()
+    assert values['mixtures smoothed'] == '2'
+    assert values['mixtures skipped'] == '8'
+    assert (values['gaps'], values['longest gap, s']) == ('1', '0.800')
+    assert values['faults: dof_names'] == '2'
+
+
+def test_diagnostics(world, likelihoods):
+    one = world().start()
+    assert one.diagnosis()[:2] == (1, 'waits for body')
+    one.send('body', likelihoods.body_message())
+    one.send('likelihood_mixture', likelihoods.message(0))
+    one.spin_until(lambda: 'smoothing' in one.diagnostics[-1].status[0].message)
+    _, _, values = one.diagnosis()
+    assert one.diagnostics[-1].status[0].name == 'smoother_node: smoothing'
+    assert (values['lifecycle'], values['status']) == ('active', 'smoothing')
+    assert values['poses in the window'] == '1'
+    assert {'latency, mean, ms', 'mixtures smoothed a second', 'last fault'} <= values.keys()
+
+
+def test_windows_are_smoothed_on_demand(running, likelihoods, monkeypatch):
+    from builtin_interfaces.msg import Time
+    from hmt_msgs.srv import SmoothWindow
+
+    answer = running.call(SmoothWindow, 'smooth_window')
+    assert not answer.success
+    assert 'no mixture from 0 to 0 ns: none is' in answer.message
+    for index in range(4):
+        running.send('likelihood_mixture', likelihoods.message(index))
+    seconds, nanoseconds = divmod(likelihoods.stamp(1), 10**9)
+    answer = running.call(
+        SmoothWindow, 'smooth_window', from_time=Time(sec=seconds, nanosec=nanoseconds)
+    )
+    assert (answer.success, answer.message) == (True, '')
+    found = answer.trajectories
+    assert [time_ns(stamp) for stamp in found.stamps] == [likelihoods.stamp(i) for i in (1, 2, 3)]
+    assert len(found.components[0].marginal_covariances) == 3 * 37 * 37
+    # The node goes on meanwhile.
+    begun, go = threading.Event(), threading.Event()
+    smooth_span = SmootherSession.smooth_span
+
+    def slow(self, *span):
+        begun.set()
+        assert go.wait(PATIENCE)
+        return smooth_span(self, *span)
+
+    monkeypatch.setattr(SmootherSession, 'smooth_span', slow)
+    client = running.other.create_client(SmoothWindow, 'smoother_node/smooth_window')
+    running.spin_until(client.service_is_ready)
+    future = client.call_async(SmoothWindow.Request())
+    running.spin_until(begun.is_set)
+    try:
+        running.send('likelihood_mixture', likelihoods.message(4))
+        assert not future.done()
+    finally:
+        go.set()
+    running.spin_until(future.done)
+    assert len(future.result().trajectories.stamps) == 5
+
+
+def test_lifecycle(world, likelihoods):
+    from hmt_msgs.srv import SmoothWindow
+
+    one = world(autostart=False)
+    one.node.start()
+    assert one.state == 'unconfigured'
+    assert one.change_state('configure')
+    assert not one.call(SmoothWindow, 'smooth_window').success
+    assert one.change_state('activate')
+    one.connect()
+    one.send('body', likelihoods.body_message())
+    assert values_of(one.send('likelihood_mixture', likelihoods.message(0)), 'fault') == []
+    assert one.change_state('deactivate')
+    assert one.change_state('cleanup')
+    assert one.node._session is None
+    assert one.state == 'unconfigured'
+
+
+def test_queue_holds_what_was_published(running, likelihoods):
+    """Mixtures that come while one is smoothed wait."""
+    queue = running.node._queue
+    data = serialise(likelihoods.message(0))
+    count = len(running.handled)
+    queue.put('likelihood_mixture', data[:60], 0.0)
+    queue.put('likelihood_mixture', data, 0.0)
+    running.spin_until(lambda: len(running.handled) == count + 2)
+    first, second = running.handled[-2:]
+    assert 'message of likelihood_mixture can not be read' in values_of(first, 'fault')[0]
+    assert values_of(second, 'fault') == []
+
+
+def start_node(*arguments):
+    return subprocess.Popen(
+        [sys.executable, '-m', 'hmt_ros.nodes.smoother_node', '--ros-args', *arguments],
+        cwd=ROOT,
+        env=dict(os.environ),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def test_ends_cleanly():
+    node = start_node('--params-file', str(CONFIG))
+    lines = []
+    try:
+        for line in node.stdout:
+            lines.append(line)
+            if 'mixtures from /likelihood_mixture' in line:
+                node.send_signal(signal.SIGINT)
+        assert node.wait(PATIENCE) == 0
+    finally:
+        node.kill()
+    assert len(lines) == 1, lines
+
+
+def test_parameter_file_reaches_the_node(tmp_path):
+    path = tmp_path / 'smoother.yaml'
+    path.write_text(CONFIG.read_text().replace('fixed_lag: 7', 'fixed_lag: -7'))
+    node = start_node('--params-file', str(path))
+    output, _ = node.communicate(timeout=PATIENCE)
+    assert node.returncode == 1
+    (line,) = output.splitlines()
+    assert line.startswith('smoother_node: ')
+    assert 'fixed_lag' in line

@@ -1,0 +1,391 @@
+"""The rules of the session that smooths."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_ros.nodes.declared_parameters import with_values
+from hmt_ros.nodes.smoothed_messages import TOPICS
+from hmt_ros.nodes.smoother_parameters import SmootherParameters
+from hmt_ros.nodes.smoother_session import BODY, FINISH, MIXTURE, SmootherSession
+from hmt_ros.smoothing import MixtureSmoother
+from msg_tools.cdr import deserialise
+from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.trajectory_mixtures import trajectory_mixture_of
+
+ROOT = Path(__file__).resolve().parents[2]
+LAG = 2
+WINDOW = ['trajectory_mixture', 'trajectory_markers']
+FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
+
+
+@pytest.fixture
+def outputs():
+    return []
+
+
+@pytest.fixture
+def session(outputs):
+    def make(wanted=lambda topic: True, **values):
+        values.setdefault('fixed_lag', LAG)
+        values = {name.replace('__', '.'): value for name, value in values.items()}
+        parameters = with_values(SmootherParameters(), values)
+        return SmootherSession(parameters, outputs.append, wanted)
+
+    return make
+
+
+@pytest.fixture
+def running(session, likelihoods):
+    """A session that knows the body."""
+
+    def make(*arguments, **values):
+        one = session(*arguments, **values)
+        one.take(BODY, likelihoods.body_message())
+        return one
+
+    return make
+
+
+def smoothed(outputs):
+    """Stamps of the poses that have become final."""
+    return [output.stamp_ns for output in outputs if output.topic == 'smoothed_pose_mixture']
+
+
+def read(outputs, topic):
+    kind = TOPICS[topic].msgtype
+    return [deserialise(output.data, kind) for output in outputs if output.topic == topic]
+
+
+def test_runs_without_ros():
+    program = (
+        'import sys\n'
+        'sys.modules["rclpy"] = sys.modules["hmt_msgs"] = None\n'
+        'import hmt_ros.nodes.smoother_session\n'
+    )
+    subprocess.run([sys.executable, '-c', program], cwd=ROOT, check=True)
+
+
+def test_poses_become_final_after_the_lag(running, outputs, likelihoods):
+    one = running()
+    stamps = [likelihoods.stamp(index) for index in range(5)]
+    for index in range(5):
+        handled = one.take(MIXTURE, likelihoods.message(index))
+        assert (handled.source, handled.stamp_ns) == (MIXTURE, stamps[index])
+        assert handled.faults == handled.warnings == ()
+        wanted = [(topic, stamps[index]) for topic in WINDOW]
+        if index >= LAG:
+            wanted += [(topic, stamps[index - LAG]) for topic in FINAL]
+        assert list(handled.published) == wanted
+    assert smoothed(outputs) == stamps[:3]
+    assert one.state.mixtures == {'received': 5, 'smoothed': 5}
+    assert (one.state.status, one.state.wants, one.state.window) == ('smoothing', '', LAG + 1)
+    finished = one.finish()
+    assert (finished.source, finished.stamp_ns) == (FINISH, stamps[-1])
+    assert [topic for topic, _ in finished.published] == FINAL * LAG
+    assert smoothed(outputs) == stamps
+    assert one.state.status == 'waiting'
+    assert one.finish().published == ()
+
+
+def test_final_poses_are_mixtures_that_need_no_kinematics(running, outputs, likelihoods):
+    one = running(error_correlation=0.0)
+    for index in range(6):
+        one.take(MIXTURE, likelihoods.message(index))
+    one.finish()
+    body = likelihoods.body
+    states = read(outputs, 'smoothed_joint_states')
+    for index, message in enumerate(read(outputs, 'smoothed_pose_mixture')):
+        content = pose_mixture_of(message, body.dof_names, body.joint_names)
+        assert content.kind == MixtureKind.SMOOTHED
+        assert (content.stamp_ns, content.frame_id) == (likelihoods.stamp(index), 'lens')
+        mixture, seen = content.mixture, likelihoods.mixture(index)
+        np.testing.assert_allclose(
+            content.joint_positions, body.joint_positions(mixture.means), atol=1e-9
+        )
+        assert np.array_equal(states[index].position, mixture.means[0])
+        # Each image has a variance of 0.001, neighbours tell a little about it.
+        elbow = body.dof_names.index('left_elbow')
+        for mean, covariance in zip(mixture.means, mixture.covariances, strict=True):
+            assert np.abs(seen.means[:, elbow] - mean[elbow]).min() < 0.02
+            assert (np.diagonal(covariance) < 1e-3).all()
+        # The elbow that is the more probable all along gets more so with every image.
+        straight = mixture.means[:, elbow] < seen.means[:, elbow].mean()
+        assert 0.6 < mixture.weights[straight].sum() < 0.95
+
+
+def test_errors_that_last_make_mixtures_wider(running, outputs, likelihoods):
+    for time in (0.0, 0.1):
+        one = running(error_correlation=time, max_trajectories=1)
+        for index in range(3):
+            one.take(MIXTURE, likelihoods.message(index))
+    narrow, wide = (pose_mixture_of(m).mixture for m in read(outputs, 'smoothed_pose_mixture'))
+    np.testing.assert_allclose(wide.covariances * np.tanh(0.5), narrow.covariances, rtol=1e-9)
+    assert np.array_equal(wide.means, narrow.means)
+
+
+def test_trajectories(running, outputs, likelihoods):
+    one = running(max_trajectories=3)
+    for index in range(4):
+        one.take(MIXTURE, likelihoods.message(index))
+    *_, last = read(outputs, 'trajectory_mixture')
+    content = trajectory_mixture_of(last, likelihoods.body.dof_names)
+    assert content.stamps_ns == tuple(likelihoods.stamp(index) for index in (1, 2, 3))
+    assert content.final_until_ns == likelihoods.stamp(1)
+    assert content.means.shape == (3, 3, likelihoods.body.dimension)
+    assert content.marginal_covariances is None
+    one.parameters = with_values(one.parameters, {'publish_covariances': True})
+    one.take(MIXTURE, likelihoods.message(4))
+    *_, last = read(outputs, 'trajectory_mixture')
+    assert trajectory_mixture_of(last).marginal_covariances.shape == (3, 3, 37, 37)
+    (final,) = read(outputs, 'smoothed_pose_mixture')[-1:]
+    found = pose_mixture_of(final).mixture
+    covariances = trajectory_mixture_of(last).marginal_covariances[:, 0]
+    np.testing.assert_allclose(found.covariances, covariances, atol=1e-12)
+
+
+def test_same_messages_same_bytes(running, outputs, likelihoods):
+    for _ in range(2):
+        one = running()
+        for index in range(4):
+            one.take(MIXTURE, likelihoods.message(index))
+        one.finish()
+    half = len(outputs) // 2
+    assert half > 0
+    assert outputs[:half] == outputs[half:]
+
+
+def test_what_nobody_wants_is_not_made(running, outputs, likelihoods):
+    one = running(wanted=lambda topic: topic == 'smoothed_joint_states')
+    for index in range(4):
+        one.take(MIXTURE, likelihoods.message(index))
+    assert {output.topic for output in outputs} == {'smoothed_joint_states'}
+    assert one.state.mixtures['smoothed'] == 4
+
+
+def test_variational_smoothing_is_chosen_by_a_parameter(running, likelihoods):
+    one = running(method='variational', max_trajectories=2, fixed_lag=1)
+    one.take(MIXTURE, likelihoods.message(0))
+    assert type(one._window.smoother) is MixtureSmoother
+    assert one.state.mixtures['smoothed'] == 1
+
+
+def test_constant_velocity(running, outputs, likelihoods):
+    one = running(dynamics__model='constant_velocity')
+    for index in range(4):
+        assert one.take(MIXTURE, likelihoods.message(index)).faults == ()
+    assert len(smoothed(outputs)) == 2
+
+
+def test_mixtures_wait_for_their_body(session, outputs, likelihoods):
+    one = session(queue_size=2)
+    assert (one.state.status, one.state.wants) == ('no body', 'body')
+    handled = [one.take(MIXTURE, likelihoods.message(index)) for index in range(4)]
+    assert [len(h.faults) for h in handled] == [0, 0, 1, 1]
+    assert [len(h.warnings) for h in handled] == [0, 0, 1, 0]
+    assert 'no body has come' in handled[2].warnings[0]
+    handled = one.take(BODY, likelihoods.body_message())
+    assert [stamp for topic, stamp in handled.published if topic == 'trajectory_mixture'] == [
+        likelihoods.stamp(2),
+        likelihoods.stamp(3),
+    ]
+    assert one.state.mixtures == {'received': 4, 'dropped': 2, 'smoothed': 2}
+
+
+def test_a_new_body_begins_a_new_window(running, outputs, likelihoods):
+    one = running()
+    other = likelihoods.body.with_stature(1.6)
+    one.take(MIXTURE, likelihoods.message(0))
+    # The mixture of the new body overtakes it.
+    assert one.take(MIXTURE, likelihoods.message(1, other)).published == ()
+    handled = one.take(BODY, likelihoods.body_message(1, other))
+    assert handled.warnings == ('another body has come: a new window begins',)
+    assert smoothed(outputs) == [likelihoods.stamp(0)]
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(0), likelihoods.stamp(1)]
+    for message, body in zip(
+        read(outputs, 'smoothed_pose_mixture'), (likelihoods.body, other), strict=True
+    ):
+        content = pose_mixture_of(message)
+        np.testing.assert_allclose(
+            content.joint_positions, body.joint_positions(content.mixture.means), atol=1e-9
+        )
+    # The same body once more changes nothing.
+    assert one.take(BODY, likelihoods.body_message(2, other)).warnings == ()
+
+
+def test_mixtures_of_a_body_that_is_gone_are_dropped(running, outputs, likelihoods):
+    one = running()
+    other = likelihoods.body.with_stature(1.6)
+    one.take(MIXTURE, likelihoods.message(0, other))
+    handled = one.take(MIXTURE, likelihoods.message(1))
+    assert 'no body that its joints are of' in handled.faults[0]
+    assert one.state.mixtures == {'received': 2, 'dropped': 1, 'smoothed': 1}
+
+
+def change(message, **fields):
+    for name, value in fields.items():
+        setattr(message, name, value)
+    return message
+
+
+def covariance_of(message, value):
+    d = len(message.dof_names)
+    message.components[0].covariance = np.full((d, d), value).reshape(-1)
+    return message
+
+
+def nan_in_mean(message):
+    mean = np.array(message.components[0].mean)
+    mean[3] = np.nan
+    message.components[0].mean = mean
+    return message
+
+
+BAD = {
+    'no components': (lambda m: change(m, components=[]), 'mixture has no components'),
+    'dof_names': (
+        lambda m: change(m, dof_names=[*m.dof_names[:-1], 'tail']),
+        "has 'tail' at 36, wanted ",
+    ),
+    'fewer dof_names': (lambda m: change(m, dof_names=m.dof_names[:-1]), '36 names, wanted 37'),
+    'not finite': (nan_in_mean, 'mixture: mean has values that are not finite'),
+    'not positive definite': (lambda m: covariance_of(m, 1.0), 'is not positive definite'),
+    'weight': (lambda m: change(m.components[0], weight=3.0) and m, 'weights that sum to 3.4'),
+    'body': (
+        lambda m: change(m, body_model='horse'),
+        'is of the body horse, wanted one of human37',
+    ),
+}
+
+
+@pytest.mark.parametrize('name', BAD)
+def test_bad_mixtures_are_skipped(running, outputs, likelihoods, name):
+    spoil, text = BAD[name]
+    one = running(longest_interval=1.0)
+    handled = []
+    for index in range(4):
+        message = likelihoods.message(index)
+        handled.append(one.take(MIXTURE, spoil(message) if index in (1, 2) else message))
+    assert [len(h.faults) for h in handled] == [0, 1, 1, 0]
+    assert [len(h.warnings) for h in handled] == [0, 1, 0, 0]
+    assert text in handled[1].warnings[0]
+    assert '\n' not in handled[1].warnings[0]
+    assert one.state.mixtures == {'received': 4, 'smoothed': 2, 'skipped': 2}
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(0), likelihoods.stamp(3)]
+
+
+def test_every_kind_of_fault_is_told_once(running, likelihoods):
+    one = running()
+    one.take(MIXTURE, likelihoods.message(0))
+    warnings = []
+    for _ in range(2):
+        for spoil, _ in BAD.values():
+            warnings += one.take(MIXTURE, spoil(likelihoods.message(1))).warnings
+        warnings += one.take(MIXTURE, likelihoods.message(0)).warnings
+    # Two faults are of the names.
+    assert len(warnings) == len(BAD)
+    assert one.state.faults['dof_names'] == 4
+    assert one.state.faults['time stands still'] == 2
+
+
+def test_time_that_stands_still_or_jumps_back_is_skipped(running, outputs, likelihoods):
+    one = running()
+    handled = [one.take(MIXTURE, likelihoods.message(index)) for index in (1, 1, 0, 2)]
+    assert [len(h.faults) for h in handled] == [0, 1, 1, 0]
+    assert 'wanted stamps that increase' in handled[1].warnings[0]
+    assert 'with reset_on_time_jump a new window would begin' in handled[2].warnings[0]
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(1), likelihoods.stamp(2)]
+
+
+def test_time_that_jumps_back_begins_a_new_window(running, outputs, likelihoods):
+    one = running(reset_on_time_jump=True)
+    for _ in range(2):
+        for index in range(4):
+            assert one.take(MIXTURE, likelihoods.message(index)).faults == ()
+    one.finish()
+    # A bag that is played twice gives the same twice.
+    wanted = [likelihoods.stamp(index) for index in range(4)]
+    assert smoothed(outputs) == [*wanted, *wanted]
+    half = len(outputs) // 2
+    assert outputs[:half] == outputs[half:]
+    assert one.state.faults == {'time jumps back': 1}
+
+
+def test_gaps_are_bridged_and_told(running, outputs, likelihoods):
+    one = running(longest_interval=0.15)
+    handled = [one.take(MIXTURE, likelihoods.message(index)) for index in (0, 1, 6, 7, 14)]
+    assert [len(h.faults) for h in handled] == [0] * 5
+    assert [len(h.warnings) for h in handled] == [0, 0, 1, 0, 0]
+    assert 'no mixture for 0.50 s' in handled[2].warnings[0]
+    assert (one.state.gaps, one.state.longest_gap) == (2, pytest.approx(0.7))
+    one.finish()
+    assert len(smoothed(outputs)) == 5
+    # Neighbours that are far away tell less.
+    variances = [
+        pose_mixture_of(message).mixture.covariances[0].trace()
+        for message in read(outputs, 'smoothed_pose_mixture')
+    ]
+    assert variances[4] > variances[0]
+
+
+def test_posteriors_are_told_but_smoothed(running, likelihoods):
+    one = running()
+    message = likelihoods.message(0, kind=MixtureKind.POSTERIOR)
+    handled = one.take(MIXTURE, message)
+    assert handled.faults == ()
+    assert 'kind POSTERIOR, wanted LIKELIHOOD' in handled.warnings[0]
+    assert one.state.mixtures['smoothed'] == 1
+
+
+def test_bodies_that_are_not_known(session, likelihoods, tmp_path):
+    one = session()
+    strange = change(likelihoods.body_message(), name='horse')
+    handled = one.take(BODY, strange)
+    assert 'horse' in handled.faults[0]
+    assert 'body_model names it' in handled.faults[0]
+    one.parameters = with_values(one.parameters, {'body_model': 'human37'})
+    assert one.take(BODY, strange).faults == ()
+    handled = one.take(BODY, change(likelihoods.body_message(), segment_names=['tail']))
+    assert 'tail' in handled.faults[0]
+    with pytest.raises(ValueError, match='body_model names it'):
+        session(body_model=str(tmp_path / 'none.yaml'))
+
+
+def test_a_span_is_smoothed_on_demand(running, likelihoods):
+    one = running(window_length=4, max_trajectories=4)
+    with pytest.raises(ValueError, match='none is'):
+        one.smooth_span()
+    for index in range(6):
+        one.take(MIXTURE, likelihoods.message(index))
+    content = trajectory_mixture_of(one.smooth_span(0, likelihoods.stamp(4)))
+    assert content.stamps_ns == tuple(likelihoods.stamp(index) for index in (2, 3, 4))
+    assert content.marginal_covariances.shape == (len(content.weights), 3, 37, 37)
+    assert content.body_model == 'human37'
+    newest = likelihoods.stamp(5)
+    assert trajectory_mixture_of(one.smooth_span(newest, 0)).stamps_ns == (newest,)
+    with pytest.raises(ValueError, match='are kept'):
+        one.smooth_span(likelihoods.stamp(7), likelihoods.stamp(9))
+    one.restart()
+    with pytest.raises(ValueError, match='none is'):
+        one.smooth_span()
+
+
+@pytest.mark.parametrize(
+    ('values', 'message'),
+    [
+        ({'method': 'guess'}, "method must be one of .* saw 'guess'"),
+        ({'dynamics.model': 'jump'}, "dynamics.model must be one of .* saw 'jump'"),
+        ({'dynamics.hip': 0.0}, 'dynamics.hip must be positive'),
+        ({'max_trajectories': 0}, 'between 1 and 1024'),
+        ({'fixed_lag': 1.5}, 'whole number'),
+    ],
+)
+def test_parameters_that_can_not_be(values, message):
+    with pytest.raises(ValueError, match=message):
+        with_values(SmootherParameters(), values)
