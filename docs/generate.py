@@ -1,6 +1,6 @@
 """Writes the parts of the pages that are made by programs.
 
-    python docs/generate.py parameters     the table of parameters in nodes.md
+    python docs/generate.py filter_node smoother_node     tables of parameters in nodes.md
     python docs/generate.py flips          times in flips.md
     python docs/generate.py kernels        times in likelihood.md
     python docs/generate.py smoothing      exactness and speed in smoothing.md (minutes)
@@ -22,7 +22,8 @@ DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent))
 
 PAGES = {
-    'parameters': 'nodes.md',
+    'filter_node': 'nodes.md',
+    'smoother_node': 'nodes.md',
     'flips': 'flips.md',
     'kernels': 'likelihood.md',
     'smoothing': 'smoothing.md',
@@ -57,21 +58,23 @@ def with_part(page: str, name: str, content: str) -> str:
 
 def part(name: str) -> str:
     """The content of a part."""
-    if name == 'parameters':
-        return parameter_table()
+    if name in ('filter_node', 'smoother_node'):
+        return parameter_table(name)
     from benchmarks import flips, kernels, smoothing, tracking
 
     pages = {'flips': flips, 'kernels': kernels, 'smoothing': smoothing, 'tracking': tracking}
     return pages[name].page()
 
 
-def parameter_table() -> str:
-    """All parameters of the filter node, as the node declares them."""
+def parameter_table(node: str) -> str:
+    """All parameters of a node, as it declares them."""
     from hmt_ros.nodes.declared_parameters import declared_parameters
     from hmt_ros.nodes.filter_parameters import FilterParameters
+    from hmt_ros.nodes.smoother_parameters import SmootherParameters
 
+    settings = {'filter_node': FilterParameters(), 'smoother_node': SmootherParameters()}
     lines = ['| parameter | default | range | takes effect | what |', '|---|---|---|---|---|']
-    for parameter in declared_parameters(FilterParameters()):
+    for parameter in declared_parameters(settings[node]):
         value = parameter.default
         text = str(value).lower() if isinstance(value, bool) else str(value)
         default = f'`{text}`' if text else 'empty'

@@ -16,9 +16,10 @@ import yaml
 
 from hmt_ros.app import COMMANDS
 from hmt_ros.body import load_body
+from hmt_ros.nodes import smoothed_messages, track_messages
 from hmt_ros.nodes.declared_parameters import declared_parameters
 from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.track_messages import TOPICS
+from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.tracking.evaluation import Scores
 from hmt_ros.tracking.subject import parse_subject
 
@@ -31,6 +32,11 @@ PAGES = [
 ]
 PAGE_IDS = [str(path.relative_to(ROOT)) for path in PAGES]
 BLOCK = re.compile(r'^(<!-- run -->\n)?```(\w+)\n(.*?)^```$', re.MULTILINE | re.DOTALL)
+# Parameters and published topics of the nodes.
+NODES = {
+    'filter_node': (FilterParameters(), track_messages.TOPICS),
+    'smoother_node': (SmootherParameters(), smoothed_messages.TOPICS),
+}
 # Programs that are not part of this repository.
 FOREIGN = {
     'sudo',
@@ -96,7 +102,6 @@ def test_python_of_a_page_runs(page, workplace, capsys):
 @pytest.mark.parametrize('page', PAGES, ids=PAGE_IDS)
 def test_commands_are_understood(page):
     targets = set(re.findall(r'^([a-z]+):', (ROOT / 'Makefile').read_text('utf-8'), re.MULTILINE))
-    parameters = {parameter.name for parameter in declared_parameters(FilterParameters())}
     for words, _ in commands(page):
         if words[:3] == ['python', '-m', 'hmt_ros']:
             parse(words[3:])
@@ -107,9 +112,9 @@ def test_commands_are_understood(page):
             assert set(named) <= targets, words
         else:
             assert words[0] in FOREIGN, words
-        if words[:4] == ['ros2', 'run', 'hmt_ros', 'filter_node']:
-            given = [b.partition(':=')[0] for a, b in pairwise(words) if a == '-p']
-            assert set(given) <= parameters
+        if words[:3] == ['ros2', 'run', 'hmt_ros']:
+            given = {b.partition(':=')[0] for a, b in pairwise(words) if a == '-p'}
+            assert given <= {p.name for p in declared_parameters(NODES[words[3]][0])}
 
 
 def parse(words: list[str]) -> None:
@@ -150,8 +155,9 @@ def test_model_file_of_the_body_page(tmp_path):
 def test_generated_parts_are_up_to_date():
     generate = runpy.run_path(str(ROOT / 'docs' / 'generate.py'))
     page = (ROOT / 'docs' / 'nodes.md').read_text('utf-8')
-    fresh = generate['with_part'](page, 'parameters', generate['parameter_table']())
-    assert page == fresh, 'run: python docs/generate.py parameters'
+    for node in NODES:
+        fresh = generate['with_part'](page, node, generate['parameter_table'](node))
+        assert page == fresh, f'run: python docs/generate.py {node}'
     for name, page_name in generate['PAGES'].items():
         text = (ROOT / 'docs' / page_name).read_text('utf-8')
         part = text.partition(f'<!-- begin {name} -->\n')[2].partition('<!-- end -->')[0]
@@ -160,21 +166,23 @@ def test_generated_parts_are_up_to_date():
         generate['with_part'](page, 'weather', '')
 
 
-def rows(page: Path, heading: str) -> list[list[str]]:
+def rows(page: str, heading: str) -> list[list[str]]:
     """Cells of the tables under a heading, without their heads."""
-    text = page.read_text('utf-8').partition(f'{heading}\n')[2]
+    text = page.partition(f'{heading}\n')[2]
     text = re.split(r'^#', text, maxsplit=1, flags=re.MULTILINE)[0]
     lines = [line for line in text.splitlines() if line.startswith('|')]
     return [[cell.strip() for cell in line.strip('|').split('|')] for line in lines[2:]]
 
 
-def test_topics_of_the_node():
-    nodes = ROOT / 'docs' / 'nodes.md'
-    published = {row[0].strip('`'): row[1] for row in rows(nodes, '### Published topics')}
-    wanted = {topic: kind.msgtype.replace('/msg/', '/') for topic, kind in TOPICS.items()}
+@pytest.mark.parametrize('node', NODES)
+def test_topics_of_a_node(node):
+    page = (ROOT / 'docs' / 'nodes.md').read_text('utf-8')
+    section = page.partition(f'\n## {node}\n')[2].partition('\n## ')[0]
+    published = {row[0].strip('`'): row[1] for row in rows(section, '### Published topics')}
+    wanted = {topic: kind.msgtype.replace('/msg/', '/') for topic, kind in NODES[node][1].items()}
     assert {topic: published[topic] for topic in wanted} == wanted
     assert set(published) - set(wanted) == {'/diagnostics', '~/handled'}
-    readme = rows(ROOT / 'README.md', '## The node and its topics')
+    readme = rows((ROOT / 'README.md').read_text('utf-8'), '## The nodes and their topics')
     named = {name for row in readme for name in re.findall(r'`([^`]+)`', row[0])}
     assert set(wanted) <= named
 

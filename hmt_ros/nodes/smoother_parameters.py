@@ -34,7 +34,7 @@ class SmootherDynamics(PoseRates):
         model: 'random_walk', or 'constant_velocity', whose state has velocities besides the pose
             and costs several times as much.
         velocity_time: how long a velocity lasts at constant velocity, s; velocities then gain so
-            much that after it poses have moved as the deviations below say.
+            much that after it poses have moved as the deviations say.
         translation: standard deviation of the root's position after one second, m.
         root, trunk, hip, knee, shoulder, elbow, neck, extremity: of the angles, rad after one
             second. Deviations grow with the square root of time.

@@ -10,6 +10,7 @@ from hmt_ros.app.recorded_input import recorded_input
 from hmt_ros.app.replay import main
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes import track_start
+from hmt_ros.nodes.smoothed_messages import TOPICS as SMOOTHED_TOPICS
 from hmt_ros.nodes.track_messages import TOPICS
 from hmt_ros.tracking import Status
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
@@ -122,9 +123,9 @@ def test_topics(replayed, entries):
     assert {topic: len(messages) for topic, messages in found.items()} == {
         'body': 1,
         'ground_truth': IMAGES,
-        **{topic: IMAGES for topic in TOPICS if topic != 'body'},
+        **{topic: IMAGES for topic in (*TOPICS, *SMOOTHED_TOPICS) if topic != 'body'},
     }
-    for topic, published in TOPICS.items():
+    for topic, published in {**TOPICS, **SMOOTHED_TOPICS}.items():
         assert {stored.msgtype for stored in found[topic]} == {published.msgtype}
         if topic != 'body':
             assert [stored.log_time_ns for stored in found[topic]] == stamps

@@ -269,8 +269,12 @@ class World:
         """Publishes a message; what became of it."""
         count = len(self.handled)
         self.publishers[source].publish(serialise(message))
-        self.spin_until(lambda: len(self.handled) > count, f'an answer to {source}')
-        return self.handled[-1]
+        # A latched message may be handled in between.
+        self.spin_until(
+            lambda: any(handled.name == source for handled in self.handled[count:]),
+            f'an answer to {source}',
+        )
+        return next(handled for handled in self.handled[count:] if handled.name == source)
 
     def call(self, kind, service, **fields):
         client = self.other.create_client(kind, f'{self.name}/{service}')
