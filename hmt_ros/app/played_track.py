@@ -14,8 +14,9 @@ from typing import Any, Protocol
 
 from hmt_ros.app.live_node import LiveNode, Player
 from hmt_ros.nodes import smoothed_messages, track_messages
+from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
 from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.filter_session import CAMERA_INFO, IMAGE, KEYPOINTS, FilterSession
+from hmt_ros.nodes.filter_session import KEYPOINTS, FilterSession
 from hmt_ros.nodes.handled import Handled, Output
 from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.nodes.smoother_session import BODY, FINISH, MIXTURE, SmootherSession

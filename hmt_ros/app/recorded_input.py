@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from hmt_ros.nodes.filter_session import CAMERA_INFO, IMAGE, KEYPOINTS
+from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.nodes.filter_session import KEYPOINTS
 from msg_tools import BagError, BagMessage, BagReader, Topic
 
 RAW, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'

@@ -20,9 +20,10 @@ from tqdm import tqdm
 from hmt_ros.app.played_track import FILTER, SMOOTHER, LiveTrack, OfflineTrack, PlayedTrack
 from hmt_ros.app.recorded_input import GROUND_TRUTH, RecordedInput, recorded_input
 from hmt_ros.nodes import smoothed_messages, track_messages
+from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
 from hmt_ros.nodes.declared_parameters import with_values
 from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.filter_session import CAMERA_INFO, IMAGE, KEYPOINTS
+from hmt_ros.nodes.filter_session import KEYPOINTS
 from hmt_ros.nodes.handled import Handled
 from hmt_ros.nodes.parameter_file import read_parameter_file
 from hmt_ros.nodes.smoother_parameters import SmootherParameters

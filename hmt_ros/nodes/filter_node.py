@@ -15,16 +15,16 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
+from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
 from hmt_ros.nodes.filter_parameters import FilterParameters
 from hmt_ros.nodes.filter_session import (
-    CAMERA_INFO,
-    IMAGE,
     KEYPOINTS,
+    PREDICTION,
     FilterSession,
     SessionState,
 )
 from hmt_ros.nodes.handled import Output
-from hmt_ros.nodes.session_node import Input, SessionNode, run
+from hmt_ros.nodes.session_node import RELIABLE, Input, SessionNode, run
 from hmt_ros.nodes.track_messages import TOPICS
 from hmt_ros.nodes.track_start import prepare_start
 
@@ -63,6 +63,8 @@ class FilterNode(SessionNode):
         qos = qos_profile_sensor_data
         yield Input(CAMERA_INFO, 'camera_info', CameraInfo, 'sensor_msgs/msg/CameraInfo', qos)
         yield Input(KEYPOINTS, 'keypoints', Keypoints2D, 'hmt_msgs/msg/Keypoints2D', qos)
+        kind = 'hmt_msgs/msg/PoseMixture'
+        yield Input(PREDICTION, 'pose_prediction', PoseMixture, kind, RELIABLE)
         if self._settings.image_transport == 'compressed':
             kind = 'sensor_msgs/msg/CompressedImage'
             yield Input(IMAGE, 'image/compressed', CompressedImage, kind, qos)
@@ -85,7 +87,9 @@ class FilterNode(SessionNode):
             return response
         self._restart_with(start)
         response.success = True
-        if start.initial is None:
+        if start.initial is None and self._settings.use_predictions:
+            response.message = 'the next pose_prediction starts a new track'
+        elif start.initial is None:
             response.message = 'the track is dropped; nothing starts a new one without subject_file'
         else:
             response.message = 'the next image starts a new track'

@@ -39,6 +39,7 @@ _TRACKER_LIMITS = {
     'rounds': (1, 100),
     'image_trust': _FRACTION,
     'jump_probability': _FRACTION,
+    'prediction_probability': _FRACTION,
     'base_iterations': (1, 100),
     'iterations': (1, 100),
     'least_log_weight': (-100.0, 0.0),
@@ -70,7 +71,7 @@ class FilterParameters:
 
     Attributes:
         subject_file: YAML file with the joints of the person in one image, which starts the track;
-            empty: the node waits for ~/reset with a mixture.
+            empty: a pose_prediction does, with use_predictions, or ~/reset with a mixture.
         background_file: image of the empty scene, as the camera sees it; empty: learned from the
             images before the track starts.
         body_model: 'human37', 'human34', 'human32', or a YAML file.
@@ -84,6 +85,11 @@ class FilterParameters:
         keypoint_sigma_px: standard deviation of keypoints that come without a covariance, px.
         keypoints_timeout: an image waits no longer when keypoints of a later stamp, or an image
             that is so much younger, have come, s.
+        use_predictions: whether poses that are predicted from the image, by bme_node, start the
+            track where there is no subject_file, and are among the hypotheses. An image then waits
+            for the prediction of its stamp.
+        prediction_timeout: an image waits no longer when a prediction of a later stamp, or an image
+            that is so much younger, has come, s.
         overlay_modes: heaviest modes that are drawn on the image; 0: no overlay.
         overlay_quality: of the JPEG pictures of the overlay.
         publish_tf: whether the segments of the heaviest mode are published on /tf.
@@ -105,6 +111,8 @@ class FilterParameters:
     use_keypoints: bool = _parameter(False, AT_ONCE)
     keypoint_sigma_px: float = _parameter(5.0, AT_ONCE, (0.01, 1000.0))
     keypoints_timeout: float = _parameter(0.5, AT_ONCE, (0.0, 60.0))
+    use_predictions: bool = _parameter(False, AT_ONCE)
+    prediction_timeout: float = _parameter(0.5, AT_ONCE, (0.0, 60.0))
     overlay_modes: int = _parameter(3, AT_ONCE, (0, 64))
     overlay_quality: int = _parameter(85, AT_ONCE, (1, 100))
     publish_tf: bool = _parameter(True, AT_ONCE)

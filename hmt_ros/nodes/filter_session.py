@@ -7,8 +7,10 @@ messages in the same order give the same bytes. The rules:
   skipped, or starts the track anew where `reset_on_time_jump` says so.
 - An image waits until a calibrated camera_info has come, and with `use_keypoints` until keypoints
   of exactly its stamp have come, or keypoints of a later stamp, or an image that is
-  `keypoints_timeout` younger. Of several keypoints of one stamp the last counts; keypoints without
-  names say that a detector saw nobody. At most `queue_size` images wait; the oldest are dropped.
+  `keypoints_timeout` younger; with `use_predictions` and `prediction_timeout` for a pose_prediction
+  in the same way. Of several of one stamp the last counts; keypoints without names, and mixtures
+  without components, say that nobody was seen. At most `queue_size` images wait; the oldest are
+  dropped.
 - A camera_info with another calibration, and ~/reset, start the track anew.
 - What can not be used is skipped. Of each kind of fault the first is told, all are counted.
 """
@@ -16,36 +18,33 @@ messages in the same order give the same bytes. The rules:
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body import Body, Camera
 from hmt_ros.image.observation import Keypoints
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE, CameraInput, InTime, WaitingImage
 from hmt_ros.nodes.filter_parameters import FilterParameters
 from hmt_ros.nodes.handled import Handled, HandlingLog, Output
+from hmt_ros.nodes.stamped_inputs import StampedInputs
 from hmt_ros.nodes.track_messages import Presentation, TrackedImage, track_messages
 from hmt_ros.nodes.track_start import TrackStart, prepare_start
 from hmt_ros.tracking import Status, Subject, Tracker
 from msg_tools import MessageError, RosbagsMessages
-from msg_tools.camera_info import CameraInfoError, camera_from_info
 from msg_tools.cdr import serialise
 from msg_tools.headers import SECOND_NS, time_ns
-from msg_tools.images import ImageError, decode_image
 from msg_tools.keypoints import keypoints_of
+from msg_tools.pose_mixtures import pose_mixture_of
 
-CAMERA_INFO, IMAGE, KEYPOINTS = 'camera_info', 'image', 'keypoints'
-FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a frame
+KEYPOINTS, PREDICTION = 'keypoints', 'pose_prediction'
 
 # A person hardly moves meanwhile.
 _SAME_MOMENT_NS = SECOND_NS // 5
-# Stamps of keypoints that are remembered.
-_REMEMBERED = 256
 
 
 @dataclass(frozen=True)
@@ -75,12 +74,6 @@ class SessionState:
     images: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
     last_fault: str = ''
-
-
-class _WaitingImage(NamedTuple):
-    image: NDArray[np.uint8]
-    stamp_ns: int
-    frame_id: str
 
 
 def _everything(_topic: str) -> bool:
@@ -118,17 +111,13 @@ class FilterSession:
         self._wanted = wanted
         self._messages = RosbagsMessages()
         self.start = prepare_start(parameters)
-        self._camera: Camera | None = None
-        self._camera_frame = ''
+        self._log = HandlingLog()
+        self._input = CameraInput(self._log, 'the track')
         self._tracker: Tracker | None = None
         self._shown_body: Body | None = None
-        self._waiting: deque[_WaitingImage] = deque()
-        self._keypoints: dict[int, Keypoints | None] = {}
-        self._newest_keypoints = -1
-        self._newest_image: int | None = None
+        self._keypoints: StampedInputs[Keypoints] = StampedInputs()
+        self._predictions: StampedInputs[GaussianMixture] = StampedInputs()
         self._weights = np.empty(0)
-        self._images: Counter[str] = Counter()
-        self._log = HandlingLog()
         self.state = self._present_state()
 
     # What comes in.
@@ -137,17 +126,21 @@ class FilterSession:
         """Handles a message.
 
         Args:
-            source: `CAMERA_INFO`, `IMAGE` or `KEYPOINTS`.
-            message: sensor_msgs/CameraInfo, Image or CompressedImage, hmt_msgs/Keypoints2D.
+            source: `CAMERA_INFO`, `IMAGE`, `KEYPOINTS` or `PREDICTION`.
+            message: sensor_msgs/CameraInfo, Image or CompressedImage, hmt_msgs/Keypoints2D or
+                PoseMixture.
         """
         self._log.begin()
         stamp = time_ns(message.header.stamp)
         if source == IMAGE:
             self._take_image(message, stamp)
         elif source == CAMERA_INFO:
-            self._take_camera_info(message)
+            if self._input.take_camera_info(message):
+                self._start_anew()
+        elif source == KEYPOINTS:
+            self._keypoints.put(stamp, self._keypoints_in(message))
         else:
-            self._take_keypoints(message, stamp)
+            self._predictions.put(stamp, self._prediction_in(message))
         self._track_what_is_ready()
         self.state = self._present_state()
         return self._log.handled(source, stamp)
@@ -161,8 +154,7 @@ class FilterSession:
 
     def count_dropped(self, images: int) -> None:
         """Counts images that were dropped before they came here, because the node was late."""
-        self._images['received'] += images
-        self._images['dropped'] += images
+        self._input.count_dropped(images)
 
     def restart(self, start: TrackStart | None = None) -> None:
         """Drops the track; the next image starts a new one.
@@ -179,53 +171,16 @@ class FilterSession:
         self._weights = np.empty(0)
         self.state = self._present_state()
 
-    def _take_camera_info(self, message: Any) -> None:
-        try:
-            camera = camera_from_info(message)
-        except CameraInfoError as error:
-            self._log.fault('camera_info', str(error))
-            return
-        self._camera_frame = str(message.header.frame_id)
-        if camera == self._camera:
-            return
-        known, self._camera = self._camera, camera
-        if known is not None:
-            self._log.note('calibration', 'camera_info changes: the track starts anew')
-            self._start_anew()
-
-    def _take_keypoints(self, message: Any, stamp: int) -> None:
-        self._newest_keypoints = max(self._newest_keypoints, stamp)
-        self._keypoints[stamp] = self._keypoints_in(message)
-        while len(self._keypoints) > _REMEMBERED:
-            del self._keypoints[min(self._keypoints)]
-
     def _take_image(self, message: Any, stamp: int) -> None:
-        self._images['received'] += 1
-        newest = self._newest_image
-        if newest is not None and stamp <= newest:
-            text = f'image of {stamp} ns comes after one of {newest} ns'
-            if stamp == newest:
-                self._skip('time stands still', f'{text}, wanted stamps that increase')
-                return
-            if not self.parameters.reset_on_time_jump:
-                self._skip(
-                    'time jumps back',
-                    f'{text}: skipped; with reset_on_time_jump the track would start anew',
-                )
-                return
-            self._log.note('time jumps back', f'{text}: the track starts anew')
+        in_time = self._input.judge_stamp(stamp, self.parameters.reset_on_time_jump)
+        if in_time is InTime.SKIPPED:
+            return
+        if in_time is InTime.JUMP:
             self._track_all()
             self._keypoints.clear()
-            self._newest_keypoints = -1
-            self._newest_image = None
+            self._predictions.clear()
             self._start_anew()
-        try:
-            picture = decode_image(message)
-        except ImageError as error:
-            self._skip('image', str(error))
-            return
-        self._newest_image = stamp
-        self._waiting.append(_WaitingImage(picture, stamp, str(message.header.frame_id)))
+        self._input.take_image(message, stamp)
 
     def _start_anew(self) -> None:
         try:
@@ -258,74 +213,82 @@ class FilterSession:
             content.confidence[use],
         )
 
+    def _prediction_in(self, message: Any) -> GaussianMixture | None:
+        """A mixture over poses of the body; None: nobody was seen."""
+        if len(message.components) == 0:
+            return None
+        body = self.start.body
+        try:
+            if message.body_model and str(message.body_model) != body.name:
+                raise MessageError(
+                    f'pose_prediction is of the body {message.body_model}, wanted one of '
+                    f'{body.name}'
+                )
+            return pose_mixture_of(message, body.dof_names).mixture
+        except ValueError as error:
+            self._log.fault('pose_prediction', str(error))
+            return None
+
     # What comes out.
 
     def _track_what_is_ready(self) -> None:
-        while self._waiting and self._camera is not None and self._has_keypoints(self._waiting[0]):
-            self._track(self._waiting.popleft(), self._camera)
-        while len(self._waiting) > self.parameters.queue_size:
-            dropped = self._waiting.popleft()
-            self._images['dropped'] += 1
-            if self._camera is None:
-                # An uncalibrated camera_info has been told already.
-                self._log.fault(
-                    'camera_info',
-                    f'image of {dropped.stamp_ns} ns is dropped: it waited for a calibrated '
-                    'camera_info',
-                )
-            else:
-                self._log.fault(
-                    'no keypoints',
-                    f'image of {dropped.stamp_ns} ns is dropped: no keypoints of its stamp have '
-                    f'come, and queue_size is {self.parameters.queue_size}',
-                )
+        source = self._input
+        while source.waiting and source.camera is not None and self._is_ready(source.waiting[0]):
+            self._track(source.waiting.popleft(), source.camera)
+        size = self.parameters.queue_size
+        for dropped in source.drop_excess(size):
+            what = 'pose_prediction' if self._has_keypoints(dropped.stamp_ns) else 'keypoints'
+            self._log.fault(
+                f'no {what}',
+                f'image of {dropped.stamp_ns} ns is dropped: no {what} of its stamp has come, and '
+                f'queue_size is {size}',
+            )
 
     def _track_all(self) -> None:
         """Nothing more comes of this track: what waits is tracked as it is."""
-        while self._waiting and self._camera is not None:
-            self._track(self._waiting.popleft(), self._camera)
-        self._images['dropped'] += len(self._waiting)
-        self._waiting.clear()
+        source = self._input
+        while source.waiting and source.camera is not None:
+            self._track(source.waiting.popleft(), source.camera)
+        source.forget_images()
 
-    def _has_keypoints(self, waiting: _WaitingImage) -> bool:
-        if not self.parameters.use_keypoints:
-            return True
+    def _is_ready(self, waiting: WaitingImage) -> bool:
         stamp = waiting.stamp_ns
-        if stamp in self._keypoints or self._newest_keypoints > stamp:
-            return True
-        assert self._newest_image is not None
-        return self._newest_image - stamp > self.parameters.keypoints_timeout * SECOND_NS
+        return self._has_keypoints(stamp) and self._has_prediction(stamp)
 
-    def _track(self, waiting: _WaitingImage, camera: Camera) -> None:
-        height, width = waiting.image.shape[:2]
-        if (width, height) != (camera.width, camera.height):
-            self._skip(
-                'size of the image',
-                f'image has {width}x{height} pixels, wanted the {camera.width}x{camera.height} of '
-                'camera_info',
-            )
+    def _has_keypoints(self, stamp: int) -> bool:
+        p = self.parameters
+        return not p.use_keypoints or self._has(self._keypoints, stamp, p.keypoints_timeout)
+
+    def _has_prediction(self, stamp: int) -> bool:
+        p = self.parameters
+        return not p.use_predictions or self._has(self._predictions, stamp, p.prediction_timeout)
+
+    def _has(self, inputs: StampedInputs[Any], stamp: int, timeout: float) -> bool:
+        assert self._input.newest is not None
+        return inputs.is_settled(stamp) or self._input.newest - stamp > timeout * SECOND_NS
+
+    def _track(self, waiting: WaitingImage, camera: Camera) -> None:
+        if not self._input.fits(waiting):
             return
-        keypoints = None
-        if self.parameters.use_keypoints:
-            keypoints = self._keypoints.get(waiting.stamp_ns)
-            for stamp in [stamp for stamp in self._keypoints if stamp <= waiting.stamp_ns]:
-                del self._keypoints[stamp]
+        stamp = waiting.stamp_ns
+        keypoints = self._keypoints.take(stamp) if self.parameters.use_keypoints else None
+        prediction = self._predictions.take(stamp) if self.parameters.use_predictions else None
         starts = self._tracker is None or self._tracker.status is Status.WAITING
         try:
             if self._tracker is None:
                 self._tracker = self.start.tracker(camera)
-            posterior, likelihood = self._tracker.step(waiting.image, waiting.stamp_ns, keypoints)
+            posterior, likelihood = self._tracker.step(waiting.image, stamp, keypoints, prediction)
             if starts and posterior is not None:
-                self._tell_how_old_the_start_is(waiting.stamp_ns)
+                self._tell_how_old_the_start_is(stamp)
             if posterior is not None and likelihood is not None:
                 self._publish(self._tracker, waiting, posterior, likelihood)
         except (ValueError, ArithmeticError) as error:
             text = ' '.join(str(error).split()) or type(error).__name__
             if not starts:
-                self._skip('estimate', f'image of {waiting.stamp_ns} ns can not be tracked: {text}')
+                self._input.skip('estimate', f'image of {stamp} ns can not be tracked: {text}')
                 return
             # The next image would fail as this one did, after as long a time.
-            self._skip('start', f'no track starts at the image of {waiting.stamp_ns} ns: {text}')
+            self._input.skip('start', f'no track starts at the image of {stamp} ns: {text}')
             self.restart(replace(self.start, background=None, initial=None))
 
     def _tell_how_old_the_start_is(self, stamp_ns: int) -> None:
@@ -340,7 +303,7 @@ class FilterSession:
     def _publish(
         self,
         tracker: Tracker,
-        waiting: _WaitingImage,
+        waiting: WaitingImage,
         posterior: GaussianMixture,
         likelihood: GaussianMixture,
     ) -> None:
@@ -348,7 +311,7 @@ class FilterSession:
         track = TrackedImage(
             image=waiting.image,
             stamp_ns=waiting.stamp_ns,
-            frame_id=waiting.frame_id or self._camera_frame or FRAME_ID,
+            frame_id=self._input.frame_of(waiting),
             body=tracker.body,
             camera=tracker.camera,
             posterior=posterior,
@@ -372,18 +335,14 @@ class FilterSession:
         track_messages(self._messages, track, presentation, self._wanted, publish)
         self._shown_body = tracker.body
         self._weights = posterior.weights
-        self._images['tracked'] += 1
+        self._input.counts['tracked'] += 1
 
     # What is told.
-
-    def _skip(self, kind: str, text: str) -> None:
-        self._images['skipped'] += 1
-        self._log.fault(kind, text)
 
     def _present_state(self) -> SessionState:
         tracker = self._tracker
         status, wants = 'no camera', 'a calibrated camera_info'
-        if self._camera is not None:
+        if self._input.camera is not None:
             status = (Status.WAITING if tracker is None else tracker.status).value
             wants = self._wants() if status == Status.WAITING.value else ''
         tracked = len(self._weights) > 0 and tracker is not None
@@ -396,15 +355,17 @@ class FilterSession:
             entropy=abs(float(-(positive * np.log(positive)).sum())) if tracked else math.nan,
             misfit=tracker.misfit if tracker is not None and tracked else math.nan,
             evaluations=tracker.evaluations if tracker is not None and tracked else 0,
-            images=Counter(self._images),
+            images=Counter(self._input.counts),
             faults=Counter(self._log.faults),
             last_fault=self._log.last_fault,
         )
 
     def _wants(self) -> str:
         initial = self.start.initial
+        if initial is None and self.parameters.use_predictions:
+            return 'a pose_prediction with components'
         if initial is None:
-            return 'subject_file, or ~/reset with a mixture'
+            return 'subject_file, use_predictions, or ~/reset with a mixture'
         if isinstance(initial, GaussianMixture):
             return 'an image'
         return f'an image of {initial.stamp_ns} ns or later, where the subject was seen'

@@ -148,7 +148,11 @@ class Tracker:
         self.status = Status.WAITING
 
     def step(
-        self, image: Image, stamp: int, keypoints: Keypoints | None = None
+        self,
+        image: Image,
+        stamp: int,
+        keypoints: Keypoints | None = None,
+        prediction: GaussianMixture | None = None,
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """Takes the next image.
 
@@ -156,14 +160,23 @@ class Tracker:
             image: (H, W, 3) BGR uint8, of the camera's size.
             stamp: of the image, ns; later than the one before.
             keypoints: joints seen in this image, if any.
+            prediction: poses that a regression expects by this image, if any. They start a track
+                that has no other start, are among the hypotheses of every image, and of a lost
+                track; they are no evidence, which would count the image twice.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses,
             heaviest first with weights that sum to 1; (None, None) while there is no track.
 
         Raises:
-            ValueError: an image of another size, or a stamp that does not increase.
+            ValueError: an image of another size, a stamp that does not increase, or a prediction
+                of another dimension.
         """
+        if prediction is not None and prediction.dimension != self.body.dimension:
+            raise ValueError(
+                f'a prediction for {self.body.name} has {self.body.dimension} dimensions, saw '
+                f'{prediction.dimension}'
+            )
         size = (self.camera.height, self.camera.width)
         if image.shape[:2] != size:
             raise ValueError(f'the camera gives images of {size}, saw {image.shape[:2]}')
@@ -171,19 +184,20 @@ class Tracker:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
         self.evaluations = 0
         if self._modes is None:
-            if not self._can_start(stamp):
+            start = self._start_at(stamp, prediction)
+            if start is None:
                 if self._learning:
                     self.background.learn(image)
                 return None, None
             observation = self._observe(image, keypoints)
-            self._begin(observation)
+            self._begin(observation, start)
         else:
             assert self._last_stamp is not None
             observation = self._observe(image, keypoints)
-            if self.status is Status.LOST and self._recover(observation):
+            if self.status is Status.LOST and self._recover(observation, prediction):
                 self._bad_images = 0
             else:
-                self._propagate(observation, (stamp - self._last_stamp) * 1e-9)
+                self._propagate(observation, (stamp - self._last_stamp) * 1e-9, prediction)
         self._last_image, self._last_stamp = image, stamp
         self._judge(observation)
         return self.posterior, self.likelihood_mixture(observation)
@@ -228,26 +242,29 @@ class Tracker:
 
     # The start of a track.
 
-    def _can_start(self, stamp: int) -> bool:
-        if isinstance(self._start, Subject):
-            return stamp >= self._start.stamp_ns
-        return self._start is not None
+    def _start_at(
+        self, stamp: int, prediction: GaussianMixture | None
+    ) -> Subject | GaussianMixture | None:
+        """What a track starts from at an image; None: it does not start there."""
+        start = self._start
+        if start is None:
+            return prediction
+        return None if isinstance(start, Subject) and stamp < start.stamp_ns else start
 
-    def _begin(self, observation: Observation) -> None:
+    def _begin(self, observation: Observation, start: Subject | GaussianMixture) -> None:
         s = self.settings
-        if isinstance(self._start, Subject):
-            begun = start_from_keypoints(self.model, self.camera, self._start)
+        if isinstance(start, Subject):
+            begun = start_from_keypoints(self.model, self.camera, start)
             self._use_body(begun.body)
             self._flesh = FleshFit(self.body)
-            observation = replace(observation, keypoints=self._start.keypoints)
+            observation = replace(observation, keypoints=start.keypoints)
             poses, log_weights = begun.poses, np.zeros(len(begun.poses))
             precisions = np.zeros((len(poses), self.body.dimension, self.body.dimension))
         else:
-            assert self._start is not None
-            poses = self._start.means
+            poses = start.means
             with np.errstate(divide='ignore'):
-                log_weights = np.log(self._start.normalised().weights)
-            precisions = _inverses(self._start.covariances)
+                log_weights = np.log(start.normalised().weights)
+            precisions = _inverses(start.covariances)
 
         def energy(x: Array, index: Index) -> tuple[Array, Array, Array]:
             value, gradient, hessian = self._energy(x, observation, None, None)
@@ -268,12 +285,12 @@ class Tracker:
             solved = self._minimise(energy, solved.x, s.iterations)
             self._keep(solved, log_weights, still, observation)
 
-    def _recover(self, observation: Observation) -> bool:
+    def _recover(self, observation: Observation, prediction: GaussianMixture | None) -> bool:
         """Starts anew from what an image alone shows; False where that is not enough.
 
         The body keeps its lengths and widths. From keypoints come all poses that explain them, from
-        a silhouette mean poses of several headings at its place; the present modes stay in
-        the race.
+        a silhouette mean poses of several headings at its place; what is predicted and the present
+        modes stay in the race.
         """
         s, poses = self.settings, None
         if observation.keypoints is not None:
@@ -282,9 +299,11 @@ class Tracker:
                 poses = poses_from_keypoints(self.body, self.camera, observation.keypoints)
         if poses is None and observation.outline is not None:
             poses = poses_from_outline(self.body, self.camera, observation.outline)
-        if poses is None:
+        if poses is None and prediction is None:
             return False
-        poses = np.concatenate([self.modes.poses, poses])
+        found = [poses] if poses is not None else []
+        found += [np.clip(prediction.means, self.body.lower, self.body.upper)] if prediction else []
+        poses = np.concatenate([self.modes.poses, *found])
 
         def energy(x: Array, _: Index) -> tuple[Array, Array, Array]:
             return self._energy(x, observation, None, None)
@@ -313,7 +332,9 @@ class Tracker:
 
     # One image after another.
 
-    def _propagate(self, observation: Observation, dt: float) -> None:
+    def _propagate(
+        self, observation: Observation, dt: float, prediction: GaussianMixture | None
+    ) -> None:
         s, m, body = self.settings, self.modes, self.body
         predicted, covariances = predict(
             s.dynamics, self._rates, m.poses, m.filtered, m.velocities, dt
@@ -333,6 +354,8 @@ class Tracker:
             candidates = self._jumps.propose(base, sources, covariances, observation, self._rng)
         else:
             candidates = self._samples(base, sources, covariances, observation)
+        if prediction is not None:
+            candidates = joined_candidates(self._expected_elsewhere(prediction, moved), candidates)
         solved = self._solve(candidates, precisions, observation)
         for _ in range(s.rounds - 1 if s.proposals == 'kjs' else 0):
             if solved.value.min() < self._usual_energy + s.surprise:
@@ -357,6 +380,24 @@ class Tracker:
             predicted_mixture = GaussianMixture(np.exp(m.log_weights), moved, covariances)
         self._keep(solved, log_priors, velocities, observation, predicted_mixture)
         self._fit_flesh(observation)
+
+    def _expected_elsewhere(self, prediction: GaussianMixture, moved: Array) -> Candidates:
+        """Candidates that the image suggests, and not the images before."""
+        s, m, body = self.settings, self.modes, self.body
+        prediction = prediction[prediction.weights > 0]
+        poses = np.clip(prediction.means, body.lower, body.upper)
+        apart = relative_joints(body, poses)[:, None] - relative_joints(body, moved)[None]
+        parents = np.linalg.norm(apart, axis=3).mean(2).argmin(1)
+        log_weights = np.log(prediction.normalised().weights)
+        return Candidates(
+            poses,
+            parents,
+            m.log_weights[parents] + np.log(s.prediction_probability) + log_weights,
+            poses,
+            np.ones(poses.shape, dtype=np.bool_),
+            m.textures,
+            parents,
+        )
 
     def _solve(
         self, candidates: Candidates, precisions: Array, observation: Observation

@@ -36,6 +36,8 @@ class TrackerSettings:
         surprise: an image whose least energy exceeds the usual one by this is searched again.
         rounds: of search in such an image at most.
         jump_probability: of a flip of one chain from one image to the next.
+        prediction_probability: of a pose that a regression predicts from the image, and not the
+            images before.
         base_iterations, iterations: Newton steps on the predictions and on the candidates.
         temperature: factor on the image's energy in a mode's weight; below 1 because neighbouring
             measurements err together.
@@ -65,6 +67,7 @@ class TrackerSettings:
     surprise: float = 6.0
     rounds: int = 3
     jump_probability: float = 0.1
+    prediction_probability: float = 0.01
     base_iterations: int = 6
     iterations: int = 6
     temperature: float = 0.3
@@ -98,5 +101,6 @@ class TrackerSettings:
                 raise ValueError(f'{name} must be at least {bound}, saw {getattr(self, name)}')
         if not self.tails > 0:
             raise ValueError(f'tails must be positive, saw {self.tails}')
-        if not 0 < self.jump_probability < 1:
-            raise ValueError(f'jump_probability must lie in (0, 1), saw {self.jump_probability}')
+        for name in ('jump_probability', 'prediction_probability'):
+            if not 0 < getattr(self, name) < 1:
+                raise ValueError(f'{name} must lie in (0, 1), saw {getattr(self, name)}')

@@ -79,7 +79,7 @@ class StandingStill:
 
     log_likelihoods = np.zeros(1)
 
-    def step(self, image, stamp, keypoints=None):
+    def step(self, image, stamp, keypoints=None, prediction=None):
         self.keypoints.append(None if keypoints is None else keypoints.names)
         if stamp < self.start.stamp_ns:
             return None, None
@@ -327,7 +327,7 @@ def test_the_bag_that_is_read_is_never_replaced(still, entries, tmp_path, capsys
 
 
 def test_interruption_leaves_nothing(short, tmp_path, monkeypatch, capsys):
-    def interrupted(self, image, stamp, keypoints=None):
+    def interrupted(self, image, stamp, keypoints=None, prediction=None):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(track_start, 'Tracker', StandingStill)

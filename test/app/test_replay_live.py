@@ -11,9 +11,10 @@ from hmt_ros.app import live_node
 from hmt_ros.app.live_node import LiveNodeError
 from hmt_ros.app.played_track import LiveTrack
 from hmt_ros.app.replay import main
+from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
 from hmt_ros.nodes.declared_parameters import with_values
 from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.filter_session import CAMERA_INFO, IMAGE, KEYPOINTS
+from hmt_ros.nodes.filter_session import KEYPOINTS
 from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from msg_tools import BagReader, BagWriter, RosbagsMessages
 from msg_tools.headers import header_message, time_ns

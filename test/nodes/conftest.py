@@ -42,6 +42,7 @@ class StubTracker:
         self.background = background
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.seen: list[tuple[int, Any]] = []
+        self.predictions: list[GaussianMixture | None] = []
         self._start = None
         StubTracker.made.append(self)
 
@@ -52,15 +53,18 @@ class StubTracker:
     def modes(self):
         return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]))
 
-    def step(self, image, stamp, keypoints=None):
+    def step(self, image, stamp, keypoints=None, prediction=None):
         assert image.shape == (self.camera.height, self.camera.width, 3)
         if self.fault is not None:
             raise self.fault
+        if self._start is None:
+            self._start = prediction
         if self._start is None or (
             isinstance(self._start, Subject) and stamp < self._start.stamp_ns
         ):
             return None, None
         self.seen.append((stamp, keypoints))
+        self.predictions.append(prediction)
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.125, 7
         means = np.tile(self.body.prior_mean, (2, 1))
         means[:, 2] = 4.0
@@ -177,6 +181,14 @@ class Likelihoods:
         means[1, moving] += 0.8
         covariances = np.tile(1e-3 * np.eye(self.body.dimension), (2, 1, 1))
         return GaussianMixture(np.array([0.6, 0.4]), means, covariances)
+
+    def nobody(self, index):
+        """A prediction from an image without a person."""
+        return self.messages.create(
+            'hmt_msgs/msg/PoseMixture',
+            header=header_message(self.messages, self.stamp(index), 'lens'),
+            kind=int(MixtureKind.PREDICTION),
+        )
 
     def message(self, index, body=None, kind=MixtureKind.LIKELIHOOD):
         body, mixture = self.body if body is None else body, self.mixture(index)

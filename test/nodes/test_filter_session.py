@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.body import Camera
+from hmt_ros.body import Camera, load_body
+from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
 from hmt_ros.nodes.declared_parameters import with_values
 from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.filter_session import CAMERA_INFO, IMAGE, KEYPOINTS, FilterSession
+from hmt_ros.nodes.filter_session import KEYPOINTS, PREDICTION, FilterSession
 from hmt_ros.nodes.track_messages import TOPICS
 from hmt_ros.nodes.track_start import prepare_start
 from msg_tools.cdr import deserialise
-from msg_tools.pose_mixtures import pose_mixture_of
+from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
+from test.nodes.conftest import Likelihoods
 
 ROOT = Path(__file__).resolve().parents[2]
 MIXTURES = ['pose_mixture', 'likelihood_mixture']
@@ -378,10 +380,67 @@ def test_keypoints_are_forgotten(session, small_camera):
     one = session(use_keypoints=True)
     for index in range(1000):
         one.take(KEYPOINTS, small_camera.keypoints(index))
-    assert len(one._keypoints) <= 256
+    assert len(one._keypoints._content) <= 256
 
 
 # Starts.
+
+
+def test_predictions_start_a_track(session, small_camera, likelihoods, stub_tracker, outputs):
+    one = session(subject_file='', use_predictions=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    assert one.state.wants == 'a pose_prediction with components'
+    one.take(IMAGE, small_camera.image(0))
+    one.take(PREDICTION, likelihoods.nobody(0))
+    assert tracked(outputs) == []
+    one.take(PREDICTION, likelihoods.message(1, kind=MixtureKind.PREDICTION))
+    one.take(IMAGE, small_camera.image(1))
+    one.take(IMAGE, small_camera.image(2))
+    one.take(PREDICTION, likelihoods.nobody(2))
+    assert tracked(outputs) == [small_camera.stamp(1), small_camera.stamp(2)]
+    first, second = stub_tracker.made[0].predictions
+    assert np.array_equal(first.means, likelihoods.mixture(1).means)
+    assert second is None
+
+
+def test_images_wait_for_predictions(session, small_camera, likelihoods, outputs):
+    one = session(use_predictions=True, prediction_timeout=0.15, queue_size=2)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.take(IMAGE, small_camera.image(1))
+    assert tracked(outputs) == []
+    one.take(IMAGE, small_camera.image(2))
+    assert tracked(outputs) == [small_camera.stamp(0)]
+    one.parameters = replace(one.parameters, prediction_timeout=60.0)
+    handled = one.take(IMAGE, small_camera.image(3))
+    (fault,) = handled.faults
+    assert 'no pose_prediction of its stamp has come, and queue_size is 2' in fault
+    one.take(PREDICTION, likelihoods.message(3))
+    assert tracked(outputs)[1:] == [small_camera.stamp(i) for i in (2, 3)]
+
+
+def test_predictions_are_not_used_unless_asked_for(session, small_camera, likelihoods, outputs):
+    one = session(subject_file='')
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(PREDICTION, likelihoods.message(0))
+    one.take(IMAGE, small_camera.image(0))
+    assert tracked(outputs) == []
+
+
+def test_bad_predictions_are_told_and_not_used(session, small_camera, likelihoods, outputs):
+    one = session(subject_file='', use_predictions=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    of_another = Likelihoods(load_body('human32')).message(0)
+    crooked = likelihoods.message(1)
+    crooked.components[0].mean = np.full(likelihoods.body.dimension, np.nan)
+    for index, message, text in ((0, of_another, 'human32'), (1, crooked, 'finite')):
+        (fault,) = one.take(PREDICTION, message).faults
+        assert text in fault
+        one.take(IMAGE, small_camera.image(index))
+    assert tracked(outputs) == []
+    one.take(PREDICTION, likelihoods.message(2))
+    one.take(IMAGE, small_camera.image(2))
+    assert tracked(outputs) == [small_camera.stamp(2)]
 
 
 def test_waits_for_the_image_of_the_subject(session, outputs, small_camera):
@@ -406,7 +465,7 @@ def test_nothing_starts_without_a_subject(session, small_camera, outputs):
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
     assert tracked(outputs) == []
-    assert one.state.wants == 'subject_file, or ~/reset with a mixture'
+    assert one.state.wants == 'subject_file, use_predictions, or ~/reset with a mixture'
 
 
 def test_settings_reach_the_tracker(session, small_camera, stub_tracker, background_file):
@@ -469,7 +528,7 @@ def test_failed_start_is_told_and_not_tried_again(session, small_camera, stub_tr
     stub_tracker.fault = None
     one.take(IMAGE, small_camera.image(1))
     assert tracked(outputs) == []
-    assert one.state.wants == 'subject_file, or ~/reset with a mixture'
+    assert one.state.wants == 'subject_file, use_predictions, or ~/reset with a mixture'
     one.restart()
     one.take(IMAGE, small_camera.image(2))
     assert tracked(outputs) == [small_camera.stamp(2)]

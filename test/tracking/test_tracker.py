@@ -322,6 +322,67 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     assert np.abs(posterior.means[0, :3] - other[:3]).max() < 0.2
 
 
+def predicted(pose) -> GaussianMixture:
+    """What a regression may say of a pose: near it, or its back to the front."""
+    means = np.stack([pose, pose])
+    means[0, 6:] += 0.05
+    means[1, 5] += np.pi
+    return GaussianMixture([0.5, 0.5], means, np.tile(0.02 * np.eye(len(pose)), (2, 1, 1)))
+
+
+def test_a_prediction_starts_a_track(human32, camera, black, motion, keypoints_of):
+    tracker = Tracker(human32, camera, keypoint_settings())
+    assert tracker.step(black, 0, keypoints_of(human32, motion[0])) == (None, None)
+    for i in (1, 2):
+        seen = keypoints_of(human32, motion[i], 1.0, i)
+        posterior, _ = tracker.step(black, i * FRAME, seen, predicted(motion[1]))
+        assert best_error(human32, posterior, human32, motion[i]) < 0.06
+    # The next track has nothing else to start from, either.
+    tracker.reset()
+    assert tracker.step(black, 0, keypoints_of(human32, motion[0])) == (None, None)
+
+
+def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, motion, keypoints_of):
+    few = ('left_hip', 'right_knee', 'left_wrist', 'right_elbow', 'left_toe')
+    other = jumped(motion)
+    errors = {}
+    for given in (False, True):
+        tracker = started(surprise=1e9, lost_images=2)
+        statuses = []
+        for i in range(6):
+            seen = keypoints_of(human32, motion[i] if i < 3 else other, 1.0, i)
+            rows = [seen.names.index(name) for name in few]
+            # Too few to start from.
+            seen = Keypoints(few, seen.pixels[rows], seen.covariances[rows], np.ones(len(few)))
+            prediction = predicted(other) if given and i == 5 else None
+            posterior, _ = tracker.step(black, i * FRAME, seen, prediction)
+            statuses.append(tracker.status)
+        assert statuses[4] is Status.LOST
+        assert (statuses[5] is Status.TRACKING) == given
+        errors[given] = best_error(tracker.body, posterior, human32, other)
+    assert errors[True] < 0.6 * errors[False]
+
+
+def test_predictions_are_among_the_hypotheses(human32, started, black, motion, keypoints_of):
+    """Search is off: nothing else finds the jump in its image."""
+    errors = {}
+    for given in (False, True):
+        tracker = started(surprise=1e9)
+        for i in range(4):
+            pose = motion[i] if i < 3 else jumped(motion)
+            prediction = predicted(pose) if given else None
+            seen = keypoints_of(human32, pose, 1.0, i)
+            posterior, _ = tracker.step(black, i * FRAME, seen, prediction)
+        errors[given] = best_error(tracker.body, posterior, human32, pose)
+    assert errors[False] > 0.2
+    assert errors[True] < 0.06
+
+
+def test_predictions_of_another_body_are_refused(started, black):
+    with pytest.raises(ValueError, match='32 dimensions, saw 37'):
+        started().step(black, 0, None, GaussianMixture([1.0], np.zeros((1, 37)), np.eye(37)[None]))
+
+
 def test_surprising_images_are_searched_again(human32, started, black, motion, keypoints_of):
     """With rounds of search the same jump is found at once, or an image later."""
     evaluations, quiet = {}, {}
