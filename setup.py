@@ -20,7 +20,7 @@ setup(
     maintainer_email='hmt-ros@example.com',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*', 'msg_tools', 'msg_tools.*']),
     package_data={
-        PACKAGE: ['config/*.yaml', 'body/models/*.yaml'],
+        PACKAGE: ['config/*.yaml', 'body/models/*.yaml', 'experts/models/*.npz'],
         # The message definitions are read by whoever works on bags without ROS.
         'msg_tools': ['hmt_msgs/msg/*.msg', 'hmt_msgs/srv/*.srv'],
     },
@@ -56,8 +56,10 @@ setup(
         'console_scripts': [
             'filter_node = hmt_ros.nodes.filter_node:main',
             'smoother_node = hmt_ros.nodes.smoother_node:main',
+            'bme_node = hmt_ros.nodes.bme_node:main',
             'replay = hmt_ros.app.replay:main',
             'make-bag = hmt_ros.app.make_bag:main',
+            'train = hmt_ros.app.train:main',
             'evaluate = hmt_ros.app.evaluate:main',
         ],
     },

@@ -1,6 +1,7 @@
 """Writes the parts of the pages that are made by programs.
 
-    python docs/generate.py filter_node smoother_node     tables of parameters in nodes.md
+    python docs/generate.py filter_node smoother_node bme_node
+                                           tables of parameters in nodes.md
     python docs/generate.py flips          times in flips.md
     python docs/generate.py kernels        times in likelihood.md
     python docs/generate.py smoothing      exactness and speed in smoothing.md (minutes)
@@ -24,6 +25,7 @@ sys.path.insert(0, str(DOCS.parent))
 PAGES = {
     'filter_node': 'nodes.md',
     'smoother_node': 'nodes.md',
+    'bme_node': 'nodes.md',
     'flips': 'flips.md',
     'kernels': 'likelihood.md',
     'smoothing': 'smoothing.md',
@@ -58,7 +60,7 @@ def with_part(page: str, name: str, content: str) -> str:
 
 def part(name: str) -> str:
     """The content of a part."""
-    if name in ('filter_node', 'smoother_node'):
+    if PAGES[name] == 'nodes.md':
         return parameter_table(name)
     from benchmarks import flips, kernels, smoothing, tracking
 
@@ -68,11 +70,16 @@ def part(name: str) -> str:
 
 def parameter_table(node: str) -> str:
     """All parameters of a node, as it declares them."""
+    from hmt_ros.nodes.bme_parameters import BmeParameters
     from hmt_ros.nodes.declared_parameters import declared_parameters
     from hmt_ros.nodes.filter_parameters import FilterParameters
     from hmt_ros.nodes.smoother_parameters import SmootherParameters
 
-    settings = {'filter_node': FilterParameters(), 'smoother_node': SmootherParameters()}
+    settings = {
+        'filter_node': FilterParameters(),
+        'smoother_node': SmootherParameters(),
+        'bme_node': BmeParameters(),
+    }
     lines = ['| parameter | default | range | takes effect | what |', '|---|---|---|---|---|']
     for parameter in declared_parameters(settings[node]):
         value = parameter.default

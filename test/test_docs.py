@@ -16,7 +16,8 @@ import yaml
 
 from hmt_ros.app import COMMANDS
 from hmt_ros.body import load_body
-from hmt_ros.nodes import smoothed_messages, track_messages
+from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
+from hmt_ros.nodes.bme_parameters import BmeParameters
 from hmt_ros.nodes.declared_parameters import declared_parameters
 from hmt_ros.nodes.filter_parameters import FilterParameters
 from hmt_ros.nodes.smoother_parameters import SmootherParameters
@@ -36,6 +37,7 @@ BLOCK = re.compile(r'^(<!-- run -->\n)?```(\w+)\n(.*?)^```$', re.MULTILINE | re.
 NODES = {
     'filter_node': (FilterParameters(), track_messages.TOPICS),
     'smoother_node': (SmootherParameters(), smoothed_messages.TOPICS),
+    'bme_node': (BmeParameters(), bme_session.TOPICS),
 }
 # Programs that are not part of this repository.
 FOREIGN = {

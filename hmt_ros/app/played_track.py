@@ -1,6 +1,7 @@
-"""Filter and smoother that take the messages of a bag, offline or as real nodes.
+"""BME, filter and smoother that take the messages of a bag, offline or as real nodes.
 
-The filter takes a message; what it publishes on `body` and `likelihood_mixture` the smoother takes,
+The BME takes an image before the filter does, and the filter what it publishes on
+`pose_prediction`; what the filter publishes on `body` and `likelihood_mixture` the smoother takes,
 in the same order; then the next message follows. At the end of the bag the smoother is told that
 there is no more: the node, to which no message says so, is deactivated.
 """
@@ -10,23 +11,35 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from hmt_ros.app.live_node import LiveNode, Player
-from hmt_ros.nodes import smoothed_messages, track_messages
+from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
+from hmt_ros.nodes.bme_parameters import BmeParameters
+from hmt_ros.nodes.bme_session import BmeSession
 from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
 from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.filter_session import KEYPOINTS, FilterSession
+from hmt_ros.nodes.filter_session import KEYPOINTS, PREDICTION, FilterSession
 from hmt_ros.nodes.handled import Handled, Output
 from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.nodes.smoother_session import BODY, FINISH, MIXTURE, SmootherSession
 from msg_tools.cdr import deserialise
 
-FILTER, SMOOTHER = 'filter_node', 'smoother_node'
+FILTER, SMOOTHER, BME = 'filter_node', 'smoother_node', 'bme_node'
 # What the smoother takes of the filter: topics, which it calls by the same names.
 HANDED_ON = (BODY, MIXTURE)
+# What the BME takes of the bag.
+SEEN_BY_BME = (CAMERA_INFO, IMAGE)
 
 Write = Callable[[str, int, bytes], None]
+
+
+class NodeParameters(NamedTuple):
+    """Parameters of the nodes that play; None: the node does not."""
+
+    filter: FilterParameters
+    smoother: SmootherParameters | None = None
+    bme: BmeParameters | None = None
 
 
 class PlayedTrack(Protocol):
@@ -54,20 +67,23 @@ class OfflineTrack:
     """Without ROS.
 
     Args:
-        parameters: of the filter.
-        smoothing: of the smoother; None: none.
+        parameters: of the nodes.
         write: takes topic, stamp and bytes of all that is published.
+
+    Raises:
+        ValueError: the parameters name a file that can not be used.
     """
 
-    def __init__(
-        self, parameters: FilterParameters, smoothing: SmootherParameters | None, write: Write
-    ) -> None:
+    def __init__(self, parameters: NodeParameters, write: Write) -> None:
         self._write = write
+        self._predicted: list[Output] = []
         self._handed: list[Output] = []
-        self._filter = FilterSession(parameters, self._filtered)
-        self._smoother = None
-        if smoothing is not None:
-            self._smoother = SmootherSession(smoothing, lambda output: write(*output))
+        self._bme = self._smoother = None
+        if parameters.bme is not None:
+            self._bme = BmeSession(parameters.bme, self._predict)
+        self._filter = FilterSession(parameters.filter, self._filtered)
+        if parameters.smoother is not None:
+            self._smoother = SmootherSession(parameters.smoother, lambda output: write(*output))
 
     def __enter__(self) -> OfflineTrack:
         return self
@@ -82,7 +98,14 @@ class OfflineTrack:
 
     def take(self, source: str, message: Any) -> Handled:
         """See `PlayedTrack`."""
-        result = self._filter.take(source, message)
+        result = None
+        if self._bme is not None and source in SEEN_BY_BME:
+            result = self._bme.take(source, message)
+            predicted, self._predicted = self._predicted, []
+            for topic, _, data in predicted:
+                read = deserialise(data, bme_session.TOPICS[topic].msgtype)
+                result = _together(result, self._filter.take(PREDICTION, read))
+        result = _together(result, self._filter.take(source, message))
         handed, self._handed = self._handed, []
         if self._smoother is not None:
             for topic, _, data in handed:
@@ -96,6 +119,10 @@ class OfflineTrack:
             return Handled(FINISH, 0, (), (), ())
         return self._smoother.finish()
 
+    def _predict(self, output: Output) -> None:
+        self._write(*output)
+        self._predicted.append(output)
+
     def _filtered(self, output: Output) -> None:
         self._write(*output)
         if output.topic in HANDED_ON:
@@ -106,52 +133,65 @@ class LiveTrack:
     """The real nodes, over DDS in lock step.
 
     Args:
-        parameters: of the filter.
-        smoothing: of the smoother; None: it is not started.
+        parameters: of the nodes.
         write: takes topic, stamp and bytes of all that is published, in the order of the nodes.
 
     Raises:
         LiveNodeError: there is no ROS, or a node does not start, answer or end.
     """
 
-    def __init__(
-        self, parameters: FilterParameters, smoothing: SmootherParameters | None, write: Write
-    ) -> None:
-        self._parameters, self._smoothing, self._write = parameters, smoothing, write
+    def __init__(self, parameters: NodeParameters, write: Write) -> None:
+        self._parameters, self._write = parameters, write
+        self._bme: LiveNode | None = None
         self._smoother: LiveNode | None = None
 
     def __enter__(self) -> LiveTrack:
         with ExitStack() as opened:
             player = Player(opened)
-            kind = 'Image'
-            topic = 'image'
-            if self._parameters.image_transport == 'compressed':
+            kind, topic = 'Image', 'image'
+            if self._parameters.filter.image_transport == 'compressed':
                 kind, topic = 'CompressedImage', 'image/compressed'
+            inputs = {
+                CAMERA_INFO: ('camera_info', 'sensor_msgs/msg/CameraInfo'),
+                KEYPOINTS: ('keypoints', 'hmt_msgs/msg/Keypoints2D'),
+                IMAGE: (topic, f'sensor_msgs/msg/{kind}'),
+            }
+            if self._parameters.bme is not None:
+                self._bme = LiveNode(
+                    player,
+                    opened,
+                    BME,
+                    self._parameters.bme,
+                    inputs={},
+                    topics=bme_session.TOPICS,
+                    sensors=(f'/{topic}', '/camera_info'),
+                    write=self._write,
+                )
             self._filter = LiveNode(
                 player,
                 opened,
                 FILTER,
-                self._parameters,
-                inputs={
-                    CAMERA_INFO: ('camera_info', 'sensor_msgs/msg/CameraInfo'),
-                    KEYPOINTS: ('keypoints', 'hmt_msgs/msg/Keypoints2D'),
-                    IMAGE: (topic, f'sensor_msgs/msg/{kind}'),
-                },
+                self._parameters.filter,
+                inputs=inputs,
                 topics=track_messages.TOPICS,
                 sensors=(f'/{topic}', '/camera_info', '/keypoints'),
                 write=self._write,
             )
-            if self._smoothing is not None:
+            if self._parameters.smoother is not None:
                 self._smoother = LiveNode(
                     player,
                     opened,
                     SMOOTHER,
-                    self._smoothing,
+                    self._parameters.smoother,
                     inputs={},
                     topics=smoothed_messages.TOPICS,
                     write=self._write,
                 )
             self._filter.wait_until_active()
+            if self._bme is not None:
+                self._bme.wait_until_active()
+                taken = [inputs[source][0] for source in SEEN_BY_BME]
+                self._filter.wait_for_subscribers((*taken, PREDICTION), 2)
             if self._smoother is not None:
                 self._smoother.wait_until_active()
                 self._filter.wait_for_subscribers(HANDED_ON, 2)
@@ -166,9 +206,9 @@ class LiveTrack:
     ) -> None:
         with self._opened:
             if kind is None:
-                self._filter.stop_well()
-                if self._smoother is not None:
-                    self._smoother.stop_well()
+                for node in (self._bme, self._filter, self._smoother):
+                    if node is not None:
+                        node.stop_well()
 
     def take(self, source: str, message: Any) -> Handled:
         """See `PlayedTrack`.
@@ -177,7 +217,13 @@ class LiveTrack:
             LiveNodeError: a node has ended, or does not answer.
         """
         self._filter.publish(source, message)
-        result = self._filter.answer(source)
+        result = None
+        if self._bme is not None and source in SEEN_BY_BME:
+            result = self._bme.answer(source)
+            # The filter gets the prediction as well, before or after what it is from.
+            for topic, _ in result.published:
+                result = _together(result, self._filter.answer(topic))
+        result = _together(result, self._filter.answer(source))
         if self._smoother is not None:
             handed = [topic for topic, _ in result.published if topic in HANDED_ON]
             for topic in handed:
@@ -192,8 +238,10 @@ class LiveTrack:
         return self._smoother.answer(FINISH)
 
 
-def _together(one: Handled, other: Handled) -> Handled:
+def _together(one: Handled | None, other: Handled) -> Handled:
     """What became of a message, and of one that it led to."""
+    if one is None:
+        return other
     return Handled(
         one.source,
         one.stamp_ns,

@@ -1,8 +1,10 @@
 """replay: tracks and smooths the person in a bag, offline or through live nodes, into a new bag.
 
+Without a subject file the track starts from what a trained model predicts from the images.
+
 Both ways give the same messages to the same objects in the same order, and write what comes out in
 the order in which it came: the bags are the same, byte for byte. What stands in one is listed in
-`hmt_ros.nodes.track_messages` and `hmt_ros.nodes.smoothed_messages`.
+`hmt_ros.nodes.track_messages`, `smoothed_messages` and `bme_session`.
 """
 
 from __future__ import annotations
@@ -10,16 +12,25 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 import yaml
 from tqdm import tqdm
 
-from hmt_ros.app.played_track import FILTER, SMOOTHER, LiveTrack, OfflineTrack, PlayedTrack
+from hmt_ros.app.played_track import (
+    BME,
+    FILTER,
+    SMOOTHER,
+    LiveTrack,
+    NodeParameters,
+    OfflineTrack,
+    PlayedTrack,
+)
 from hmt_ros.app.recorded_input import GROUND_TRUTH, RecordedInput, recorded_input
-from hmt_ros.nodes import smoothed_messages, track_messages
+from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
+from hmt_ros.nodes.bme_parameters import BmeParameters
 from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
 from hmt_ros.nodes.declared_parameters import with_values
 from hmt_ros.nodes.filter_parameters import FilterParameters
@@ -36,12 +47,15 @@ Settings = TypeVar('Settings')
 
 # What the bag and the command say, whatever a parameter file says.
 _DECIDED_HERE = ('image_transport', 'autostart')
-_OF_SMOOTHER = 'smoother.'
+# What stands before the parameters of a node in --set.
+_PREFIXES = {SMOOTHER: 'smoother.', BME: 'bme.', FILTER: ''}
 # What every node has.
 _OF_ROS = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
 
 EPILOG = """\
-A track starts from a subject file, which says where the joints of the person are in one image:
+A track starts from a subject file, which says where the joints of the person are in one image;
+without one from what a trained model predicts from silhouettes (--bme), which knows nothing of the
+person's size:
 
   stamp_ns: 1700000000000000000          # of that image
   sigma_px: 3.0                          # how exactly one has clicked
@@ -52,12 +66,14 @@ A track starts from a subject file, which says where the joints of the person ar
 OUT gets the topics pose_mixture and likelihood_mixture (hmt_msgs/PoseMixture: weights, poses,
 covariances, joint positions), body, joint_states, /tf, markers and overlay/compressed; of the
 smoother smoothed_pose_mixture, trajectory_mixture, smoothed_joint_states and trajectory_markers;
-and the ground_truth of IN where it has one. It is written whole or not at all.
+of the BME pose_prediction; and the ground_truth of IN where it has one. It is written whole or not
+at all.
 
 examples:
   replay bags/reach -o out --subject bags/reach/subject.yaml --background bags/reach/background.png
   replay walk.mcap -o out --subject walk.yaml --set max_hypotheses=16 --set proposals=css --seed 1
   replay walk.mcap -o out --subject walk.yaml --config filter.yaml --live
+  replay walk.mcap -o out --background empty.png --set bme.stature=1.75
 
 exit code: 0 done, 1 bad input (one line on stderr says which), 130 interrupted
 """
@@ -121,6 +137,14 @@ def _parser() -> argparse.ArgumentParser:
     person = parser.add_argument_group('the person')
     person.add_argument('--subject', type=Path, metavar='FILE', help='subject file, see below')
     person.add_argument(
+        '--bme',
+        nargs='?',
+        const='',
+        metavar='MODEL',
+        help='predict poses with a trained model too, and use them (always without --subject); '
+        'without MODEL the small one that comes with the package',
+    )
+    person.add_argument(
         '--background',
         type=Path,
         metavar='FILE',
@@ -138,16 +162,16 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         metavar='FILE',
         help='parameter file, such as hmt_ros/config/filter_node.yaml, which lists all of the '
-        'filter; what is for the smoother stands in a section smoother_node. May be given several '
-        'times',
+        'filter; what is for the others stands in sections smoother_node and bme_node. May be '
+        'given several times',
     )
     settings.add_argument(
         '--set',
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help='one parameter of the filter, or smoother.NAME=VALUE; may be given several times, and '
-        'goes before --config',
+        help='one parameter of the filter, or smoother.NAME=VALUE, or bme.NAME=VALUE; may be given '
+        'several times, and goes before --config',
     )
     settings.add_argument('--seed', type=int, metavar='N', help='of all that is random (0)')
 
@@ -179,24 +203,35 @@ def _replay(options: argparse.Namespace) -> str:
         if bag.damage is not None and not options.keep_going:
             raise BagError(f'{source} {bag.damage}')
         recorded = recorded_input(bag, options.image_topic, options.camera_info_topic)
-        parameters = _filter_parameters(options, recorded)
-        smoothing = None if options.no_smoother else _smoother_parameters(options)
-        if not parameters.subject_file:
-            raise ValueError(f'--subject FILE is needed to start a track; {_subject_hint(source)}')
+        parameters = _node_parameters(options, recorded)
         # What the parameters name is looked at before a node is started.
-        subject = prepare_start(parameters).initial
+        subject = prepare_start(parameters.filter).initial
+        if subject is None and not options.quiet:
+            _tell(f'no --subject: the track starts from a prediction{_subject_hint(source)}')
         with BagWriter(target, overwrite=options.overwrite) as out:
             topics = dict(track_messages.TOPICS)
-            if smoothing is not None:
+            if parameters.smoother is not None:
                 topics.update(smoothed_messages.TOPICS)
+            if parameters.bme is not None:
+                topics.update(bme_session.TOPICS)
             for topic, published in topics.items():
                 out.add_topic(topic, published.msgtype, latched=published.latched)
             way = LiveTrack if options.live else OfflineTrack
-            with way(parameters, smoothing, out.write_serialised) as track:
-                count = _play(options, bag, recorded, parameters, track, out)
+            with way(parameters, out.write_serialised) as track:
+                count = _play(options, bag, recorded, parameters.filter, track, out)
             if not count.tracked:
                 raise ValueError(f'{source}: {_why_nothing(count, subject)}')
     return f'{target}: {count.tracked} of {count.images} images tracked'
+
+
+def _node_parameters(options: argparse.Namespace, recorded: RecordedInput) -> NodeParameters:
+    tracking = _filter_parameters(options, recorded)
+    smoothing = None if options.no_smoother else _smoother_parameters(options)
+    predicting = None
+    if options.bme is not None or not tracking.subject_file:
+        predicting = _bme_parameters(options, recorded, tracking)
+        tracking = replace(tracking, use_predictions=True)
+    return NodeParameters(tracking, smoothing, predicting)
 
 
 def _filter_parameters(options: argparse.Namespace, recorded: RecordedInput) -> FilterParameters:
@@ -225,12 +260,29 @@ def _smoother_parameters(options: argparse.Namespace) -> SmootherParameters:
     return with_values(SmootherParameters(), values)
 
 
+def _bme_parameters(
+    options: argparse.Namespace, recorded: RecordedInput, tracking: FilterParameters
+) -> BmeParameters:
+    values = {
+        'background_file': tracking.background_file,
+        **{
+            f'background.{field.name}': getattr(tracking.background, field.name)
+            for field in fields(tracking.background)
+        },
+        **_given_values(options, BME),
+        'image_transport': recorded.transport,
+    }
+    if options.bme:
+        values['model_file'] = options.bme
+    return with_values(BmeParameters(), values)
+
+
 def _given_values(options: argparse.Namespace, node: str) -> dict[str, Any]:
     """What --config and --set give a node, by name."""
     values: dict[str, Any] = {}
     for file in options.config:
         # What stands for all nodes is the filter's: many names mean something else to the smoother.
-        read = read_parameter_file(file, node, by_name=node == SMOOTHER)
+        read = read_parameter_file(file, node, by_name=node != FILTER)
         values.update(
             (name, value)
             for name, value in read.items()
@@ -238,12 +290,12 @@ def _given_values(options: argparse.Namespace, node: str) -> dict[str, Any]:
         )
     for text in options.set:
         name, equals, value = text.partition('=')
-        of_smoother = name.startswith(_OF_SMOOTHER)
-        name = name.removeprefix(_OF_SMOOTHER)
+        of = next(of for of, prefix in _PREFIXES.items() if name.startswith(prefix))
+        name = name.removeprefix(_PREFIXES[of])
         if not equals or name in _DECIDED_HERE:
             why = f'{name} is decided by replay' if equals else 'wanted NAME=VALUE'
             raise ValueError(f'--set {text}: {why}')
-        if of_smoother != (node == SMOOTHER):
+        if of != node:
             continue
         try:
             values[name] = yaml.safe_load(value)
@@ -257,8 +309,8 @@ def _given_values(options: argparse.Namespace, node: str) -> dict[str, Any]:
 def _subject_hint(bag: Path) -> str:
     beside = (bag if bag.is_dir() else bag.parent) / 'subject.yaml'
     if beside.is_file():
-        return f'beside the bag lies {beside}'
-    return 'it says where the joints of the person are in one image, --help shows one'
+        return f'; beside the bag lies {beside}'
+    return ''
 
 
 @dataclass

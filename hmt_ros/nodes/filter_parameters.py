@@ -54,7 +54,7 @@ _TRACKER_LIMITS = {
     'search.refined': (1, 1024),
     'search.iterations': (1, 100),
 }
-_BACKGROUND_LIMITS = {
+BACKGROUND_LIMITS = {
     'shadow_threshold': _FRACTION,
     'smallest_part': _FRACTION,
     'largest_gap': (0.0, 10.0),
@@ -124,7 +124,7 @@ class FilterParameters:
     )
     background: BackgroundSettings = field(
         default_factory=BackgroundSettings,
-        metadata={EFFECT: NEXT_TRACK, LIMITS: _BACKGROUND_LIMITS},
+        metadata={EFFECT: NEXT_TRACK, LIMITS: BACKGROUND_LIMITS},
     )
 
     def __post_init__(self) -> None:

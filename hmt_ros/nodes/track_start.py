@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,10 +12,9 @@ from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes.filter_parameters import FilterParameters
+from hmt_ros.nodes.picture_file import read_picture
 from hmt_ros.tracking import Subject, Tracker, read_subject
 from msg_tools.pose_mixtures import pose_mixture_of
-
-_LARGEST_FILE = 2**28  # bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +70,7 @@ def prepare_start(
         ValueError: a file or a mixture that can not be used; one line that says why.
     """
     body = _body(parameters.body_model)
-    background = _picture(parameters.background_file) if parameters.background_file else None
+    background = read_picture(parameters.background_file) if parameters.background_file else None
     initial: Subject | GaussianMixture | None = None
     if mixture is not None and len(mixture.components):
         if present is not None and present.name == body.name:
@@ -96,27 +93,3 @@ def _body(model: str) -> Body:
     if not body.shapes:
         raise ValueError(f'body_model {model} has no flesh: wanted one such as human37')
     return body
-
-
-def _picture(file: str) -> NDArray[np.uint8]:
-    """A picture, BGR.
-
-    Raises:
-        ValueError: there is none in the file.
-    """
-    path = Path(file)
-    try:
-        if path.stat().st_size > _LARGEST_FILE:
-            raise ValueError(f'{path}: {path.stat().st_size} bytes, wanted a picture')
-        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    except OSError as error:
-        raise ValueError(f'{path}: can not be read ({error.strerror})') from error
-    picture = None
-    if data.size:
-        try:
-            picture = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        except cv2.error:
-            picture = None
-    if picture is None:
-        raise ValueError(f'{path}: not a picture that OpenCV reads, wanted png or jpeg for example')
-    return np.asarray(picture, dtype=np.uint8)

@@ -9,7 +9,7 @@ import pytest
 
 from hmt_ros.app import live_node
 from hmt_ros.app.live_node import LiveNodeError
-from hmt_ros.app.played_track import LiveTrack
+from hmt_ros.app.played_track import LiveTrack, NodeParameters
 from hmt_ros.app.replay import main
 from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
 from hmt_ros.nodes.declared_parameters import with_values
@@ -150,7 +150,7 @@ class Nobody:
 
 def test_node_that_is_silent_or_dies_is_told(parameters, monkeypatch):
     entries = {topic: message for topic, _, message in recorded(1)}
-    with LiveTrack(parameters, None, lambda *output: None) as track:
+    with LiveTrack(NodeParameters(parameters), lambda *output: None) as track:
         running = track._filter
         handled = track.take(CAMERA_INFO, entries['camera_info'])
         assert (handled.source, handled.faults, handled.published) == (CAMERA_INFO, (), ())
@@ -170,7 +170,7 @@ def test_node_that_does_not_start_is_told(parameters, monkeypatch):
     monkeypatch.setattr(live_node.sys, 'executable', '/bin/false')
     with (
         pytest.raises(LiveNodeError, match='ended with code 1: it has said nothing'),
-        LiveTrack(parameters, SmootherParameters(), lambda *output: None),
+        LiveTrack(NodeParameters(parameters, SmootherParameters()), lambda *output: None),
     ):
         raise AssertionError('it has started')
 

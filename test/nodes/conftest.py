@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 from dataclasses import dataclass, field
+from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.nodes import track_start
+from hmt_ros.nodes import bme_session, track_start
 from hmt_ros.tracking import Status, Subject, TrackerSettings
 from msg_tools import RosbagsMessages
 from msg_tools.bodies import message_of_body
@@ -135,6 +136,64 @@ class SmallCamera:
 @pytest.fixture
 def small_camera():
     return SmallCamera()
+
+
+@dataclass
+class Somebody(SmallCamera):
+    """A camera that sees a white pillar of 10x24 pixels, which moves, before a grey wall."""
+
+    def picture(self, index, size=(64, 48)):
+        picture = np.full((size[1], size[0], 3), 90, np.uint8)
+        left = 20 + round(index) % 20
+        picture[12:36, left : left + 10] = 250
+        return picture
+
+    def at_the_border(self, index):
+        picture = np.full((48, 64, 3), 90, np.uint8)
+        picture[12:36, :8] = 250
+        return image_message(self.messages, picture, self.stamp(index), 'lens')
+
+    def empty(self, index):
+        wall = np.full((48, 64, 3), 90, np.uint8)
+        return image_message(self.messages, wall, self.stamp(index), 'lens')
+
+
+@pytest.fixture
+def somebody():
+    return Somebody()
+
+
+class StubPredictor:
+    """What `hmt_ros.experts.PosePredictor` shows; its poses do not depend on the silhouette."""
+
+    body = load_body('human37')
+    asked: list[tuple[Any, GaussianMixture | None, float]] = []  # noqa: RUF012
+    fault: Exception | None = None
+
+    def with_body(self, body):
+        assert body is not self.body
+        return self
+
+    def observe(self, mask, camera, previous=None, *, max_components=8, size_spread=0.06):
+        if self.fault is not None:
+            raise self.fault
+        StubPredictor.asked.append((mask, previous, size_spread))
+        means = np.tile(self.body.prior_mean, (2, 1))
+        means[:, 2] = [4.0, 4.5]
+        covariances = np.tile(1e-2 * np.eye(self.body.dimension), (2, 1, 1))
+        return SimpleNamespace(
+            mixture=GaussianMixture([0.7, 0.3], means, covariances)[:max_components].normalised(),
+            place=SimpleNamespace(remarks=('cut at the left',) if mask[:, 0].any() else ()),
+            support=0.5,
+        )
+
+
+@pytest.fixture
+def stub_predictor(monkeypatch):
+    monkeypatch.setattr(bme_session, 'load_predictor', lambda path: StubPredictor())
+    monkeypatch.setattr(StubPredictor, 'asked', [])
+    monkeypatch.setattr(StubPredictor, 'fault', None)
+    return StubPredictor
 
 
 @pytest.fixture(scope='session')
@@ -287,6 +346,15 @@ class World:
             f'an answer to {source}',
         )
         return next(handled for handled in self.handled[count:] if handled.name == source)
+
+    @staticmethod
+    def of_ros(message):
+        """A message of rosbags as one of ROS."""
+        from rclpy.serialization import deserialize_message
+
+        package, _, name = message.__msgtype__.split('/')
+        kind = getattr(import_module(f'{package}.msg'), name)
+        return deserialize_message(serialise(message), kind)
 
     def call(self, kind, service, **fields):
         client = self.other.create_client(kind, f'{self.name}/{service}')

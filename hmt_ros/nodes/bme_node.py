@@ -1,0 +1,109 @@
+"""bme_node: images in, mixtures over poses out; a lifecycle node around a `BmeSession`."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from hmt_msgs.msg import PoseMixture
+from hmt_msgs.srv import PredictPose
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from hmt_ros.nodes.bme_parameters import BmeParameters
+from hmt_ros.nodes.bme_session import TOPICS, BmeSession, BmeState
+from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.nodes.handled import Output
+from hmt_ros.nodes.session_node import Input, SessionNode, first_line, run
+from msg_tools.cdr import serialise
+
+NAME = 'bme_node'
+_CHECKED = ('model_file', 'background_file', 'stature')
+
+
+class BmeNode(SessionNode):
+    """The node; parameters are those of `BmeParameters`."""
+
+    TOPICS = TOPICS
+    CLASSES = {'hmt_msgs/msg/PoseMixture': PoseMixture}  # noqa: RUF012
+    COUNTED = IMAGE
+    COUNTED_NAME = 'images'
+    DONE = 'predicted'
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(NAME, BmeParameters(), 'prediction', **options)
+
+    def _new_session(
+        self, publish: Callable[[Output], None], wanted: Callable[[str], bool]
+    ) -> BmeSession:
+        return BmeSession(self._settings, publish, wanted)
+
+    def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
+        yield PredictPose, '~/predict_pose', self._on_predict_pose
+
+    def _wanted_inputs(self) -> Iterable[Input]:
+        qos = qos_profile_sensor_data
+        yield Input(CAMERA_INFO, 'camera_info', CameraInfo, 'sensor_msgs/msg/CameraInfo', qos)
+        if self._settings.image_transport == 'compressed':
+            kind = 'sensor_msgs/msg/CompressedImage'
+            yield Input(IMAGE, 'image/compressed', CompressedImage, kind, qos)
+        else:
+            yield Input(IMAGE, 'image', Image, 'sensor_msgs/msg/Image', qos)
+
+    def _check_changed(self, settings: BmeParameters, changed: Mapping[str, Any]) -> None:
+        if any(name in changed for name in _CHECKED):
+            BmeSession(settings, lambda output: None)
+
+    def _on_predict_pose(
+        self, request: PredictPose.Request, response: PredictPose.Response
+    ) -> PredictPose.Response:
+        session = self._session
+        if session is None:
+            response.success, response.message = False, 'the node is not configured'
+            return response
+        image = request.image if len(request.image.data) else request.compressed_image
+        try:
+            if not len(image.data):
+                raise ValueError('the request has no image: fill image or compressed_image')
+            data = serialise(session.predict_once(image))
+        except (ValueError, ArithmeticError) as error:
+            response.success, response.message = False, first_line(error)
+            return response
+        response.success = True
+        response.mixture = deserialize_message(data, PoseMixture)
+        return response
+
+    def _counts(self, state: BmeState) -> Counter[str]:
+        return state.images
+
+    def _judgement(self, state: BmeState) -> tuple[bytes, str]:
+        rates = self._rates
+        if rates.dropped:
+            return DiagnosticStatus.WARN, f'late: {rates.dropped} images dropped in a second'
+        if rates.faults:
+            return DiagnosticStatus.WARN, state.last_fault
+        if state.wants:
+            return DiagnosticStatus.WARN, f'waits for {state.wants}'
+        return DiagnosticStatus.OK, f'{state.status}, {state.modes} modes'
+
+    def _state_values(self, state: BmeState) -> list[tuple[str, str]]:
+        return [
+            ('images without a person', str(state.images['empty'])),
+            ('modes', str(state.modes)),
+            ('entropy of the weights, nats', f'{state.entropy:.3f}'),
+            ('height of the silhouette, px', str(state.height)),
+            ('support', f'{state.support:.3f}'),
+        ]
+
+
+def main(args: list[str] | None = None) -> int:
+    """Runs the node until it is told to stop; 0, or 1 where it could not start."""
+    return run(NAME, BmeNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
