@@ -11,6 +11,7 @@ import hmt_ros
 COMMANDS = {
     'replay': ('hmt_ros.app.replay', 'track the person in a bag, into a new bag'),
     'make-bag': ('hmt_ros.app.make_bag', 'render a motion into a bag with ground truth'),
+    'train': ('hmt_ros.app.train', 'learn to predict poses from silhouettes'),
     'evaluate': ('hmt_ros.app.evaluate', 'errors and calibration of mixtures against ground truth'),
 }
 
@@ -23,7 +24,7 @@ commands:
 {commands}
 
 python -m hmt_ros <command> --help tells what a command takes. Each is an executable of ROS 2 as
-well, ros2 run hmt_ros <command>, and so is the node, ros2 run hmt_ros filter_node.
+well, ros2 run hmt_ros <command>, and so are the nodes: filter_node, smoother_node, bme_node.
 
 options:
   -h, --help  show this

@@ -406,6 +406,11 @@ def _why_nothing(count: _Count, subject: object) -> str:
             f'the joints of the subject file were seen at {subject.stamp_ns} ns, after the last '
             f'image, which is of {count.last_stamp} ns: is it the file of another bag?'
         )
+    if subject is None and not count.last_fault:
+        return (
+            f'nobody is seen in its {count.images} images: give the empty scene by --background '
+            'FILE, or the joints of the person in one image by --subject FILE'
+        )
     why = f': {count.last_fault}' if count.last_fault else ''
     return f'none of its {count.images} images was tracked{why}'
 

@@ -34,7 +34,7 @@ from hmt_ros.nodes.handled import Handled, HandlingLog, Output
 from hmt_ros.nodes.stamped_inputs import StampedInputs
 from hmt_ros.nodes.track_messages import Presentation, TrackedImage, track_messages
 from hmt_ros.nodes.track_start import TrackStart, prepare_start
-from hmt_ros.tracking import Status, Subject, Tracker
+from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker
 from msg_tools import MessageError, RosbagsMessages
 from msg_tools.cdr import serialise
 from msg_tools.headers import SECOND_NS, time_ns
@@ -116,7 +116,7 @@ class FilterSession:
         self._tracker: Tracker | None = None
         self._shown_body: Body | None = None
         self._keypoints: StampedInputs[Keypoints] = StampedInputs()
-        self._predictions: StampedInputs[GaussianMixture] = StampedInputs()
+        self._predictions: StampedInputs[PosePrediction] = StampedInputs()
         self._weights = np.empty(0)
         self.state = self._present_state()
 
@@ -213,8 +213,8 @@ class FilterSession:
             content.confidence[use],
         )
 
-    def _prediction_in(self, message: Any) -> GaussianMixture | None:
-        """A mixture over poses of the body; None: nobody was seen."""
+    def _prediction_in(self, message: Any) -> PosePrediction | None:
+        """A mixture over poses, of the body at the lengths that its joints tell; None: nobody."""
         if len(message.components) == 0:
             return None
         body = self.start.body
@@ -224,7 +224,11 @@ class FilterSession:
                     f'pose_prediction is of the body {message.body_model}, wanted one of '
                     f'{body.name}'
                 )
-            return pose_mixture_of(message, body.dof_names).mixture
+            content = pose_mixture_of(message, body.dof_names)
+            body = body.with_joints_at(
+                content.mixture.means, content.joint_names, content.joint_positions
+            )
+            return PosePrediction(content.mixture, body)
         except ValueError as error:
             self._log.fault('pose_prediction', str(error))
             return None

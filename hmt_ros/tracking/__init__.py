@@ -1,7 +1,16 @@
 """The filter: proposals and mixture density propagation over images (KJS)."""
 
+from hmt_ros.tracking.pose_prediction import PosePrediction
 from hmt_ros.tracking.subject import Subject, SubjectError, read_subject
 from hmt_ros.tracking.tracker import Status, Tracker
 from hmt_ros.tracking.tracker_settings import TrackerSettings
 
-__all__ = ['Status', 'Subject', 'SubjectError', 'Tracker', 'TrackerSettings', 'read_subject']
+__all__ = [
+    'PosePrediction',
+    'Status',
+    'Subject',
+    'SubjectError',
+    'Tracker',
+    'TrackerSettings',
+    'read_subject',
+]

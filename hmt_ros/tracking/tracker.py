@@ -34,6 +34,7 @@ from hmt_ros.tracking.initialisation import (
     start_from_keypoints,
 )
 from hmt_ros.tracking.kinematic_jumps import KinematicJumps
+from hmt_ros.tracking.pose_prediction import PosePrediction
 from hmt_ros.tracking.proposals import covariance_scaled_samples, spherical_samples
 from hmt_ros.tracking.pruning import choose_hypotheses, inherited_log_weights
 from hmt_ros.tracking.subject import Subject
@@ -152,7 +153,7 @@ class Tracker:
         image: Image,
         stamp: int,
         keypoints: Keypoints | None = None,
-        prediction: GaussianMixture | None = None,
+        prediction: PosePrediction | None = None,
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """Takes the next image.
 
@@ -161,8 +162,9 @@ class Tracker:
             stamp: of the image, ns; later than the one before.
             keypoints: joints seen in this image, if any.
             prediction: poses that a regression expects by this image, if any. They start a track
-                that has no other start, are among the hypotheses of every image, and of a lost
-                track; they are no evidence, which would count the image twice.
+                that has no other start, with the lengths that they assume, are among the hypotheses
+                of every image, and of a lost track; they are no evidence, which would count the
+                image twice.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses,
@@ -170,13 +172,10 @@ class Tracker:
 
         Raises:
             ValueError: an image of another size, a stamp that does not increase, or a prediction
-                of another dimension.
+                of a body with other degrees of freedom.
         """
-        if prediction is not None and prediction.dimension != self.body.dimension:
-            raise ValueError(
-                f'a prediction for {self.body.name} has {self.body.dimension} dimensions, saw '
-                f'{prediction.dimension}'
-            )
+        if prediction is not None:
+            prediction.seen_as(self.body)
         size = (self.camera.height, self.camera.width)
         if image.shape[:2] != size:
             raise ValueError(f'the camera gives images of {size}, saw {image.shape[:2]}')
@@ -243,15 +242,17 @@ class Tracker:
     # The start of a track.
 
     def _start_at(
-        self, stamp: int, prediction: GaussianMixture | None
-    ) -> Subject | GaussianMixture | None:
+        self, stamp: int, prediction: PosePrediction | None
+    ) -> Subject | GaussianMixture | PosePrediction | None:
         """What a track starts from at an image; None: it does not start there."""
         start = self._start
         if start is None:
             return prediction
         return None if isinstance(start, Subject) and stamp < start.stamp_ns else start
 
-    def _begin(self, observation: Observation, start: Subject | GaussianMixture) -> None:
+    def _begin(
+        self, observation: Observation, start: Subject | GaussianMixture | PosePrediction
+    ) -> None:
         s = self.settings
         if isinstance(start, Subject):
             begun = start_from_keypoints(self.model, self.camera, start)
@@ -261,6 +262,10 @@ class Tracker:
             poses, log_weights = begun.poses, np.zeros(len(begun.poses))
             precisions = np.zeros((len(poses), self.body.dimension, self.body.dimension))
         else:
+            if isinstance(start, PosePrediction):
+                self._use_body(start.body)
+                self._flesh = FleshFit(self.body)
+                start = start.both_ways(self.body)
             poses = start.means
             with np.errstate(divide='ignore'):
                 log_weights = np.log(start.normalised().weights)
@@ -285,7 +290,7 @@ class Tracker:
             solved = self._minimise(energy, solved.x, s.iterations)
             self._keep(solved, log_weights, still, observation)
 
-    def _recover(self, observation: Observation, prediction: GaussianMixture | None) -> bool:
+    def _recover(self, observation: Observation, prediction: PosePrediction | None) -> bool:
         """Starts anew from what an image alone shows; False where that is not enough.
 
         The body keeps its lengths and widths. From keypoints come all poses that explain them, from
@@ -302,7 +307,8 @@ class Tracker:
         if poses is None and prediction is None:
             return False
         found = [poses] if poses is not None else []
-        found += [np.clip(prediction.means, self.body.lower, self.body.upper)] if prediction else []
+        if prediction is not None:
+            found.append(prediction.both_ways(self.body).means)
         poses = np.concatenate([self.modes.poses, *found])
 
         def energy(x: Array, _: Index) -> tuple[Array, Array, Array]:
@@ -333,7 +339,7 @@ class Tracker:
     # One image after another.
 
     def _propagate(
-        self, observation: Observation, dt: float, prediction: GaussianMixture | None
+        self, observation: Observation, dt: float, prediction: PosePrediction | None
     ) -> None:
         s, m, body = self.settings, self.modes, self.body
         predicted, covariances = predict(
@@ -355,7 +361,9 @@ class Tracker:
         else:
             candidates = self._samples(base, sources, covariances, observation)
         if prediction is not None:
-            candidates = joined_candidates(self._expected_elsewhere(prediction, moved), candidates)
+            candidates = joined_candidates(
+                self._expected_elsewhere(prediction.seen_as(self.body), moved), candidates
+            )
         solved = self._solve(candidates, precisions, observation)
         for _ in range(s.rounds - 1 if s.proposals == 'kjs' else 0):
             if solved.value.min() < self._usual_energy + s.surprise:
@@ -384,15 +392,14 @@ class Tracker:
     def _expected_elsewhere(self, prediction: GaussianMixture, moved: Array) -> Candidates:
         """Candidates that the image suggests, and not the images before."""
         s, m, body = self.settings, self.modes, self.body
-        prediction = prediction[prediction.weights > 0]
-        poses = np.clip(prediction.means, body.lower, body.upper)
+        poses = prediction.means
         apart = relative_joints(body, poses)[:, None] - relative_joints(body, moved)[None]
         parents = np.linalg.norm(apart, axis=3).mean(2).argmin(1)
-        log_weights = np.log(prediction.normalised().weights)
+        log_weights = np.log(s.prediction_probability * prediction.weights)
         return Candidates(
             poses,
             parents,
-            m.log_weights[parents] + np.log(s.prediction_probability) + log_weights,
+            m.log_weights[parents] + log_weights,
             poses,
             np.ones(poses.shape, dtype=np.bool_),
             m.textures,

@@ -16,7 +16,7 @@ import pytest
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes import bme_session, track_start
-from hmt_ros.tracking import Status, Subject, TrackerSettings
+from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
 from msg_tools import RosbagsMessages
 from msg_tools.bodies import message_of_body
 from msg_tools.camera_info import camera_info_message
@@ -43,7 +43,7 @@ class StubTracker:
         self.background = background
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.seen: list[tuple[int, Any]] = []
-        self.predictions: list[GaussianMixture | None] = []
+        self.predictions: list[PosePrediction | None] = []
         self._start = None
         StubTracker.made.append(self)
 
@@ -58,8 +58,8 @@ class StubTracker:
         assert image.shape == (self.camera.height, self.camera.width, 3)
         if self.fault is not None:
             raise self.fault
-        if self._start is None:
-            self._start = prediction
+        if self._start is None and prediction is not None:
+            self._start = prediction.mixture
         if self._start is None or (
             isinstance(self._start, Subject) and stamp < self._start.stamp_ns
         ):

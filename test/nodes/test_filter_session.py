@@ -399,7 +399,10 @@ def test_predictions_start_a_track(session, small_camera, likelihoods, stub_trac
     one.take(PREDICTION, likelihoods.nobody(2))
     assert tracked(outputs) == [small_camera.stamp(1), small_camera.stamp(2)]
     first, second = stub_tracker.made[0].predictions
-    assert np.array_equal(first.means, likelihoods.mixture(1).means)
+    assert np.array_equal(first.mixture.means, likelihoods.mixture(1).means)
+    assert np.allclose(
+        list(first.body.segment_lengths.values()), list(likelihoods.body.segment_lengths.values())
+    )
     assert second is None
 
 
@@ -433,14 +436,20 @@ def test_bad_predictions_are_told_and_not_used(session, small_camera, likelihood
     of_another = Likelihoods(load_body('human32')).message(0)
     crooked = likelihoods.message(1)
     crooked.components[0].mean = np.full(likelihoods.body.dimension, np.nan)
-    for index, message, text in ((0, of_another, 'human32'), (1, crooked, 'finite')):
+    torn = likelihoods.message(2)
+    torn.components[0].joint_positions[3].x += 1.0
+    for index, message, text in (
+        (0, of_another, 'human32'),
+        (1, crooked, 'finite'),
+        (2, torn, 'mm from where'),
+    ):
         (fault,) = one.take(PREDICTION, message).faults
         assert text in fault
         one.take(IMAGE, small_camera.image(index))
     assert tracked(outputs) == []
-    one.take(PREDICTION, likelihoods.message(2))
-    one.take(IMAGE, small_camera.image(2))
-    assert tracked(outputs) == [small_camera.stamp(2)]
+    one.take(PREDICTION, likelihoods.message(4))
+    one.take(IMAGE, small_camera.image(4))
+    assert tracked(outputs) == [small_camera.stamp(4)]
 
 
 def test_waits_for_the_image_of_the_subject(session, outputs, small_camera):

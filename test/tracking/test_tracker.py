@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hmt_ros.body import Body
+from hmt_ros.body import Body, load_body
 from hmt_ros.body.procedural_motion import procedural_motion
 from hmt_ros.body.viewpoint import Viewpoint
 from hmt_ros.image.background import BackgroundModel
@@ -16,7 +16,7 @@ from hmt_ros.image.observation import Keypoints, Observation
 from hmt_ros.image.renderer import render_frames
 from hmt_ros.image.scene import Scene
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking import Status, Subject, Tracker, TrackerSettings
+from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.dynamics import DynamicsSettings
 
 OFF = TermSettings(0.0, 1.0, 1.0)
@@ -322,12 +322,13 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     assert np.abs(posterior.means[0, :3] - other[:3]).max() < 0.2
 
 
-def predicted(pose) -> GaussianMixture:
+def predicted(body, pose) -> PosePrediction:
     """What a regression may say of a pose: near it, or its back to the front."""
     means = np.stack([pose, pose])
     means[0, 6:] += 0.05
     means[1, 5] += np.pi
-    return GaussianMixture([0.5, 0.5], means, np.tile(0.02 * np.eye(len(pose)), (2, 1, 1)))
+    covariances = np.tile(0.02 * np.eye(len(pose)), (2, 1, 1))
+    return PosePrediction(GaussianMixture([0.5, 0.5], means, covariances), body)
 
 
 def test_a_prediction_starts_a_track(human32, camera, black, motion, keypoints_of):
@@ -335,7 +336,7 @@ def test_a_prediction_starts_a_track(human32, camera, black, motion, keypoints_o
     assert tracker.step(black, 0, keypoints_of(human32, motion[0])) == (None, None)
     for i in (1, 2):
         seen = keypoints_of(human32, motion[i], 1.0, i)
-        posterior, _ = tracker.step(black, i * FRAME, seen, predicted(motion[1]))
+        posterior, _ = tracker.step(black, i * FRAME, seen, predicted(human32, motion[1]))
         assert best_error(human32, posterior, human32, motion[i]) < 0.06
     # The next track has nothing else to start from, either.
     tracker.reset()
@@ -354,7 +355,7 @@ def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, mot
             rows = [seen.names.index(name) for name in few]
             # Too few to start from.
             seen = Keypoints(few, seen.pixels[rows], seen.covariances[rows], np.ones(len(few)))
-            prediction = predicted(other) if given and i == 5 else None
+            prediction = predicted(human32, other) if given and i == 5 else None
             posterior, _ = tracker.step(black, i * FRAME, seen, prediction)
             statuses.append(tracker.status)
         assert statuses[4] is Status.LOST
@@ -370,7 +371,7 @@ def test_predictions_are_among_the_hypotheses(human32, started, black, motion, k
         tracker = started(surprise=1e9)
         for i in range(4):
             pose = motion[i] if i < 3 else jumped(motion)
-            prediction = predicted(pose) if given else None
+            prediction = predicted(human32, pose) if given else None
             seen = keypoints_of(human32, pose, 1.0, i)
             posterior, _ = tracker.step(black, i * FRAME, seen, prediction)
         errors[given] = best_error(tracker.body, posterior, human32, pose)
@@ -379,8 +380,30 @@ def test_predictions_are_among_the_hypotheses(human32, started, black, motion, k
 
 
 def test_predictions_of_another_body_are_refused(started, black):
-    with pytest.raises(ValueError, match='32 dimensions, saw 37'):
-        started().step(black, 0, None, GaussianMixture([1.0], np.zeros((1, 37)), np.eye(37)[None]))
+    human37 = load_body('human37')
+    other = PosePrediction(
+        GaussianMixture([1.0], human37.prior_mean[None], np.eye(37)[None]), human37
+    )
+    with pytest.raises(ValueError, match='of 37 dimensions, saw the body human32, of 32'):
+        started().step(black, 0, None, other)
+    with pytest.raises(ValueError, match='human37 has 37 dimensions, saw 32'):
+        PosePrediction(GaussianMixture([1.0], np.zeros((1, 32)), np.eye(32)[None]), human37)
+    with pytest.raises(ValueError, match='no weight'):
+        PosePrediction(GaussianMixture([0.0], np.zeros((1, 37)), np.eye(37)[None]), human37)
+
+
+def test_predictions_are_as_far_away_as_the_person_is_large(human32, motion):
+    larger = human32.with_stature(1.1 * human32.stature)
+    prediction = predicted(human32, motion[0])
+    seen = prediction.seen_as(larger)
+    assert np.allclose(seen.means[:, :3], 1.1 * motion[0, :3])
+    as_large = prediction.seen_as(human32).means
+    assert np.allclose(larger.joint_positions(seen.means), 1.1 * human32.joint_positions(as_large))
+    both = prediction.both_ways(human32)
+    assert np.isclose(both.weights.sum(), 1.0)
+    depths = human32.joint_positions(both.means)[..., 2]
+    assert np.abs(depths[2, 0] - depths[0, 0]) < 1e-9
+    assert np.abs(depths[2] - depths[0]).max() > 0.1
 
 
 def test_surprising_images_are_searched_again(human32, started, black, motion, keypoints_of):

@@ -1,0 +1,97 @@
+"""Mirror images of poses: left for right, and the reversal in depth that silhouettes can not see.
+
+A body is its own mirror image, left for right. Mirrored in the plane through the pelvis across the
+line of sight it has, but for perspective, the same silhouette: who comes may as well go, who bends
+forwards may bend away. The joint angles of that pose are those of the mirrored body, so that limits
+that hold for the one hold for the other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.skeleton import Skeleton
+
+Array = NDArray[np.float64]
+
+# What the root has to turn about, one after the other.
+ROOT_AXES = 'zyx'
+
+
+def mirror(body: Body, poses: ArrayLike) -> Array:
+    """Poses (N, d) of the mirror image, left for right: x in the camera frame changes its sign."""
+    q = np.array(poses, dtype=np.float64, ndmin=2)
+    skeleton = body.skeleton
+    order = skeleton.dof_index(tuple(_other_side(name) for name in skeleton.dof_names))
+    along_x = skeleton.dof_axes == 0
+    signs = np.where(along_x == skeleton.dof_is_rotation, 1.0, -1.0)
+    result: Array = q[:, order] * signs
+    return result
+
+
+def reverse_depth(body: Body, poses: ArrayLike) -> Array:
+    """Poses (N, d) mirrored in the plane through the pelvis across the line of sight.
+
+    Args:
+        body: whose root turns about z, y and x.
+        poses: (N, d) with the pelvis before the camera.
+
+    Raises:
+        ValueError: a body with another root.
+    """
+    q = np.array(poses, dtype=np.float64, ndmin=2)
+    skeleton = body.skeleton
+    dofs = root_rotation_dofs(skeleton)
+    frames = forward(skeleton, q)
+    pelvis = frames.joints()[skeleton.joint_index(('pelvis',))[0]].T
+    ray = pelvis / np.linalg.norm(pelvis, axis=1, keepdims=True)
+    across = np.eye(3) - 2.0 * ray[:, :, None] * ray[:, None, :]
+    result = mirror(body, q)
+    result[:, :3] = q[:, :3]
+    left_for_right = np.diag([-1.0, 1.0, 1.0])
+    turned = across @ root_rotations(body, q) @ left_for_right
+    result[:, dofs] = root_angles(body, turned)
+    return np.clip(result, body.lower, body.upper)
+
+
+def root_rotation_dofs(skeleton: Skeleton) -> list[int]:
+    """The rotations of the root, about z, y and x in this order.
+
+    Raises:
+        ValueError: it has others.
+    """
+    own = [j for j in skeleton.segment_dofs[0] if skeleton.dof_is_rotation[j]]
+    axes = ''.join('xyz'[skeleton.dof_axes[j]] for j in own)
+    if axes != ROOT_AXES:
+        raise ValueError(f'the root of {skeleton.name} turns about {axes!r}, wanted {ROOT_AXES!r}')
+    return own
+
+
+def root_rotations(body: Body, poses: Array) -> Array:
+    """Rotations (N, 3, 3) from the pelvis to the camera frame."""
+    result: Array = forward(body.skeleton, poses).columns[0].transpose(2, 1, 0)
+    return result
+
+
+def root_angles(body: Body, rotations: Array) -> Array:
+    """Angles (N, 3) about z, y, x of the root for rotations (N, 3, 3); |y| stays below its limit.
+
+    The angle about z is between -pi and pi.
+    """
+    r = body.skeleton.mounts[0].T @ rotations
+    y = np.arctan2(-r[:, 2, 0], np.hypot(r[:, 2, 1], r[:, 2, 2]))
+    limits = root_rotation_dofs(body.skeleton)[1]
+    y = np.clip(y, body.lower[limits], body.upper[limits])
+    z, x = np.arctan2(r[:, 1, 0], r[:, 0, 0]), np.arctan2(r[:, 2, 1], r[:, 2, 2])
+    return np.stack([z, y, x], axis=1)
+
+
+def _other_side(name: str) -> str:
+    if name.startswith('left_'):
+        return 'right_' + name.removeprefix('left_')
+    if name.startswith('right_'):
+        return 'left_' + name.removeprefix('right_')
+    return name

@@ -1,0 +1,63 @@
+"""Poses that something else than the tracker expects by an image alone, such as a regression."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.mirror import reverse_depth
+from hmt_ros.inference.mixture import GaussianMixture
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrediction:
+    """A mixture over poses, and whose they are.
+
+    Attributes:
+        mixture: over poses (d,), with some weight above 0.
+        body: that the poses are of, at the lengths that were assumed.
+
+    Raises:
+        ValueError: a mixture that is not over poses of the body.
+    """
+
+    mixture: GaussianMixture
+    body: Body
+
+    def __post_init__(self) -> None:
+        if self.mixture.dimension != self.body.dimension:
+            raise ValueError(
+                f'a prediction for {self.body.name} has {self.body.dimension} dimensions, saw '
+                f'{self.mixture.dimension}'
+            )
+        if not self.mixture.weights.sum() > 0:
+            raise ValueError('a prediction has no weight')
+
+    def seen_as(self, body: Body) -> GaussianMixture:
+        """The same for a person of other lengths: as much further away as the person is larger.
+
+        Raises:
+            ValueError: a body with other degrees of freedom.
+        """
+        if body.dof_names != self.body.dof_names:
+            raise ValueError(
+                f'a prediction for {self.body.name}, of {self.body.dimension} dimensions, saw the '
+                f'body {body.name}, of {body.dimension}'
+            )
+        kept = self.mixture[self.mixture.weights > 0].normalised()
+        means = np.array(kept.means)
+        means[:, :3] *= body.scale / self.body.scale
+        return GaussianMixture(
+            kept.weights, np.clip(means, body.lower, body.upper), kept.covariances
+        )
+
+    def both_ways(self, body: Body) -> GaussianMixture:
+        """As `seen_as`, with the reversal in depth, which a silhouette does not tell from it."""
+        seen = self.seen_as(body)
+        return GaussianMixture(
+            np.tile(0.5 * seen.weights, 2),
+            np.concatenate([seen.means, reverse_depth(body, seen.means)]),
+            np.tile(seen.covariances, (2, 1, 1)),
+        )
