@@ -231,6 +231,10 @@ def _node_parameters(options: argparse.Namespace, recorded: RecordedInput) -> No
     if options.bme is not None or not tracking.subject_file:
         predicting = _bme_parameters(options, recorded, tracking)
         tracking = replace(tracking, use_predictions=True)
+    else:
+        for text in options.set:
+            if text.startswith(_PREFIXES[BME]):
+                raise ValueError(f'--set {text}: nothing is predicted; --bme does')
     return NodeParameters(tracking, smoothing, predicting)
 
 

@@ -57,7 +57,7 @@ class BmeParameters:
     background_images: int = _parameter(30, AT_ONCE, (1, 10_000))
     stature: float = _parameter(0.0, NEXT_CONFIGURE, (0.0, 3.0))
     least_height: int = _parameter(40, AT_ONCE, (1, 10_000))
-    propagate: bool = _parameter(True, AT_ONCE)
+    propagate: bool = _parameter(False, AT_ONCE)
     longest_interval: float = _parameter(0.5, AT_ONCE, (0.0, 60.0))
     max_hypotheses: int = _parameter(5, AT_ONCE, (1, 64))
     reset_on_time_jump: bool = _parameter(False, AT_ONCE)

@@ -241,17 +241,36 @@ def test_subject_files(good, subject, message, tmp_path, capsys):
     assert message in fails(good, tmp_path, capsys, subject=subject)
 
 
-def test_subject_is_needed(tmp_path, capsys):
+def test_without_a_subject_somebody_must_be_seen(tmp_path, capsys):
     out = tmp_path / 'out'
-    assert main([str(REACH), '-o', str(out)]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(
-        'replay: --subject FILE is needed to start a track; beside the bag lies '
-    )
-    assert line.endswith(str(REACH / 'subject.yaml'))
     bag = write(tmp_path / 'bag', INFO, IMAGE)
     assert main([str(bag), '-o', str(out)]) == 1
-    assert 'where the joints of the person are in one image' in capsys.readouterr().err
+    told, line = capsys.readouterr().err.splitlines()
+    assert told == 'replay: no --subject: the track starts from a prediction'
+    assert 'nobody is seen in its 1 images: give the empty scene by --background FILE' in line
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ('option', 'message'),
+    [
+        (['--bme', 'nowhere.npz'], 'nowhere.npz: no such model; wanted a file, or one of'),
+        (['--bme', str(REACH / 'metadata.yaml')], 'metadata.yaml: '),
+        (['--set', 'bme.magic=1'], 'there is no parameter magic'),
+        (['--set', 'bme.max_hypotheses=0'], 'max_hypotheses must lie between'),
+        (['--set', 'bme.image_transport=raw'], 'is decided by replay'),
+        (
+            ['--set', 'bme.stature=1.8', '--subject', str(REACH / 'subject.yaml')],
+            '--set bme.stature=1.8: nothing is predicted; --bme does',
+        ),
+    ],
+)
+def test_models_that_can_not_be(tmp_path, capsys, option, message):
+    out = tmp_path / 'out'
+    bag = write(tmp_path / 'bag', INFO, IMAGE)
+    assert main([str(bag), '-o', str(out), '--quiet', *option]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
     assert not out.exists()
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from hmt_ros.app.recorded_input import recorded_input
 from hmt_ros.app.replay import main
+from hmt_ros.experts.shipped_models import load_predictor
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes import track_start
 from hmt_ros.nodes.smoothed_messages import TOPICS as SMOOTHED_TOPICS
@@ -67,7 +68,7 @@ class StandingStill:
     def __init__(self, body, camera, settings, background, seed):
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
-        self.keypoints = []
+        self.keypoints, self.predictions = [], []
         StandingStill.made.append(self)
 
     def reset(self, start):
@@ -81,6 +82,7 @@ class StandingStill:
 
     def step(self, image, stamp, keypoints=None, prediction=None):
         self.keypoints.append(None if keypoints is None else keypoints.names)
+        self.predictions.append(prediction)
         if stamp < self.start.stamp_ns:
             return None, None
         mean = self.body.prior_mean[None].copy()
@@ -156,6 +158,31 @@ def test_mixtures_explain_the_images(replayed):
         errors = errors - (joints[order] - joints[order][:1])
         assert np.linalg.norm(errors, axis=2).mean(1).min() < 0.15
         assert decode_image(overlay.message).shape == (360, 480, 3)
+
+
+def test_without_a_subject_a_prediction_starts_the_track(short, tmp_path, capsys):
+    out = tmp_path / 'out'
+    command = [str(short), '-o', str(out), '--background', str(REACH / 'background.png')]
+    assert main(command) == 0
+    assert 'no --subject: the track starts from a prediction' in capsys.readouterr().err
+    found = read(out)
+    assert {len(found[topic]) for topic in ('pose_prediction', 'pose_mixture')} == {IMAGES}
+    predicted = pose_mixture_of(found['pose_prediction'][0].message)
+    assert predicted.kind == MixtureKind.PREDICTION
+    (body,) = (stored.message for stored in found['body'])
+    # The person is as large as the model says.
+    model = load_predictor().body.segment_lengths
+    assert dict(zip(body.segment_names, body.segment_lengths, strict=True)) == pytest.approx(model)
+    again = tmp_path / 'again' / 'out'
+    assert main([*command[:2], str(again), *command[3:], '--bme', '--quiet']) == 0
+    assert content(again) == content(out)
+
+
+def test_predictions_beside_a_subject(still, short, tmp_path):
+    out = tmp_path / 'out'
+    assert main([str(short), '-o', str(out), *PERSON, '--bme', '--quiet']) == 0
+    assert len(read(out)['pose_prediction']) == IMAGES
+    assert [prediction is None for prediction in still[0].predictions] == [False] * IMAGES
 
 
 def test_ground_truth_is_copied(replayed, entries):

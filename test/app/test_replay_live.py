@@ -56,12 +56,12 @@ def messages(folder, topic):
         return [(stored.log_time_ns, bytes(stored.data)) for stored in bag.messages([topic])]
 
 
-def both_ways(bag, tmp_path, capsys, *options):
+def both_ways(bag, tmp_path, capsys, *options, person=PERSON):
     """The folders, and the exit codes and lines, of the same replay offline and live."""
     folders, ends = [], []
     for how in ('offline', 'live'):
         out = tmp_path / how / 'out'
-        command = [str(bag), '-o', str(out), *PERSON, *options]
+        command = [str(bag), '-o', str(out), *person, *options]
         code = main([*command, '--live'] if how == 'live' else command)
         streams = capsys.readouterr()
         folders.append(out)
@@ -79,6 +79,17 @@ def test_same_mixtures_of_every_image(tmp_path, capsys):
         assert len(messages(offline, topic)) == 3
         assert messages(offline, topic) == messages(live, topic)
     # And everything else.
+    assert content(offline) == content(live)
+
+
+def test_same_without_a_subject(tmp_path, capsys):
+    """What the BME predicts reaches the filter beside the image that it is from."""
+    bag = write(tmp_path / 'bag', recorded(3))
+    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, person=PERSON[2:])
+    assert one == other
+    assert one[0] == 0
+    for topic in ('pose_prediction', 'pose_mixture'):
+        assert len(messages(offline, topic)) == 3
     assert content(offline) == content(live)
 
 
