@@ -30,7 +30,7 @@ from hmt_ros.tracking.evaluation import (
 from msg_tools import BagMessage, BagReader
 from msg_tools.headers import time_ns
 from msg_tools.message_error import check_weights
-from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_of
 from msg_tools.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_of
 
 Array = NDArray[np.float64]
@@ -259,6 +259,7 @@ class _Bodies:
     def __init__(self, model: str | None) -> None:
         self._model = model
         self._known: dict[str, Body] = {}
+        self._measured: dict[str, Body] = {}
 
     def learn(self, stored: BagMessage) -> None:
         """Takes a message about a body; a model that is not known leaves the body unknown."""
@@ -285,6 +286,30 @@ class _Bodies:
             body = next(iter(self._known.values()))
         return body if body is not None and body.dof_names == dof_names else None
 
+    def of_pose(self, topic: str, content: PoseMixture) -> Body | None:
+        """The body of a mixture: that of the bag, or one of the lengths that its joints tell."""
+        known = self.of(topic, content.dof_names)
+        for body in (known, self._measured.get(topic)):
+            if body is not None and _is_there(body, content):
+                return body
+        try:
+            body = load_body(self._model or content.body_model).with_joints_at(
+                content.mixture.means, content.joint_names, content.joint_positions
+            )
+        except (FileNotFoundError, ValueError):
+            return known
+        if body.dof_names != content.dof_names:
+            return known
+        self._measured[topic] = body
+        return body
+
+
+def _is_there(body: Body, content: PoseMixture) -> bool:
+    if content.joint_names != body.joint_names or content.dof_names != body.dof_names:
+        return False
+    computed = body.joint_positions(content.mixture.means)
+    return bool(np.abs(computed - content.joint_positions).max() <= SAME_PLACE)
+
 
 def _namespace(topic: str) -> str:
     return topic.lstrip('/').rpartition('/')[0]
@@ -294,11 +319,14 @@ def _read_pose(stored: BagMessage, topic: _Topic, bodies: _Bodies) -> None:
     message = stored.message
     _check_frame(topic, str(message.header.frame_id))
     names = tuple(str(name) for name in message.joint_names)
+    if not message.components and int(message.kind) == MixtureKind.PREDICTION:
+        topic.kind = MixtureKind.PREDICTION.name.lower()
+        return  # nobody was seen: the frame is missing
     try:
         if message.components and all(len(c.covariance) for c in message.components):
             content = pose_mixture_of(message)
             topic.kind = content.kind.name.lower()
-            body = bodies.of(stored.topic, content.dof_names)
+            body = bodies.of_pose(stored.topic, content)
             pose = _Pose(
                 content.stamp_ns, content.mixture.weights, content.mixture,
                 content.joint_positions, names, body,

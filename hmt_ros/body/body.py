@@ -191,7 +191,10 @@ class Body:
         Raises:
             ValueError: no lengths do within 1 mm, or a name that is not known.
         """
-        which = self.skeleton.joint_index(tuple(joint_names))
+        try:
+            which = self.skeleton.joint_index(tuple(joint_names))
+        except KeyError as error:
+            raise ValueError(error.args[0]) from error
         wanted = np.asarray(joints, dtype=np.float64) - self.joint_positions(poses)[:, which]
         # Joints are linear in the lengths.
         slopes = kinematics.joint_length_jacobians(self.skeleton, poses)[:, which]

@@ -178,12 +178,20 @@ def test_frames_without_mixture_and_mixtures_without_truth(capsys, tmp_path, bod
     assert (found['frames'], found['missing'], found['without_truth']) == (3, 2, 1)
 
 
-def test_a_bag_without_body_has_errors_but_no_densities(
-    capsys, tmp_path, body, mixtures, bag, truth_file
-):
-    path = write(tmp_path / 'out', body, mixtures, with_body=False)
-    found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+def test_a_bag_without_body(capsys, tmp_path, body, mixtures, bag, truth_file):
+    """Joints tell the lengths of a body that is known by name; of another there are only errors."""
+
+    def of_a_stranger(message):
+        message.body_model = 'stranger'
+        return message
+
     wanted = report(capsys, bag, '--truth', truth_file)['topics']['pose_mixture']
+    path = write(tmp_path / 'known', body, mixtures, with_body=False)
+    found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+    for name in ('best_mm', 'coverage_90', 'negative_log_likelihood'):
+        assert found[name] == pytest.approx(wanted[name])
+    path = write(tmp_path / 'unknown', body, mixtures, with_body=False, change=of_a_stranger)
+    found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
     assert found['best_mm'] == pytest.approx(wanted['best_mm'])
     assert found['coverage_90'] is None
     assert found['negative_log_likelihood'] is None
@@ -205,16 +213,34 @@ def test_unknown_covariances(capsys, tmp_path, body, mixtures, truth_file):
     assert found['best_mm'] > 0
 
 
-def test_body_of_another_person_is_noticed(capsys, tmp_path, body, mixtures, truth_file):
+@pytest.mark.parametrize('torn', [False, True])
+def test_joints_tell_the_lengths(capsys, tmp_path, body, mixtures, truth_file, torn):
+    """The bag's body is of another person; joints that no lengths explain are noticed."""
     path = tmp_path / 'out'
     with BagWriter(path) as bag:
         other = body.with_stature(1.6)
         bag.write('body', START_NS, message_of_body(MESSAGES, other, START_NS, FRAME_ID))
         for stamp, mixture in zip(STAMPS, mixtures):
-            bag.write('pose_mixture', stamp, mixture_message(body, mixture, stamp))
+            message = mixture_message(body, mixture, stamp)
+            message.components[0].joint_positions[5].x += 0.2 * torn
+            bag.write('pose_mixture', stamp, message)
     found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
-    assert found['note'] == 'joint positions are not those of the body human37 of the bag'
-    assert found['coverage_90'] is None
+    note = 'joint positions are not those of the body human37 of the bag'
+    assert found['note'] == (note if torn else '')
+    assert (found['coverage_90'] is None) == torn
+
+
+def test_predictions_without_anybody_are_missing(capsys, tmp_path, body, mixtures, truth_file):
+    path = tmp_path / 'out'
+    with BagWriter(path) as bag:
+        for i, (stamp, mixture) in enumerate(zip(STAMPS, mixtures)):
+            message = mixture_message(body, mixture, stamp, kind=MixtureKind.PREDICTION)
+            if i < 2:
+                message.components = []
+            bag.write('pose_prediction', stamp, message)
+    found = report(capsys, path, '--truth', truth_file)['topics']['pose_prediction']
+    assert (found['frames'], found['missing']) == (FRAMES - 2, 2)
+    assert found['coverage_90'] is not None
 
 
 def test_the_body_may_change_on_the_way(capsys, tmp_path, body, poses, truth_file):

@@ -209,3 +209,5 @@ def test_lengths_are_those_that_joints_tell(name):
     joints[0, 3] += 0.1
     with pytest.raises(ValueError, match='mm from where'):
         body.with_joints_at(poses, body.joint_names, joints)
+    with pytest.raises(ValueError, match='has no joint'):
+        body.with_joints_at(poses, ('tail',), joints[:, :1])
