@@ -11,7 +11,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from benchmarks.clips import Clip, find_clips, read_clip, rounded, table
@@ -30,7 +31,7 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import TermSettings
 from hmt_ros.image.observation import Keypoints
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking import Tracker, TrackerSettings, read_subject
+from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings, read_subject
 from hmt_ros.tracking.evaluation import EVALUATED_JOINTS, ORIGIN, Scores, joint_mixtures, score
 from hmt_ros.tracking.initialisation import start_from_keypoints
 
@@ -151,9 +152,22 @@ def accuracy(
     settings: TrackerSettings,
     seed: int,
     keypoints: dict[int, Keypoints] | None = None,
+    predict: Callable[[NDArray[np.uint8]], PosePrediction] | None = None,
 ) -> dict[str, Any]:
-    """Scores of one run over a clip, with evaluations and seconds an image."""
+    """Scores of one run over a clip, with evaluations and seconds an image.
+
+    Args:
+        clip: images and truth.
+        body: model of the person.
+        settings: of the tracker.
+        seed: of the tracker.
+        keypoints: by stamp; None: none are used.
+        predict: from which the track starts, and which is used in every image; None: the subject.
+    """
     tracker = new_tracker(clip, body, settings, seed)
+    if predict is not None:
+        background = BackgroundModel.from_image(clip.background)
+        tracker = Tracker(body, clip.camera, settings, background, seed)
     bodies: list[Body] = []
     mixtures: list[GaussianMixture] = []
     stamps: list[int] = []
@@ -161,7 +175,12 @@ def accuracy(
     seconds: list[float] = []
     for stamp, image in zip(clip.stamps, clip.images, strict=True):
         start = time.perf_counter()
-        posterior, _ = tracker.step(image, stamp, keypoints[stamp] if keypoints else None)
+        posterior, _ = tracker.step(
+            image,
+            stamp,
+            None if keypoints is None else keypoints[stamp],
+            None if predict is None else predict(image),
+        )
         seconds.append(time.perf_counter() - start)
         evaluations.append(tracker.evaluations)
         if posterior is not None and stamp in clip.truth.joints:

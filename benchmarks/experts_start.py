@@ -1,0 +1,97 @@
+"""The tracker when it starts from predictions, beside the one that starts from a subject file.
+
+The subject file tells where joints are in one image, and the person's lengths. Predictions know
+neither: lengths are those of the motions that were learned from.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.clips import Clip, find_clips, read_clip
+from benchmarks.experts_motion import BEST_OF, learn_from, predictor_of, recorded
+from benchmarks.smoothing_clips import NAMES
+from benchmarks.tracking import accuracy
+from hmt_ros.body import load_body
+from hmt_ros.experts.pose_predictor import PosePredictor
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.tracking import PosePrediction, TrackerSettings
+
+WANTED = 1.20  # error over that of the track from a subject file
+KEPT = ('best_mm', 'heaviest_mm', 'frames_lost', 'coverage_90', 'joint_coverage_90')
+
+
+def starts(
+    name: str = 'local', samples: int = 6000, *, quick: bool = False
+) -> dict[str, Any] | str:
+    """Scores by clip of both ways to start, or why there are none."""
+    try:
+        folders = [folder for folder in find_clips(None)[0] if folder.name in NAMES]
+        sequences = recorded('train')
+    except ValueError as error:
+        return f'skipped: {error}'
+    predictor, _ = predictor_of(learn_from(sequences, samples), name, dynamics=False)
+    body, settings = load_body('human37'), TrackerSettings()
+    result: dict[str, Any] = {'clips': {}}
+    for folder in folders[:1] if quick else folders:
+        clip = read_clip(folder, 6 if quick else None)
+        found = {
+            'subject': accuracy(clip, body, settings, 0),
+            'prediction': accuracy(clip, body, settings, 0, predict=Predicting(predictor, clip)),
+        }
+        result['clips'][clip.name] = {
+            what: {key: one[key] for key in KEPT} for what, one in found.items()
+        }
+    result['wanted'] = []
+    for key in ('best_mm', 'heaviest_mm'):
+        by_start = {
+            what: float(np.mean([clip[what][key] for clip in result['clips'].values()]))
+            for what in ('subject', 'prediction')
+        }
+        ratio = by_start['prediction'] / by_start['subject']
+        result['wanted'].append(
+            {
+                'what': f'{key.removesuffix("_mm")} from predictions over from a subject file',
+                'value': ratio,
+                'wanted': f'at most {WANTED:g}',
+                'met': ratio <= WANTED,
+            }
+        )
+    return result
+
+
+class Predicting:
+    """Predictions from the images of a clip.
+
+    Args:
+        predictor: that has learned.
+        clip: of whose empty scene the background is.
+    """
+
+    def __init__(self, predictor: PosePredictor, clip: Clip) -> None:
+        self._predictor, self._camera = predictor, clip.camera
+        self._background = BackgroundModel.from_image(clip.background)
+
+    def __call__(self, image: NDArray[np.uint8]) -> PosePrediction:
+        mask = self._background.silhouette(image)
+        found = self._predictor.observe(mask, self._camera, max_components=BEST_OF)
+        return PosePrediction(found.mixture, self._predictor.body)
+
+
+def as_rows(found: dict[str, Any]) -> list[list[str]]:
+    """A table."""
+    head = ['clip', 'started from', 'best, mm', 'heaviest, mm', 'lost', '90 %', 'joint 90 %']
+    rows = [head]
+    for clip, both in found['clips'].items():
+        for what, one in both.items():
+            rows.append(
+                [
+                    clip, what, f'{one["best_mm"]:.0f}', f'{one["heaviest_mm"]:.0f}',
+                    f'{one["frames_lost"]:.0f}', f'{100 * one["coverage_90"]:.0f} %',
+                    f'{100 * one["joint_coverage_90"]:.0f} %',
+                ]
+            )  # fmt: skip
+    return rows
