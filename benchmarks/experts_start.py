@@ -76,6 +76,7 @@ class Predicting:
         self._background = BackgroundModel.from_image(clip.background)
 
     def __call__(self, image: NDArray[np.uint8]) -> PosePrediction:
+        """Of the person in an image (H, W, 3)."""
         mask = self._background.silhouette(image)
         found = self._predictor.observe(mask, self._camera, max_components=BEST_OF)
         return PosePrediction(found.mixture, self._predictor.body)
