@@ -11,6 +11,7 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
 
 USAGE = """usage: python -m benchmarks [NAME [options]]
 
+  experts    conditional densities: a toy, motions of people apart, clips, speed
   tracking   accuracy, calibration and speed of the tracker on clips with known truth
   flips      time per leaf of the interpretation trees
   kernels    the compiled likelihood against vectorised numpy
@@ -23,9 +24,10 @@ Without a name all of them run. Every benchmark takes --json and --help.
 def main(argv: list[str]) -> int:
     """Runs one benchmark, or all; the exit code is that of the first that fails."""
     # Only now: they import numpy.
-    from benchmarks import flips, kernels, smoothing, tracking
+    from benchmarks import experts, flips, kernels, smoothing, tracking
 
     benchmarks = {
+        'experts': experts.main,
         'flips': flips.main,
         'kernels': kernels.main,
         'smoothing': smoothing.main,

@@ -1,0 +1,233 @@
+"""train: learns to predict poses from silhouettes, from recorded or procedural motions.
+
+    train --mocap DIR -o MODEL.npz
+    train --motions procedural -o MODEL.npz
+
+Beside the model lies a report: affinity matrices, multimodality, and what was learned from.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+import numpy as np
+from tqdm import tqdm
+
+from hmt_ros.app.training_report import write_report
+from hmt_ros.body import Body, load_body
+from hmt_ros.body.procedural_motion import PROCEDURAL_MOTIONS
+from hmt_ros.experts.learned_models import KINDS, new_model
+from hmt_ros.experts.predictor_learning import described, learned_predictor
+from hmt_ros.experts.training_set import (
+    PoseSequence,
+    TrainingSettings,
+    motion_files,
+    procedural_sequence,
+    recorded_sequence,
+    training_set,
+    typical_body,
+)
+
+Item = TypeVar('Item')
+
+PROCEDURAL_SEEDS, PROCEDURAL_SECONDS = 5, 12.0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command; 0: the model is there, 1: bad input, and one line on stderr says which."""
+    try:
+        options = _parser().parse_args(argv)
+        return _train(options)
+    except (ValueError, OSError) as error:
+        text = ' '.join(str(error).split()) or type(error).__name__
+        print(f'train: {text}', file=sys.stderr)
+        return 1
+
+
+class _Parser(argparse.ArgumentParser):
+    """Bad input is one line and exit code 1, as everywhere else."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f'{message}; --help tells more')
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog='train', description='Learns to predict poses from silhouettes, from motions.'
+    )
+    parser.add_argument(
+        '-o', '--output', type=Path, required=True, metavar='MODEL.npz', help='file of the model'
+    )
+    parser.add_argument('--overwrite', action='store_true', help='replace the file that is there')
+    parser.add_argument('--quiet', action='store_true', help='no progress bar, no summary')
+    parser.add_argument('--seed', type=_whole(0), default=0, help='of all that is random (0)')
+    parser.add_argument(
+        '--report', type=Path, metavar='DIR', help='folder of the figures (MODEL_report)'
+    )
+
+    motion = parser.add_argument_group('motions')
+    motion.add_argument(
+        '--mocap', type=Path, metavar='DIR',
+        help='folder of recorded motions (.bvh, or .amc beside its .asf), searched in depth',
+    )  # fmt: skip
+    motion.add_argument(
+        '--motions', metavar='NAMES',
+        help=f'procedural, for all, or names with commas ({", ".join(PROCEDURAL_MOTIONS)})',
+    )  # fmt: skip
+    motion.add_argument(
+        '--body', default='human37', help='body model: a name or a YAML file (human37)'
+    )
+
+    learning = parser.add_argument_group('learning')
+    learning.add_argument(
+        '--model', choices=sorted(KINDS), default='local', help='what learns (local)'
+    )
+    learning.add_argument(
+        '--experts', type=_whole(1, 1000), help='of the model; modes at most of the local one (5)'
+    )
+    learning.add_argument(
+        '--samples', type=_whole(50, 1_000_000), default=6000, help='silhouettes (6000)'
+    )
+    learning.add_argument(
+        '--dynamics', action=argparse.BooleanOptionalAction, default=True,
+        help='learn p(x_t | x_t-1, r_t) as well (yes)',
+    )  # fmt: skip
+    return parser
+
+
+def _whole(low: int, high: int = 2**63 - 1) -> Any:
+    """Reader of a whole number in a range."""
+
+    def read(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = low - 1
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(
+                f'wanted a whole number from {low} to {high}, saw {text!r}'
+            )
+        return value
+
+    return read
+
+
+def _train(options: argparse.Namespace) -> int:
+    output = options.output
+    if output.suffix != '.npz':
+        output = output.with_name(output.name + '.npz')
+    if output.exists() and not options.overwrite:
+        raise ValueError(f'{output} exists: --overwrite replaces it')
+    if not output.parent.is_dir():
+        raise ValueError(f'there is no folder {output.parent} for {output.name}')
+    body = load_body(options.body)
+    if not body.shapes:
+        raise ValueError(f'body {options.body} has no flesh: wanted one such as human37')
+    sequences, skipped = _sequences(options, body)
+    body = typical_body(body, sequences)
+    settings = TrainingSettings(samples=options.samples, seed=options.seed)
+    bar = _bars(options.quiet)
+    pairs = training_set(body, sequences, settings, bar('rendering', GROUPS))
+    training = described(body, pairs, progress=bar('describing', SILHOUETTES))
+    kind, count = KINDS[options.model], len(pairs)
+    model = new_model(options.model, options.experts, options.seed, count)
+    dynamics = None
+    if options.dynamics:
+        experts = options.experts or kind.dynamics_experts
+        dynamics = new_model(options.model, experts, options.seed, count)
+    seen = training.with_components(kind.components)
+    notes = {
+        'model': options.model,
+        'samples': len(pairs),
+        'motions': len(sequences),
+        'seed': options.seed,
+        'activities': sorted(set(pairs.activities)),
+    }
+    _say(options, f'learning {options.model} from {len(pairs)} silhouettes')
+    predictor = learned_predictor(body, seen, model, dynamics, notes, options.seed)
+    predictor.save(output)
+    report = options.report or output.with_name(f'{output.stem}_report')
+    report.mkdir(parents=True, exist_ok=True)
+    figures = write_report(report, body, sequences, pairs, training)
+    skips = f', {skipped} skipped' if skipped else ''
+    _say(
+        options, f'{output}: {len(sequences)} motions{skips}, {output.stat().st_size / 1e6:.1f} MB'
+    )
+    for path, what in figures:
+        _say(options, f'  {path}: {what}')
+    return 0
+
+
+GROUPS, SILHOUETTES = 'groups', 'silhouettes'
+
+
+def _bars(quiet: bool) -> Callable[[str, str], Callable[[Iterable[Item], int], Iterable[Item]]]:
+    def bar(what: str, unit: str) -> Callable[[Iterable[Item], int], Iterable[Item]]:
+        def through(items: Iterable[Item], count: int) -> Iterable[Item]:
+            # None: shown where stderr is a terminal.
+            return tqdm(items, what, count, unit=f' {unit}', disable=True if quiet else None)
+
+        return through
+
+    return bar
+
+
+def _say(options: argparse.Namespace, text: str) -> None:
+    if not options.quiet:
+        print(text, flush=True)
+
+
+def _sequences(options: argparse.Namespace, body: Body) -> tuple[list[PoseSequence], int]:
+    """Motions to learn from, and how many files could not be read."""
+    if options.mocap is None and options.motions is None:
+        raise ValueError('nothing to learn from: give --mocap DIR or --motions procedural')
+    sequences: list[PoseSequence] = []
+    skipped = 0
+    if options.motions is not None:
+        for name in _procedural_names(options.motions):
+            sequences += [
+                procedural_sequence(name, body, PROCEDURAL_SECONDS, options.seed + i)
+                for i in range(PROCEDURAL_SEEDS)
+            ]
+    if options.mocap is not None:
+        files = motion_files(options.mocap)
+        for path in tqdm(
+            files, 'reading', unit=' motions', disable=True if options.quiet else None
+        ):
+            sequence = _sequence_or_warning(path, body)
+            if sequence is None:
+                skipped += 1
+            else:
+                sequences.append(sequence)
+        if skipped == len(files):
+            raise ValueError(f'none of the {skipped} motions in {options.mocap} can be used')
+    return sequences, skipped
+
+
+def _sequence_or_warning(path: Path, body: Body) -> PoseSequence | None:
+    """The motion of a file, or None and one line on stderr that says why not."""
+    try:
+        return recorded_sequence(path, body)
+    except (ValueError, OSError, np.linalg.LinAlgError) as error:
+        text = ' '.join(str(error).split()) or type(error).__name__
+        tqdm.write(f'train: skipped {path.name}: {text}', file=sys.stderr)
+        return None
+
+
+def _procedural_names(text: str) -> list[str]:
+    names = list(PROCEDURAL_MOTIONS) if text == 'procedural' else text.split(',')
+    unknown = [name for name in names if name not in PROCEDURAL_MOTIONS]
+    if unknown:
+        raise ValueError(
+            f'--motions: no motion {unknown[0]!r}, wanted procedural, or some of '
+            f'{", ".join(PROCEDURAL_MOTIONS)}'
+        )
+    return names
+
+
+if __name__ == '__main__':
+    sys.exit(main())

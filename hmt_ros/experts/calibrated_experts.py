@@ -1,0 +1,270 @@
+"""Experts that know how wrong they are of motions that they have not learned from.
+
+    p(x | r) ~ sum_i g_i(r)^(1 / T) N(x; f_i(r), c_i(r) s (O_i + E))
+
+Frames of one motion are alike, so that a model is too sure of any other: its gates decide too
+sharply in many dimensions, and its covariances are those of motions it knows. Whole motions are
+left out in turn, and the temperature T of the gates and the covariance E that is added are those
+under which these are most probable. The factor s then makes regions as wide as they claim to be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
+
+from hmt_ros.experts.conditional_density import Components, ConditionalDensity
+from hmt_ros.experts.conditional_experts import ConditionalExperts
+from hmt_ros.experts.gates import log_softmax
+from hmt_ros.experts.joint_experts import JointExperts
+from hmt_ros.experts.local_experts import LocalExperts
+from hmt_ros.experts.model_file import Arrays, check_header, header, nested, parameters_of, part
+from hmt_ros.experts.nearest_neighbours import NearestNeighbours
+from hmt_ros.experts.relevance_vector_regression import RelevanceVectorRegression
+from hmt_ros.experts.training_pairs import checked_pairs
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+MODELS: dict[str, type[ConditionalDensity]] = {
+    model.kind: model
+    for model in (
+        LocalExperts, ConditionalExperts, JointExperts, RelevanceVectorRegression,
+        NearestNeighbours,
+    )
+}  # fmt: skip
+FOLDS = 3
+# Samples of each fold that are left out, at most.
+LEFT_OUT = 500
+TEMPERATURES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
+ITERATIONS = 6
+# What a region of this probability should cover of the samples left out.
+COVERED = 0.9
+# A component with less weight says nothing of where a region is.
+LIGHT = 0.02
+LARGEST_FACTOR = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What changes the mixtures of a model.
+
+    Attributes:
+        temperature: T of the gates, at least 1.
+        added: (D, D) E, positive semidefinite.
+        factor: s, at least 1.
+
+    Raises:
+        ValueError: values out of their range.
+    """
+
+    temperature: float
+    added: Array
+    factor: float
+
+    def __post_init__(self) -> None:
+        size = len(self.added)
+        if self.added.shape != (size, size) or not np.isfinite(self.added).all():
+            raise ValueError(f'added must be finite and (D, D), saw {self.added.shape}')
+        for name in ('temperature', 'factor'):
+            if not 1.0 <= getattr(self, name) < np.inf:
+                raise ValueError(f'{name} must be at least 1, saw {getattr(self, name)}')
+
+    def of(self, found: Components) -> Components:
+        """The mixtures changed."""
+        return replace(
+            found,
+            log_weights=log_softmax(found.log_weights / self.temperature),
+            noise=self.factor * (found.noise + self.added),
+        )
+
+
+class CalibratedExperts(ConditionalDensity):
+    """A model whose gates and covariances are calibrated on motions left out.
+
+    Args:
+        model: that learns; its parameters are those of this one.
+        folds: parts that the motions are split into, of which each is left out once.
+
+    Attributes:
+        calibration_: what was learned of motions left out.
+    """
+
+    kind = 'calibrated_experts'
+
+    calibration_: Calibration
+
+    def __init__(self, model: ConditionalDensity, folds: int = FOLDS) -> None:
+        self.model = model
+        self.folds = folds
+
+    def fit(
+        self,
+        inputs: ArrayLike,
+        targets: ArrayLike,
+        sample_weight: ArrayLike | None = None,
+        *,
+        groups: ArrayLike | None = None,
+    ) -> Self:
+        """Learns from inputs (N, p) and targets (N, D).
+
+        Args:
+            inputs: (N, p).
+            targets: (N, D).
+            sample_weight: (N,) or None.
+            groups: (N,) which samples belong together: the motion, say, as a number. Neighbouring
+                numbers are left out together. None: the samples are in such an order.
+
+        Raises:
+            ValueError: wrong shapes, values that are not finite, too few samples.
+        """
+        pairs = checked_pairs(inputs, targets, sample_weight, at_least=2, what='to leave one out')
+        if self.folds < 2:
+            raise ValueError(f'folds is {self.folds}, wanted at least 2')
+        if groups is None:
+            labels = np.arange(len(pairs))
+        else:
+            labels = np.asarray(groups)
+            if labels.shape != (len(np.asarray(inputs)),):
+                raise ValueError(f'groups have shape {labels.shape}, wanted one for each input')
+            if sample_weight is not None:
+                labels = labels[np.asarray(sample_weight) > 0]
+        fold = folds_of(labels, self.folds)
+        rng = np.random.default_rng(0)
+        left_out = []
+        for number in np.unique(fold):
+            inside = fold != number
+            if not inside.any():
+                raise ValueError('groups has one group only, wanted two at least to leave one out')
+            some = pairs[np.flatnonzero(inside)]
+            self.model.fit(some.inputs, some.targets, some.weights)
+            rows = rng.permutation(np.flatnonzero(~inside))[:LEFT_OUT]
+            found = self.model.components(pairs.inputs[rows])
+            left_out.append((found, pairs.targets[rows]))
+        self.calibration_ = calibration(left_out)
+        self.model.fit(pairs.inputs, pairs.targets, pairs.weights)
+        self.n_inputs_, self.n_outputs_ = self.model.n_inputs_, self.model.n_outputs_
+        return self
+
+    def components(self, inputs: ArrayLike) -> Components:
+        """The mixtures at inputs (n, p)."""
+        self._check_learned()
+        return self.calibration_.of(self.model.components(inputs))
+
+    def jacobians(self, inputs: ArrayLike) -> Array:
+        """Derivatives (n, M, D, p) of the components' means by the input."""
+        return self.model.jacobians(inputs)
+
+    def support(self, inputs: ArrayLike) -> Array:
+        """How far the inputs (n, p) are supported by training data, (n,)."""
+        return self.model.support(inputs)
+
+    def to_arrays(self) -> Arrays:
+        """The whole model as arrays; see `ConditionalDensity.to_arrays`."""
+        self._check_learned()
+        shape = np.array([self.n_inputs_, self.n_outputs_])
+        arrays = header(self.kind, {'folds': self.folds}) | {'shape': shape}
+        return arrays | self._learned() | nested('model', self.model.to_arrays())
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], where: str = 'model') -> Self:
+        """The model that `to_arrays` gave; see `ConditionalDensity.from_arrays`."""
+        check_header(arrays, cls.kind, where)
+        try:
+            own = part('model', arrays)
+            kind = str(own['kind'])
+            if kind not in MODELS:
+                raise ValueError(f'a model of kind {kind!r}, wanted one of {sorted(MODELS)}')
+            result = cls(MODELS[kind].from_arrays(own, where), **parameters_of(arrays))
+            result.n_inputs_, result.n_outputs_ = (int(n) for n in arrays['shape'])
+            result._set_learned(arrays)
+            result.components(np.zeros((1, result.n_inputs_)))
+        except (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError) as fault:
+            text = ' '.join(str(fault).split())
+            raise ValueError(
+                f'{where}: a damaged model file ({type(fault).__name__}: {text}); train it again'
+            ) from fault
+        return result
+
+    def _learned(self) -> Arrays:
+        found = self.calibration_
+        return {
+            'temperature': np.array(found.temperature),
+            'added': found.added,
+            'factor': np.array(found.factor),
+        }
+
+    def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        self.calibration_ = Calibration(
+            float(arrays['temperature']),
+            np.asarray(arrays['added'], dtype=np.float64),
+            float(arrays['factor']),
+        )
+
+
+def folds_of(groups: NDArray[Any], folds: int) -> Index:
+    """Fold (N,) of each sample: groups in order, two runs of neighbours to each fold."""
+    names, which = np.unique(groups, return_inverse=True)
+    runs = np.arange(len(names)) * min(2 * folds, len(names)) // len(names)
+    result: Index = (runs % folds)[which].astype(np.intp)
+    return result
+
+
+def calibration(left_out: list[tuple[Components, Array]]) -> Calibration:
+    """The calibration under which samples that were left out are most probable.
+
+    Args:
+        left_out: mixtures at inputs, and the targets (n, D), of one model after the other.
+    """
+    candidates = [_added_noise(left_out, temperature) for temperature in TEMPERATURES]
+    found = max(candidates, key=lambda one: one[0])[1]
+    squares = np.concatenate([_squared_distances(found.of(c), z) for c, z in left_out])
+    wanted = float(chi2.ppf(COVERED, left_out[0][1].shape[1]))
+    factor = float(np.clip(np.quantile(squares, COVERED) / wanted, 1.0, LARGEST_FACTOR))
+    return replace(found, factor=factor)
+
+
+def _added_noise(
+    left_out: list[tuple[Components, Array]], temperature: float
+) -> tuple[float, Calibration]:
+    """E for a temperature, by expectation maximisation, and the log likelihood with it."""
+    size = left_out[0][1].shape[1]
+    found = Calibration(temperature, np.zeros((size, size)), 1.0)
+    likelihood = -np.inf
+    for _ in range(ITERATIONS):
+        lack, own, total, count = np.zeros((size, size)), np.zeros((size, size)), 0.0, 0
+        for components, targets in left_out:
+            changed = found.of(components)
+            log = changed.log_weights + changed.component_log_densities(targets)
+            total += float(np.logaddexp.reduce(log, axis=1).sum())
+            count += len(targets)
+            shares = np.exp(log_softmax(log))
+            for i in np.flatnonzero(shares.sum(0) > 1e-6).tolist():
+                offsets = targets - changed.means[:, i]
+                lack += (shares[:, i] / changed.inflation[:, i] * offsets.T) @ offsets
+                own += shares[:, i].sum() * components.noise[i]
+        likelihood = total / count
+        values, vectors = np.linalg.eigh((lack - own) / count)
+        latest, found = found, replace(found, added=(vectors * np.maximum(values, 0)) @ vectors.T)
+    # The likelihood is that of what the last iteration began with.
+    return likelihood, latest
+
+
+def _squared_distances(found: Components, targets: Array) -> Array:
+    """Squared Mahalanobis distance (n,) of each target to the nearest component with weight."""
+    squares = np.empty_like(found.log_weights)
+    for i, noise in enumerate(found.noise):
+        offsets = targets - found.means[:, i]
+        away = np.einsum('ni,ni->n', offsets, np.linalg.solve(noise, offsets.T).T)
+        squares[:, i] = away / found.inflation[:, i]
+    light = np.exp(found.log_weights - found.log_weights.max(1, keepdims=True)) < LIGHT
+    result: Array = np.where(light, np.inf, squares).min(1)
+    return result

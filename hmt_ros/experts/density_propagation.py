@@ -1,0 +1,297 @@
+"""Discriminative density propagation: mixtures through conditional densities (BME 2.1).
+
+Rule (1), with a model of p(x_t | x_{t-1}, r_t) whose input is the state, then the observation:
+
+    p(x_t | R_t) = integral p(x_t | x_{t-1}, r_t) p(x_{t-1} | R_{t-1}) dx_{t-1}
+
+Each expert i is linearised at the mean m_j of each component before, which leaves
+
+    sum_ij g_i(m_j, r) w_j N(x; f_i(m_j, r), F_ij S_j F_ij' + c_i O_i),    F = df / dx_{t-1}
+
+Rule (9), with models of p(x_t | r_t), of the dynamics p(x_t | x_{t-1}), and the equilibrium p(x_t):
+
+    p(x_t | R_t) ~ p(x_t | r_t) / p(x_t) integral p(x_t | x_{t-1}) p(x_{t-1} | R_{t-1}) dx_{t-1}
+
+The M^2 components are reduced to M: clusters of means first, which then descend a bound on the
+Kullback-Leibler divergence from the large mixture to the small one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import logsumexp
+
+from hmt_ros.experts.conditional_density import ConditionalDensity
+from hmt_ros.inference import GaussianMixture
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# Below it no kernel fires: the experts have seen nothing like the input.
+LEAST_SUPPORT = 1e-3
+# Components with a smaller share than this of the weight are dropped before the reduction.
+NEGLIGIBLE = 1e-8
+
+
+def propagate(
+    model: ConditionalDensity,
+    previous: GaussianMixture,
+    observation: ArrayLike,
+    *,
+    n_components: int | None = None,
+    without_past: GaussianMixture | None = None,
+    least_support: float = LEAST_SUPPORT,
+) -> GaussianMixture:
+    """p(x_t | R_t) by rule (1).
+
+    Components before in whose place the model has no support give their weight to the prediction
+    from the observation alone; where none has support, that prediction is the result.
+
+    Args:
+        model: of p(x_t | x_{t-1}, r_t) with inputs (x_{t-1}, r_t), states first.
+        previous: p(x_{t-1} | R_{t-1}) over states (d,).
+        observation: r_t (q,), perhaps with q = 0.
+        n_components: M of the result; None for as many as the model has experts.
+        without_past: p(x_t | r_t); None trusts the model everywhere.
+        least_support: of `ConditionalDensity.support`.
+
+    Raises:
+        ValueError: dimensions that do not fit, an observation that is not finite.
+    """
+    previous = previous.normalised()
+    inputs = _inputs(model, previous, observation)
+    trusted = np.ones(len(previous), dtype=bool)
+    if without_past is not None:
+        if without_past.dimension != model.n_outputs_:
+            raise ValueError(
+                f'without_past has dimension {without_past.dimension}, '
+                f'wanted {model.n_outputs_} as the model predicts'
+            )
+        trusted = model.support(inputs) >= least_support
+    parts = []
+    if trusted.any():
+        parts.append(linearised_products(model, previous[trusted], observation))
+    lost = float(previous.weights[~trusted].sum())
+    if without_past is not None and lost > 0:
+        rest = without_past.normalised()
+        parts.append(GaussianMixture(lost * rest.weights, rest.means, rest.covariances))
+    whole = GaussianMixture(
+        np.concatenate([one.weights for one in parts]),
+        np.concatenate([one.means for one in parts]),
+        np.concatenate([one.covariances for one in parts]),
+    )
+    return reduced(whole, n_components or _experts(model, inputs)).sorted()
+
+
+def propagate_by_dynamics(
+    dynamics: ConditionalDensity,
+    previous: GaussianMixture,
+    predicted: GaussianMixture,
+    equilibrium: GaussianMixture,
+    *,
+    n_components: int | None = None,
+) -> GaussianMixture:
+    """p(x_t | R_t) by rule (9).
+
+    Args:
+        dynamics: model of p(x_t | x_{t-1}).
+        previous: p(x_{t-1} | R_{t-1}).
+        predicted: p(x_t | r_t).
+        equilibrium: p(x_t). A single Gaussian is divided out exactly, as long as it is wider than
+            what it divides; else each product is weighted by 1 / p at its mean.
+        n_components: of the result; None for as many as `predicted` has.
+
+    Raises:
+        ValueError: dimensions that do not fit.
+    """
+    count = n_components or len(predicted)
+    prior = reduced(linearised_products(dynamics, previous, np.zeros(0)), count)
+    for name, one in (('predicted', predicted), ('equilibrium', equilibrium)):
+        if one.dimension != prior.dimension:
+            raise ValueError(
+                f'{name} has dimension {one.dimension}, wanted {prior.dimension} as the dynamics'
+            )
+    return reduced(divided_product(predicted, prior, equilibrium), count).sorted()
+
+
+def linearised_products(
+    model: ConditionalDensity, previous: GaussianMixture, observation: ArrayLike
+) -> GaussianMixture:
+    """The integral of rule (1) with experts linearised at each mean, all products kept.
+
+    Args:
+        model: with inputs (x_{t-1}, r_t).
+        previous: J components over states (d,); their weights are kept as they are.
+        observation: r_t (q,).
+    """
+    inputs = _inputs(model, previous, observation)
+    found = model.components(inputs)
+    slopes = model.jacobians(inputs)[..., : previous.dimension]
+    spread = slopes @ previous.covariances[:, None] @ np.swapaxes(slopes, -1, -2)
+    covariances = spread + found.inflation[:, :, None, None] * found.noise
+    weights = np.exp(found.log_weights) * previous.weights[:, None]
+    d = model.n_outputs_
+    return GaussianMixture(
+        weights.reshape(-1), found.means.reshape(-1, d), covariances.reshape(-1, d, d)
+    )
+
+
+def divided_product(
+    a: GaussianMixture, b: GaussianMixture, divisor: GaussianMixture
+) -> GaussianMixture:
+    """a(x) b(x) / divisor(x), normalised, one component for each pair."""
+    d = a.dimension
+    precision_a, shift_a, constant_a = _canonical(a)
+    precision_b, shift_b, constant_b = _canonical(b)
+    precision = (precision_a[:, None] + precision_b).reshape(-1, d, d)
+    shift = (shift_a[:, None] + shift_b).reshape(-1, d)
+    constant = (constant_a[:, None] + constant_b).reshape(-1)
+    exact = np.zeros(len(shift), dtype=bool)
+    if len(divisor) == 1:
+        divisor = divisor.normalised()
+        precision_d, shift_d, constant_d = _canonical(divisor)
+        less = precision - precision_d
+        # A divisor that is nearly as narrow leaves next to no Gaussian.
+        exact = np.linalg.eigvalsh(less)[:, 0] > 1e-3 * np.linalg.eigvalsh(precision)[:, 0]
+        precision = np.where(exact[:, None, None], less, precision)
+        shift = np.where(exact[:, None], shift - shift_d, shift)
+        constant = np.where(exact, constant - constant_d, constant)
+    inverse: Array = np.linalg.inv(precision).astype(np.float64)
+    covariances: Array = 0.5 * (inverse + np.swapaxes(inverse, -1, -2))
+    means = np.einsum('nij,nj->ni', covariances, shift)
+    log_det = np.linalg.slogdet(covariances)[1]
+    log = constant + 0.5 * ((shift * means).sum(1) + log_det)
+    # Without the division there is one factor of 2 pi more in the denominator.
+    at_mean = 0.5 * d * np.log(2.0 * np.pi) + divisor.log_density(means)
+    log = np.where(exact, log, log - at_mean)
+    return GaussianMixture(np.exp(log - logsumexp(log)), means, covariances)
+
+
+def reduced(mixture: GaussianMixture, count: int, iterations: int = 10) -> GaussianMixture:
+    """At most `count` components: clusters of means, then descent of `divergence_bound`.
+
+    Where pairwise merging (`GaussianMixture.reduce`) opens with a lower bound than the clusters,
+    it is what descends. The mixture's mean and covariance are kept, as every step matches moments.
+
+    Raises:
+        ValueError: count < 1.
+    """
+    if count < 1:
+        raise ValueError(f'{count} components asked for, wanted at least 1')
+    mixture = mixture.normalised()
+    if len(mixture) <= count:
+        return mixture
+    large = mixture[mixture.weights > NEGLIGIBLE].normalised()
+    if len(large) <= count:
+        return large
+    starts = clustered(large, count), large.reduce(count)
+    bound, share, small = min(
+        ((*_assignment(large, start), start) for start in starts), key=lambda one: one[0]
+    )
+    for _ in range(iterations):
+        better = _moments(large, share)
+        new_bound, share = _assignment(large, better)
+        if bound - new_bound < 1e-4:
+            break
+        bound, small = new_bound, better
+    return small
+
+
+def clustered(mixture: GaussianMixture, count: int, iterations: int = 20) -> GaussianMixture:
+    """Components merged by clusters of their means, in the metric of the mean covariance."""
+    average = np.einsum('k,kij->ij', mixture.weights / mixture.weights.sum(), mixture.covariances)
+    points = np.linalg.solve(np.linalg.cholesky(average), mixture.means.T).T
+    chosen = [int(np.argmax(mixture.weights))]
+    for _ in range(count - 1):
+        distance = ((points[:, None] - points[chosen]) ** 2).sum(2).min(1)
+        chosen.append(int(np.argmax(mixture.weights * distance)))
+    centres = points[chosen]
+    labels: Index = np.full(len(points), -1)
+    for _ in range(iterations):
+        new = np.argmin(((points[:, None] - centres) ** 2).sum(2), axis=1)
+        if (new == labels).all():
+            break
+        labels = new
+        member = (labels[:, None] == np.arange(len(centres))) * mixture.weights[:, None]
+        total = member.sum(0)
+        full = total > 0
+        centres[full] = (member.T @ points)[full] / total[full, None]
+    share = (labels[:, None] == np.arange(len(centres))).astype(np.float64)
+    return _moments(mixture, share)
+
+
+def divergence_bound(large: GaussianMixture, small: GaussianMixture) -> float:
+    """sum_a w_a min_b KL(large_a || small_b) >= KL(large || small), nats.
+
+    It bounds the divergence where the weight of each small component is the sum of the weights that
+    it stands for, as `refined` leaves them [Goldberger & Roweis, NIPS 2004].
+    """
+    return _assignment(large, small)[0]
+
+
+def refined(large: GaussianMixture, small: GaussianMixture) -> GaussianMixture:
+    """One descent of `divergence_bound`: components to the closest, then their moments."""
+    return _moments(large, _assignment(large, small)[1])
+
+
+def _assignment(large: GaussianMixture, small: GaussianMixture) -> tuple[float, Array]:
+    """The bound, and which large component goes to which small one, (A, B) of 0 and 1."""
+    divergences = gaussian_divergences(large, small)
+    share = np.zeros_like(divergences)
+    share[np.arange(len(large)), np.argmin(divergences, axis=1)] = 1.0
+    return float(large.weights @ divergences.min(axis=1)), share
+
+
+def gaussian_divergences(a: GaussianMixture, b: GaussianMixture) -> Array:
+    """KL(a_i || b_j), (A, B), between components."""
+    inverse = np.linalg.inv(b.covariances)
+    trace = a.covariances.reshape(len(a), -1) @ inverse.reshape(len(b), -1).T
+    offsets = a.means - b.means[:, None]
+    square = ((offsets @ inverse) * offsets).sum(2).T
+    log_det = np.linalg.slogdet(b.covariances)[1] - np.linalg.slogdet(a.covariances)[1][:, None]
+    result: Array = 0.5 * (trace + square + log_det - a.dimension)
+    return result
+
+
+def _moments(mixture: GaussianMixture, share: Array) -> GaussianMixture:
+    """Components of the moments of what the shares (K, B) assign to them; empty ones are left."""
+    mass = share * mixture.weights[:, None]
+    total = mass.sum(0)
+    mass, total = mass[:, total > 0], total[total > 0]
+    mass = mass / total
+    means = mass.T @ mixture.means
+    offsets = mixture.means[:, None] - means
+    covariances = (mass.T @ mixture.covariances.reshape(len(mixture), -1)).reshape(
+        -1, mixture.dimension, mixture.dimension
+    )
+    offsets = np.swapaxes(offsets, 0, 1)
+    covariances += np.swapaxes(offsets * mass.T[:, :, None], 1, 2) @ offsets
+    return GaussianMixture(total, means, 0.5 * (covariances + np.swapaxes(covariances, 1, 2)))
+
+
+def _canonical(mixture: GaussianMixture) -> tuple[Array, Array, Array]:
+    """Precisions P, shifts P m, and the logarithms of w N at x = 0."""
+    precision: Array = np.linalg.inv(mixture.covariances).astype(np.float64)
+    shift = np.einsum('kij,kj->ki', precision, mixture.means)
+    square = (shift * mixture.means).sum(1)
+    log_det = np.linalg.slogdet(mixture.covariances)[1]
+    with np.errstate(divide='ignore'):
+        constant = np.log(mixture.weights)
+    return precision, shift, constant - 0.5 * (square + log_det)
+
+
+def _inputs(model: ConditionalDensity, previous: GaussianMixture, observation: ArrayLike) -> Array:
+    """Inputs (J, d + q) at the means of the components before."""
+    observation = np.asarray(observation, dtype=np.float64)
+    if observation.ndim != 1 or previous.dimension + len(observation) != model.n_inputs_:
+        raise ValueError(
+            f'states of dimension {previous.dimension} and an observation of shape '
+            f'{observation.shape}, wanted {model.n_inputs_} numbers together'
+        )
+    rows = np.broadcast_to(observation, (len(previous), len(observation)))
+    return np.hstack([previous.means, rows])
+
+
+def _experts(model: ConditionalDensity, inputs: Array) -> int:
+    return int(model.components(inputs[:1]).means.shape[1])

@@ -1,0 +1,338 @@
+"""Gates: which expert is responsible for an input (BME 2.2.2 and 2.2.3).
+
+`SoftmaxGates` model the choice alone:
+
+    g(r) = softmax(V phi(r)),    V_ik ~ N(0, 1 / b_k),    b_k ~ Gamma(A, B)
+
+`GaussianGates` model where each expert's inputs lie:
+
+    g_i(r) proportional to a_i N(r; m_i, C_i)
+
+Both learn towards responsibilities h (N, M) and never lower
+
+    sum_n s_n sum_i h_ni log g_i(r_n) + penalty
+
+which is their share of the bound that the experts climb. The penalty of the softmax is its log
+prior and the Laplace approximation of the integral over V, that of the Gaussians an inverse
+Wishart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+
+from hmt_ros.experts.basis import Basis, LinearBasis, RadialBasis, basis_of
+from hmt_ros.experts.model_file import Arrays, nested, part
+from hmt_ros.experts.training_pairs import Standardisation
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# Gamma hyperprior of precisions: shape and rate (BME 2.2.2).
+SHAPE, RATE = 1e-2, 1e-4
+# Bounds on precisions: a gate that is as sharp as it likes would never converge.
+LEAST_PRECISION = 1e-5
+# A function that determines less than this part of a parameter may be pruned.
+USELESS = 0.05
+DAMPING_LIMIT = 1e10
+# Newton steps between two E-steps; the next M-step goes on from there.
+NEWTON_STEPS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class SoftmaxGates:
+    """Multinomial logistic regression with relevance determination.
+
+    Attributes:
+        basis: K functions.
+        weights: (M, K) V.
+        precisions: (K,) b.
+        penalty: of the bound, nats.
+    """
+
+    basis: Basis
+    weights: Array
+    precisions: Array
+    penalty: float
+
+    @classmethod
+    def flat(cls, basis: Basis, experts: int) -> SoftmaxGates:
+        """Equal gates of M experts that have learned nothing."""
+        count = len(basis)
+        return cls(basis, np.zeros((experts, count)), np.full(count, 1e-1), -np.inf)
+
+    def features(self, inputs: Array) -> Array:
+        """What `log_scores` and `learned` want of inputs (n, p)."""
+        return self.basis.evaluate(inputs)
+
+    def log_scores(self, features: Array) -> Array:
+        """log g, (n, M)."""
+        return log_softmax(features @ self.weights.T)
+
+    def learned(
+        self, features: Array, responsibilities: Array, sample_weights: Array
+    ) -> tuple[SoftmaxGates, Array]:
+        """Better gates and the features that are left after pruning (n, K')."""
+        if len(self.weights) == 1:
+            return replace(self, penalty=0.0), features
+        problem = _Softmax(features, responsibilities, sample_weights)
+        best = self._settled(problem, self.weights, self.precisions, steps=0)
+        moved = self._settled(problem, self.weights, self.precisions)
+        best = max(best, moved, key=lambda one: one.value)
+        updated = self._settled(problem, moved.weights, problem.better_precisions(moved))
+        best = max(best, updated, key=lambda one: one.value)
+        useless = best.determined < USELESS * len(self.weights)
+        useless[0] = False
+        kept = np.flatnonzero(~useless)
+        basis = self.basis
+        if useless.any() and isinstance(basis, RadialBasis):
+            fewer = self._settled(problem.of(kept), best.weights[:, kept], best.precisions[kept])
+            if fewer.value >= best.value:
+                best, features = fewer, features[:, kept]
+                basis = basis.subset(kept[1:] - 1)
+        return SoftmaxGates(basis, best.weights, best.precisions, best.penalty), features
+
+    def of_experts(self, kept: Index) -> SoftmaxGates:
+        """The gates of some of the experts."""
+        return replace(self, weights=self.weights[kept])
+
+    def arrays(self) -> Arrays:
+        """For a file."""
+        own = {'weights': self.weights, 'precisions': self.precisions}
+        return own | nested('basis', self.basis.arrays())
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> SoftmaxGates:
+        """The gates whose `arrays` these are."""
+        basis = basis_of(part('basis', arrays))
+        return cls(basis, arrays['weights'], arrays['precisions'], 0.0)
+
+    @staticmethod
+    def _settled(
+        problem: _Softmax, weights: Array, precisions: Array, steps: int = NEWTON_STEPS
+    ) -> _SoftmaxFit:
+        return problem.laplace(problem.newton(weights, precisions, steps), precisions)
+
+
+@dataclass(frozen=True, eq=False)
+class _SoftmaxFit:
+    """Weights with their precisions, and how good they are.
+
+    Attributes:
+        value: share of the bound, nats.
+        penalty: the part of it that does not depend on responsibilities.
+        determined: (K,) effective number of parameters of each function, 0 to M.
+    """
+
+    weights: Array
+    precisions: Array
+    value: float
+    penalty: float
+    determined: Array
+
+
+class _Softmax:
+    """Likelihood, gradient and Hessian of the softmax for given responsibilities."""
+
+    def __init__(self, features: Array, responsibilities: Array, sample_weights: Array) -> None:
+        self.features = features
+        self.targets = responsibilities * sample_weights[:, None]
+        self.sample_weights = sample_weights
+
+    def of(self, functions: Index) -> _Softmax:
+        result = _Softmax.__new__(_Softmax)
+        result.features = self.features[:, functions]
+        result.targets, result.sample_weights = self.targets, self.sample_weights
+        return result
+
+    def likelihood(self, weights: Array) -> tuple[float, Array]:
+        """sum s h log g, and the gates (N, M)."""
+        log_gates = log_softmax(self.features @ weights.T)
+        return float((self.targets * log_gates).sum()), np.exp(log_gates)
+
+    def curvature(self, gates: Array) -> Array:
+        """Minus the Hessian of the likelihood, (M K, M K)."""
+        experts, count = gates.shape[1], self.features.shape[1]
+        result = np.empty((experts, count, experts, count))
+        for i in range(experts):
+            for j in range(i, experts):
+                scale = self.sample_weights * gates[:, i] * ((i == j) - gates[:, j])
+                block = self.features.T @ (scale[:, None] * self.features)
+                result[i, :, j] = block
+                result[j, :, i] = block.T
+        return result.reshape(experts * count, experts * count)
+
+    def newton(self, weights: Array, precisions: Array, steps: int) -> Array:
+        """Damped Newton steps, each accepted by the ratio of true to predicted gain."""
+        shape = weights.shape
+        prior = np.tile(precisions, shape[0])
+        likelihood, gates = self.likelihood(weights)
+        value = likelihood - 0.5 * float((precisions * weights**2).sum())
+        damping, growth = 1e-3, 2.0
+        fresh = True
+        for _ in range(2 * steps):
+            if fresh:
+                gradient = ((self.targets - self.sample_weights[:, None] * gates).T) @ self.features
+                gradient = (gradient - precisions * weights).ravel()
+                hessian = self.curvature(gates)
+                hessian[np.diag_indices_from(hessian)] += prior
+                scale = np.diagonal(hessian).copy()
+            damped = hessian.copy()
+            damped[np.diag_indices_from(damped)] += damping * scale
+            step = cho_solve((cholesky(damped, lower=True), True), gradient)
+            predicted = float(gradient @ step - 0.5 * step @ hessian @ step)
+            if predicted < 1e-4 or damping > DAMPING_LIMIT:
+                break
+            trial = weights + step.reshape(shape)
+            likelihood, trial_gates = self.likelihood(trial)
+            trial_value = likelihood - 0.5 * float((precisions * trial**2).sum())
+            ratio = (trial_value - value) / predicted
+            fresh = ratio > 1e-3
+            if fresh:
+                weights, value, gates = trial, trial_value, trial_gates
+                damping *= max(1.0 / 3.0, 1.0 - (2.0 * min(ratio, 2.0) - 1.0) ** 3)
+                growth = 2.0
+            else:
+                damping *= growth
+                growth *= 2.0
+        return weights
+
+    def laplace(self, weights: Array, precisions: Array) -> _SoftmaxFit:
+        """The share of the bound, with the integral over weights approximated at their optimum."""
+        experts, count = weights.shape
+        likelihood, gates = self.likelihood(weights)
+        hessian = self.curvature(gates)
+        hessian[np.diag_indices_from(hessian)] += np.tile(precisions, experts)
+        factor = cholesky(hessian, lower=True)
+        half_log_det = float(np.log(np.diagonal(factor)).sum())
+        penalty = -0.5 * float((precisions * weights**2).sum()) - half_log_det
+        penalty += 0.5 * experts * float(np.log(precisions).sum())
+        # Relative to a precision at the top of its hyperprior, so that functions can be left out.
+        hyper = SHAPE * np.log(precisions * RATE / SHAPE) - RATE * precisions + SHAPE
+        penalty += float(hyper.sum())
+        inverse = solve_triangular(factor, np.eye(len(factor)), lower=True)
+        variances = (inverse**2).sum(0).reshape(experts, count)
+        determined = experts - precisions * variances.sum(0)
+        return _SoftmaxFit(weights, precisions, likelihood + penalty, penalty, determined)
+
+    @staticmethod
+    def better_precisions(found: _SoftmaxFit) -> Array:
+        """MacKay's fixed point with the hyperprior."""
+        determined = np.maximum(found.determined, 0.0)
+        precisions = (determined + 2.0 * SHAPE) / ((found.weights**2).sum(0) + 2.0 * RATE)
+        result: Array = np.maximum(precisions, LEAST_PRECISION)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianGates:
+    """Where the inputs of each expert lie.
+
+    Attributes:
+        standardisation: r -> z.
+        log_shares: (M,) log a.
+        means: (M, p) m, standardised.
+        covariances: (M, p, p) C, standardised.
+        strength: samples that the prior of C counts for.
+        target: (p, p) covariance that the prior pulls to.
+        penalty: of the bound, nats.
+    """
+
+    standardisation: Standardisation
+    log_shares: Array
+    means: Array
+    covariances: Array
+    strength: float
+    target: Array
+    penalty: float
+
+    def __post_init__(self) -> None:
+        factors = np.linalg.cholesky(self.covariances)
+        size = factors.shape[1]
+        inverse = np.array([solve_triangular(f, np.eye(size), lower=True) for f in factors])
+        object.__setattr__(self, '_whiteners', inverse)
+        log_det = 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
+        object.__setattr__(self, '_log_dets', log_det)
+
+    def features(self, inputs: Array) -> Array:
+        """Standardised inputs (n, p)."""
+        return self.standardisation.apply(inputs)
+
+    def log_scores(self, features: Array) -> Array:
+        """log a_i N(r; m_i, C_i), (n, M), not normalised over experts; r standardised."""
+        whiteners: Array = self.__dict__['_whiteners']
+        log_dets: Array = self.__dict__['_log_dets']
+        result = np.empty((len(features), len(self.means)))
+        for i, mean in enumerate(self.means):
+            z = (features - mean) @ whiteners[i].T
+            result[:, i] = (z * z).sum(1)
+        size = features.shape[1] * np.log(2.0 * np.pi)
+        log_scores: Array = self.log_shares - 0.5 * (result + log_dets + size)
+        return log_scores
+
+    def learned(
+        self, features: Array, responsibilities: Array, sample_weights: Array
+    ) -> tuple[GaussianGates, Array]:
+        """Weighted means and covariances (BME 45 to 47) with their prior."""
+        share = responsibilities * sample_weights[:, None]
+        total = share.sum(0)
+        means = (share.T @ features) / total[:, None]
+        covariances = np.empty_like(self.covariances)
+        for i, mean in enumerate(means):
+            offsets = features - mean
+            scatter = offsets.T @ (share[:, i, None] * offsets)
+            covariance = (scatter + self.strength * self.target) / (total[i] + self.strength)
+            covariances[i] = 0.5 * (covariance + covariance.T)
+        result = replace(
+            self, log_shares=np.log(total / total.sum()), means=means, covariances=covariances
+        )
+        log_dets: Array = result.__dict__['_log_dets']
+        traces = np.einsum('mij,ji->m', np.linalg.inv(covariances), self.target)
+        penalty = -0.5 * self.strength * float((log_dets + traces).sum())
+        return replace(result, penalty=penalty), features
+
+    def of_experts(self, kept: Index) -> GaussianGates:
+        """The gates of some of the experts."""
+        shares = self.log_shares[kept]
+        return replace(
+            self,
+            log_shares=log_softmax(shares[None])[0],
+            means=self.means[kept],
+            covariances=self.covariances[kept],
+        )
+
+    def arrays(self) -> Arrays:
+        """For a file."""
+        return {
+            'log_shares': self.log_shares,
+            'means': self.means,
+            'covariances': self.covariances,
+            'strength': np.array(self.strength),
+            'target': self.target,
+        } | nested('basis', LinearBasis(self.standardisation).arrays())
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> GaussianGates:
+        """The gates whose `arrays` these are."""
+        return cls(
+            basis_of(part('basis', arrays)).standardisation,
+            arrays['log_shares'],
+            arrays['means'],
+            arrays['covariances'],
+            float(arrays['strength']),
+            arrays['target'],
+            0.0,
+        )
+
+
+def log_softmax(scores: Array) -> Array:
+    """Scores (n, M) less the logarithm of the sum of their exponentials."""
+    result: Array = scores - scores.max(axis=1, keepdims=True)
+    result -= np.log(np.exp(result).sum(axis=1, keepdims=True))
+    return result

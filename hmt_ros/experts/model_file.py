@@ -1,0 +1,126 @@
+"""Learned models in files: one .npz of plain arrays, without pickled objects.
+
+An archive names its format, the version of the format and the kind of model, and holds the
+constructor's parameters as JSON besides the learned arrays. A part of a larger file keeps its
+arrays under a prefix: `nested` and `part`.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FORMAT = 'hmt_ros model'
+VERSION = 1
+
+Arrays = dict[str, NDArray[Any]]
+
+# What every archive holds besides the arrays of its kind.
+_HEADER = ('format', 'version', 'kind', 'parameters')
+
+
+def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
+    """The arrays that say what an archive is.
+
+    Args:
+        kind: of model.
+        parameters: anything that JSON can hold.
+    """
+    return {
+        'format': np.array(FORMAT),
+        'version': np.array(VERSION),
+        'kind': np.array(kind),
+        'parameters': np.array(json.dumps(dict(parameters), sort_keys=True)),
+    }
+
+
+def check_header(arrays: Mapping[str, NDArray[Any]], kind: str | None, where: str) -> str:
+    """The kind of model that the arrays are.
+
+    Args:
+        arrays: of an archive.
+        kind: wanted; None for any.
+        where: the name of the file, for messages.
+
+    Raises:
+        ValueError: another format, another version, another kind.
+    """
+    if any(name not in arrays for name in _HEADER) or str(arrays['format']) != FORMAT:
+        raise ValueError(f'{where}: not a model file of hmt_ros; train one with `train`')
+    version = str(arrays['version'])
+    if version != str(VERSION):
+        raise ValueError(
+            f'{where}: model file of version {version}, wanted {VERSION}; train it again'
+        )
+    found = str(arrays['kind'])
+    if kind is not None and found != kind:
+        raise ValueError(f'{where}: a model of kind {found!r}, wanted {kind!r}; load it as {found}')
+    return found
+
+
+def parameters_of(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """The constructor's parameters that an archive holds."""
+    result = json.loads(str(arrays['parameters']))
+    if not isinstance(result, dict):
+        raise ValueError(f'parameters are a {type(result).__name__}, wanted a mapping')
+    return result
+
+
+def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
+    """Writes an archive; the same arrays give the same bytes.
+
+    Args:
+        path: of the file; '.npz' is appended where it is missing.
+        arrays: with those of `header`.
+
+    Returns:
+        The path written.
+    """
+    path = Path(path)
+    if path.suffix != '.npz':
+        path = path.with_name(path.name + '.npz')
+    content: dict[str, Any] = dict(arrays)
+    with path.open('wb') as file:
+        np.savez_compressed(file, **content)
+    return path
+
+
+def read_arrays(path: str | Path, kind: str | None = None) -> Arrays:
+    """The arrays of an archive of the kind.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not an archive of this format, version and kind.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f'{path}: no such model file; train one with `train`')
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as fault:
+        text = ' '.join(str(fault).split())
+        raise ValueError(f'{path}: not a model file of hmt_ros ({text})') from fault
+    check_header(arrays, kind, str(path))
+    return arrays
+
+
+def nested(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    """The arrays under names that open with the prefix, to go into a larger archive."""
+    return {f'{prefix}/{name}': value for name, value in arrays.items()}
+
+
+def part(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
+    """The arrays that `nested` has put under the prefix."""
+    opening = f'{prefix}/'
+    return {
+        name.removeprefix(opening): value
+        for name, value in arrays.items()
+        if name.startswith(opening)
+    }

@@ -1,0 +1,244 @@
+"""The target that experts learn: a pose as it looks from where the camera sees it, without a wrap.
+
+A target has D = 6 + A numbers. The first six are two axes of the pelvis, the one to the front and
+the one up, in the frame of the viewing ray: the camera turned so that its optical axis meets the
+pelvis. The same posture then has the same target wherever in the image it is, and a turning person
+meets no jump from +180 to -180 degrees. The others are the A joint angles, all of which lie within
+limits less than a turn apart. Where the person is, is not part of the target: the look of a
+silhouette does not say it, see `root_placement`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmt_ros.body import Body
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.mirror import root_angles, root_rotations
+
+Array = NDArray[np.float64]
+
+AXES = 6
+ROOT = ('root_tx', 'root_ty', 'root_tz')
+TURNS = ('root_z', 'root_y', 'root_x')
+# A mean over opposite headings is a short vector, whose direction means little: its derivative is
+# taken as if it were not shorter than this.
+SHORTEST = 0.1
+STEEPEST = np.radians(86.0)  # of the middle root angle; further, the other two fall together
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEncoding:
+    """Targets of the poses of a body.
+
+    Attributes:
+        body: whose root has the degrees of freedom tx, ty, tz, z, y, x in this order, as those that
+            ship.
+
+    Raises:
+        ValueError: a body with another root.
+    """
+
+    body: Body
+
+    def __post_init__(self) -> None:
+        skeleton = self.body.skeleton
+        segments = skeleton.dof_segments
+        if self.body.dof_names[:AXES] != ROOT + TURNS or (segments[:AXES] != 0).any():
+            raise ValueError(
+                f'body {self.body.name} has the root {self.body.dof_names[:AXES]}, wanted '
+                f'{ROOT + TURNS}: take one such as human37'
+            )
+
+    @property
+    def size(self) -> int:
+        """Length of a target, D."""
+        return self.body.dimension
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the numbers of a target, (D,)."""
+        axes = tuple(f'{axis}_{c}' for axis in ('front', 'up') for c in 'xyz')
+        return axes + self.body.dof_names[AXES:]
+
+    def encode(self, poses: ArrayLike) -> Array:
+        """Targets (N, D) of poses (N, d), whose roots lie before the camera.
+
+        Raises:
+            ValueError: poses of wrong shape, not finite, or at the camera's centre.
+        """
+        poses = np.asarray(poses, dtype=np.float64)
+        turned = root_rotations(self.body, poses)
+        seen = ray_rotations(poses[:, :3]).transpose(0, 2, 1) @ turned
+        axes = seen[:, :, 1:].transpose(0, 2, 1).reshape(-1, AXES)
+        return np.concatenate([axes, poses[:, AXES:]], axis=1)
+
+    def decode(self, targets: ArrayLike, roots: ArrayLike) -> Array:
+        """Poses (N, d) of targets (N, D), with the roots at (N, 3), camera frame, m.
+
+        Axes that are not perpendicular are made so, the front first; joint angles beyond the limits
+        of the body are set to them.
+        """
+        targets, roots = self._checked(targets, roots)
+        poses = np.empty((len(targets), self.body.dimension))
+        poses[:, :3] = roots
+        turned = ray_rotations(roots) @ _orthogonal(targets[:, :AXES])
+        poses[:, 3:AXES] = root_angles(self.body, turned)
+        lower, upper = self.body.lower[AXES:], self.body.upper[AXES:]
+        poses[:, AXES:] = np.clip(targets[:, AXES:], lower, upper)
+        return poses
+
+    def jacobians(self, targets: ArrayLike, roots: ArrayLike) -> tuple[Array, Array]:
+        """Derivatives of `decode`: by the targets (N, d, D) and by the roots (N, d, 3).
+
+        A joint angle that is set to its limit is taken to move all the same: its spread stays.
+        """
+        targets, roots = self._checked(targets, roots)
+        n, d = len(targets), self.body.dimension
+        poses = self.decode(targets, roots)
+        # Angles from a small rotation of the root: the inverse of the axes that they turn about.
+        axes = forward(self.body.skeleton, poses).axes[3:AXES].transpose(2, 1, 0)  # (N, 3, angle)
+        from_rotation = np.linalg.pinv(axes, rcond=np.cos(STEEPEST) / 2)
+        by_target, by_root = np.zeros((n, d, d)), np.zeros((n, d, 3))
+        to_camera = ray_rotations(roots)
+        by_target[:, 3:AXES, :AXES] = (
+            from_rotation @ to_camera @ _rotation_by_axes(targets[:, :AXES])
+        )
+        by_target[:, AXES:, AXES:] = np.eye(d - AXES)
+        by_root[:, :3] = np.eye(3)
+        by_root[:, 3:AXES] = from_rotation @ _rotation_by_root(roots)
+        return by_target, by_root
+
+    def decode_gaussian(
+        self, mean: Array, covariance: Array, root: Array, root_covariance: Array
+    ) -> tuple[Array, Array]:
+        """Gaussian over poses, (d,) and (d, d), of one over targets and one over the root.
+
+        By linearisation; target and root are independent.
+
+        Args:
+            mean, covariance: (D,), (D, D) over targets.
+            root, root_covariance: (3,) m, (3, 3) m^2.
+        """
+        by_target, by_root = (x[0] for x in self.jacobians(mean[None], root[None]))
+        result = by_target @ covariance @ by_target.T + by_root @ root_covariance @ by_root.T
+        return self.decode(mean[None], root[None])[0], 0.5 * (result + result.T)
+
+    def encoding_jacobian(self, pose: ArrayLike) -> Array:
+        """Derivative (D, d) of `encode` at a pose (d,)."""
+        pose = np.asarray(pose, dtype=np.float64)[None]
+        d = self.body.dimension
+        result = np.zeros((d, d))
+        to_ray = ray_rotations(pose[:, :3])[0].T
+        axes = forward(self.body.skeleton, pose).axes[3:AXES, :, 0].T  # (3, angle)
+        front_up = root_rotations(self.body, pose)[0].T[1:]  # camera frame
+        for k, axis in enumerate(front_up):
+            rows = slice(3 * k, 3 * k + 3)
+            result[rows, 3:AXES] = to_ray @ -_cross_matrix(axis) @ axes
+            # The frame of the ray turns with the root: seen from it the axis turns back.
+            result[rows, :3] = to_ray @ _cross_matrix(axis) @ _rotation_by_root(pose[:, :3])[0]
+        result[AXES:, AXES:] = np.eye(d - AXES)
+        return result
+
+    def _checked(self, targets: ArrayLike, roots: ArrayLike) -> tuple[Array, Array]:
+        targets = np.asarray(targets, dtype=np.float64)
+        roots = np.asarray(roots, dtype=np.float64)
+        if targets.shape != (len(targets), self.size) or roots.shape != (len(targets), 3):
+            raise ValueError(
+                f'targets {targets.shape} and roots {roots.shape}, wanted (N, {self.size}), (N, 3)'
+            )
+        return targets, roots
+
+
+def ray_rotations(points: Array) -> Array:
+    """The least rotations (N, 3, 3) that turn the optical axis to points (N, 3).
+
+    Raises:
+        ValueError: a point at the camera's centre or straight behind it.
+    """
+    distance = np.linalg.norm(points, axis=1)
+    if not (distance > 0).all() or not (points[:, 2] > -0.99 * distance).all():
+        raise ValueError('the root must lie before the camera')
+    a, b, c = (points / distance[:, None]).T
+    k = 1.0 / (1.0 + c)
+    result = np.empty((len(points), 3, 3))
+    result[:, 0, 0], result[:, 1, 1], result[:, 2, 2] = 1 - k * a * a, 1 - k * b * b, c
+    result[:, 0, 1] = result[:, 1, 0] = -k * a * b
+    result[:, 0, 2], result[:, 1, 2], result[:, 2, 0], result[:, 2, 1] = a, b, -a, -b
+    return result
+
+
+def _rotation_by_root(points: Array) -> Array:
+    """Small rotation (N, 3, 3) of the ray's frame, camera frame, by the point (N, 3)."""
+    distance = np.linalg.norm(points, axis=1)
+    direction = points / distance[:, None]
+    a, b, c = direction.T
+    k = 1.0 / (1.0 + c)
+    zero, one = np.zeros_like(a), np.ones_like(a)
+    by_a = [[-2 * k * a, -k * b, one], [-k * b, zero, zero], [-one, zero, zero]]
+    by_b = [[zero, -k * a, zero], [-k * a, -2 * k * b, one], [zero, -one, zero]]
+    by_c = [[k * k * a * a, k * k * a * b, zero], [k * k * a * b, k * k * b * b, zero],
+            [zero, zero, one]]  # fmt: skip
+    change = np.array([by_a, by_b, by_c]).transpose(3, 0, 1, 2)  # (N, component, 3, 3)
+    skew = change @ ray_rotations(points)[:, None].transpose(0, 1, 3, 2)
+    # A direction keeps its length: only changes across it count, and for these it is a rotation.
+    across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+    across /= distance[:, None, None]
+    skew = np.einsum('ncij,ncd->ndij', skew, across)
+    return np.stack([skew[:, :, 2, 1], skew[:, :, 0, 2], skew[:, :, 1, 0]], axis=1)
+
+
+def _orthogonal(axes: Array) -> Array:
+    """Rotations (N, 3, 3) whose second and third columns are nearest to axes (N, 6)."""
+    front = _unit(axes[:, :3])
+    up = axes[:, 3:] - (axes[:, 3:] * front).sum(1, keepdims=True) * front
+    up = _unit(up)
+    result = np.empty((len(axes), 3, 3))
+    result[:, :, 1], result[:, :, 2] = front, up
+    for k in range(3):  # the cross product of both
+        i, j = (k + 1) % 3, (k + 2) % 3
+        result[:, k, 0] = front[:, i] * up[:, j] - front[:, j] * up[:, i]
+    return result
+
+
+def _rotation_by_axes(axes: Array) -> Array:
+    """Small rotations (N, 3, 6) that axes (N, 6) cause, in the frame that they are given in."""
+    front, up = axes[:, :3], axes[:, 3:]
+    frame = _orthogonal(axes)
+    y, z = frame[:, :, 1], frame[:, :, 2]
+    result = np.empty((len(axes), 3, AXES))
+    eye = np.eye(3)
+    across = eye - y[:, :, None] * y[:, None, :]
+    dy = across / np.maximum(np.linalg.norm(front, axis=1), SHORTEST)[:, None, None]
+    along = (up * y).sum(1)[:, None, None]
+    rest = np.linalg.norm(up - along[:, :, 0] * y, axis=1)
+    # d(up - (up y) y): by the front through y, and by the up axis itself.
+    by_front = -(y[:, :, None] * (up[:, None, :] @ dy)) - along * dy
+    flat = eye - z[:, :, None] * z[:, None, :]
+    flat /= np.maximum(rest, SHORTEST)[:, None, None]
+    dz = [flat @ by_front, flat @ across]
+    dys = [dy, np.zeros_like(dy)]
+    x = frame[:, :, 0]
+    for k in range(2):
+        # dy = w x y and dz = w x z give w = x (dy z) + y (dz x) + z (dx y), with dx y = -x dy.
+        result[:, :, 3 * k : 3 * k + 3] = (
+            x[:, :, None] * (z[:, None] @ dys[k])
+            + y[:, :, None] * (x[:, None] @ dz[k])
+            - z[:, :, None] * (x[:, None] @ dys[k])
+        )
+    return result
+
+
+def _unit(vectors: Array) -> Array:
+    """Unit vectors (N, 3); of a vector of no length the optical axis, against the view."""
+    norm = np.sqrt((vectors * vectors).sum(1, keepdims=True))
+    result: Array = vectors / np.maximum(norm, 1e-9)
+    result[norm[:, 0] <= 1e-9] = 0.0, 0.0, -1.0
+    return result
+
+
+def _cross_matrix(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

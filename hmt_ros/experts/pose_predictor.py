@@ -1,0 +1,359 @@
+"""From a silhouette to a mixture over full poses: descriptor, experts, encoding and placement.
+
+    mask -> centred view -> descriptor -> experts -> mixture over targets
+    mask -> place and size -> root of each component -> mixture over poses
+
+All that is learned is in one object and one file. With dynamics, which are experts of
+p(x_t | x_t-1, r_t), it also propagates a mixture over time (BME 2.1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.experts.calibrated_experts import MODELS as CALIBRATED_MODELS
+from hmt_ros.experts.calibrated_experts import CalibratedExperts
+from hmt_ros.experts.conditional_density import ConditionalDensity
+from hmt_ros.experts.density_propagation import propagate, reduced
+from hmt_ros.experts.model_file import (
+    Arrays,
+    header,
+    nested,
+    parameters_of,
+    part,
+    read_arrays,
+    write_arrays,
+)
+from hmt_ros.experts.pose_encoding import PoseEncoding
+from hmt_ros.experts.root_placement import (
+    SIZE_SPREAD,
+    RootPlacement,
+    place_roots,
+    placed_gaussians,
+)
+from hmt_ros.image.centred_view import centred_view
+from hmt_ros.image.contour import person_blob
+from hmt_ros.image.silhouette_descriptor import (
+    PlaceAndSize,
+    SilhouetteDescriptor,
+    place_and_size,
+    silhouette_parts,
+)
+from hmt_ros.inference import GaussianMixture
+
+Array = NDArray[np.float64]
+
+KIND = 'pose_predictor'
+MODELS: dict[str, type[ConditionalDensity]] = {
+    **CALIBRATED_MODELS,
+    CalibratedExperts.kind: CalibratedExperts,
+}
+MAX_COMPONENTS = 8
+LIGHTEST = 1e-3  # weight below which a component is left out
+JITTER = 1e-9  # m^2 and rad^2, of a pose
+# Share of p(x_t | r_t) in a mixture that is propagated, so that a track that has lost its way finds
+# back.
+ANEW = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What was made of a silhouette.
+
+    Attributes:
+        mixture: over poses, heaviest component first.
+        place: of the person in the image; its remarks are for the user.
+        placement: of the components, in the order of the mixture.
+        support: 0 to 1, how far the silhouette is like those that were learned from.
+    """
+
+    mixture: GaussianMixture
+    place: PlaceAndSize
+    placement: RootPlacement
+    support: float
+
+
+class PosePredictor:
+    """Mixtures over the poses of a body from silhouettes.
+
+    Args:
+        body: whose poses are predicted.
+        descriptor: that has learned.
+        model: of p(z | descriptor), that has learned.
+        target_basis: (D, D) B; what models learn is z = B' x of a target x.
+        dynamics: of p(z | previous z, descriptor), that has learned; None: no dynamics.
+        notes: what a file keeps to say where the model comes from; JSON.
+
+    Raises:
+        ValueError: parts that do not fit each other.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        descriptor: SilhouetteDescriptor,
+        model: ConditionalDensity,
+        target_basis: Array,
+        dynamics: ConditionalDensity | None = None,
+        notes: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.encoding = PoseEncoding(body)
+        self.descriptor = descriptor
+        self.model = model
+        self.dynamics = dynamics
+        self.notes = dict(notes or {})
+        size = self.encoding.size
+        self.target_basis = target_basis
+        _check_fit('model', model, descriptor.size, size)
+        if dynamics is not None:
+            _check_fit('dynamics', dynamics, size + descriptor.size, size)
+        if target_basis.shape != (size, size) or not np.isfinite(target_basis).all():
+            raise ValueError(
+                f'target_basis must be finite and ({size}, {size}), saw {target_basis.shape}'
+            )
+        self._from_basis = np.asarray(np.linalg.inv(target_basis), dtype=np.float64)
+
+    @property
+    def body(self) -> Body:
+        """Whose poses are predicted."""
+        return self.encoding.body
+
+    def with_body(self, body: Body) -> PosePredictor:
+        """The same predictor for a person of other lengths.
+
+        Raises:
+            ValueError: a body with other degrees of freedom.
+        """
+        _check_body(body, self.body.dof_names, f'this predictor, of {self.body.name}')
+        return PosePredictor(
+            body, self.descriptor, self.model, self.target_basis, self.dynamics, self.notes
+        )
+
+    def predict(self, mask: ArrayLike, camera: Camera) -> GaussianMixture:
+        """Mixture over poses of the person in a mask (H, W); see `observe`."""
+        return self.observe(mask, camera).mixture
+
+    def observe(
+        self,
+        mask: ArrayLike,
+        camera: Camera,
+        previous: GaussianMixture | None = None,
+        *,
+        max_components: int = MAX_COMPONENTS,
+        size_spread: float = SIZE_SPREAD,
+    ) -> Prediction:
+        """What a mask (H, W) says about the person in it.
+
+        Args:
+            mask: not zero where the person is.
+            camera: that saw it.
+            previous: mixture over poses one step before; taken into account where there are
+                dynamics.
+            max_components: of the mixture at most; the heaviest stay.
+            size_spread: relative standard deviation of the person's size; 0 where the lengths of
+                the body are those of the person.
+
+        Raises:
+            NoSilhouetteError: nobody is seen.
+            ValueError: a mask that is not of this camera.
+        """
+        seen = np.asarray(mask)
+        if seen.shape != (camera.height, camera.width):
+            raise ValueError(
+                f'the mask has shape {seen.shape}, but the camera gives '
+                f'({camera.height}, {camera.width})'
+            )
+        blob = person_blob(seen)
+        place = place_and_size(blob)
+        parts = silhouette_parts(centred_view(blob, camera), self.descriptor.points)
+        descriptor = self.descriptor.describe_parts([parts])
+        support = float(self.model.support(descriptor)[0])
+        before = None if previous is None else self._to_targets(previous)
+        targets = self.targets_after(descriptor[0], before, max_components)
+        placement = place_roots(
+            self.encoding, camera, place, targets.means, targets.covariances,
+            size_spread=size_spread,
+        )  # fmt: skip
+        means, covariances = placed_gaussians(
+            self.encoding, targets.means, targets.covariances, placement
+        )
+        covariances += JITTER * np.eye(self.encoding.size)
+        mixture = GaussianMixture(targets.weights, means, covariances)
+        return Prediction(mixture, place, placement, support)
+
+    def propagate(
+        self, previous: GaussianMixture, mask: ArrayLike, camera: Camera
+    ) -> GaussianMixture:
+        """Mixture over poses given that of the image before (BME 2.1, rule 1).
+
+        Without dynamics, and where no kernel of the dynamics fires, this is `predict`.
+        """
+        return self.observe(mask, camera, previous).mixture
+
+    def describe(self, mask: ArrayLike, camera: Camera) -> Array:
+        """Descriptor (p,) of the person in a mask (H, W), seen straight."""
+        view = centred_view(person_blob(mask), camera)
+        parts = silhouette_parts(view, self.descriptor.points)
+        result: Array = self.descriptor.describe_parts([parts])[0]
+        return result
+
+    def targets(self, descriptors: ArrayLike) -> list[GaussianMixture]:
+        """Mixtures over targets (D,) for descriptors (n, p)."""
+        return [_transformed(x, self._from_basis) for x in self.model.predict(descriptors)]
+
+    def targets_after(
+        self,
+        descriptor: ArrayLike,
+        previous: GaussianMixture | None = None,
+        max_components: int = MAX_COMPONENTS,
+    ) -> GaussianMixture:
+        """Mixture over targets (D,) for one descriptor, heaviest component first.
+
+        Args:
+            descriptor: (p,).
+            previous: mixture over targets one step before; taken into account where there are
+                dynamics.
+            max_components: of the mixture at most; the heaviest stay.
+        """
+        row = np.asarray(descriptor, dtype=np.float64)
+        found = _heaviest(self.model.predict(row[None])[0], max_components)
+        if previous is not None and self.dynamics is not None:
+            after = propagate(
+                self.dynamics, _transformed(previous, self.target_basis), row, without_past=found,
+                n_components=max_components,
+            )  # fmt: skip
+            # The past may be wrong, and rule (1) never gives up what it has once followed.
+            whole = _blended(after, found, ANEW)
+            found = _heaviest(reduced(whole, max_components), max_components)
+        return _transformed(found, self._from_basis)
+
+    def _to_targets(self, poses: GaussianMixture) -> GaussianMixture:
+        """A mixture over poses as one over targets."""
+        slopes = np.stack([self.encoding.encoding_jacobian(mean) for mean in poses.means])
+        covariances = slopes @ poses.covariances @ slopes.transpose(0, 2, 1)
+        # Axes of unit length have no spread along themselves.
+        covariances += JITTER * np.eye(self.encoding.size)
+        return GaussianMixture(poses.weights, self.encoding.encode(poses.means), covariances)
+
+    def save(self, path: str | Path) -> Path:
+        """Writes the predictor into an .npz file, without pickled objects, and returns its path."""
+        body = self.body
+        parameters = {
+            'body': body.name,
+            'dof_names': list(body.dof_names),
+            'lengths': body.segment_lengths,
+            'descriptor': self.descriptor.parameters(),
+            'notes': self.notes,
+        }
+        arrays: Arrays = header(KIND, parameters)
+        arrays |= nested('descriptor', self.descriptor.to_arrays())
+        arrays |= nested('model', self.model.to_arrays())
+        if self.dynamics is not None:
+            arrays |= nested('dynamics', self.dynamics.to_arrays())
+        arrays['target_basis'] = self.target_basis
+        return write_arrays(path, arrays)
+
+    @classmethod
+    def load(cls, path: str | Path, body: Body | None = None) -> PosePredictor:
+        """Reads a predictor that `save` wrote.
+
+        Args:
+            path: of the file.
+            body: of the person, with the degrees of freedom that the predictor has learned; None:
+                the shipped body of the name in the file, with the lengths in the file.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: not such a file, another version, or another body.
+        """
+        arrays = read_arrays(path, KIND)
+        where = str(path)
+        try:
+            parameters = parameters_of(arrays)
+            names = tuple(str(x) for x in parameters['dof_names'])
+            if body is None:
+                body = load_body(str(parameters['body']))
+                _check_body(body, names, where)
+                body = body.with_segment_lengths(parameters['lengths'])
+            else:
+                _check_body(body, names, where)
+            descriptor = SilhouetteDescriptor.from_arrays(
+                parameters['descriptor'], part('descriptor', arrays)
+            )
+            model = _model_of(part('model', arrays), where)
+            dynamics = part('dynamics', arrays)
+            return cls(
+                body, descriptor, model, np.asarray(arrays['target_basis'], dtype=np.float64),
+                _model_of(dynamics, where) if dynamics else None, parameters['notes'],
+            )  # fmt: skip
+        except _WrongBodyError as fault:
+            raise ValueError(str(fault)) from None
+        except FileNotFoundError as fault:
+            raise ValueError(
+                f'{where}: trained for a body {parameters["body"]!r}, which does not ship: give it'
+            ) from fault
+        except (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError) as fault:
+            text = ' '.join(str(fault).split())
+            raise ValueError(
+                f'{where}: a damaged model file ({type(fault).__name__}: {text}); train it again'
+            ) from fault
+
+
+class _WrongBodyError(ValueError):
+    """A body that a predictor was not trained for."""
+
+
+def _check_body(body: Body, names: Sequence[str], where: str) -> None:
+    if tuple(names) != body.dof_names:
+        missing = sorted(set(names) - set(body.dof_names))
+        more = sorted(set(body.dof_names) - set(names))
+        raise _WrongBodyError(
+            f'{where}: trained for a body of {len(names)} degrees of freedom, but {body.name} has '
+            f'{body.dimension} (missing {missing}, more {more}); use that body or train again'
+        )
+
+
+def _check_fit(what: str, model: ConditionalDensity, inputs: int, outputs: int) -> None:
+    if (model.n_inputs_, model.n_outputs_) != (inputs, outputs):
+        raise ValueError(
+            f'the {what} has {model.n_inputs_} inputs and {model.n_outputs_} outputs, wanted '
+            f'{inputs} and {outputs}'
+        )
+
+
+def _model_of(arrays: Arrays, where: str) -> ConditionalDensity:
+    kind = str(arrays['kind'])
+    if kind not in MODELS:
+        raise ValueError(f'a model of kind {kind!r}, wanted one of {sorted(MODELS)}')
+    return MODELS[kind].from_arrays(arrays, where)
+
+
+def _heaviest(mixture: GaussianMixture, count: int) -> GaussianMixture:
+    """The heaviest components, normalised."""
+    ordered = mixture.normalised().sorted()
+    kept = max(int((ordered.weights >= LIGHTEST).sum()), 1)
+    return ordered[: min(kept, count)].normalised()
+
+
+def _blended(a: GaussianMixture, b: GaussianMixture, share: float) -> GaussianMixture:
+    """The components of both, with this share of the weight for those of b."""
+    weights = (1.0 - share) * a.normalised().weights, share * b.normalised().weights
+    return GaussianMixture(
+        np.concatenate(weights),
+        np.concatenate([a.means, b.means]),
+        np.concatenate([a.covariances, b.covariances]),
+    )
+
+
+def _transformed(mixture: GaussianMixture, basis: Array) -> GaussianMixture:
+    """The mixture of B' x for x of a mixture."""
+    covariances = basis.T @ mixture.covariances @ basis
+    covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
+    return GaussianMixture(mixture.weights, mixture.means @ basis, covariances)

@@ -1,0 +1,367 @@
+"""Sparse Bayesian regression with several outputs, by greedy evidence maximisation (BME 2.2).
+
+    X = Phi W + E,   E_n ~ N(0, O / h_n),   W ~ MN(0, A^-1, O),   A = diag(precisions)
+
+Samples have weights h, the outputs share one subset of basis functions and one precision for each
+of them, and the prior of the weights has the noise's covariance across outputs. With this choice
+everything is in closed form: with L = A + Phi' H Phi, the posterior of W is MN(M, L^-1, O),
+M = L^-1 Phi' H X, and the evidence, the integral over W of the weighted likelihood, is
+
+    log p(X) = -D T/2 log 2 pi - T/2 log|O| + D/2 (log|A| - log|L|) - 1/2 tr O^-1 (X'HX - M'LM)
+
+where T = sum h. For given precisions the best O is (X'HX - M'LM + prior) / (T + nu). For given O
+the best precision of one function has the closed form of Tipping & Faul (AISTATS 2003), with all D
+outputs together: functions are added, removed and re-estimated one at a time, always the one that
+gains most. Only the sums Phi'H Phi, Phi'HX and X'HX enter, so a step costs O(K m + K D) for K
+candidates of which m are active, whatever the number of samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.lapack import dpotri
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# A candidate whose part that the active ones do not explain is below this share is not added.
+INDEPENDENT = 1e-8
+# Two functions that are equal but for this share of their squares are one.
+ALIGNED = 1e-8
+# Rounds of greedy steps, each followed by a new estimate of the noise.
+ROUNDS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class WeightedSums:
+    """What the evidence needs to know of the samples.
+
+    Attributes:
+        gram: (K, K) Phi' H Phi of all candidates.
+        cross: (K, D) Phi' H X.
+        outer: (D, D) X' H X.
+        total: sum of weights T.
+    """
+
+    gram: Array
+    cross: Array
+    outer: Array
+    total: float
+
+    @classmethod
+    def of(cls, features: Array, targets: Array, weights: Array) -> WeightedSums:
+        """Sums over features (N, K), targets (N, D), weights (N,)."""
+        # Most samples are none of an expert's business.
+        some = weights > 1e-10 * weights.max()
+        if not some.all():
+            features, targets, weights = features[some], targets[some], weights[some]
+        root = np.sqrt(weights)[:, None]
+        phi, x = root * features, root * targets
+        return cls(phi.T @ phi, phi.T @ x, x.T @ x, float(weights.sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class RegressionPrior:
+    """Inverse Wishart penalty -nu/2 log|O| - 1/2 tr(O^-1 scale) of the noise.
+
+    Attributes:
+        strength: nu >= 0, in samples.
+        scale: (D, D) nu times the covariance that it pulls to.
+    """
+
+    strength: float
+    scale: Array
+
+
+@dataclass(frozen=True, eq=False)
+class SparseRegression:
+    """The posterior of the weights of the active basis functions.
+
+    Attributes:
+        active: (m,) indices of basis functions.
+        precisions: (m,) diagonal of A.
+        weights: (m, D) M.
+        covariance: (m, m) L^-1; the covariance of the weights is its Kronecker product with O.
+        noise: (D, D) O.
+        evidence: log evidence plus the penalty of the noise, nats.
+    """
+
+    active: Index
+    precisions: Array
+    weights: Array
+    covariance: Array
+    noise: Array
+    evidence: float
+
+    def mean(self, features: Array) -> Array:
+        """M' phi, (n, D), of features (n, K) of all candidates."""
+        result: Array = features[:, self.active] @ self.weights
+        return result
+
+    def spread(self, features: Array) -> Array:
+        """phi' L^-1 phi, (n,): the variance of the mean in units of the noise."""
+        phi = features[:, self.active]
+        result: Array = ((phi @ self.covariance) * phi).sum(1)
+        return result
+
+
+def posterior(
+    sums: WeightedSums, active: Index, precisions: Array, noise: Array, prior: RegressionPrior
+) -> SparseRegression:
+    """The posterior for given functions, precisions and noise, by a fresh Cholesky factor."""
+    count, outputs = len(active), len(noise)
+    inner = sums.gram[np.ix_(active, active)] + np.diag(precisions)
+    covariance, half, weights = np.zeros((0, 0)), np.zeros((0, outputs)), np.zeros((0, outputs))
+    log_det_inner = 0.0
+    # LAPACK as older versions of scipy call it refuses empty matrices.
+    if count:
+        # Scaled to a unit diagonal: precisions span many orders of magnitude.
+        root = 1.0 / np.sqrt(np.diagonal(inner))
+        factor = cholesky(inner * root[:, None] * root, lower=True, check_finite=False)
+        covariance, _ = dpotri(factor, lower=True)
+        covariance = np.tril(covariance) + np.tril(covariance, -1).T
+        covariance *= root[:, None] * root
+        cross = root[:, None] * sums.cross[active]
+        half = solve_triangular(factor, cross, lower=True, check_finite=False)
+        weights = root[:, None] * solve_triangular(factor, half, lower=True, trans=1)
+        log_det_inner = 2.0 * float(np.log(np.diagonal(factor)).sum() - np.log(root).sum())
+    residual = sums.outer - half.T @ half
+    noise_factor = cholesky(noise, lower=True, check_finite=False)
+    log_det_noise = 2.0 * float(np.log(np.diagonal(noise_factor)).sum())
+    z = solve_triangular(noise_factor, residual + prior.scale, lower=True, check_finite=False)
+    z = solve_triangular(noise_factor, z.T, lower=True, check_finite=False)
+    evidence = -0.5 * (
+        outputs * sums.total * np.log(2.0 * np.pi)
+        + (sums.total + prior.strength) * log_det_noise
+        + outputs * (log_det_inner - float(np.log(precisions).sum()))
+        + float(np.trace(z))
+    )
+    return SparseRegression(
+        active,
+        precisions,
+        weights,
+        covariance,
+        noise,
+        evidence,
+    )
+
+
+def with_best_noise(
+    sums: WeightedSums, found: SparseRegression, prior: RegressionPrior
+) -> SparseRegression:
+    """The same functions and precisions with the noise that maximises the evidence."""
+    cross = sums.cross[found.active]
+    residual = sums.outer - cross.T @ found.weights
+    noise = (residual + prior.scale) / (sums.total + prior.strength)
+    noise = 0.5 * (noise + noise.T)
+    return posterior(sums, found.active, found.precisions, noise, prior)
+
+
+def maximise_evidence(
+    sums: WeightedSums,
+    prior: RegressionPrior,
+    start: SparseRegression | None = None,
+    *,
+    steps: int = 10,
+    rounds: int = ROUNDS,
+    tolerance: float = 1e-3,
+) -> SparseRegression:
+    """Climbs the evidence from a start, or from the mean alone.
+
+    Args:
+        sums: of the samples.
+        prior: of the noise.
+        start: an earlier result, perhaps for other weights of the samples.
+        steps: greedy ones between two estimates of the noise.
+        rounds: at most so many estimates of the noise.
+        tolerance: ends when a round gains less, nats.
+    """
+    if start is None:
+        none: Index = np.zeros(0, dtype=np.intp)
+        noise = (sums.outer + prior.scale) / (sums.total + prior.strength)
+        found = posterior(sums, none, np.zeros(0), noise, prior)
+    else:
+        found = posterior(sums, start.active, start.precisions, start.noise, prior)
+        found = with_best_noise(sums, found, prior)
+    for _ in range(rounds):
+        before = found.evidence
+        found, moved = _greedy(sums, found, prior, steps, 0.1 * tolerance)
+        found = with_best_noise(sums, found, prior)
+        if not moved or found.evidence - before < tolerance:
+            break
+    return found
+
+
+def maximum_likelihood(sums: WeightedSums) -> SparseRegression:
+    """Least squares with all functions, no prior and no uncertainty of the weights.
+
+    Raises:
+        ValueError: the functions depend on each other, or residuals that vanish.
+    """
+    count = len(sums.gram)
+    try:
+        root = 1.0 / np.sqrt(np.diagonal(sums.gram))
+        factor = cholesky(sums.gram * root[:, None] * root, lower=True)
+        half = solve_triangular(factor, root[:, None] * sums.cross, lower=True)
+        noise = (sums.outer - half.T @ half) / sums.total
+        noise_factor = cholesky(noise, lower=True)
+    except (np.linalg.LinAlgError, ValueError) as fault:
+        raise ValueError(
+            f'least squares have no solution for {count} functions and {sums.total:.3g} samples '
+            "of an expert; use fewer experts, or learning='bayesian'"
+        ) from fault
+    weights = root[:, None] * solve_triangular(factor, half, lower=True, trans=1)
+    log_det = 2.0 * float(np.log(np.diagonal(noise_factor)).sum())
+    outputs = len(noise)
+    evidence = -0.5 * sums.total * (outputs * (np.log(2.0 * np.pi) + 1.0) + log_det)
+    everything = np.arange(count)
+    nothing = np.zeros((count, count))
+    return SparseRegression(
+        everything, np.zeros(count), weights, nothing, 0.5 * (noise + noise.T), evidence
+    )
+
+
+def _greedy(
+    sums: WeightedSums,
+    found: SparseRegression,
+    prior: RegressionPrior,
+    steps: int,
+    tolerance: float,
+) -> tuple[SparseRegression, bool]:
+    """Adds, removes and re-estimates functions for a fixed noise, the best one each time."""
+    state = _GreedyState(sums, found)
+    moved = False
+    for _ in range(steps):
+        if not state.step(tolerance):
+            break
+        moved = True
+    if not moved:
+        return found, False
+    if len(state.active) == 0:
+        none: Index = np.zeros(0, dtype=np.intp)
+        return posterior(sums, none, np.zeros(0), found.noise, prior), True
+    better = posterior(sums, state.active, state.precisions, found.noise, prior)
+    # Rank-one updates have drifted: what they promised did not come true.
+    if not better.evidence > found.evidence:
+        return found, False
+    return better, True
+
+
+class _GreedyState:
+    """Tipping & Faul's quantities for all candidates, kept by rank-one updates.
+
+    S_k = phi_k' C^-1 phi_k and Q_k = phi_k' C^-1 X in whitened outputs, C = H^-1 + Phi A^-1 Phi'.
+    """
+
+    def __init__(self, sums: WeightedSums, found: SparseRegression) -> None:
+        self.gram = sums.gram
+        self.outputs = len(found.noise)
+        factor = cholesky(found.noise, lower=True, check_finite=False)
+        whitened = solve_triangular(factor, sums.cross.T, lower=True, check_finite=False).T
+        self.active = found.active
+        self.precisions = found.precisions
+        self.covariance = found.covariance
+        columns = self.gram[:, self.active]
+        half = columns @ self.covariance
+        self.S = np.diagonal(self.gram) - (half * columns).sum(1)
+        self.Q = whitened - half @ whitened[self.active]
+        self.least = INDEPENDENT * np.maximum(np.diagonal(self.gram), 1e-300)
+        self.is_active = np.zeros(len(self.gram), dtype=bool)
+        self.is_active[self.active] = True
+        self._exclude()
+
+    def step(self, tolerance: float) -> bool:
+        """Does what gains most; False when nothing gains as much as the tolerance, in nats."""
+        with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
+            k, gain, precision = self._best()
+        if not gain > tolerance:
+            return False
+        if not self.is_active[k]:
+            self._add(k, precision)
+        else:
+            place = int(np.flatnonzero(self.active == k)[0])
+            if np.isinf(precision):
+                self._remove(place)
+            else:
+                self._change(place, precision)
+        return True
+
+    def _best(self) -> tuple[int, float, float]:
+        """The function with the largest gain of evidence, the gain, and its new precision."""
+        d = self.outputs
+        s, q = self.S.copy(), np.einsum('kd,kd->k', self.Q, self.Q)
+        # Active functions: as if they were not in the model.
+        a, own = self.precisions, self.active
+        variances = np.diagonal(self.covariance)
+        s[own], q[own] = 1.0 / variances - a, q[own] / (a * variances) ** 2
+        ratio = q / (d * s)
+        worth = q > d * s
+        worth[own] &= s[own] > INDEPENDENT * a
+        s[own] = np.maximum(s[own], 0.0)
+        best = np.where(worth, d * s**2 / np.where(worth, q - d * s, 1.0), np.inf)
+        gain = np.where(worth, 0.5 * d * (ratio - 1.0 - np.log(ratio)), 0.0)
+        gain[self.excluded | (~self.is_active & (self.least >= self.S))] = -np.inf
+        gain[own] -= 0.5 * (d * np.log(a / (a + s[own])) + q[own] / (a + s[own]))
+        gain[np.isnan(gain)] = -np.inf
+        # A precision that stays as it is cannot be updated, and gains nothing.
+        gain[own] = np.where(np.abs(best[own] - a) <= 1e-9 * a, -np.inf, gain[own])
+        k = int(np.argmax(gain))
+        return k, float(gain[k]), float(best[k])
+
+    def _exclude(self) -> None:
+        """Candidates that equal an active function: only the sum of their variances counts."""
+        squares = np.diagonal(self.gram)
+        aligned = self.gram[:, self.active] ** 2 >= (1.0 - ALIGNED) * np.outer(
+            squares, squares[self.active]
+        )
+        self.excluded = aligned.any(1) & ~self.is_active
+
+    def _add(self, k: int, precision: float) -> None:
+        variance = 1.0 / (precision + self.S[k])
+        column = self.gram[self.active, k]
+        pull = self.covariance @ column
+        left = self.gram[:, k] - self.gram[:, self.active] @ pull
+        m = len(self.active)
+        grown = np.empty((m + 1, m + 1))
+        grown[:m, :m] = self.covariance + variance * np.outer(pull, pull)
+        grown[m, :m] = grown[:m, m] = -variance * pull
+        grown[m, m] = variance
+        self.covariance = grown
+        self.S = self.S - variance * left**2
+        self.Q = self.Q - np.outer(variance * left, self.Q[k])
+        self.active = np.append(self.active, k)
+        self.precisions = np.append(self.precisions, precision)
+        self.is_active[k] = True
+        squares = np.diagonal(self.gram)
+        self.excluded |= self.gram[:, k] ** 2 >= (1.0 - ALIGNED) * squares * squares[k]
+        self.excluded[k] = False
+
+    def _change(self, place: int, precision: float) -> None:
+        column = self.covariance[:, place].copy()
+        old = self.precisions[place]
+        kappa = 1.0 / (column[place] + 1.0 / (precision - old))
+        self._take(place, column, kappa)
+        self.precisions = self.precisions.copy()
+        self.precisions[place] = precision
+
+    def _remove(self, place: int) -> None:
+        column = self.covariance[:, place].copy()
+        self._take(place, column, 1.0 / column[place])
+        self.is_active[self.active[place]] = False
+        self.covariance = np.delete(np.delete(self.covariance, place, 0), place, 1)
+        self.active = np.delete(self.active, place)
+        self.precisions = np.delete(self.precisions, place)
+        self._exclude()
+
+    def _take(self, place: int, column: Array, kappa: float) -> None:
+        """Takes kappa column column' from the covariance."""
+        left = self.gram[:, self.active] @ column
+        # The weight itself: Q of an active function is its precision times its weight.
+        weight = self.Q[self.active[place]] / self.precisions[place]
+        self.covariance = self.covariance - kappa * np.outer(column, column)
+        self.S = self.S + kappa * left**2
+        self.Q = self.Q + np.outer(kappa * left, weight)

@@ -1,0 +1,162 @@
+"""Pairs of inputs and targets, checked once where they come in, and their scales."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+SCALINGS = ('each', 'common')
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingPairs:
+    """N inputs with their targets.
+
+    Attributes:
+        inputs: (N, p).
+        targets: (N, D).
+        weights: (N,) positive; a sample of weight 2 counts like two equal samples.
+    """
+
+    inputs: Array
+    targets: Array
+    weights: Array
+
+    def __len__(self) -> int:
+        return len(self.inputs)
+
+    def __getitem__(self, rows: NDArray[np.intp]) -> TrainingPairs:
+        return TrainingPairs(self.inputs[rows], self.targets[rows], self.weights[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Standardisation:
+    """Moves and scales columns: z = (v - centre) / scale.
+
+    Attributes:
+        centre, scale: (p,) each; scales are positive.
+    """
+
+    centre: Array
+    scale: Array
+
+    @classmethod
+    def of(cls, values: Array, weights: Array, scaling: str = 'each') -> Standardisation:
+        """That which makes the weighted mean 0 and the variance 1.
+
+        Args:
+            values: (N, p).
+            weights: (N,).
+            scaling: 'each' column by itself, or one scale 'common' to all, which keeps the
+                metric. A column that does not vary keeps its scale.
+        """
+        share = weights / weights.sum()
+        centre = share @ values
+        variance = share @ (values - centre) ** 2
+        if scaling == 'common':
+            variance = np.full_like(variance, variance.mean())
+        # Rounding makes a tiny variance of a column that is constant.
+        constant = variance <= (1e-12 * np.maximum(1.0, np.abs(centre))) ** 2
+        return cls(centre, np.where(constant, 1.0, np.sqrt(variance)))
+
+    def apply(self, values: Array) -> Array:
+        """Scaled values, of the same shape."""
+        result: Array = (values - self.centre) / self.scale
+        return result
+
+
+def checked_pairs(
+    inputs: ArrayLike,
+    targets: ArrayLike,
+    sample_weight: ArrayLike | None = None,
+    *,
+    at_least: int = 1,
+    what: str = 'samples',
+) -> TrainingPairs:
+    """The pairs as arrays; samples of weight zero are left out.
+
+    Args:
+        inputs: (N, p).
+        targets: (N, D).
+        sample_weight: (N,) not negative, or None for ones.
+        at_least, what: how many samples are needed, and for what.
+
+    Raises:
+        ValueError: wrong shapes, values that are not finite, too few samples.
+    """
+    inputs = finite_matrix(inputs, 'inputs', '(N, p)')
+    targets = finite_matrix(targets, 'targets', '(N, D)')
+    if len(inputs) != len(targets):
+        raise ValueError(
+            f'{len(inputs)} inputs and {len(targets)} targets, wanted as many of both; pair them up'
+        )
+    if inputs.shape[1] == 0 or targets.shape[1] == 0:
+        raise ValueError(
+            f'inputs {inputs.shape} and targets {targets.shape}, wanted at least one column each'
+        )
+    if sample_weight is None:
+        weights = np.ones(len(inputs))
+    else:
+        weights = np.asarray(sample_weight, dtype=np.float64)
+        if weights.shape != (len(inputs),):
+            raise ValueError(f'sample_weight has shape {weights.shape}, wanted ({len(inputs)},)')
+        if not (np.isfinite(weights).all() and (weights >= 0).all()):
+            raise ValueError(
+                'sample_weight has values that are negative or not finite, wanted >= 0'
+            )
+    kept = np.flatnonzero(weights > 0)
+    if len(kept) < at_least:
+        raise ValueError(
+            f'{len(kept)} samples, wanted at least {at_least} ({what}); '
+            'give more samples or ask for less'
+        )
+    return TrainingPairs(inputs[kept], targets[kept], weights[kept])
+
+
+def checked_inputs(inputs: ArrayLike, columns: int) -> Array:
+    """Inputs (n, p) of a model that has learned from p columns.
+
+    Raises:
+        ValueError: wrong shape, values that are not finite.
+    """
+    inputs = finite_matrix(inputs, 'inputs', f'(n, {columns})')
+    if inputs.shape[1] != columns:
+        raise ValueError(
+            f'inputs have {inputs.shape[1]} columns, wanted {columns} as in training; '
+            'describe them as the training data were'
+        )
+    return inputs
+
+
+def finite_matrix(values: ArrayLike, name: str, wanted: str) -> Array:
+    """Values as a matrix of finite numbers.
+
+    Raises:
+        ValueError: not two axes, or values that are not finite.
+    """
+    matrix = np.asarray(values, dtype=np.float64)
+    if matrix.ndim != 2:
+        raise ValueError(f'{name} have shape {matrix.shape}, wanted {wanted}')
+    bad = ~np.isfinite(matrix)
+    if bad.any():
+        row, column = (int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f'{name} have {int(bad.sum())} values that are not finite, the first in row {row}, '
+            f'column {column}; leave such rows out'
+        )
+    return matrix
+
+
+def checked_scaling(scaling: str) -> str:
+    """The name of a scaling.
+
+    Raises:
+        ValueError: no such scaling.
+    """
+    if scaling not in SCALINGS:
+        raise ValueError(f'scaling is {scaling!r}, wanted one of {", ".join(SCALINGS)}')
+    return scaling

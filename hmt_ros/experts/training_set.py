@@ -1,0 +1,444 @@
+"""Pairs of silhouettes and poses to learn from: motions seen from all around (BME 3).
+
+Recorded or procedural motions are poses of one body. Of these the ones that differ are kept, some
+mirrored left to right, some with the arms and trunk of another moment. Each is turned to a random
+heading, seen from a random height and distance by a person of random build, and drawn as a
+silhouette whose outline is as uneven as that of background subtraction. The same seed gives the
+same set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body import Body, Camera
+from hmt_ros.body.mirror import mirror, root_angles, root_rotations
+from hmt_ros.body.motion_file import Motion, read_motion
+from hmt_ros.body.procedural_motion import procedural_motion
+from hmt_ros.body.retarget import body_from_motion, retarget
+from hmt_ros.experts.pose_encoding import AXES, PoseEncoding
+from hmt_ros.image.renderer import render_silhouettes
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Bytes = NDArray[np.uint8]
+Item = TypeVar('Item')
+Progress = Callable[[Iterable[Item], int], Iterable[Item]]
+
+RATE = 30.0  # Hz, of the sequences and of the step that dynamics learns
+MOTION_SUFFIXES = ('.bvh', '.amc')
+# A level camera that looks along the world's y axis, far enough for every motion.
+LEVEL = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+SIDE = 224  # px, of a training image
+FILLED = 0.86  # of it that the largest person of a group fills
+ROOM = 0.36  # m that flesh reaches beyond the joints, both ends together
+GROUP = 16  # silhouettes of one person
+LEGS = ('hip', 'knee', 'ankle')
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """How a training set is made.
+
+    Attributes:
+        samples: number of pairs.
+        novelty: poses of a motion that differ less than this from the last one kept are left out,
+            mean distance of joints, m.
+        mirrored: share of poses that are mirrored left to right.
+        mixed: share of poses whose trunk, head and arms are those of another pose.
+        elevation, elevation_spread: by which the camera looks down on the person, mean and standard
+            deviation, degrees; never beyond -20 and 50.
+        roll_spread: of the camera, degrees.
+        distances: of the camera to the person, m, least and most.
+        length_spread: relative standard deviation of each length.
+        width_range, width_spread: factors on the thickness of the whole body, and relative standard
+            deviation of each part of it.
+        boundary_noise: standard deviation of the outline, px of a person 200 px tall.
+        seed: of all that is random.
+    """
+
+    samples: int = 6000
+    novelty: float = 0.03
+    mirrored: float = 0.5
+    mixed: float = 0.0
+    elevation: float = 8.0
+    elevation_spread: float = 10.0
+    roll_spread: float = 2.0
+    distances: tuple[float, float] = (2.5, 8.0)
+    length_spread: float = 0.05
+    width_range: tuple[float, float] = (0.85, 1.3)
+    width_spread: float = 0.12
+    boundary_noise: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.samples < 1:
+            raise ValueError(f'samples must be at least 1, saw {self.samples}')
+        for name in ('mirrored', 'mixed'):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f'{name} is a share from 0 to 1, saw {getattr(self, name)}')
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSequence:
+    """A motion as poses of the body that is learned.
+
+    Attributes:
+        name: of the motion.
+        activity: what is done.
+        poses: (T, d), RATE poses per second, as a level camera sees them.
+        lengths: of the person who moved, by name, m.
+
+    Raises:
+        ValueError: poses that are not finite.
+    """
+
+    name: str
+    activity: str
+    poses: Array
+    lengths: dict[str, float]
+
+    def __post_init__(self) -> None:
+        bad = np.asarray(~np.isfinite(self.poses).all(axis=1))
+        if bad.any():
+            raise ValueError(
+                f'{self.name}: {int(bad.sum())} of {len(bad)} poses are not finite, the first in '
+                f'frame {int(np.argmax(bad))}'
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingSet:
+    """Pairs of silhouettes and poses.
+
+    Attributes:
+        poses: (N, d) as the camera of the image sees them.
+        previous: (N, d) the same person 1 / RATE s before.
+        packed: (N, SIDE, SIDE / 8) silhouettes, bits.
+        activities: (N,) what is done.
+        sequences, frames: (N,) where the pose comes from.
+    """
+
+    poses: Array
+    previous: Array
+    packed: Bytes
+    activities: tuple[str, ...]
+    sequences: Index
+    frames: Index
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def mask(self, sample: int) -> Bytes:
+        """Silhouette (SIDE, SIDE) of a sample."""
+        return np.unpackbits(self.packed[sample], axis=1)
+
+    def masks(self) -> Iterator[Bytes]:
+        """All silhouettes in turn."""
+        return (self.mask(i) for i in range(len(self)))
+
+
+def motion_files(folder: Path) -> list[Path]:
+    """Motions of a folder and of those in it, in a fixed order.
+
+    Raises:
+        ValueError: no such folder, or no motion in it.
+    """
+    if not folder.is_dir():
+        raise ValueError(f'{folder} is no folder: wanted one with motions ({_suffixes()})')
+    found = sorted(x for x in folder.rglob('*') if x.suffix.lower() in MOTION_SUFFIXES)
+    if not found:
+        raise ValueError(f'{folder} has no motion: wanted files {_suffixes()}')
+    return found
+
+
+def _suffixes() -> str:
+    return ' or '.join(MOTION_SUFFIXES)
+
+
+def recorded_sequence(path: Path, body: Body) -> PoseSequence:
+    """The motion of a file as poses of a body.
+
+    Raises:
+        ValueError, OSError: a file that is no motion, or of a skeleton that is not known.
+    """
+    motion = read_motion(path)
+    motion = _at_rate(motion)
+    own = body_from_motion(motion, body)
+    pelvis = motion.joint_positions(['pelvis'])[:, 0]
+    centre = 0.5 * (pelvis.min(0) + pelvis.max(0))
+    reach = float(np.linalg.norm(pelvis - centre, axis=1).max())
+    translation = np.array([0.0, 0.0, reach + 5.0]) - LEVEL @ centre
+    poses = retarget(motion, own, (LEVEL, translation))
+    return PoseSequence(motion.name, activity_of(path.stem), poses, own.segment_lengths)
+
+
+def _at_rate(motion: Motion) -> Motion:
+    return motion.part(0, None, max(round(motion.fps / RATE), 1))
+
+
+def activity_of(stem: str) -> str:
+    """What is done, from the name of a file: cmu_07_05_slowwalk is slowwalk."""
+    words = [x for x in stem.replace('-', '_').split('_') if x]
+    named = [x for x in words if sum(c.isalpha() for c in x) > 1 and not x[0].isdigit()]
+    return (named[-1].rstrip('0123456789') if named else stem).lower()
+
+
+def procedural_sequence(
+    name: str, body: Body, duration: float = 16.0, seed: int = 0
+) -> PoseSequence:
+    """A procedural motion as poses of a body; see `procedural_motion`."""
+    poses = procedural_motion(name, body, duration, RATE, seed)
+    return PoseSequence(f'{name} {seed}', name, poses, body.segment_lengths)
+
+
+def typical_body(body: Body, sequences: Sequence[PoseSequence]) -> Body:
+    """The body with the median lengths of those who moved, every motion counting once."""
+    names = list(sequences[0].lengths)
+    table = np.array([[sequence.lengths[name] for name in names] for sequence in sequences])
+    medians = np.median(table, axis=0).tolist()
+    return body.with_segment_lengths(dict(zip(names, medians, strict=True)))
+
+
+def training_set(
+    body: Body,
+    sequences: Sequence[PoseSequence],
+    settings: TrainingSettings | None = None,
+    progress: Progress[Index] | None = None,
+) -> TrainingSet:
+    """Pairs of silhouettes and poses of motions.
+
+    Args:
+        body: with flesh, whose poses the sequences are.
+        sequences: the motions.
+        settings: how.
+        progress: goes through groups of silhouettes, and is told how many there are.
+
+    Raises:
+        ValueError: no motions, or a body without flesh or with another root.
+    """
+    s = settings or TrainingSettings()
+    if not sequences:
+        raise ValueError('no motions to learn from')
+    PoseEncoding(body)  # a root that can be turned
+    rng = np.random.default_rng(s.seed)
+    pool = [_novel(body, sequence.poses, s.novelty) for sequence in sequences]
+    which = np.repeat(np.arange(len(pool)), [len(x) for x in pool])
+    frames = np.concatenate(pool)
+    chosen = _drawn(len(which), s.samples, rng)
+    which, frames = which[chosen], frames[chosen]
+    poses, previous = _moments(sequences, which, frames)
+    poses, previous = _mixed(body, poses, previous, s.mixed, rng)
+    swapped = rng.random(len(poses)) < s.mirrored
+    poses[swapped] = mirror(body, poses[swapped])
+    previous[swapped] = mirror(body, previous[swapped])
+    view = _views(len(poses), s, rng)
+    # One distance for all persons of a group: they are as large in the image of one camera.
+    groups = [np.arange(i, min(i + GROUP, len(poses))) for i in range(0, len(poses), GROUP)]
+    distances = np.repeat(rng.uniform(*s.distances, len(groups)), GROUP)[: len(poses)]
+    poses, previous = _seen(body, poses, previous, view, distances)
+    packed = np.empty((len(poses), SIDE, SIDE // 8), dtype=np.uint8)
+    for rows in groups if progress is None else progress(groups, len(groups)):
+        person = random_build(body, s, rng)
+        masks = render_silhouettes(person, poses[rows], _fitting_camera(person, poses[rows]))
+        for row, mask in zip(rows, masks, strict=True):
+            noisy = _uneven(mask.view(np.uint8), s.boundary_noise, rng)
+            packed[row] = np.packbits(noisy, axis=1)
+    activities = tuple(sequences[i].activity for i in which.tolist())
+    return TrainingSet(poses, previous, packed, activities, which, frames)
+
+
+def _novel(body: Body, poses: Array, distance: float) -> Index:
+    """Frames (n,) of poses (T, d) that differ from the one kept before; heading does not count."""
+    still = poses.copy()
+    still[:, :3] = 0.0
+    still[:, 3] = 0.0
+    joints = body.joint_positions(still)
+    kept = [0]
+    for t in range(1, len(poses)):
+        away = np.linalg.norm(joints[t] - joints[kept[-1]], axis=1).mean()
+        if away >= distance:
+            kept.append(t)
+    return np.array(kept, dtype=np.intp)
+
+
+def _drawn(available: int, count: int, rng: np.random.Generator) -> Index:
+    """So many of the available, none a second time before all have come."""
+    rounds = -(-count // available)
+    order = np.concatenate([rng.permutation(available) for _ in range(rounds)])
+    return np.sort(order[:count])
+
+
+def _moments(sequences: Sequence[PoseSequence], which: Index, frames: Index) -> tuple[Array, Array]:
+    """Poses (N, d), and those one step before; the first frame of a motion stands still."""
+    moments = list(zip(which.tolist(), frames.tolist(), strict=True))
+    poses = np.stack([sequences[i].poses[t] for i, t in moments])
+    previous = np.stack([sequences[i].poses[max(t - 1, 0)] for i, t in moments])
+    return poses, previous
+
+
+def _mixed(
+    body: Body, poses: Array, previous: Array, share: float, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Some poses get trunk, head and arms of another one."""
+    names = body.dof_names
+    upper = np.array(
+        [i >= AXES and not any(leg in name for leg in LEGS) for i, name in enumerate(names)]
+    )
+    mine = np.flatnonzero(rng.random(len(poses)) < share)
+    other = rng.integers(len(poses), size=len(mine))
+    changed, before = poses.copy(), previous.copy()
+    changed[np.ix_(mine, upper)] = poses[np.ix_(other, upper)]
+    before[np.ix_(mine, upper)] = previous[np.ix_(other, upper)]
+    return changed, before
+
+
+def _views(count: int, s: TrainingSettings, rng: np.random.Generator) -> Array:
+    """Rotations (N, 3, 3) of the person in front of the camera."""
+    heading = rng.uniform(-np.pi, np.pi, count)
+    elevation = np.radians(np.clip(rng.normal(s.elevation, s.elevation_spread, count), -20.0, 50.0))
+    roll = np.radians(rng.normal(0.0, s.roll_spread, count))
+    result: Array = _about(2, roll) @ _about(0, elevation) @ _about(1, heading)
+    return result
+
+
+def _about(axis: int, angle: Array) -> Array:
+    """Rotations (N, 3, 3) about an axis of the camera frame."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    result = np.zeros((len(angle), 3, 3))
+    result[:, axis, axis] = 1.0
+    result[:, i, i] = result[:, j, j] = np.cos(angle)
+    result[:, j, i] = np.sin(angle)
+    result[:, i, j] = -result[:, j, i]
+    return result
+
+
+def _seen(
+    body: Body, poses: Array, previous: Array, view: Array, distances: Array
+) -> tuple[Array, Array]:
+    """Poses turned to a view, with the middle of the joints on the optical axis."""
+    step = np.einsum('nij,nj->ni', view, previous[:, :3] - poses[:, :3])
+    poses, previous = poses.copy(), previous.copy()
+    for x in (poses, previous):
+        x[:, 3:AXES] = root_angles(body, view @ root_rotations(body, x))
+    poses[:, :3] = 0.0
+    joints = body.joint_positions(poses)
+    poses[:, :3] = -0.5 * (joints.min(1) + joints.max(1))
+    poses[:, 2] += distances
+    previous[:, :3] = poses[:, :3] + step
+    return poses, previous
+
+
+def random_build(body: Body, s: TrainingSettings, rng: np.random.Generator) -> Body:
+    """A body with random lengths and widths, as the persons of a training set have."""
+    lengths = {
+        name: value * (1.0 + s.length_spread * rng.normal())
+        for name, value in body.segment_lengths.items()
+    }
+    whole = rng.uniform(*s.width_range)
+    widths = whole * np.exp(s.width_spread * rng.normal(size=len(body.shapes)))
+    return body.with_segment_lengths(lengths).with_widths(np.clip(widths, 0.6, 1.8).tolist())
+
+
+def _fitting_camera(body: Body, poses: Array) -> Camera:
+    """A camera in whose image all persons of a group fit."""
+    joints = body.joint_positions(poses)
+    reach = np.abs(joints[..., :2]).max(2) + 0.5 * ROOM
+    focal = 0.5 * FILLED * SIDE / float((reach / np.maximum(joints[..., 2], 0.3)).max())
+    middle = 0.5 * (SIDE - 1)
+    return Camera(focal, focal, middle, middle, SIDE, SIDE)
+
+
+def _uneven(mask: Bytes, deviation: float, rng: np.random.Generator) -> Bytes:
+    """The mask with an outline moved by smooth noise, px of a person 200 px tall."""
+    noise = rng.normal(size=mask.shape).astype(np.float32)
+    if deviation == 0 or not mask.any():
+        return mask
+    inside = cv2.distanceTransform(mask, cv2.DIST_L2, 3)
+    outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 3)
+    smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), 1.5), dtype=np.float32)
+    smooth *= np.float32(deviation * max(cv2.boundingRect(mask)[2:]) / 200.0 / smooth.std())
+    # Between the pixels the distance is half a pixel from either side.
+    signed = np.where(mask > 0, inside - 0.5, 0.5 - outside)
+    result: Bytes = (signed + smooth > 0).astype(np.uint8)
+    return result if result.any() else mask
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSequence:
+    """A motion as a camera sees it, frame after frame.
+
+    Attributes:
+        poses: (n, d) before the camera, with the middle of the joints on its optical axis.
+        masks: (n, SIDE, SIDE) silhouettes, 1 inside.
+        camera: that sees them.
+    """
+
+    poses: Array
+    masks: Bytes
+    camera: Camera
+
+
+def seen_from(
+    body: Body,
+    sequence: PoseSequence,
+    heading: float,
+    elevation: float = 0.0,
+    *,
+    frames: slice = slice(None),
+    distance: float = 5.0,
+    boundary_noise: float = 0.0,
+    seed: int = 0,
+) -> SeenSequence:
+    """Some frames of a motion, seen from one side all the time.
+
+    Args:
+        body: of the person, with flesh, whose poses the sequence has.
+        sequence: the motion.
+        heading: where the person looks on average: 0 to the camera, 90 across the image to the
+            right, 180 away from the camera, degrees.
+        elevation: by which the camera looks down, degrees.
+        frames: of the motion.
+        distance: of the camera, m.
+        boundary_noise: standard deviation of the outline, px of a person 200 px tall.
+        seed: of that noise.
+
+    Raises:
+        ValueError: no frames.
+    """
+    poses = sequence.poses[frames]
+    if len(poses) == 0:
+        raise ValueError(f'{sequence.name}: no frames in {frames} of {len(sequence.poses)}')
+    x, _, z = root_rotations(body, poses)[:, :, 1].mean(0)
+    turn = np.arctan2(z, x) + 0.5 * np.pi - np.radians(heading)
+    down = np.full(len(poses), np.radians(elevation))
+    view = _about(0, down) @ _about(1, np.full(len(poses), turn))
+    poses, _ = _seen(body, poses, poses, view, np.full(len(poses), distance))
+    camera = _fitting_camera(body, poses)
+    rng = np.random.default_rng(seed)
+    drawn = render_silhouettes(body, poses, camera)
+    masks = np.stack([_uneven(mask.view(np.uint8), boundary_noise, rng) for mask in drawn])
+    return SeenSequence(poses, masks, camera)
+
+
+def side_view(
+    body: Body, sequence: PoseSequence, count: int = 120, distance: float = 5.0
+) -> SeenSequence:
+    """The first frames of a motion, of a person who on average looks across the image.
+
+    Args:
+        body: with flesh, whose poses the sequence has.
+        sequence: the motion.
+        count: of frames at most; longer motions are seen at half the rate of the sequence.
+        distance: of the camera, m.
+    """
+    step = 2 if len(sequence.poses) >= 2 * count else 1
+    frames = slice(0, count * step, step)
+    return seen_from(body, sequence, 90.0, frames=frames, distance=distance)

@@ -1,0 +1,193 @@
+"""The person in a mask, and points spaced evenly along the outline (BME 3).
+
+A mask may show more than the person: other people, ghosts, pieces that subtraction tore off. One
+blob is taken for the person, together with the pieces that belong to it, and what was left out is
+counted, so that a caller can say it. A person whom the border of the image cuts is marked, side by
+side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+
+SMALLEST = 60  # px; fewer than these show no posture
+# A person is at most this many times wider than high, or higher than wide; whatever is longer is
+# the trace of something else. A person has limbs, and does not fill the box all around.
+LONGEST = 5.0
+FULLEST = 0.93
+# A smaller piece belongs to the person when it is near: share of the area, share of the height.
+PIECE = 0.35
+GAP = 0.12
+NOTABLE = 0.02  # share of the person's area from which something left out is worth a word
+SMALLEST_HOLE = 0.004  # share of the area; the outline of a smaller hole is noise
+SIDES = ('left', 'top', 'right', 'bottom')
+
+
+class NoSilhouetteError(ValueError):
+    """A mask in which nobody is seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class PersonBlob:
+    """The part of a mask that is taken for the person.
+
+    Attributes:
+        mask: (h, w) uint8, 1 inside; cut out of the image at the bounding box.
+        left, top: of the bounding box in the image, px.
+        cut: whether the border of the image cuts the person: left, top, right, bottom.
+        left_out: number of other blobs that are notable, and not part of the person.
+    """
+
+    mask: Bytes
+    left: int
+    top: int
+    cut: tuple[bool, bool, bool, bool]
+    left_out: int
+
+    @property
+    def box(self) -> tuple[float, float, float, float]:
+        """Left, top, right and bottom edge, px; half a pixel beyond the outermost centres."""
+        height, width = self.mask.shape
+        return self.left - 0.5, self.top - 0.5, self.left + width - 0.5, self.top + height - 0.5
+
+    @property
+    def area(self) -> int:
+        """Number of pixels."""
+        return int(np.count_nonzero(self.mask))
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a user should know: blobs left out, sides on which the person is cut."""
+        result = []
+        if self.left_out:
+            result.append(
+                f'{self.left_out} other blob{"s" if self.left_out > 1 else ""} left out: the '
+                'largest that looks like a person is used'
+            )
+        if any(self.cut):
+            sides = [side for side, cut in zip(SIDES, self.cut, strict=True) if cut]
+            result.append(f'the person is cut by the border of the image ({", ".join(sides)})')
+        return tuple(result)
+
+
+def person_blob(mask: ArrayLike) -> PersonBlob:
+    """The largest blob of a mask that looks like a person, and the pieces that belong to it.
+
+    Args:
+        mask: (H, W), not zero where something is seen.
+
+    Raises:
+        NoSilhouetteError: nothing is seen, or only specks.
+        ValueError: an array that is no mask.
+    """
+    array = np.asarray(mask)
+    if array.ndim != 2:
+        raise ValueError(f'a mask has two axes (H, W), saw an array of shape {array.shape}')
+    height, width = array.shape
+    seen = np.ascontiguousarray(array != 0).view(np.uint8)
+    x, y, w, h = cv2.boundingRect(seen)
+    if w == 0:
+        raise NoSilhouetteError('the silhouette is empty: nobody is seen')
+    part = seen[y : y + h, x : x + w]
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(part, connectivity=8)
+    area = stats[1:, cv2.CC_STAT_AREA]
+    if area.max() < SMALLEST:
+        raise NoSilhouetteError(
+            f'the largest blob of the silhouette has {area.max()} px, wanted {SMALLEST} at least'
+        )
+    left_out = 0
+    if count > 2:
+        kept, left_out = _belonging(np.asarray(stats[1:], dtype=np.int32))
+        part = np.concatenate([[False], kept])[labels].astype(np.uint8)
+        dx, dy, w, h = cv2.boundingRect(part)
+        part, x, y = np.ascontiguousarray(part[dy : dy + h, dx : dx + w]), x + dx, y + dy
+    cut = (x == 0, y == 0, x + w == width, y + h == height)
+    return PersonBlob(part, x, y, cut, left_out)
+
+
+def _belonging(stats: NDArray[np.int32]) -> tuple[Mask, int]:
+    """Which of some blobs are the person, and how many notable ones are not."""
+    area = stats[:, cv2.CC_STAT_AREA].astype(float)
+    width, height = (stats[:, i].astype(float) for i in (cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT))
+    like = np.maximum(width / height, height / width) <= LONGEST
+    like &= area < FULLEST * width * height
+    like &= area >= SMALLEST
+    main = int(np.argmax(np.where(like, area, -1.0) if like.any() else area))
+    left, top = stats[:, cv2.CC_STAT_LEFT], stats[:, cv2.CC_STAT_TOP]
+    apart_x = np.maximum(left - (left + width)[main], left[main] - (left + width))
+    apart_y = np.maximum(top - (top + height)[main], top[main] - (top + height))
+    near = np.maximum(apart_x, apart_y) < GAP * max(height[main], width[main])
+    kept = near & (area < PIECE * area[main])
+    kept[main] = True
+    return kept, int(np.count_nonzero(~kept & (area >= NOTABLE * area[main])))
+
+
+def sample_contour(mask: Bytes, count: int = 100) -> tuple[Array, Array]:
+    """Points at equal distances along the outlines of a mask, and the direction in which they run.
+
+    The outer outline of every piece and those of its holes share the points by their lengths. The
+    inside lies to the same hand everywhere.
+
+    Args:
+        mask: (h, w) uint8, 1 inside.
+        count: of the points.
+
+    Returns:
+        points (count, 2), px, and directions (count,), rad.
+
+    Raises:
+        NoSilhouetteError: no outline of notable length.
+    """
+    bordered = cv2.copyMakeBorder(mask, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    found, tree = cv2.findContours(bordered, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    area = np.count_nonzero(mask)
+    outlines = []
+    for outline, (_, _, _, parent) in zip(found, tree[0] if tree is not None else ()):
+        if len(outline) < 12:
+            continue
+        if parent >= 0 and cv2.contourArea(outline) < SMALLEST_HOLE * area:
+            continue
+        outlines.append(_smooth(outline[:, 0].astype(np.float64) - 1.0))
+    if not outlines:
+        raise NoSilhouetteError('the silhouette has no outline')
+    steps = [np.linalg.norm(np.roll(x, -1, axis=0) - x, axis=1) for x in outlines]
+    lengths = np.array([x.sum() for x in steps])
+    # Whole outlines one after the other; a point is at a share of the total length.
+    at = (np.arange(count) + 0.5) / count * lengths.sum()
+    ends = np.cumsum(lengths)
+    points, directions = np.empty((count, 2)), np.empty(count)
+    for outline, step, end, length in zip(outlines, steps, ends, lengths, strict=True):
+        mine = (at >= end - length) & (at < end)
+        if not mine.any():
+            continue
+        along = np.concatenate([[0.0], np.cumsum(step)])
+        closed = np.concatenate([outline, outline[:1]])
+        here = at[mine] - (end - length)
+        points[mine] = np.stack([np.interp(here, along, closed[:, i]) for i in (0, 1)], axis=1)
+        chord = 0.5 * length / len(outline) * SMOOTHING
+        ahead, behind = (
+            np.stack([np.interp(s % length, along, closed[:, i]) for i in (0, 1)], axis=1)
+            for s in (here + chord, here - chord)
+        )
+        directions[mine] = np.arctan2(*(ahead - behind).T[::-1])
+    return points, directions
+
+
+SMOOTHING = 5  # points of an outline that are averaged: the steps of the raster are no corners
+
+
+def _smooth(outline: Array) -> Array:
+    total = outline.copy()
+    for k in range(1, SMOOTHING // 2 + 1):
+        total += np.roll(outline, k, axis=0)
+        total += np.roll(outline, -k, axis=0)
+    result: Array = total / (2 * (SMOOTHING // 2) + 1)
+    return result

@@ -1,0 +1,131 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_ros.app import train
+from hmt_ros.experts.pose_predictor import PosePredictor
+
+BVH = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation
+  End Site
+  {
+    OFFSET 0 10 0
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.033
+0 0 0 0 0 0
+0 0 0 0 0 0
+"""
+
+
+@pytest.fixture(autouse=True)
+def short_motions(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, 'PROCEDURAL_SECONDS', 2.5)
+    monkeypatch.setattr(train, 'PROCEDURAL_SEEDS', 2)
+
+
+def test_procedural_motions_give_a_model_and_figures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / 'model.npz'
+    arguments = ['--motions', 'reach', '--samples', '120', '--seed', '3']
+    assert train.main([*arguments, '-o', str(output)]) == 0
+    predictor = PosePredictor.load(output)
+    assert predictor.body.name == 'human37'
+    assert predictor.dynamics is not None
+    assert predictor.notes['samples'] == 120
+    assert predictor.notes['activities'] == ['reach']
+    figures = sorted(x.name for x in (tmp_path / 'model_report').iterdir())
+    assert figures == ['affinities.png', 'multimodality.png', 'silhouettes.png']
+    for name in figures:
+        assert (tmp_path / 'model_report' / name).read_bytes()[:4] == b'\x89PNG'
+    assert '2 motions, ' in capsys.readouterr().out
+    again = tmp_path / 'again.npz'
+    assert train.main([*arguments, '-o', str(again), '--quiet']) == 0
+    assert again.read_bytes() == output.read_bytes()
+    assert capsys.readouterr().out == ''
+
+
+@pytest.mark.parametrize('model', ['nearest', 'joint'])
+def test_models_by_name(model: str, tmp_path: Path) -> None:
+    output = tmp_path / 'model.npz'
+    arguments = ['--motions', 'walk', '--samples', '90', '--model', model, '--experts', '2']
+    assert train.main([*arguments, '-o', str(output), '--no-dynamics', '--quiet']) == 0
+    predictor = PosePredictor.load(output)
+    assert predictor.dynamics is None
+    assert predictor.notes['model'] == model
+
+
+def test_broken_motions_are_skipped_and_counted(
+    mocap_walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / 'motions'
+    (folder / 'deeper').mkdir(parents=True)
+    (folder / 'deeper' / 'fine_walk.bvh').write_bytes(mocap_walk.read_bytes())
+    (folder / 'broken.bvh').write_text('HIERARCHY\nROOT Hips\n{\n')
+    (folder / 'unknown.bvh').write_text(BVH)
+    (folder / 'alone.amc').write_text(':DEGREES\n1\nroot 0 0 0 0 0 0\n')
+    output = tmp_path / 'model.npz'
+    arguments = ['--mocap', str(folder), '-o', str(output), '--samples', '60', '--no-dynamics']
+    assert train.main(arguments) == 0
+    captured = capsys.readouterr()
+    warnings = [x for x in captured.err.splitlines() if x.startswith('train: skipped')]
+    assert sorted(x.split()[2] for x in warnings) == ['alone.amc:', 'broken.bvh:', 'unknown.bvh:']
+    assert '1 motions, 3 skipped' in captured.out
+    assert PosePredictor.load(output).notes['activities'] == ['walk']
+
+
+@pytest.fixture(scope='module')
+def mocap_walk() -> Path:
+    import os
+
+    root = Path(__file__).resolve().parents[2]
+    folder = Path(os.environ.get('HMT_SHARED', root / '..' / 'shared')) / 'mocap'
+    path = folder / 'train' / 'cmu_07_01_walk.bvh'
+    if not path.is_file():
+        pytest.skip(f'no development motions in {folder} (set HMT_SHARED)')
+    return path
+
+
+def _fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    assert train.main(arguments) == 1
+    error = capsys.readouterr().err.strip().splitlines()
+    assert error[-1].startswith('train: ')
+    return error[-1]
+
+
+def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = str(tmp_path / 'm.npz')
+    empty = tmp_path / 'empty'
+    empty.mkdir()
+    cases = [
+        (['-o', output], 'nothing to learn from'),
+        (['-o', output, '--mocap', str(empty)], 'has no motion'),
+        (['-o', output, '--mocap', str(tmp_path / 'absent')], 'no folder'),
+        (['-o', output, '--motions', 'swim'], "no motion 'swim'"),
+        (['-o', str(tmp_path / 'x' / 'm.npz'), '--motions', 'walk'], 'no folder'),
+        (['-o', output, '--motions', 'walk', '--samples', '3'], 'from 50'),
+        (['-o', output, '--motions', 'walk', '--body', 'nobody'], 'nobody'),
+        (['--motions', 'walk'], '-o'),
+    ]
+    for arguments, wanted in cases:
+        assert wanted in _fails(arguments, capsys)
+    (empty / 'broken.bvh').write_text('nothing')
+    assert 'none of the 1 motions' in _fails(['-o', output, '--mocap', str(empty)], capsys)
+    assert not Path(output).exists()
+
+
+def test_a_model_that_is_there_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / 'm.npz'
+    np.savez(output, a=np.zeros(3))
+    before = output.read_bytes()
+    assert '--overwrite' in _fails(['-o', str(output), '--motions', 'walk'], capsys)
+    assert output.read_bytes() == before

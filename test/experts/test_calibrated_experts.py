@@ -1,0 +1,128 @@
+"""Calibration on groups left out: what it changes, what it keeps, and its files."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_ros.experts import JointExperts, NearestNeighbours, RelevanceVectorRegression
+from hmt_ros.experts.calibrated_experts import (
+    CalibratedExperts,
+    Calibration,
+    calibration,
+    folds_of,
+)
+from hmt_ros.experts.conditional_density import Components
+from hmt_ros.experts.learned_models import KINDS, new_model
+
+GROUPS, EACH = 12, 40
+
+
+def grouped(seed: int, spread: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Targets that are a line plus an offset that all samples of a group share."""
+    rng = np.random.default_rng(seed)
+    groups = np.repeat(np.arange(GROUPS), EACH)
+    places = np.linspace(-3.0, 3.0, GROUPS)[rng.permutation(GROUPS)]
+    inputs = places[groups, None] + 0.1 * rng.normal(size=(len(groups), 1))
+    offsets = spread * rng.normal(size=(GROUPS, 2))[groups]
+    targets = np.c_[inputs, -inputs] + offsets + 0.05 * rng.normal(size=(len(groups), 2))
+    return inputs, targets, groups
+
+
+def test_what_motions_left_out_add() -> None:
+    inputs, targets, groups = grouped(0, 0.5)
+    model = CalibratedExperts(NearestNeighbours(3))
+    # Neighbours of the same group know its offset: the plain model is far too sure.
+    plain = NearestNeighbours(3).fit(inputs, targets)
+    assert np.sqrt(np.trace(plain.noise_)) < 0.25
+    model.fit(inputs, targets, groups=groups)
+    found = np.sqrt(np.trace(model.calibration_.added))
+    assert 0.5 < found < 2.0
+    new_inputs, new_targets, _ = grouped(1, 0.5)
+    before = plain.log_density(new_inputs, new_targets).mean()
+    assert model.log_density(new_inputs, new_targets).mean() > before + 2.0
+
+
+def test_one_expert_gets_the_covariance_that_was_missing() -> None:
+    rng = np.random.default_rng(2)
+    true = np.array([[2.0, 0.6], [0.6, 1.0]])
+    targets = rng.multivariate_normal([0.0, 0.0], true, size=4000)
+    zeros = np.zeros((4000, 1))
+    claimed = Components(zeros, np.zeros((4000, 1, 2)), np.ones((4000, 1)), 0.1 * np.eye(2)[None])
+    found = calibration([(claimed, targets)])
+    np.testing.assert_allclose(
+        found.factor * (found.added + 0.1 * np.eye(2)), true, rtol=0.1, atol=0.08
+    )
+    assert found.factor == pytest.approx(1.0, abs=0.06)
+
+
+def test_gates_that_are_right_by_chance_are_softened() -> None:
+    rng = np.random.default_rng(3)
+    count = 1000
+    branch, sign = rng.integers(0, 2, count), rng.integers(0, 2, count)
+    targets = (4.0 * branch - 2.0)[:, None] + 0.3 * rng.normal(size=(count, 1))
+    means = np.broadcast_to(np.array([[-2.0], [2.0]]), (count, 2, 1))
+    sure = np.where(sign[:, None] == np.arange(2), 0.0, -12.0)  # says nothing of the branch
+    noise = 0.09 * np.ones((2, 1, 1))
+    found = calibration([(Components(sure, means, np.ones((count, 2)), noise), targets)])
+    assert found.temperature == 6.0
+    weights = np.exp(found.of(Components(sure, means, np.ones((count, 2)), noise)).log_weights)
+    np.testing.assert_allclose(weights.sum(1), 1.0)
+    assert weights.min() > 0.1
+
+
+def test_means_stay_as_they_are() -> None:
+    inputs, targets, groups = grouped(4, 0.2)
+    model = CalibratedExperts(JointExperts(2, 'linear')).fit(inputs, targets, groups=groups)
+    plain = JointExperts(2, 'linear').fit(inputs, targets)
+    np.testing.assert_array_equal(
+        model.components(inputs[:9]).means, plain.components(inputs[:9]).means
+    )
+    np.testing.assert_array_equal(model.jacobians(inputs[:9]), plain.jacobians(inputs[:9]))
+    np.testing.assert_array_equal(model.support(inputs[:9]), plain.support(inputs[:9]))
+
+
+def test_a_file_brings_it_back(tmp_path: Path) -> None:
+    inputs, targets, groups = grouped(5, 0.2)
+    model = CalibratedExperts(RelevanceVectorRegression(), folds=2)
+    model.fit(inputs, targets, groups=groups)
+    again = CalibratedExperts.load(model.save(tmp_path / 'model'))
+    assert again.folds == 2
+    np.testing.assert_allclose(
+        again.log_density(inputs, targets), model.log_density(inputs, targets), rtol=1e-9
+    )
+    with pytest.raises(ValueError, match="'calibrated_experts', wanted 'joint_experts'"):
+        JointExperts.load(tmp_path / 'model.npz')
+
+
+def test_folds_leave_whole_groups_out() -> None:
+    groups = np.repeat([7, 3, 5, 9, 1, 8], 4)
+    folds = folds_of(groups, 3)
+    assert all(len(set(folds[groups == name])) == 1 for name in np.unique(groups))
+    assert set(folds) == {0, 1, 2}
+    assert set(folds_of(np.array([0, 0, 1]), 3)) == {0, 1}
+
+
+def test_bad_input() -> None:
+    inputs, targets, groups = grouped(6, 0.2)
+    model = CalibratedExperts(NearestNeighbours(3))
+    with pytest.raises(ValueError, match='one group only'):
+        model.fit(inputs, targets, groups=np.zeros(len(inputs)))
+    with pytest.raises(ValueError, match='groups have shape'):
+        model.fit(inputs, targets, groups=groups[:-1])
+    with pytest.raises(ValueError, match='folds is 1'):
+        CalibratedExperts(NearestNeighbours(3), folds=1).fit(inputs, targets)
+    with pytest.raises(ValueError, match='has not learned'):
+        CalibratedExperts(NearestNeighbours(3)).components(inputs)
+    with pytest.raises(ValueError, match='temperature must be at least 1'):
+        Calibration(0.5, np.zeros((2, 2)), 1.0)
+
+
+def test_models_by_name() -> None:
+    for name in KINDS:
+        assert isinstance(new_model(name), CalibratedExperts)
+    few = new_model('joint', samples=200)
+    assert isinstance(few, CalibratedExperts)
+    assert few.model.get_params()['n_experts'] == 5
+    with pytest.raises(ValueError, match="no model 'forest'"):
+        new_model('forest')

@@ -1,0 +1,235 @@
+"""Propagation of mixtures against samples, grids and closed forms."""
+
+import numpy as np
+import pytest
+
+from hmt_ros.experts import JointExperts
+from hmt_ros.experts.density_propagation import (
+    clustered,
+    divergence_bound,
+    divided_product,
+    gaussian_divergences,
+    linearised_products,
+    propagate,
+    propagate_by_dynamics,
+    reduced,
+    refined,
+)
+from hmt_ros.inference import GaussianMixture
+
+
+def random_mixture(rng, components, dimension, spread=2.0):
+    factors = rng.normal(size=(components, dimension, 2 * dimension)) * 0.4
+    return GaussianMixture(
+        rng.dirichlet(np.ones(components)),
+        spread * rng.normal(size=(components, dimension)),
+        factors @ np.swapaxes(factors, 1, 2),
+    )
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture(scope='module')
+def linear_model():
+    """p(x_t | x_{t-1}, r_t) with states and targets of 2, observations of 1."""
+    rng = np.random.default_rng(1)
+    before, seen = rng.normal(size=(400, 2)), rng.normal(size=(400, 1))
+    side = rng.integers(0, 2, 400)
+    turned = before @ np.array([[0.8, -0.3], [0.3, 0.8]]) + seen * [1.0, -0.5]
+    after = turned + side[:, None] * [3.0, 1.0] + 0.1 * rng.normal(size=(400, 2))
+    return JointExperts(2, 'linear', n_starts=2).fit(np.hstack([before, seen]), after)
+
+
+@pytest.fixture(scope='module')
+def kernel_model():
+    rng = np.random.default_rng(2)
+    before = rng.uniform(-2.0, 2.0, (400, 1))
+    after = np.sin(before) + rng.choice([-1.0, 1.0], (400, 1)) + 0.05 * rng.normal(size=(400, 1))
+    return JointExperts(2, width=0.8, n_starts=2).fit(before, after)
+
+
+@pytest.fixture(scope='module')
+def previous():
+    return GaussianMixture(
+        [0.3, 0.7],
+        [[0.0, 0.5], [-1.0, 0.2]],
+        [[[0.04, 0.01], [0.01, 0.03]], [[0.02, 0.0], [0.0, 0.05]]],
+    )
+
+
+def samples_through(model, previous, observation, count, rng):
+    """Draws of p(x_t | R_t): a state before, then the model's own mixture there."""
+    states = previous.sample(count, rng)
+    inputs = np.hstack([states, np.broadcast_to(observation, (count, len(observation)))])
+    weights, means, covariances = model.predict_arrays(inputs)
+    chosen = (weights.cumsum(1) > rng.random((count, 1))).argmax(1)
+    rows = np.arange(count)
+    factors = np.linalg.cholesky(covariances[rows, chosen])
+    noise = np.einsum('nij,nj->ni', factors, rng.normal(size=means[:, 0].shape))
+    return means[rows, chosen] + noise
+
+
+def test_products_agree_with_samples(linear_model, previous, rng):
+    observation = np.array([0.4])
+    found = linearised_products(linear_model, previous, observation)
+    assert len(found) == len(previous) * 2
+    draws = samples_through(linear_model, previous, observation, 200_000, rng)
+    np.testing.assert_allclose(found.mean(), draws.mean(0), atol=0.03)
+    np.testing.assert_allclose(found.covariance(), np.cov(draws.T), atol=0.06)
+    # Draws are as probable under the mixture as the mixture's own.
+    own = found.log_density(found.sample(200_000, rng)).mean()
+    assert found.log_density(draws).mean() == pytest.approx(own, abs=0.05)
+
+
+def test_products_are_written_out(linear_model, previous):
+    observation = np.array([0.4])
+    found = linearised_products(linear_model, previous, observation)
+    k = 0
+    for w, m, s in zip(previous.weights, previous.means, previous.covariances, strict=True):
+        point = np.append(m, observation)[None]
+        gates, means, covariances = linear_model.predict_arrays(point)
+        slopes = linear_model.jacobians(point)[0, :, :, :2]
+        for i in range(2):
+            assert found.weights[k] == pytest.approx(w * gates[0, i])
+            np.testing.assert_allclose(found.means[k], means[0, i])
+            expected = slopes[i] @ s @ slopes[i].T + covariances[0, i]
+            np.testing.assert_allclose(found.covariances[k], expected)
+            k += 1
+
+
+def test_kernel_experts_agree_with_samples(kernel_model, rng):
+    previous = GaussianMixture([0.5, 0.5], [[-1.0], [0.6]], [[[0.01]], [[0.02]]])
+    found = propagate(kernel_model, previous, np.zeros(0), n_components=4)
+    draws = samples_through(kernel_model, previous, np.zeros(0), 100_000, rng)
+    edges = np.linspace(-3.0, 3.0, 61)
+    counted = np.histogram(draws, edges, density=True)[0]
+    middle = 0.5 * (edges[1:] + edges[:-1])[:, None]
+    assert 0.05 * np.abs(counted - np.exp(found.log_density(middle))).sum() < 0.15
+
+
+def test_rule_one_reduces_and_sorts(linear_model, previous):
+    found = propagate(linear_model, previous, np.array([0.4]))
+    assert len(found) == 2
+    assert found.weights[0] >= found.weights[1]
+    whole = linearised_products(linear_model, previous, np.array([0.4]))
+    np.testing.assert_allclose(found.mean(), whole.mean(), atol=1e-10)
+    np.testing.assert_allclose(found.covariance(), whole.covariance(), atol=1e-10)
+
+
+def test_no_kernel_fires_in_the_first_frame(kernel_model):
+    alone = GaussianMixture([0.4, 0.6], [[5.0], [7.0]], [[[1.0]], [[2.0]]])
+    far = GaussianMixture([1.0], [[1e3]], [[[0.1]]])
+    found = propagate(kernel_model, far, np.zeros(0), without_past=alone)
+    np.testing.assert_allclose(found.means, alone.sorted().means)
+    both = GaussianMixture([0.25, 0.75], [[0.3], [1e3]], [[[0.1]], [[0.1]]])
+    found = propagate(kernel_model, both, np.zeros(0), without_past=alone, n_components=4)
+    assert found.weights[found.means[:, 0] > 4.0].sum() == pytest.approx(0.75)
+
+
+def test_dimensions_that_do_not_fit_are_named(linear_model, previous):
+    with pytest.raises(ValueError, match='wanted 3 numbers together'):
+        propagate(linear_model, previous, np.zeros(2))
+    alone = GaussianMixture([1.0], [[0.0]], [[[1.0]]])
+    with pytest.raises(ValueError, match='without_past has dimension 1, wanted 2'):
+        propagate(linear_model, previous, np.zeros(1), without_past=alone)
+    with pytest.raises(ValueError, match='0 components'):
+        reduced(previous, 0)
+
+
+GRID = np.linspace(-12.0, 14.0, 8001)[:, None]
+STEP = float(GRID[1, 0] - GRID[0, 0])
+
+
+def on_grid(*mixtures):
+    return [np.exp(one.log_density(GRID)) for one in mixtures]
+
+
+@pytest.fixture(scope='module')
+def factors():
+    a = GaussianMixture([0.3, 0.7], [[0.0], [1.0]], [[[0.2]], [[0.1]]])
+    b = GaussianMixture([0.5, 0.5], [[0.5], [2.0]], [[[0.3]], [[0.2]]])
+    return a, b
+
+
+def test_product_over_a_gaussian_is_exact(factors):
+    wide = GaussianMixture([1.0], [[0.5]], [[[2.0]]])
+    a, b, c = on_grid(*factors, wide)
+    expected = a * b / c / (a * b / c).sum() / STEP
+    found = divided_product(*factors, wide)
+    np.testing.assert_allclose(on_grid(found)[0], expected, atol=1e-12)
+
+
+def test_product_over_a_mixture_is_weighted_at_its_means(factors):
+    wide = GaussianMixture([0.6, 0.4], [[-1.0], [4.0]], [[[6.0]], [[6.0]]])
+    a, b, c = on_grid(*factors, wide)
+    expected = a * b / c / (a * b / c).sum() / STEP
+    assert STEP * np.abs(on_grid(divided_product(*factors, wide))[0] - expected).sum() < 0.05
+
+
+def test_a_narrow_equilibrium_keeps_the_product_a_density(factors):
+    narrow = GaussianMixture([1.0], [[0.5]], [[[0.01]]])
+    found = divided_product(*factors, narrow)
+    assert np.isfinite(found.weights).all()
+    assert (found.covariances > 0).all()
+
+
+def test_rule_nine_on_a_grid(kernel_model):
+    previous = GaussianMixture([1.0], [[0.2]], [[[1e-4]]])
+    predicted = GaussianMixture([0.5, 0.5], [[1.3], [-0.7]], [[[0.3]], [[0.3]]])
+    equilibrium = GaussianMixture([1.0], [[0.0]], [[[1.6]]])
+    found = propagate_by_dynamics(kernel_model, previous, predicted, equilibrium, n_components=4)
+    prior = linearised_products(kernel_model, previous, np.zeros(0))
+    a, b, c = on_grid(prior, predicted, equilibrium)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        expected = np.where(a * b > 1e-250, a * b / c, 0.0)
+    expected /= expected.sum() * STEP
+    assert STEP * np.abs(on_grid(found)[0] - expected).sum() < 1e-3
+
+
+def test_divergences_between_gaussians(rng):
+    a, b = random_mixture(rng, 3, 2), random_mixture(rng, 2, 2)
+    found = gaussian_divergences(a, b)
+    for i in range(3):
+        for j in range(2):
+            inverse = np.linalg.inv(b.covariances[j])
+            offset = a.means[i] - b.means[j]
+            ratio = np.linalg.det(b.covariances[j]) / np.linalg.det(a.covariances[i])
+            expected = np.trace(inverse @ a.covariances[i]) + offset @ inverse @ offset - 2
+            assert found[i, j] == pytest.approx(0.5 * (expected + np.log(ratio)))
+
+
+def test_refinement_lowers_a_bound_of_the_divergence(rng):
+    large = random_mixture(rng, 25, 4)
+    small = large[:5].normalised()
+    bounds = [divergence_bound(large, small)]
+    for _ in range(8):
+        small = refined(large, small)
+        bounds.append(divergence_bound(large, small))
+    assert np.diff(bounds).max() < 1e-10
+    assert bounds[-1] < bounds[0]
+    points = large.sample(20_000, rng)
+    divergence = (large.log_density(points) - small.log_density(points)).mean()
+    assert divergence < bounds[-1]
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_reduction_keeps_moments_and_little_is_lost(seed):
+    rng = np.random.default_rng(seed)
+    large = random_mixture(rng, 25, 3)
+    small = reduced(large, 5)
+    assert len(small) == 5
+    np.testing.assert_allclose(small.mean(), large.mean(), atol=1e-6)
+    np.testing.assert_allclose(small.covariance(), large.covariance(), atol=1e-6)
+    points = large.sample(20_000, rng)
+    lost = [(large.log_density(points) - q.log_density(points)).mean()
+            for q in (small, clustered(large, 5), large.reduce(1))]  # fmt: skip
+    assert lost[0] < lost[1] + 0.01
+    assert lost[0] < 0.6 * lost[2]
+
+
+def test_components_that_are_few_are_kept(rng):
+    mixture = random_mixture(rng, 3, 2)
+    assert reduced(mixture, 3) == mixture.normalised()

@@ -1,0 +1,226 @@
+from __future__ import annotations
+
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.experts.local_experts import LocalExperts
+from hmt_ros.experts.nearest_neighbours import NearestNeighbours
+from hmt_ros.experts.pose_predictor import PosePredictor
+from hmt_ros.experts.predictor_learning import Described, described, learned_predictor
+from hmt_ros.experts.training_set import TrainingSettings, procedural_sequence, training_set
+from hmt_ros.image.contour import NoSilhouetteError
+from hmt_ros.image.renderer import render_silhouettes
+from hmt_ros.image.silhouette_descriptor import SilhouetteDescriptor
+from hmt_ros.tracking.evaluation import EVALUATED_JOINTS
+
+CAMERA = Camera(400.0, 400.0, 199.5, 149.5, 400, 300)
+
+
+@pytest.fixture(scope='module')
+def body() -> Body:
+    return load_body('human37')
+
+
+@pytest.fixture(scope='module')
+def training(body: Body) -> Described:
+    sequences = [procedural_sequence('walk', body, 5.0, seed) for seed in (1, 2)]
+    settings = TrainingSettings(samples=600, elevation_spread=3.0)
+    pairs = training_set(body, sequences, settings)
+    return described(body, pairs, SilhouetteDescriptor(codebook_size=25, components=30))
+
+
+@pytest.fixture(scope='module')
+def predictor(body: Body, training: Described) -> PosePredictor:
+    return learned_predictor(
+        body, training, LocalExperts(n_neighbours=20), LocalExperts(n_neighbours=20)
+    )
+
+
+@pytest.fixture(scope='module')
+def clip(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    """Poses and masks of a walk that was not learned from."""
+    poses = procedural_sequence('walk', body, 1.2, 9).poses[::2].copy()
+    poses[:, :3] += [0.3, 0.0, 4.2] - poses[:, :3].mean(0)
+    return poses, render_silhouettes(body, poses, CAMERA)
+
+
+def errors(body: Body, found: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Pelvis-aligned joint errors (K,) in m."""
+    index = body.skeleton.joint_index(['pelvis', *EVALUATED_JOINTS])
+    joints, true = (body.joint_positions(x)[:, index] for x in (found, pose[None]))
+    joints, true = (x[:, 1:] - x[:, :1] for x in (joints, true))
+    return np.linalg.norm(joints - true, axis=2).mean(1)
+
+
+def test_poses_of_a_new_walk(
+    predictor: PosePredictor, body: Body, clip: tuple[np.ndarray, np.ndarray]
+) -> None:
+    best, depth = [], []
+    for pose, mask in zip(*clip, strict=True):
+        mixture = predictor.predict(mask, CAMERA)
+        assert mixture.weights.sum() == pytest.approx(1.0)
+        assert (np.diff(mixture.weights) <= 0).all()
+        mixture.cholesky()
+        away = errors(body, mixture.means, pose)
+        best.append(away.min())
+        k = int(away.argmin())
+        depth.append((mixture.means[k, 2] - pose[2]) / np.sqrt(mixture.covariances[k, 2, 2]))
+    assert np.mean(best) < 0.09
+    assert np.abs(depth).mean() < 2.0
+
+
+def test_propagation_keeps_what_was_known(
+    predictor: PosePredictor, body: Body, clip: tuple[np.ndarray, np.ndarray]
+) -> None:
+    poses, masks = clip
+    prior = predictor.predict(masks[0], CAMERA)
+    first = int(errors(body, prior.means, poses[0]).argmin())
+    sure = prior[[first]].normalised()
+    alone = predictor.predict(masks[1], CAMERA)
+    after = predictor.propagate(sure, masks[1], CAMERA)
+    weighted = [float(m.weights @ errors(body, m.means, poses[1])) for m in (alone, after)]
+    assert weighted[1] < weighted[0]
+
+
+def test_without_dynamics_propagation_predicts(
+    body: Body, training: Described, clip: tuple[np.ndarray, np.ndarray]
+) -> None:
+    plain = learned_predictor(body, training, NearestNeighbours(5, 'common'))
+    mask = clip[1][3]
+    mixture = plain.predict(mask, CAMERA)
+    assert plain.propagate(mixture, mask, CAMERA) == mixture
+
+
+def test_a_file_brings_it_back(
+    predictor: PosePredictor, clip: tuple[np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    path = predictor.save(tmp_path / 'model')
+    assert path.name == 'model.npz'
+    again = PosePredictor.load(path)
+    assert again.body.segment_lengths == predictor.body.segment_lengths
+    one, two = (x.predict(clip[1][2], CAMERA) for x in (predictor, again))
+    # Kept in half precision.
+    np.testing.assert_allclose(two.means[0], one.means[0], atol=0.01)
+    assert path.read_bytes() == predictor.save(tmp_path / 'other.npz').read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        assert all(name.endswith('.npy') for name in archive.namelist())
+    np.load(path, allow_pickle=False)
+
+
+def test_another_person(
+    predictor: PosePredictor, body: Body, clip: tuple[np.ndarray, np.ndarray]
+) -> None:
+    tall = predictor.with_body(body.with_stature(1.2 * body.stature))
+    one, two = (x.predict(clip[1][0], CAMERA) for x in (predictor, tall))
+    # The same silhouette of a larger person is further away.
+    ratio = np.linalg.norm(two.means[0, :3]) / np.linalg.norm(one.means[0, :3])
+    assert ratio == pytest.approx(1.2, abs=0.02)
+
+
+def test_nobody_is_seen(predictor: PosePredictor) -> None:
+    with pytest.raises(NoSilhouetteError, match='empty'):
+        predictor.predict(np.zeros((300, 400)), CAMERA)
+
+
+def test_several_blobs_are_said(
+    predictor: PosePredictor, clip: tuple[np.ndarray, np.ndarray]
+) -> None:
+    mask = clip[1][0].copy()
+    free = 30 if mask[:, :60].sum() == 0 else 340
+    mask[20:60, free : free + 30] = True
+    found = predictor.observe(mask, CAMERA)
+    assert 'left out' in found.place.remarks[0]
+    plain = predictor.predict(clip[1][0], CAMERA)
+    np.testing.assert_allclose(found.mixture.means, plain.means, atol=1e-9)
+
+
+def test_a_person_cut_by_the_border(
+    predictor: PosePredictor, clip: tuple[np.ndarray, np.ndarray]
+) -> None:
+    mask = clip[1][0].copy()
+    rows = np.flatnonzero(mask.any(1))
+    knees = int(rows[0] + 0.75 * len(rows))
+    cut = np.roll(mask, 300 - knees, axis=0)
+    cut[: 300 - knees] = False
+    found = predictor.observe(cut, CAMERA)
+    assert found.placement.cut
+    assert 'bottom' in found.place.remarks[-1]
+    whole = predictor.observe(mask, CAMERA)
+    spreads = [
+        np.sqrt(x.mixture.covariances[0, 2, 2]) / x.mixture.means[0, 2] for x in (found, whole)
+    ]
+    assert spreads[0] > 2 * spreads[1]
+
+
+def test_a_mask_of_another_camera(predictor: PosePredictor) -> None:
+    with pytest.raises(ValueError, match=r'\(300, 400\)'):
+        predictor.predict(np.ones((10, 10)), CAMERA)
+
+
+def test_nan_in_the_training_data(body: Body, training: Described) -> None:
+    descriptors = training.descriptors.copy()
+    descriptors[7, 2] = np.nan
+    with pytest.raises(ValueError, match='finite'):
+        learned_predictor(body, replace(training, descriptors=descriptors), LocalExperts())
+    targets = training.targets.copy()
+    targets[3] = np.inf
+    with pytest.raises(ValueError, match='finite'):
+        learned_predictor(body, replace(training, targets=targets), LocalExperts())
+
+
+def test_fewer_samples_than_neighbours(body: Body, training: Described) -> None:
+    few = replace(
+        training, descriptors=training.descriptors[:9], targets=training.targets[:9],
+        previous=training.previous[:9],
+    )  # fmt: skip
+    with pytest.raises(ValueError, match='9 samples'):
+        learned_predictor(body, few, LocalExperts())
+
+
+def _changed(path: Path, target: Path, **changes: object) -> Path:
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    arrays |= {name: np.asarray(value) for name, value in changes.items()}
+    np.savez(target, **{name: value for name, value in arrays.items() if value.shape != (0,)})
+    return target
+
+
+def test_files_that_are_no_predictors(predictor: PosePredictor, tmp_path: Path) -> None:
+    path = predictor.save(tmp_path / 'model.npz')
+    content = path.read_bytes()
+    garbage, cut, empty = (tmp_path / f'{x}.npz' for x in ('garbage', 'cut', 'empty'))
+    garbage.write_bytes(b'not a model' * 100)
+    cut.write_bytes(content[: len(content) // 2])
+    empty.write_bytes(b'')
+    for bad in (garbage, cut, empty):
+        with pytest.raises(ValueError, match='not a model file') as caught:
+            PosePredictor.load(bad)
+        assert bad.name in str(caught.value)
+        assert '\n' not in str(caught.value)
+    with pytest.raises(FileNotFoundError, match='no such model'):
+        PosePredictor.load(tmp_path / 'absent.npz')
+    with pytest.raises(ValueError, match='version 99'):
+        PosePredictor.load(_changed(path, tmp_path / 'v.npz', version=99))
+    other = NearestNeighbours(1).fit(np.eye(4), np.eye(4)).save(tmp_path / 'nn.npz')
+    with pytest.raises(ValueError, match="kind 'nearest_neighbours'"):
+        PosePredictor.load(other)
+    with pytest.raises(ValueError, match='damaged'):
+        PosePredictor.load(_changed(path, tmp_path / 'd.npz', **{'descriptor/basis': np.eye(3)}))
+    with pytest.raises(ValueError, match='damaged'):
+        PosePredictor.load(_changed(path, tmp_path / 'e.npz', target_basis=np.zeros(0)))
+
+
+def test_another_body(predictor: PosePredictor, tmp_path: Path) -> None:
+    path = predictor.save(tmp_path / 'model.npz')
+    with pytest.raises(ValueError, match='37 degrees of freedom, but human32 has 32'):
+        PosePredictor.load(path, load_body('human32'))
+    with pytest.raises(ValueError, match='human34'):
+        predictor.with_body(load_body('human34'))
+    text = str(np.load(path)['parameters']).replace('"human37"', '"nobody"')
+    with pytest.raises(ValueError, match="body 'nobody'"):
+        PosePredictor.load(_changed(path, tmp_path / 'n.npz', parameters=text))
