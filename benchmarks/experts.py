@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import experts_clips, experts_motion, experts_toy
+from benchmarks import experts_clips, experts_motion, experts_start, experts_toy
 from benchmarks.clips import rounded, table
 from benchmarks.experts_motion import BEST_OF, COLUMNS, Learned, SeenMotion
 from benchmarks.machine import best_time, description, on_machine
@@ -17,7 +17,7 @@ from hmt_ros.body import Camera, load_body
 from hmt_ros.experts.training_set import procedural_sequence
 from hmt_ros.image.renderer import render_silhouettes
 
-STAGES = ('toy', 'oracle', 'learning', 'motion', 'clips', 'speed')
+STAGES = ('toy', 'oracle', 'learning', 'motion', 'clips', 'start', 'speed')
 SAMPLES = 6000
 PROPAGATED = ('local',)
 MILLISECONDS = {'descriptor': 5.0, 'prediction': 1.0}
@@ -64,6 +64,7 @@ def measure(
         },
         'motion': lambda: motion(quick, propagated),
         'clips': lambda: experts_clips.clips(samples=300 if quick else SAMPLES, quick=quick),
+        'start': lambda: experts_start.starts(samples=300 if quick else SAMPLES, quick=quick),
         'speed': lambda: speed(0.0 if quick else 1.0, 96 if quick else 3000),
     }
     return {'machine': description(), **{name: stages[name]() for name in STAGES if name in only}}
@@ -131,7 +132,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     rows = _summary_rows(result)
     if len(rows) > 1:
         parts.append(table(rows, markdown=markdown))
-    for name in ('motion', 'clips'):
+    for name in ('motion', 'clips', 'start'):
         found = result.get(name)
         if isinstance(found, str):
             parts.append(f'{name}: {found}')
@@ -147,6 +148,10 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         ]
         if wanted:
             parts.append(table(_verdict_rows(wanted), markdown=markdown))
+    if isinstance(result.get('start'), dict):
+        found = result['start']
+        parts.append(table(experts_start.as_rows(found), left=2, markdown=markdown))
+        parts.append(table(_verdict_rows(found['wanted']), markdown=markdown))
     return '\n\n'.join(parts)
 
 

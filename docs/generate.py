@@ -5,6 +5,7 @@
     python docs/generate.py flips          times in flips.md
     python docs/generate.py kernels        times in likelihood.md
     python docs/generate.py smoothing      exactness and speed in smoothing.md (minutes)
+    python docs/generate.py experts        experts.md (a quarter of an hour)
     python docs/generate.py tracking       accuracy and speed in tracking.md (minutes)
 
 Such a part stands between `<!-- begin NAME -->` and `<!-- end -->`.
@@ -29,6 +30,7 @@ PAGES = {
     'flips': 'flips.md',
     'kernels': 'likelihood.md',
     'smoothing': 'smoothing.md',
+    'experts': 'experts.md',
     'tracking': 'tracking.md',
 }
 
@@ -62,9 +64,15 @@ def part(name: str) -> str:
     """The content of a part."""
     if PAGES[name] == 'nodes.md':
         return parameter_table(name)
-    from benchmarks import flips, kernels, smoothing, tracking
+    from benchmarks import experts, flips, kernels, smoothing, tracking
 
-    pages = {'flips': flips, 'kernels': kernels, 'smoothing': smoothing, 'tracking': tracking}
+    pages = {
+        'flips': flips,
+        'kernels': kernels,
+        'smoothing': smoothing,
+        'experts': experts,
+        'tracking': tracking,
+    }
     return pages[name].page()
 
 

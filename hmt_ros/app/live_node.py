@@ -25,7 +25,7 @@ import hmt_ros
 from hmt_ros.nodes.declared_parameters import values_of
 from hmt_ros.nodes.handled import Handled
 from hmt_ros.nodes.parameter_file import yaml_scalar
-from hmt_ros.nodes.published_topic import PublishedTopic
+from hmt_ros.nodes.published_topic import SUBSCRIBERS, PublishedTopic
 from msg_tools.cdr import canonical, deserialise, serialise
 
 # Generous: they end a replay that hangs. A node that ends is noticed at once.
@@ -53,7 +53,7 @@ class Player:
         self.domain = opened.enter_context(reserved_domain())
         try:
             import rclpy
-            from diagnostic_msgs.msg import DiagnosticStatus
+            from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
             from hmt_msgs.msg import Body, Keypoints2D, PoseMixture, TrajectoryMixture
             from rclpy.executors import SingleThreadedExecutor
             from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -86,6 +86,15 @@ class Player:
         self.executor = SingleThreadedExecutor(context=context)
         opened.callback(self.executor.shutdown)
         self.executor.add_node(self.node)
+        # The values of the diagnostics of each node, by its name.
+        self.diagnostics: dict[str, dict[str, str]] = {}
+
+        def diagnosed(message: DiagnosticArray) -> None:
+            for status in message.status:
+                name = status.name.partition(':')[0]
+                self.diagnostics[name] = {value.key: value.value for value in status.values}
+
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', diagnosed, self.reliable)
 
 
 class LiveNode:
@@ -189,15 +198,35 @@ class LiveNode:
             'the subscriptions of the node',
         )
 
-    def wait_for_subscribers(self, topics: tuple[str, ...], count: int) -> None:
-        """Returns when so many others, this player among them, listen to topics of the node.
+    def wait_until_heard(self, sources: tuple[str, ...], count: int) -> None:
+        """Returns when so many nodes, this one among them, hear what is published for it.
 
         Raises:
             LiveNodeError: they do not.
         """
-        node = self._player.node
+        publishers = [self._publishers[source] for source in sources]
         self._wait(
-            lambda: all(node.count_subscribers(topic) >= count for topic in topics),
+            lambda: all(one.get_subscription_count() >= count for one in publishers),
+            START_SECONDS,
+            f'who hears {", ".join(sources)}',
+        )
+
+    def wait_for_subscribers(self, topics: tuple[str, ...], count: int) -> None:
+        """Returns when so many others, this player among them, are connected to topics of the node.
+
+        The graph does not tell: who is known to it may not have met the publisher yet. The node
+        itself does, in its diagnostics.
+
+        Raises:
+            LiveNodeError: they are not.
+        """
+
+        def connected() -> bool:
+            values = self._player.diagnostics.get(self.name, {})
+            return all(int(values.get(f'{SUBSCRIBERS}{x}', '0')) >= count for x in topics)
+
+        self._wait(
+            connected,
             START_SECONDS,
             f'who listens to {", ".join(topics)}',
         )

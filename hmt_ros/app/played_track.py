@@ -190,8 +190,8 @@ class LiveTrack:
             self._filter.wait_until_active()
             if self._bme is not None:
                 self._bme.wait_until_active()
-                taken = [inputs[source][0] for source in SEEN_BY_BME]
-                self._filter.wait_for_subscribers((*taken, PREDICTION), 2)
+                self._bme.wait_for_subscribers((PREDICTION,), 2)
+                self._filter.wait_until_heard(SEEN_BY_BME, 2)
             if self._smoother is not None:
                 self._smoother.wait_until_active()
                 self._filter.wait_for_subscribers(HANDED_ON, 2)

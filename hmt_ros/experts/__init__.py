@@ -2,7 +2,7 @@
 
 from hmt_ros.experts.conditional_density import ConditionalDensity
 from hmt_ros.experts.conditional_experts import ConditionalExperts
-from hmt_ros.experts.density_propagation import propagate
+from hmt_ros.experts.density_propagation import propagate, propagate_by_dynamics
 from hmt_ros.experts.joint_experts import JointExperts
 from hmt_ros.experts.local_experts import LocalExperts
 from hmt_ros.experts.nearest_neighbours import NearestNeighbours
@@ -20,4 +20,5 @@ __all__ = [
     'RelevanceVectorRegression',
     'load_predictor',
     'propagate',
+    'propagate_by_dynamics',
 ]

@@ -1,7 +1,8 @@
 """The models that poses are predicted with, by name, with what each of them needs.
 
 All are calibrated on motions left out. How many experts a model has, how stiff they are and how
-many components of the descriptor it sees was chosen on motions of people apart.
+many components of the descriptor it sees was chosen by looking at motions of other people, so that
+numbers on those flatter it.
 """
 
 from __future__ import annotations

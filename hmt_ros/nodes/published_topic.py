@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+# What diagnostics say before the name of a topic: how many are connected to its publisher.
+SUBSCRIBERS = 'subscribers of '
+
 
 class PublishedTopic(NamedTuple):
     """A topic of a node.

@@ -51,7 +51,7 @@ from hmt_ros.nodes.declared_parameters import (
 )
 from hmt_ros.nodes.handled import Handled, Output
 from hmt_ros.nodes.input_queue import InputQueue, Waiting
-from hmt_ros.nodes.published_topic import PublishedTopic
+from hmt_ros.nodes.published_topic import SUBSCRIBERS, PublishedTopic
 from msg_tools.cdr import deserialise
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -445,6 +445,10 @@ class SessionNode(LifecycleNode):
                 *((f'faults: {kind}', str(count)) for kind, count in sorted(state.faults.items())),
                 ('last fault', state.last_fault),
                 *self._rates.values(),
+                *(
+                    (f'{SUBSCRIBERS}{topic}', str(publisher.get_subscription_count()))
+                    for topic, publisher in self._outputs.items()
+                ),
             ]
         status.values = [KeyValue(key=key, value=value) for key, value in values]
         message = DiagnosticArray(status=[status])
