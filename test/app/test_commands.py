@@ -33,7 +33,7 @@ def test_unknown_commands_are_one_line(arguments, message, capsys):
     assert main(arguments) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
-    assert 'replay, make-bag, evaluate' in line
+    assert 'replay, make-bag, train, evaluate' in line
 
 
 @pytest.mark.parametrize('command', ['replay', 'make-bag', 'evaluate'])

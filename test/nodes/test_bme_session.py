@@ -116,7 +116,7 @@ def test_background_is_learned_from_the_first_images(session, outputs, somebody)
 
 
 def test_predictions_take_those_before_into_account(session, somebody, stub_predictor):
-    one = session(longest_interval=0.25)
+    one = session(propagate=True, longest_interval=0.25)
     one.take(CAMERA_INFO, somebody.info())
     for index in (0, 1, 4):
         one.take(IMAGE, somebody.image(index))
@@ -127,7 +127,7 @@ def test_predictions_take_those_before_into_account(session, somebody, stub_pred
     gained = second.covariances[0] - 1e-2 * np.eye(37)
     assert np.allclose(gained, np.diag(PoseRates().rates(stub_predictor.body.skeleton) * 2 / 30))
     assert third is None
-    alone = session(propagate=False)
+    alone = session()
     alone.take(CAMERA_INFO, somebody.info())
     for index in (0, 1):
         alone.take(IMAGE, somebody.image(index))
