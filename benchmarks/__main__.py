@@ -15,6 +15,7 @@ USAGE = """usage: python -m benchmarks [NAME [options]]
   tracking   accuracy, calibration and speed of the tracker on clips with known truth
   flips      time per leaf of the interpretation trees
   kernels    the compiled likelihood against vectorised numpy
+  nodes      images at the rate of a camera, through DDS
   smoothing  exactness, speed and peers of the smoother
 
 Without a name all of them run. Every benchmark takes --json and --help.
@@ -24,12 +25,13 @@ Without a name all of them run. Every benchmark takes --json and --help.
 def main(argv: list[str]) -> int:
     """Runs one benchmark, or all; the exit code is that of the first that fails."""
     # Only now: they import numpy.
-    from benchmarks import experts, flips, kernels, smoothing, tracking
+    from benchmarks import experts, flips, kernels, nodes, smoothing, tracking
 
     benchmarks = {
         'experts': experts.main,
         'flips': flips.main,
         'kernels': kernels.main,
+        'nodes': nodes.main,
         'smoothing': smoothing.main,
         'tracking': tracking.main,
     }

@@ -159,14 +159,15 @@ class _Softmax:
     def curvature(self, gates: Array) -> Array:
         """Minus the Hessian of the likelihood, (M K, M K)."""
         experts, count = gates.shape[1], self.features.shape[1]
-        result = np.empty((experts, count, experts, count))
+        # sum_n s (diag(g) - g g') x (phi phi'), the second part as one product with itself.
+        shared = (np.sqrt(self.sample_weights)[:, None] * gates)[:, :, None]
+        shared = (shared * self.features[:, None]).reshape(len(gates), experts * count)
+        result: Array = -(shared.T @ shared)
         for i in range(experts):
-            for j in range(i, experts):
-                scale = self.sample_weights * gates[:, i] * ((i == j) - gates[:, j])
-                block = self.features.T @ (scale[:, None] * self.features)
-                result[i, :, j] = block
-                result[j, :, i] = block.T
-        return result.reshape(experts * count, experts * count)
+            own = slice(i * count, (i + 1) * count)
+            scale = self.sample_weights * gates[:, i]
+            result[own, own] += self.features.T @ (scale[:, None] * self.features)
+        return result
 
     def newton(self, weights: Array, precisions: Array, steps: int) -> Array:
         """Damped Newton steps, each accepted by the ratio of true to predicted gain."""

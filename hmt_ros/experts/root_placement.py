@@ -40,7 +40,8 @@ OUTLINE_SIGMA, CLOTHES = 1.5, 0.02
 DEPTH_SPREAD, ACROSS_SPREAD = 0.7, 1.0
 STEPS = 10
 DONE = 3e-4  # relative to the depth
-LONGEST_STEP = 0.4  # share of the depth
+TURNED = 0.05  # share of the depth: a step that turns the line of sight this far, as an angle
+LONGEST_STEP = 0.4  # shares of the depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,9 +97,10 @@ def place_roots(
     roots = _first_roots(encoding, camera, sides, targets)
     start, prior = roots.copy(), _prior(roots)
     nearest = 1.05 * body.lower[2]
+    slopes = encoding.jacobians(targets, roots)
     for _ in range(STEPS):
         residual, by_root, by_target = _box_error(
-            encoding, mesh, camera, targets, roots, sides, cut
+            encoding, mesh, camera, targets, roots, slopes, sides, cut
         )
         spread = by_target @ covariances @ by_target.transpose(0, 2, 1) + noise * np.eye(4)
         weighted = np.linalg.solve(spread, by_root).transpose(0, 2, 1)
@@ -112,7 +114,12 @@ def place_roots(
         roots[:, 2] = np.maximum(roots[:, 2], nearest)
         if share.max() < DONE:
             break
-    residual, by_root, by_target = _box_error(encoding, mesh, camera, targets, roots, sides, cut)
+        if share.max() > TURNED:
+            slopes = encoding.jacobians(targets, roots)
+    slopes = encoding.jacobians(targets, roots)
+    residual, by_root, by_target = _box_error(
+        encoding, mesh, camera, targets, roots, slopes, sides, cut
+    )
     spread = by_target @ covariances @ by_target.transpose(0, 2, 1) + noise * np.eye(4)
     weighted = np.linalg.solve(spread, by_root).transpose(0, 2, 1)
     gain = np.linalg.solve(weighted @ by_root + prior, weighted)  # (M, 3, 4)
@@ -182,16 +189,19 @@ def _box_error(
     camera: Camera,
     targets: Array,
     roots: Array,
+    slopes: tuple[Array, Array],
     sides: Array,
     cut: NDArray[np.bool_],
 ) -> tuple[Array, Array, Array]:
     """Sides of the boxes of M postures minus those seen (M, 4), and their derivatives.
 
+    `slopes` are the Jacobians of the encoding about there.
+
     Returns:
         residuals (M, 4), by the roots (M, 4, 3), by the targets (M, 4, D).
     """
     poses = encoding.decode(targets, roots)
-    by_target, by_root = encoding.jacobians(targets, roots)
+    by_target, by_root = slopes
     frames = forward(encoding.body.skeleton, poses)
     points = frames.points(mesh.segments, mesh.vertices)  # (V, 3, M)
     points[:, 2] = np.maximum(points[:, 2], 0.05)  # a hand behind the camera is at its plane
@@ -199,11 +209,11 @@ def _box_error(
     outermost = np.stack([u.argmin(0), v.argmin(0), u.argmax(0), v.argmax(0)], axis=1)  # (M, 4)
     rows = np.arange(len(poses))[:, None]
     chosen = points[outermost, :, rows]  # (M, 4, 3)
-    pixels, slopes = camera.project_with_derivative(chosen.transpose(2, 0, 1))
+    pixels, by_point = camera.project_with_derivative(chosen.transpose(2, 0, 1))
     coordinate = np.array([0, 1, 0, 1])
-    # pixels (2, M, 4) and slopes (2, 3, M, 4), of the coordinate that the side bounds
+    # pixels (2, M, 4) and by_point (2, 3, M, 4), of the coordinate that the side bounds
     value = np.stack([pixels[c, :, k] for k, c in enumerate(coordinate)], axis=1)
-    slope = np.stack([slopes[c, :, :, k].T for k, c in enumerate(coordinate)], axis=1)
+    slope = np.stack([by_point[c, :, :, k].T for k, c in enumerate(coordinate)], axis=1)
     by_pose = np.einsum('mkc,mkdc->mkd', slope, _by_pose(frames, mesh, outermost, chosen))
     residual = value - sides
     # Where the image ends the person reaches it, and how far beyond is not known.

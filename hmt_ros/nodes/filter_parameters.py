@@ -40,6 +40,7 @@ _TRACKER_LIMITS = {
     'image_trust': _FRACTION,
     'jump_probability': _FRACTION,
     'prediction_probability': _FRACTION,
+    'facing_trial': (0.0, 60.0),
     'base_iterations': (1, 100),
     'iterations': (1, 100),
     'least_log_weight': (-100.0, 0.0),

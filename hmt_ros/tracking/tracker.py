@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
@@ -27,6 +28,7 @@ from hmt_ros.tracking.candidates import (
     some_minima,
 )
 from hmt_ros.tracking.dynamics import predict, update_velocities
+from hmt_ros.tracking.facing_trial import DECIDED, faces_like, log_shares
 from hmt_ros.tracking.flesh_fitting import FleshFit
 from hmt_ros.tracking.initialisation import (
     poses_from_keypoints,
@@ -86,6 +88,21 @@ class Modes:
     log_likelihoods: Array
     textures: Textures | None
 
+    def joined(self, other: Modes, log_shares: Array, count: int) -> Modes:
+        """The heaviest modes of both, for the log probabilities (2,) of the two."""
+        log_weights = np.concatenate(
+            [self.log_weights + log_shares[0], other.log_weights + log_shares[1]]
+        )
+        kept = np.argsort(-log_weights, kind='stable')[:count]
+        parts = {
+            name: np.concatenate([getattr(self, name), getattr(other, name)])[kept]
+            for name in ('poses', 'velocities', 'covariances', 'filtered', 'log_likelihoods')
+        }
+        log_weights = log_weights[kept]
+        return Modes(
+            log_weights=log_weights - np.logaddexp.reduce(log_weights), textures=None, **parts
+        )
+
 
 class Tracker:
     """Follows one person through images; the posterior over poses is a mixture.
@@ -122,6 +139,10 @@ class Tracker:
         self._bad_images = 0
         self._flesh = FleshFit(body)
         self._usual_energy = np.inf
+        self._least_energy = 0.0
+        self._other_way: Tracker | None = None
+        self._evidence = 0.0
+        self._undecided_until = 0
         self.status = Status.WAITING
         self.misfit = 0.0
         self.evaluations = 0
@@ -146,6 +167,7 @@ class Tracker:
         self._bad_images = 0
         self._flesh = FleshFit(self.body)
         self._usual_energy = np.inf
+        self._other_way = None
         self.status = Status.WAITING
 
     def step(
@@ -189,25 +211,34 @@ class Tracker:
                     self.background.learn(image)
                 return None, None
             observation = self._observe(image, keypoints)
-            self._begin(observation, start)
+            self._begin(observation, start, stamp)
         else:
             assert self._last_stamp is not None
             observation = self._observe(image, keypoints)
-            if self.status is Status.LOST and self._recover(observation, prediction):
-                self._bad_images = 0
-            else:
-                self._propagate(observation, (stamp - self._last_stamp) * 1e-9, prediction)
+            self._follow(observation, stamp, prediction)
         self._last_image, self._last_stamp = image, stamp
         self._judge(observation)
+        if self._other_way is not None:
+            self._other_way._judge(observation)
+            self._decide_facing(observation, stamp)
         return self.posterior, self.likelihood_mixture(observation)
 
     @property
     def modes(self) -> Modes:
-        """The present modes.
+        """The present modes; those of both ways to face while that is not decided.
 
         Raises:
             ValueError: there is no track.
         """
+        other = self._other_way
+        if other is None:
+            return self._own
+        shares = log_shares([self._evidence, other._evidence])
+        return self._own.joined(other._own, shares, self.settings.max_hypotheses)
+
+    @property
+    def _own(self) -> Modes:
+        """The modes that this tracker follows itself."""
         if self._modes is None:
             raise ValueError('there is no track yet')
         return self._modes
@@ -251,9 +282,13 @@ class Tracker:
         return None if isinstance(start, Subject) and stamp < start.stamp_ns else start
 
     def _begin(
-        self, observation: Observation, start: Subject | GaussianMixture | PosePrediction
+        self,
+        observation: Observation,
+        start: Subject | GaussianMixture | PosePrediction,
+        stamp: int,
     ) -> None:
         s = self.settings
+        known = not isinstance(start, PosePrediction) or observation.keypoints is not None
         if isinstance(start, Subject):
             begun = start_from_keypoints(self.model, self.camera, start)
             self._use_body(begun.body)
@@ -289,8 +324,12 @@ class Tracker:
                 break
             solved = self._minimise(energy, solved.x, s.iterations)
             self._keep(solved, log_weights, still, observation)
+        if not known:
+            self._follow_both_ways(solved, log_weights, observation, stamp)
 
-    def _recover(self, observation: Observation, prediction: PosePrediction | None) -> bool:
+    def _recover(
+        self, observation: Observation, prediction: PosePrediction | None, stamp: int
+    ) -> bool:
         """Starts anew from what an image alone shows; False where that is not enough.
 
         The body keeps its lengths and widths. From keypoints come all poses that explain them, from
@@ -309,20 +348,76 @@ class Tracker:
         found = [poses] if poses is not None else []
         if prediction is not None:
             found.append(prediction.both_ways(self.body).means)
-        poses = np.concatenate([self.modes.poses, *found])
+        poses = np.concatenate([self._own.poses, *found])
 
         def energy(x: Array, _: Index) -> tuple[Array, Array, Array]:
             return self._energy(x, observation, None, None)
 
         solved = self._minimise(energy, poses, 3 * s.iterations)
         self._keep(solved, np.zeros(len(poses)), np.zeros_like(poses), observation)
+        if observation.keypoints is None:
+            self._follow_both_ways(solved, np.zeros(len(poses)), observation, stamp)
         return True
+
+    # Which way the person faces.
+
+    def _follow_both_ways(
+        self, solved: Minimum, log_weights: Array, observation: Observation, stamp: int
+    ) -> None:
+        """Follows those that face like the best, and beside them those that face otherwise."""
+        s = self.settings
+        self._other_way, self._evidence = None, 0.0
+        if s.facing_trial == 0:
+            return
+        usable = np.flatnonzero(np.isfinite(solved.value))
+        best = usable[np.argmax(log_weights[usable] - s.temperature * solved.value[usable])]
+        alike = faces_like(self.body, solved.x, solved.x[best])
+        ways = usable[alike[usable]], usable[~alike[usable]]
+        if len(ways[1]) == 0:
+            return
+        other = Tracker(self.model, self.camera, s, self.background, self._seed + 1)
+        other._use_body(self.body)
+        other._flesh = deepcopy(self._flesh)
+        for tracker, rows in zip((self, other), ways, strict=True):
+            tracker._keep(
+                some_minima(solved, rows), log_weights[rows], np.zeros_like(solved.x[rows]),
+                observation,
+            )  # fmt: skip
+            tracker._evidence = -s.temperature * tracker._least_energy
+        self._other_way = other
+        self._undecided_until = stamp + round(s.facing_trial * 1e9)
+
+    def _decide_facing(self, observation: Observation, stamp: int) -> None:
+        """Gives one way to face up where the images speak against it.
+
+        When time is over and they do not, both become one mixture.
+        """
+        other = self._other_way
+        assert other is not None
+        ahead = self._evidence - other._evidence
+        lost = self.status is Status.LOST, other.status is Status.LOST
+        decided = abs(ahead) >= DECIDED or lost[0] != lost[1]
+        if not decided and stamp < self._undecided_until:
+            return
+        shares = log_shares([self._evidence, other._evidence])
+        modes = self._own.joined(other._own, shares, self.settings.max_hypotheses)
+        if lost[0] > lost[1] or (lost[0] == lost[1] and ahead < 0):
+            for name in (
+                '_modes', '_flesh', '_usual_energy', '_least_energy', '_bad_images',
+                '_outline_costs', '_rng', 'misfit', 'status',
+            ):  # fmt: skip
+                setattr(self, name, getattr(other, name))
+            self._use_body(other.body)
+        if not decided:
+            frames = forward(self.body.skeleton, modes.poses)
+            self._modes = replace(modes, textures=self._textures(frames, observation))
+        self._other_way = None
 
     def _fit_flesh(self, observation: Observation) -> bool:
         """Moves the widths of the flesh by what an image says; False where it says nothing more."""
         if self._flesh.images >= self.settings.flesh_images or observation.outline is None:
             return False
-        m = self.modes
+        m = self._own
         poses, weights = m.poses[:4], np.exp(m.log_weights[:4])
         body = self._flesh.update(
             self._likelihood, replace(observation, keypoints=None), poses, weights / weights.sum()
@@ -338,10 +433,36 @@ class Tracker:
 
     # One image after another.
 
-    def _propagate(
-        self, observation: Observation, dt: float, prediction: PosePrediction | None
+    def _follow(
+        self, observation: Observation, stamp: int, prediction: PosePrediction | None
     ) -> None:
-        s, m, body = self.settings, self.modes, self.body
+        """Takes the next image of a track."""
+        assert self._last_stamp is not None
+        dt = (stamp - self._last_stamp) * 1e-9
+        if self.status is Status.LOST and self._recover(observation, prediction, stamp):
+            self._bad_images = 0
+            return
+        other = self._other_way
+        if other is None:
+            expected = None if prediction is None else prediction.seen_as(self.body)
+            self._propagate(observation, dt, expected)
+            return
+        other.evaluations = 0
+        for tracker in (self, other):
+            expected = None
+            if prediction is not None:
+                # Neither is offered the way that the other faces.
+                both = prediction.both_ways(tracker.body)
+                own = both[faces_like(tracker.body, both.means, tracker._own.poses[0])]
+                expected = own.normalised() if len(own) else None
+            tracker._propagate(observation, dt, expected)
+            tracker._evidence -= self.settings.temperature * tracker._least_energy
+        self.evaluations += other.evaluations
+
+    def _propagate(
+        self, observation: Observation, dt: float, expected: GaussianMixture | None
+    ) -> None:
+        s, m, body = self.settings, self._own, self.body
         predicted, covariances = predict(
             s.dynamics, self._rates, m.poses, m.filtered, m.velocities, dt
         )
@@ -360,10 +481,8 @@ class Tracker:
             candidates = self._jumps.propose(base, sources, covariances, observation, self._rng)
         else:
             candidates = self._samples(base, sources, covariances, observation)
-        if prediction is not None:
-            candidates = joined_candidates(
-                self._expected_elsewhere(prediction.seen_as(self.body), moved), candidates
-            )
+        if expected is not None:
+            candidates = joined_candidates(self._expected_elsewhere(expected, moved), candidates)
         solved = self._solve(candidates, precisions, observation)
         for _ in range(s.rounds - 1 if s.proposals == 'kjs' else 0):
             if solved.value.min() < self._usual_energy + s.surprise:
@@ -391,7 +510,7 @@ class Tracker:
 
     def _expected_elsewhere(self, prediction: GaussianMixture, moved: Array) -> Candidates:
         """Candidates that the image suggests, and not the images before."""
-        s, m, body = self.settings, self.modes, self.body
+        s, m, body = self.settings, self._own, self.body
         poses = prediction.means
         apart = relative_joints(body, poses)[:, None] - relative_joints(body, moved)[None]
         parents = np.linalg.norm(apart, axis=3).mean(2).argmin(1)
@@ -480,7 +599,7 @@ class Tracker:
         """Predictions corrected by the optical flow, before shapes are compared."""
         if observation.flow is None or self.settings.likelihood.motion.weight == 0:
             return predicted
-        textures, everyone = self.modes.textures, np.arange(len(predicted))
+        textures, everyone = self._own.textures, np.arange(len(predicted))
 
         def energy(x: Array, index: Index) -> tuple[Array, Array, Array]:
             image = self._motion_likelihood.image_energy(
@@ -503,7 +622,7 @@ class Tracker:
         self, base: Minimum, sources: Candidates, covariances: Array, observation: Observation
     ) -> Candidates:
         """Candidates of covariance-scaled or spherical sampling."""
-        s, m = self.settings, self.modes
+        s, m = self.settings, self._own
         draw = covariance_scaled_samples if s.proposals == 'css' else spherical_samples
         moved = sources.poses
         k = len(moved)
@@ -540,6 +659,7 @@ class Tracker:
         usable = np.flatnonzero(np.isfinite(solved.value))
         if len(usable) == 0:
             raise ValueError('no hypothesis has a finite energy')
+        self._least_energy = float(solved.value[usable].min())
         log_weights = log_priors[usable] - s.temperature * solved.value[usable]
         kept = choose_hypotheses(
             relative_joints(self.body, solved.x[usable]),
@@ -561,9 +681,7 @@ class Tracker:
         rows = usable[kept.chosen[order]]
         poses = solved.x[rows]
         frames = forward(self.body.skeleton, poses)
-        textures = None
-        if observation.intensity is not None:
-            textures = capture_textures(self.body, self.camera, frames, observation.intensity)
+        textures = self._textures(frames, observation)
         image = self._likelihood.image_energy(frames, observation, derivatives=False)
         filtered = _covariances(solved.hessian[rows], solved.free[rows])
         covariances = filtered
@@ -573,6 +691,12 @@ class Tracker:
             poses, velocities[rows], covariances, filtered, weights[order], -image.value, textures
         )
         self._outline_costs = image.costs
+
+    def _textures(self, frames: Frames, observation: Observation) -> Textures | None:
+        """What an image shows on the surfaces of poses."""
+        if observation.intensity is None:
+            return None
+        return capture_textures(self.body, self.camera, frames, observation.intensity)
 
     def _honest_covariances(
         self, poses: Array, frames: Frames, free: NDArray[np.bool_], observation: Observation
@@ -608,7 +732,7 @@ class Tracker:
         if len(seen) == 0:
             return 0.0
         which = self.body.skeleton.joint_index([keypoints.names[i] for i in seen])
-        pixels = self.camera.project(self.body.joint_positions(self.modes.poses)[:, which])
+        pixels = self.camera.project(self.body.joint_positions(self._own.poses)[:, which])
         error = pixels - keypoints.pixels[seen]
         precisions = np.linalg.inv(keypoints.covariances[seen])
         sigma = self.settings.likelihood.joints.sigma
@@ -670,7 +794,7 @@ class Tracker:
         """Where the person can be in the next image; None: anywhere."""
         if self._modes is None or self.status is Status.LOST:
             return None
-        pixels = self.camera.project(self.body.joint_positions(self._modes.poses)).reshape(-1, 2)
+        pixels = self.camera.project(self.body.joint_positions(self.modes.poses)).reshape(-1, 2)
         pixels = pixels[np.isfinite(pixels).all(1)]
         if len(pixels) == 0:
             return None

@@ -38,6 +38,8 @@ class TrackerSettings:
         jump_probability: of a flip of one chain from one image to the next.
         prediction_probability: of a pose that a regression predicts from the image, and not the
             images before.
+        facing_trial: seconds that both ways to face are followed at most, where a track starts from
+            silhouettes or predictions alone; 0: the better one at once. It costs twice the time.
         base_iterations, iterations: Newton steps on the predictions and on the candidates.
         temperature: factor on the image's energy in a mode's weight; below 1 because neighbouring
             measurements err together.
@@ -68,6 +70,7 @@ class TrackerSettings:
     rounds: int = 3
     jump_probability: float = 0.1
     prediction_probability: float = 0.01
+    facing_trial: float = 2.0
     base_iterations: int = 6
     iterations: int = 6
     temperature: float = 0.3
@@ -96,6 +99,7 @@ class TrackerSettings:
             )
         least = {'samples': 1, 'rounds': 1, 'iterations': 1, 'base_iterations': 1, 'lost_images': 1}
         least |= {'combinations': 1, 'alternatives': 1, 'temperature': 0, 'exploration': 0}
+        least |= {'facing_trial': 0}
         for name, bound in least.items():
             if not getattr(self, name) >= bound:
                 raise ValueError(f'{name} must be at least {bound}, saw {getattr(self, name)}')
