@@ -20,6 +20,7 @@ from hmt_ros.app.pictures import draw_overlays, draw_overview, draw_side_views, 
 from hmt_ros.app.recorded_track import RecordedTrack, read_images, read_track
 from hmt_ros.app.truth import Truth, read_truth, truth_of, truth_topic
 from msg_tools import BagReader
+from msg_tools.error_line import error_line
 
 # Times that are shown in the overview and on the sheets.
 IN_OVERVIEW, ON_SHEETS = 4, 8
@@ -31,7 +32,7 @@ def main(argv: list[str] | None = None) -> int:
         options = _parser().parse_args(argv)
         return _demonstrate(options)
     except (ValueError, OSError) as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
+        text = error_line(error)
         print(f'demo: {text}', file=sys.stderr)
         return 1
 

@@ -16,6 +16,7 @@ from hmt_ros.app.bag_scores import TopicScores, score_bag
 from hmt_ros.app.truth import Truth, read_truth, truth_of, truth_topic
 from hmt_ros.tracking.evaluation import MODEL_SIGMA
 from msg_tools import BagReader
+from msg_tools.error_line import error_line
 
 EPILOG = """\
 Errors are mean distances of hips, knees, ankles, shoulders, elbows, wrists and neck from where
@@ -40,7 +41,7 @@ def main(argv: list[str] | None = None) -> int:
         truth = _truth(options)
         found = _scores(options, truth)
     except (ValueError, OSError) as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
+        text = error_line(error)
         print(f'evaluate: {text}', file=sys.stderr)
         return 1
     if options.json:

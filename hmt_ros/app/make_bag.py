@@ -22,6 +22,7 @@ from hmt_ros.body.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
 from hmt_ros.body.retarget import body_from_motion, retarget
 from hmt_ros.body.viewpoint import Viewpoint
 from hmt_ros.image.scene import Scene
+from msg_tools.error_line import error_line
 
 Array = NDArray[np.float64]
 
@@ -52,7 +53,7 @@ def main(argv: list[str] | None = None) -> int:
                 progress=not options.quiet,
             )
     except (ValueError, OSError) as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
+        text = error_line(error)
         print(f'make-bag: {text}', file=sys.stderr)
         return 1
     return 0

@@ -41,6 +41,7 @@ from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.nodes.track_start import prepare_start
 from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
+from msg_tools.error_line import error_line
 from msg_tools.headers import header_message, time_ns
 
 Settings = TypeVar('Settings')
@@ -85,7 +86,7 @@ def main(argv: list[str] | None = None) -> int:
         options = _parser().parse_args(argv)
         summary = _replay(options)
     except (ValueError, OSError) as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
+        text = error_line(error)
         print(f'replay: {text}', file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -304,7 +305,7 @@ def _given_values(options: argparse.Namespace, node: str) -> dict[str, Any]:
         try:
             values[name] = yaml.safe_load(value)
         except yaml.YAMLError as error:
-            raise ValueError(f'--set {text}: {" ".join(str(error).split())}') from error
+            raise ValueError(f'--set {text}: {error_line(error)}') from error
         if values[name] is None:
             values[name] = value
     return values

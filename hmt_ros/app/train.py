@@ -31,6 +31,7 @@ from hmt_ros.experts.training_set import (
     training_set,
     typical_body,
 )
+from msg_tools.error_line import error_line
 
 Item = TypeVar('Item')
 
@@ -43,7 +44,7 @@ def main(argv: list[str] | None = None) -> int:
         options = _parser().parse_args(argv)
         return _train(options)
     except (ValueError, OSError) as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
+        text = error_line(error)
         print(f'train: {text}', file=sys.stderr)
         return 1
 
@@ -213,7 +214,7 @@ def _sequence_or_warning(path: Path, body: Body) -> PoseSequence | None:
     try:
         return recorded_sequence(path, body)
     except (ValueError, OSError, np.linalg.LinAlgError) as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
+        text = error_line(error)
         tqdm.write(f'train: skipped {path.name}: {text}', file=sys.stderr)
         return None
 

@@ -18,8 +18,9 @@ from hmt_ros.nodes.bme_parameters import BmeParameters
 from hmt_ros.nodes.bme_session import TOPICS, BmeSession, BmeState
 from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
 from hmt_ros.nodes.handled import Output
-from hmt_ros.nodes.session_node import Input, SessionNode, first_line, run
+from hmt_ros.nodes.session_node import Input, SessionNode, run
 from msg_tools.cdr import serialise
+from msg_tools.error_line import error_line
 
 NAME = 'bme_node'
 _CHECKED = ('model_file', 'background_file', 'stature')
@@ -71,7 +72,7 @@ class BmeNode(SessionNode):
                 raise ValueError('the request has no image: fill image or compressed_image')
             data = serialise(session.predict_once(image))
         except (ValueError, ArithmeticError) as error:
-            response.success, response.message = False, first_line(error)
+            response.success, response.message = False, error_line(error)
             return response
         response.success = True
         response.mixture = deserialize_message(data, PoseMixture)

@@ -41,6 +41,7 @@ from hmt_ros.nodes.published_topic import PublishedTopic
 from hmt_ros.tracking.dynamics import PoseRates
 from msg_tools import RosbagsMessages
 from msg_tools.cdr import serialise
+from msg_tools.error_line import error_line
 from msg_tools.headers import SECOND_NS, header_message, time_ns
 from msg_tools.images import decode_image
 from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
@@ -194,7 +195,7 @@ class BmeSession:
         try:
             mixture = self._mixture_of(waiting, camera)
         except (ValueError, ArithmeticError) as error:
-            text = ' '.join(str(error).split()) or type(error).__name__
+            text = error_line(error)
             self._input.skip(
                 'estimate', f'no prediction from the image of {waiting.stamp_ns} ns: {text}'
             )
@@ -350,7 +351,7 @@ def _predictor_of(parameters: BmeParameters) -> tuple[PosePredictor, float]:
     try:
         predictor = load_predictor(parameters.model_file or SHIPPED)
     except OSError as error:
-        raise ValueError(' '.join(str(error).split())) from error
+        raise ValueError(error_line(error)) from error
     if not parameters.stature:
         return predictor, SIZE_SPREAD
     body = predictor.body.with_stature(parameters.stature)

@@ -37,6 +37,7 @@ from hmt_ros.nodes.track_start import TrackStart, prepare_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker
 from msg_tools import MessageError, RosbagsMessages
 from msg_tools.cdr import serialise
+from msg_tools.error_line import error_line
 from msg_tools.headers import SECOND_NS, time_ns
 from msg_tools.keypoints import keypoints_of
 from msg_tools.pose_mixtures import pose_mixture_of
@@ -287,7 +288,7 @@ class FilterSession:
             if posterior is not None and likelihood is not None:
                 self._publish(self._tracker, waiting, posterior, likelihood)
         except (ValueError, ArithmeticError) as error:
-            text = ' '.join(str(error).split()) or type(error).__name__
+            text = error_line(error)
             if not starts:
                 self._input.skip('estimate', f'image of {stamp} ns can not be tracked: {text}')
                 return

@@ -53,6 +53,7 @@ from hmt_ros.nodes.handled import Handled, Output
 from hmt_ros.nodes.input_queue import InputQueue, Waiting
 from hmt_ros.nodes.published_topic import SUBSCRIBERS, PublishedTopic
 from msg_tools.cdr import deserialise
+from msg_tools.error_line import error_line
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
@@ -333,7 +334,7 @@ class SessionNode(LifecycleNode):
                 return change(request, response)
             except RuntimeError as error:
                 wanted = request.transition.label or request.transition.id
-                self.get_logger().warn(f'transition {wanted} is not possible: {first_line(error)}')
+                self.get_logger().warn(f'transition {wanted} is not possible: {error_line(error)}')
                 response.success = False
                 return response
 
@@ -390,7 +391,7 @@ class SessionNode(LifecycleNode):
             message = deserialise(waiting.content, self._types[waiting.source])
         except Exception as error:  # noqa: BLE001
             # Bytes from outside meet generated code here, which does not say what it may raise.
-            handled = session.refuse(waiting.source, first_line(error))
+            handled = session.refuse(waiting.source, error_line(error))
         else:
             handled = session.take(waiting.source, message)
         if self._counts(session.state)[self.DONE] > done:
@@ -503,11 +504,6 @@ class Rates:
         ]
 
 
-def first_line(error: BaseException) -> str:
-    """The text of an error as one line."""
-    return ' '.join(str(error).split()) or type(error).__name__
-
-
 def run(name: str, make: Callable[[], SessionNode], args: list[str] | None = None) -> int:
     """Runs a node until it is told to stop; 0, or 1 where it could not start."""
     # The handlers of rclpy end the context under whatever is going on; ours let it come to its end.
@@ -518,7 +514,7 @@ def run(name: str, make: Callable[[], SessionNode], args: list[str] | None = Non
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make()
     except (ParameterException, ValueError, RuntimeError) as error:
-        sys.stderr.write(f'{name}: {first_line(error)}\n')
+        sys.stderr.write(f'{name}: {error_line(error)}\n')
         rclpy.try_shutdown()
         return 1
     executor = SingleThreadedExecutor()

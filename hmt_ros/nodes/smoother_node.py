@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
 from hmt_ros.nodes.handled import Output
-from hmt_ros.nodes.session_node import LATCHED, Input, SessionNode, first_line, run
+from hmt_ros.nodes.session_node import LATCHED, Input, SessionNode, run
 from hmt_ros.nodes.smoothed_messages import TOPICS
 from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.nodes.smoother_session import (
@@ -32,6 +32,7 @@ from hmt_ros.nodes.smoother_session import (
     known_body,
 )
 from msg_tools.cdr import serialise
+from msg_tools.error_line import error_line
 from msg_tools.headers import time_ns
 
 NAME = 'smoother_node'
@@ -93,7 +94,7 @@ class SmootherNode(SessionNode):
         try:
             data = await found
         except ValueError as error:
-            response.success, response.message = False, first_line(error)
+            response.success, response.message = False, error_line(error)
             return response
         response.success = True
         response.trajectories = deserialize_message(data, TrajectoryMixture)

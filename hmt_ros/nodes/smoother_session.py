@@ -40,6 +40,7 @@ from hmt_ros.smoothing.mode_sequence import merge_close_modes
 from hmt_ros.smoothing.path_smoother import PathSmoother
 from msg_tools import MessageError, RosbagsMessages
 from msg_tools.cdr import serialise
+from msg_tools.error_line import error_line
 from msg_tools.headers import SECOND_NS, time_ns
 from msg_tools.message_error import check_names
 from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
@@ -265,7 +266,7 @@ class SmootherSession:
         try:
             update = self._window.step(stamp, used)
         except (ValueError, ArithmeticError) as error:
-            text = ' '.join(str(error).split()) or type(error).__name__
+            text = error_line(error)
             self._skip('estimate', f'mixture of {stamp} ns can not be smoothed: {text}')
             self._end_window()
             return
@@ -427,7 +428,7 @@ def known_body(name: str) -> Body:
     try:
         return load_body(name)
     except OSError as error:
-        text = ' '.join(str(error).split())
+        text = error_line(error)
         raise ValueError(f'{text}; body_model names it, or a file with it') from error
 
 
