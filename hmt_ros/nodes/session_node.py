@@ -22,7 +22,7 @@ import traceback
 from abc import abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -52,6 +52,7 @@ from hmt_ros.nodes.declared_parameters import (
 from hmt_ros.nodes.handled import Handled, Output
 from hmt_ros.nodes.input_queue import InputQueue, Waiting
 from hmt_ros.nodes.published_topic import SUBSCRIBERS, PublishedTopic
+from hmt_ros.nodes.session import Session
 from msg_tools.cdr import deserialise
 from msg_tools.error_line import error_line
 
@@ -67,30 +68,6 @@ SMALL_QUEUE = 100
 _RESTART = 'restart'
 # What a last estimate may take at the end, s; kernels that are being compiled are not waited for.
 _LAST_ESTIMATE = 5.0
-
-
-class Session(Protocol):
-    """What a node holds: takes messages, publishes through the function that it was made with.
-
-    Attributes:
-        parameters: of the node, may be replaced.
-        state: for diagnostics, replaced with every message.
-    """
-
-    parameters: Any
-    state: Any
-
-    def take(self, source: str, message: Any) -> Handled:
-        """Handles a message."""
-
-    def refuse(self, source: str, text: str) -> Handled:
-        """Counts a message that could not even be read."""
-
-    def count_dropped(self, messages: int) -> None:
-        """Counts messages that were dropped before they came here."""
-
-    def restart(self, start: Any = None) -> None:
-        """Starts the estimate anew."""
 
 
 class Input(NamedTuple):
