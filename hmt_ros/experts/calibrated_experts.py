@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.gates import log_softmax
@@ -219,7 +219,8 @@ def calibration(left_out: list[tuple[Components, Array]]) -> Calibration:
     candidates = [_added_noise(left_out, temperature) for temperature in TEMPERATURES]
     found = max(candidates, key=lambda one: one[0])[1]
     squares = np.concatenate([_squared_distances(found.of(c), z) for c, z in left_out])
-    wanted = float(chi2.ppf(COVERED, left_out[0][1].shape[1]))
+    # The quantile of a chi square distribution with a degree of freedom for each dimension.
+    wanted = float(2.0 * gammaincinv(left_out[0][1].shape[1] / 2.0, COVERED))
     factor = float(np.clip(np.quantile(squares, COVERED) / wanted, 1.0, LARGEST_FACTOR))
     return replace(found, factor=factor)
 
