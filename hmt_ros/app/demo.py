@@ -9,18 +9,17 @@ import argparse
 import sys
 import time
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
 from hmt_ros.app import replay
 from hmt_ros.app.bag_scores import score_bag
+from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.evaluate import as_text
 from hmt_ros.app.pictures import draw_overlays, draw_overview, draw_side_views, draw_weights
 from hmt_ros.app.recorded_track import RecordedTrack, read_images, read_track
 from hmt_ros.app.truth import Truth, read_truth, truth_of, truth_topic
 from msg_tools import BagReader
-from msg_tools.error_line import error_line
 
 # Times that are shown in the overview and on the sheets.
 IN_OVERVIEW, ON_SHEETS = 4, 8
@@ -28,24 +27,11 @@ IN_OVERVIEW, ON_SHEETS = 4, 8
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the demonstration; 0: done, 1: bad input, and one line on stderr says which."""
-    try:
-        options = _parser().parse_args(argv)
-        return _demonstrate(options)
-    except (ValueError, OSError) as error:
-        text = error_line(error)
-        print(f'demo: {text}', file=sys.stderr)
-        return 1
+    return run_command(_parser(), _demonstrate, argv)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Bad input is one line and exit code 1, as everywhere else."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(f'{message}; --help tells more')
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+def _parser() -> CommandParser:
+    parser = CommandParser(
         prog='demo',
         description='Tracks the person of a bag, draws pictures of the track and, where the truth '
         'is known, prints errors.',
