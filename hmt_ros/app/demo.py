@@ -52,7 +52,7 @@ def _parser() -> CommandParser:
 def _demonstrate(options: argparse.Namespace) -> int:
     source, folder = options.bag, options.output
     target = folder / source.resolve().name
-    how = 'filter_node' if options.live else 'the tracker'
+    how = 'the real nodes' if options.live else 'the tracker'
     print(f'{source} through {how}', flush=True)
     arguments = [str(source), '-o', str(target), '--overwrite']
     for option, name in (('--subject', 'subject.yaml'), ('--background', 'background.png')):
@@ -69,6 +69,7 @@ def _demonstrate(options: argparse.Namespace) -> int:
     print(_summary(track, spent))
     if truth is not None:
         print(as_text(score_bag(target, truth), truth, by_joint=False))
+        print('docs/evaluation.md tells what the numbers mean')
     print('\nwhat came out')
     for path, what in ((target, 'bag: ' + ', '.join(_topics(target))), *pictures):
         print(f'  {path!s:{max(len(str(x)) for x, _ in pictures)}}  {what}')
