@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import sys
 
+from hmt_ros.app.printing import until_nobody_reads
+
 # Before numpy is imported: with small matrices a second BLAS thread costs more than it brings.
 for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
     os.environ.setdefault(_name, '1')
@@ -51,4 +53,4 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == '__main__':
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(until_nobody_reads(lambda: main(sys.argv[1:])))

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from benchmarks import experts_clips, experts_motion, experts_start, experts_toy
-from benchmarks.clips import rounded, table
+from benchmarks.clips import table
+from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.experts_motion import BEST_OF, COLUMNS, Learned, SeenMotion
-from benchmarks.machine import best_time, description, on_machine
+from benchmarks.machine import best_time, on_machine
 from hmt_ros.body import Camera, load_body
 from hmt_ros.experts.training_set import procedural_sequence
 from hmt_ros.image.renderer import render_silhouettes
@@ -25,24 +24,15 @@ MILLISECONDS = {'descriptor': 5.0, 'prediction': 1.0}
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = argparse.ArgumentParser(prog='python -m benchmarks experts', description=__doc__)
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument('--quick', action='store_true', help='fewer seeds, samples and frames')
-    parser.add_argument(
-        '--only', nargs='+', choices=STAGES, default=STAGES, metavar='STAGE',
-        help=f'some of {", ".join(STAGES)}',
-    )  # fmt: skip
+    parser = benchmark_parser('experts', __doc__, quick='fewer seeds, samples and frames')
+    add_choice(parser, STAGES)
     parser.add_argument(
         '--propagate', nargs='*', choices=COLUMNS, default=PROPAGATED, metavar='MODEL',
         help=f'models that learn dynamics too, minutes for the experts, of {", ".join(COLUMNS)}',
     )  # fmt: skip
     options = parser.parse_args(argv)
     result = measure(quick=options.quick, only=options.only, propagated=options.propagate)
-    if options.json:
-        print(json.dumps(rounded(result), indent=1))
-        return 0
-    print(as_text(result))
-    return 0
+    return show(result, as_text, as_json=options.json)
 
 
 def page() -> str:
@@ -67,7 +57,7 @@ def measure(
         'start': lambda: experts_start.starts(samples=300 if quick else SAMPLES, quick=quick),
         'speed': lambda: speed(0.0 if quick else 1.0, 96 if quick else 3000),
     }
-    return {'machine': description(), **{name: stages[name]() for name in STAGES if name in only}}
+    return run_stages('experts', stages, only)
 
 
 def motion(quick: bool = False, propagated: Sequence[str] = PROPAGATED) -> dict[str, Any] | str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,7 +18,8 @@ from benchmarks import (
     numpy_smoothing,
 )
 from benchmarks.arm_waving import waving
-from benchmarks.clips import rounded, table
+from benchmarks.clips import table
+from benchmarks.command import benchmark_parser, show
 from benchmarks.machine import best_time, description, on_machine
 from benchmarks.smoothing_relations import CLOSE, layers_of
 from hmt_ros.body import Camera, load_body
@@ -47,16 +46,10 @@ OFF = TermSettings(0.0, 1.0, 1.0)
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = argparse.ArgumentParser(prog='python -m benchmarks kernels', description=__doc__)
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument('--quick', action='store_true', help='measure less long')
+    parser = benchmark_parser('kernels', __doc__, quick='measure less long')
     options = parser.parse_args(argv)
     result = measure(0.1 if options.quick else 1.0)
-    if options.json:
-        print(json.dumps(rounded(result), indent=1))
-        return 0
-    print(as_text(result))
-    return 0
+    return show(result, as_text, as_json=options.json)
 
 
 def page() -> str:

@@ -11,39 +11,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.interpretation_tree import LIMIT_TOLERANCE, STRAIGHT, TOUCHING
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.body.skeleton import Skeleton
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-# Two solutions nearer than this are one: the ray touches the sphere, m.
-TOUCHING = 1e-6
-# Sine of an elbow or knee angle below which the segments count as straight: their twist is free.
-STRAIGHT = 1e-6
-LIMIT_TOLERANCE = 1e-9  # rad
-
 
 def enumerate_flips(
     body: Body, camera: Camera | None, poses: ArrayLike, chains: Sequence[str] | str
 ) -> tuple[Array, Index]:
-    """All poses with the image of the given ones that flips of some chains reach.
-
-    Args:
-        body: whose `chains` have the names.
-        camera: that looks; flips live on its rays, whatever its lens, so it only has to stand at
-            the origin of the poses' frame. May be None.
-        poses: (N, d).
-        chains: one name or several; of several the product of their trees is taken.
-
-    Returns:
-        poses (M, d), ordered by the pose they come from, which stands first of its leaves, and the
-        index (M,) of that pose.
-
-    Raises:
-        KeyError: a chain that the body does not have.
-        ValueError: a chain whose joints have no closed form, or that contains another's segments.
-    """
+    """As `hmt_ros.body.enumerate_flips`."""
     del camera
     names = [chains] if isinstance(chains, str) else list(chains)
     skeleton = body.skeleton

@@ -2,31 +2,21 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.body.kinematics import Frames
+from hmt_ros.body.self_intersection import TOLERANCE, _pairs
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-
-# Overlap that is tolerated before it costs anything: flesh gives way, and ellipsoids fit roughly.
-TOLERANCE = 0.02  # m
 
 
 def self_intersection_energy(
     body: Body, frames: Frames, *, sigma: float = 0.02
 ) -> tuple[Array, Array, Array]:
-    """Energy (N,), gradient (N, d) and Gauss-Newton Hessian (N, d, d) of overlapping parts.
-
-    Args:
-        body: whose parts may not overlap; neighbours along the skeleton are left out.
-        frames: of N poses.
-        sigma: overlap that costs 1/2, m.
-    """
+    """As `hmt_ros.body.self_intersection.self_intersection_energy`, of the same pairs of parts."""
     first, second = _pairs(body)
     n, d = frames.count, body.dimension
     if len(first) == 0:
@@ -66,33 +56,6 @@ def _overlaps(
     reach = _radius_along(frames, segments, radii, first, direction)
     reach += _radius_along(frames, segments, radii, second, direction)
     return p, q, direction, reach - distance
-
-
-@lru_cache(maxsize=64)
-def _pairs(body: Body) -> tuple[Index, Index]:
-    """Pairs of parts that are no neighbours along the skeleton and do not touch at rest."""
-    parts = body.flesh.parts
-    parents = body.skeleton.parents
-    fleshy = {p.segment for p in parts}
-
-    def fleshy_parent(s: int) -> int:
-        """The nearest segment above that carries flesh."""
-        step = parents[s]
-        while step >= 0 and step not in fleshy:
-            step = parents[step]
-        return step
-
-    pairs = []
-    for i in range(len(parts)):
-        for j in range(i + 1, len(parts)):
-            a, b = parts[i].segment, parts[j].segment
-            if a != b and fleshy_parent(a) != b and fleshy_parent(b) != a:
-                pairs.append((i, j))
-    first, second = np.array(pairs, dtype=np.intp).reshape(-1, 2).T
-    rest = body.prior_mean.copy()
-    rest[~body.skeleton.dof_is_rotation] = 0.0
-    apart = _overlaps(body, forward(body.skeleton, rest[None]), first, second)[3][:, 0] < TOLERANCE
-    return first[apart], second[apart]
 
 
 def _nearest_points(middle: Array, axis: Array, first: Index, second: Index) -> tuple[Array, Array]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import multiprocessing
 import time
 from collections.abc import Callable, Sequence
@@ -13,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.arm_waving import STEP, waving
-from benchmarks.clips import rounded, table
+from benchmarks.clips import table
+from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.exact_smoothing import (
     divergence,
     enumerated,
@@ -21,7 +20,7 @@ from benchmarks.exact_smoothing import (
     modes,
     particle_marginals,
 )
-from benchmarks.machine import best_time, description, on_machine, peak_memory
+from benchmarks.machine import best_time, on_machine, peak_memory
 from benchmarks.smoothing_clips import as_rows as rows_of_clips
 from benchmarks.smoothing_clips import clips
 from benchmarks.smoothing_peers import (
@@ -48,20 +47,11 @@ WALKS = (1.0, 4.0, 16.0)
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = argparse.ArgumentParser(prog='python -m benchmarks smoothing', description=__doc__)
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument('--quick', action='store_true', help='fewer sequences and repetitions')
-    parser.add_argument(
-        '--only', nargs='+', choices=PARTS, default=PARTS, metavar='PART',
-        help=f'some of {", ".join(PARTS)}',
-    )  # fmt: skip
+    parser = benchmark_parser('smoothing', __doc__, quick='fewer sequences and repetitions')
+    add_choice(parser, PARTS, 'PART')
     options = parser.parse_args(argv)
     result = measure(quick=options.quick, only=options.only)
-    if options.json:
-        print(json.dumps(rounded(result), indent=1))
-        return 0
-    print(as_text(result))
-    return 0
+    return show(result, as_text, as_json=options.json)
 
 
 def page() -> str:
@@ -83,7 +73,7 @@ def measure(*, quick: bool = False, only: Sequence[str] = PARTS) -> dict[str, An
         'relations': lambda: relations(6 if quick else TIMES),
         'clips': lambda: clips(quick),
     }
-    return {'machine': description(), **{name: parts[name]() for name in PARTS if name in only}}
+    return run_stages('smoothing', parts, only)
 
 
 def peak_memory_apart(times: int) -> float:

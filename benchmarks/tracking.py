@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from benchmarks.clips import Clip, find_clips, read_clip, rounded, table
-from benchmarks.machine import description, on_machine, peak_memory, resident_memory
+from benchmarks.command import told
+from benchmarks.machine import description, forget_peak, on_machine, peak_memory, resident_memory
 from benchmarks.stages import StageClock
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
@@ -111,7 +112,9 @@ def measure(options: argparse.Namespace, folders: list[Path], source: str) -> di
         runs = len(folders) * len(seeds) * 3
         with tqdm(total=runs, unit='run', desc='tracking', disable=not sys.stderr.isatty()) as bar:
             result['accuracy'] = [
-                entry for folder in folders for entry in _accuracies(folder, limit, seeds, bar)
+                entry
+                for folder in told('tracking', folders, lambda folder: folder.name)
+                for entry in _accuracies(folder, limit, seeds, bar)
             ]
     if 'speed' in options.parts:
         result['speed'] = speed(read_clip(folders[-1], 20 if options.quick else 60))
@@ -300,6 +303,7 @@ def _over_seeds(entries: list[dict[str, Any]]) -> dict[str, Any]:
 
 def speed(clip: Clip) -> dict[str, Any]:
     """Time of a step and of its stages, and of OpenCV's work on the same images, in turn."""
+    forget_peak()
     tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
     subtractor = cv2.createBackgroundSubtractorMOG2()
     for _ in range(10):
@@ -352,6 +356,7 @@ def opencv_work(subtractor: Any, image: Any) -> Any:
 
 def memory(clip: Clip, frames: int) -> dict[str, Any]:
     """Resident memory while a clip is played back and forth."""
+    forget_peak()
     tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
     every = max(frames // 50, 1)
     seen: list[tuple[int, float]] = []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from msg_tools.error_line import error_line
+
 
 class BagError(ValueError):
     """A bag that can not be read or written, in one line: what was seen, wanted, and what to do."""
@@ -14,5 +16,5 @@ def reason(error: BaseException) -> str:
     """What an exception of a library says, short enough for a line of ours."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    text = ' '.join(str(error).split()) or type(error).__name__
+    text = error_line(error)
     return text if len(text) <= 160 else f'{text[:157]}...'

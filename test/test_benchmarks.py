@@ -1,6 +1,7 @@
 """The benchmarks run, and what they compare is comparable. Times are printed, never asserted."""
 
 import json
+import multiprocessing
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import pytest
 from benchmarks import flips, kernels, tracking
 from benchmarks.__main__ import main
 from benchmarks.clips import find_clips, read_clip, rounded, table
+from benchmarks.command import run_stages
+from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.stages import STAGES, StageClock
 from hmt_ros.body import load_body
 from hmt_ros.body.interpretation_tree import enumerate_flips
@@ -214,3 +217,27 @@ def test_command_line(capsys, tmp_path):
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert main(['flips', '--json', '--quick']) == 0
     assert json.loads(capsys.readouterr().out)['cases']
+
+
+def test_stages_are_told_as_they_begin(capsys):
+    seen = []
+    stages = {name: lambda name=name: seen.append(name) or len(seen) for name in 'abc'}
+    result = run_stages('letters', stages, ('c', 'a'))
+    assert (list(result), result['a'], result['c']) == (['machine', 'a', 'c'], 1, 2)
+    assert capsys.readouterr().err == 'letters: a, 1 of 2, at 0:00\nletters: c, 2 of 2, at 0:00\n'
+
+
+def test_peak_memory_is_that_of_the_process_alone():
+    forget_peak()
+    assert peak_memory() == pytest.approx(resident_memory(), rel=0.05)
+    block = np.ones(50_000_000)
+    largest = peak_memory()
+    assert largest > block.nbytes
+    # A child that is started by one so large.
+    with multiprocessing.get_context('spawn').Pool(1) as pool:
+        assert pool.apply(peak_memory) < block.nbytes
+    del block
+    # The kernel counts by batches of pages.
+    assert peak_memory() == pytest.approx(largest, rel=0.01)
+    forget_peak()
+    assert peak_memory() < largest - 3e8

@@ -120,6 +120,19 @@ def test_everything_but_the_nodes_imports_without_ros() -> None:
     assert int(result.stdout) == len(names)
 
 
+def test_nothing_slow_is_imported_before_it_is_needed() -> None:
+    program = (
+        'import sys\n'
+        'import hmt_ros.app.replay, hmt_ros.app.evaluate\n'
+        'import hmt_ros.experts, hmt_ros.smoothing, hmt_ros.tracking\n'
+        'print([name for name in ("scipy.stats", "matplotlib") if name in sys.modules])\n'
+    )
+    result = subprocess.run(
+        [sys.executable, '-c', program], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert (result.stdout, result.stderr) == ('[]\n', '')
+
+
 def test_every_folder_of_modules_is_a_package() -> None:
     folders = {path.parent for path in MODULES.values()}
     assert [folder for folder in folders if not (folder / '__init__.py').is_file()] == []

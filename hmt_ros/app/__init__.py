@@ -6,6 +6,7 @@ import importlib
 import sys
 
 import hmt_ros
+from hmt_ros.app.printing import until_nobody_reads
 
 # Command: (module, what it does). A module is imported when its command is given.
 COMMANDS = {
@@ -34,7 +35,10 @@ options:
 
 def main(argv: list[str] | None = None) -> int:
     """Runs a command; 0: done, 1: bad input, and one line on stderr says which."""
-    arguments = sys.argv[1:] if argv is None else argv
+    return until_nobody_reads(lambda: _run(sys.argv[1:] if argv is None else argv))
+
+
+def _run(arguments: list[str]) -> int:
     command, *rest = arguments or ['']
     if command in ('-h', '--help'):
         print(_help(), end='')

@@ -9,12 +9,12 @@ import argparse
 import sys
 import time
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
 from hmt_ros.app import replay
 from hmt_ros.app.bag_scores import score_bag
+from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.evaluate import as_text
 from hmt_ros.app.pictures import draw_overlays, draw_overview, draw_side_views, draw_weights
 from hmt_ros.app.recorded_track import RecordedTrack, read_images, read_track
@@ -27,24 +27,11 @@ IN_OVERVIEW, ON_SHEETS = 4, 8
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the demonstration; 0: done, 1: bad input, and one line on stderr says which."""
-    try:
-        options = _parser().parse_args(argv)
-        return _demonstrate(options)
-    except (ValueError, OSError) as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
-        print(f'demo: {text}', file=sys.stderr)
-        return 1
+    return run_command(_parser(), _demonstrate, argv)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Bad input is one line and exit code 1, as everywhere else."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(f'{message}; --help tells more')
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+def _parser() -> CommandParser:
+    parser = CommandParser(
         prog='demo',
         description='Tracks the person of a bag, draws pictures of the track and, where the truth '
         'is known, prints errors.',
@@ -65,7 +52,7 @@ def _parser() -> argparse.ArgumentParser:
 def _demonstrate(options: argparse.Namespace) -> int:
     source, folder = options.bag, options.output
     target = folder / source.resolve().name
-    how = 'filter_node' if options.live else 'the tracker'
+    how = 'the real nodes' if options.live else 'the tracker'
     print(f'{source} through {how}', flush=True)
     arguments = [str(source), '-o', str(target), '--overwrite']
     for option, name in (('--subject', 'subject.yaml'), ('--background', 'background.png')):
@@ -82,6 +69,7 @@ def _demonstrate(options: argparse.Namespace) -> int:
     print(_summary(track, spent))
     if truth is not None:
         print(as_text(score_bag(target, truth), truth, by_joint=False))
+        print('docs/evaluation.md tells what the numbers mean')
     print('\nwhat came out')
     for path, what in ((target, 'bag: ' + ', '.join(_topics(target))), *pictures):
         print(f'  {path!s:{max(len(str(x)) for x, _ in pictures)}}  {what}')

@@ -8,11 +8,12 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from tqdm import tqdm
 
 from hmt_ros.app.bag_scores import TopicScores, score_bag
+from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.truth import Truth, read_truth, truth_of, truth_topic
 from hmt_ros.tracking.evaluation import MODEL_SIGMA
 from msg_tools import BagReader
@@ -35,30 +36,11 @@ examples:
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; 0: done, 1: bad input, and one line on stderr says which."""
-    try:
-        options = _parser().parse_args(argv)
-        truth = _truth(options)
-        found = _scores(options, truth)
-    except (ValueError, OSError) as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
-        print(f'evaluate: {text}', file=sys.stderr)
-        return 1
-    if options.json:
-        print(json.dumps(as_json(found, truth, options.model_sigma), indent=1))
-    else:
-        print(as_text(found, truth))
-    return 0
+    return run_command(_parser(), _evaluate, argv)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Bad input is one line and exit code 1, as everywhere else."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(f'{message}; --help tells more')
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+def _parser() -> CommandParser:
+    parser = CommandParser(
         prog='evaluate',
         description='Errors and calibration of the mixtures in a bag, against ground truth.',
         epilog=EPILOG,
@@ -108,6 +90,16 @@ def _length(text: str) -> float:
     if not 1e-4 <= value <= 1:
         raise argparse.ArgumentTypeError(f'wanted a length from 0.0001 to 1 m, saw {text!r}')
     return value
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    truth = _truth(options)
+    found = _scores(options, truth)
+    if options.json:
+        print(json.dumps(as_json(found, truth, options.model_sigma), indent=1))
+    else:
+        print(as_text(found, truth))
+    return 0
 
 
 def _truth(options: argparse.Namespace) -> Truth:

@@ -9,11 +9,11 @@ import argparse
 import math
 import sys
 from pathlib import Path
-from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.rendered_bag import MEASURED, Take, new_bag_folder, write_bag
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.footsteps import sole
@@ -31,42 +31,11 @@ LARGEST = 10_000  # px, of a side of the image
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; 0: the bag is there, 1: bad input, and one line on stderr says which."""
-    try:
-        options = _parser().parse_args(argv)
-        viewpoint = Viewpoint(options.distance, options.camera_height, math.radians(options.pitch))
-        scene = Scene(
-            viewpoint=viewpoint,
-            seed=options.seed,
-            noise=options.noise,
-            shadow=Scene.shadow if options.shadow else 0.0,
-        )
-        camera = _camera(options.size, options.fov)
-        with new_bag_folder(options.output, overwrite=options.overwrite) as folder:
-            take = _take(options, viewpoint)
-            write_bag(
-                folder,
-                take,
-                camera,
-                scene,
-                quality=options.jpeg_quality,
-                progress=not options.quiet,
-            )
-    except (ValueError, OSError) as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
-        print(f'make-bag: {text}', file=sys.stderr)
-        return 1
-    return 0
+    return run_command(_parser(), _make_bag, argv)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Bad input is one line and exit code 1, as everywhere else."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(f'{message}; --help tells more')
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+def _parser() -> CommandParser:
+    parser = CommandParser(
         prog='make-bag',
         description='Renders a motion into a bag with ground truth.',
     )
@@ -79,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('--overwrite', action='store_true', help='replace the bag that is there')
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
-    parser.add_argument('--seed', type=_whole(0), default=0, help='of all that is random (0)')
+    parser.add_argument('--seed', type=whole_number(0), default=0, help='of all that is random (0)')
 
     motion = parser.add_argument_group('motion')
     motion.add_argument(
@@ -90,24 +59,24 @@ def _parser() -> argparse.ArgumentParser:
     )
     motion.add_argument(
         '--stature',
-        type=_number(0.3, 3),
+        type=number(0.3, 3),
         help="of the person, m; not with --mocap (the model's)",
     )
     motion.add_argument(
-        '--duration', type=_number(0.001, 1e5), help=f's ({DURATION:g}, or all of --mocap)'
+        '--duration', type=number(0.001, 1e5), help=f's ({DURATION:g}, or all of --mocap)'
     )
     motion.add_argument(
-        '--start', type=_number(0, 1e6), default=0.0, help='where in --mocap to begin, s (0)'
+        '--start', type=number(0, 1e6), default=0.0, help='where in --mocap to begin, s (0)'
     )
     motion.add_argument(
         '--fps',
-        type=_number(0.01, 1000),
+        type=number(0.01, 1000),
         default=30.0,
         help='images per second; with --mocap the nearest that every n-th frame gives (30)',
     )
     motion.add_argument(
         '--heading',
-        type=_number(-3600, 3600),
+        type=number(-3600, 3600),
         help='of the person at first, degrees; 0: to the camera, 90: to the right of the image '
         f'(one that suits the motion; {HEADING:g} with --mocap)',
     )
@@ -117,25 +86,25 @@ def _parser() -> argparse.ArgumentParser:
         '--size', type=_size, default=(640, 480), metavar='WxH', help='of the images, px (640x480)'
     )
     camera.add_argument(
-        '--fov', type=_number(1, 150), default=51.7, help='horizontal field of view, degrees (51.7)'
+        '--fov', type=number(1, 150), default=51.7, help='horizontal field of view, degrees (51.7)'
     )
     camera.add_argument(
         '--distance',
-        type=_number(0.3, 1000),
+        type=number(0.3, 1000),
         default=5.6,
         help='of the camera to the middle of the motion, m (5.6)',
     )
     camera.add_argument(
-        '--camera-height', type=_number(0.01, 100), default=1.2, help='over the floor, m (1.2)'
+        '--camera-height', type=number(0.01, 100), default=1.2, help='over the floor, m (1.2)'
     )
     camera.add_argument(
         '--pitch',
-        type=_number(-80, 80),
+        type=number(-80, 80),
         default=0.0,
         help='by which the camera looks down, degrees (0)',
     )
     camera.add_argument(
-        '--noise', type=_number(0, 100), default=2.5, help='of a pixel, grey levels of 255 (2.5)'
+        '--noise', type=number(0, 100), default=2.5, help='of a pixel, grey levels of 255 (2.5)'
     )
     camera.add_argument(
         '--shadow',
@@ -144,43 +113,9 @@ def _parser() -> argparse.ArgumentParser:
         help='of the person, on the floor (yes)',
     )
     camera.add_argument(
-        '--jpeg-quality', type=_whole(1, 100), default=90, metavar='Q', help='1 to 100 (90)'
+        '--jpeg-quality', type=whole_number(1, 100), default=90, metavar='Q', help='1 to 100 (90)'
     )
     return parser
-
-
-def _number(low: float, high: float) -> Any:
-    """Reader of a number in a range."""
-
-    def read(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(
-                f'wanted a number from {low:g} to {high:g}, saw {text!r}'
-            )
-        return value
-
-    return read
-
-
-def _whole(low: int, high: int = 2**63 - 1) -> Any:
-    """Reader of a whole number in a range."""
-
-    def read(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = low - 1
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(
-                f'wanted a whole number from {low} to {high}, saw {text!r}'
-            )
-        return value
-
-    return read
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -190,6 +125,28 @@ def _size(text: str) -> tuple[int, int]:
     if not (8 <= int(width) <= LARGEST and 8 <= int(height) <= LARGEST):
         raise argparse.ArgumentTypeError(f'wanted sides of 8 to {LARGEST} px, saw {text!r}')
     return int(width), int(height)
+
+
+def _make_bag(options: argparse.Namespace) -> int:
+    viewpoint = Viewpoint(options.distance, options.camera_height, math.radians(options.pitch))
+    scene = Scene(
+        viewpoint=viewpoint,
+        seed=options.seed,
+        noise=options.noise,
+        shadow=Scene.shadow if options.shadow else 0.0,
+    )
+    camera = _camera(options.size, options.fov)
+    with new_bag_folder(options.output, overwrite=options.overwrite) as folder:
+        take = _take(options, viewpoint)
+        write_bag(
+            folder,
+            take,
+            camera,
+            scene,
+            quality=options.jpeg_quality,
+            progress=not options.quiet,
+        )
+    return 0
 
 
 def _camera(size: tuple[int, int], fov: float) -> Camera:

@@ -98,7 +98,7 @@ def draw_overview(
         axes[1, len(moments) // 2].set_xlabel('to the camera, m')
         _add_legend(figure, truth is not None)
         figure.subplots_adjust(
-            left=0.55 / width, right=1 - 0.1 / width, top=1 - 0.25 / figure.get_figheight(),
+            left=0.65 / width, right=1 - 0.1 / width, top=1 - 0.25 / figure.get_figheight(),
             bottom=0.75 / figure.get_figheight(), wspace=0.06, hspace=0.06,
         )  # fmt: skip
         _save(figure, path)

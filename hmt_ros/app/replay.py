@@ -14,11 +14,12 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 import yaml
 from tqdm import tqdm
 
+from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.played_track import (
     BME,
     FILTER,
@@ -41,6 +42,7 @@ from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.nodes.track_start import prepare_start
 from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
+from msg_tools.error_line import error_line
 from msg_tools.headers import header_message, time_ns
 
 Settings = TypeVar('Settings')
@@ -81,30 +83,11 @@ exit code: 0 done, 1 bad input (one line on stderr says which), 130 interrupted
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; 0: the bag is there, 1: bad input, and one line on stderr says which."""
-    try:
-        options = _parser().parse_args(argv)
-        summary = _replay(options)
-    except (ValueError, OSError) as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
-        print(f'replay: {text}', file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print('replay: interrupted, nothing is written', file=sys.stderr)
-        return 130
-    if not options.quiet:
-        print(summary)
-    return 0
+    return run_command(_parser(), _replay, argv)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Bad input is one line and exit code 1, as everywhere else."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(f'{message}; --help tells more')
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+def _parser() -> CommandParser:
+    parser = CommandParser(
         prog='replay',
         description='Tracks and smooths the person in a bag of images, into a new bag of mixtures '
         'over poses.',
@@ -194,7 +177,18 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _replay(options: argparse.Namespace) -> str:
+def _replay(options: argparse.Namespace) -> int:
+    try:
+        summary = _replayed(options)
+    except KeyboardInterrupt:
+        print('replay: interrupted, nothing is written', file=sys.stderr)
+        return 130
+    if not options.quiet:
+        print(summary)
+    return 0
+
+
+def _replayed(options: argparse.Namespace) -> str:
     """Replays the bag; a line that sums up what came out."""
     source, target = options.bag, options.output
     if target.exists() and target.resolve() in (source.resolve(), source.resolve().parent):
@@ -304,7 +298,7 @@ def _given_values(options: argparse.Namespace, node: str) -> dict[str, Any]:
         try:
             values[name] = yaml.safe_load(value)
         except yaml.YAMLError as error:
-            raise ValueError(f'--set {text}: {" ".join(str(error).split())}') from error
+            raise ValueError(f'--set {text}: {error_line(error)}') from error
         if values[name] is None:
             values[name] = value
     return values

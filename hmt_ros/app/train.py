@@ -12,11 +12,12 @@ import argparse
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from tqdm import tqdm
 
+from hmt_ros.app.command_line import CommandParser, run_command, whole_number
 from hmt_ros.app.training_report import write_report
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.procedural_motion import PROCEDURAL_MOTIONS
@@ -31,6 +32,7 @@ from hmt_ros.experts.training_set import (
     training_set,
     typical_body,
 )
+from msg_tools.error_line import error_line
 
 Item = TypeVar('Item')
 
@@ -39,24 +41,11 @@ PROCEDURAL_SEEDS, PROCEDURAL_SECONDS = 5, 12.0
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; 0: the model is there, 1: bad input, and one line on stderr says which."""
-    try:
-        options = _parser().parse_args(argv)
-        return _train(options)
-    except (ValueError, OSError) as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
-        print(f'train: {text}', file=sys.stderr)
-        return 1
+    return run_command(_parser(), _train, argv)
 
 
-class _Parser(argparse.ArgumentParser):
-    """Bad input is one line and exit code 1, as everywhere else."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(f'{message}; --help tells more')
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
+def _parser() -> CommandParser:
+    parser = CommandParser(
         prog='train', description='Learns to predict poses from silhouettes, from motions.'
     )
     parser.add_argument(
@@ -64,7 +53,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument('--overwrite', action='store_true', help='replace the file that is there')
     parser.add_argument('--quiet', action='store_true', help='no progress bar, no summary')
-    parser.add_argument('--seed', type=_whole(0), default=0, help='of all that is random (0)')
+    parser.add_argument('--seed', type=whole_number(0), default=0, help='of all that is random (0)')
     parser.add_argument(
         '--report', type=Path, metavar='DIR', help='folder of the figures (MODEL_report)'
     )
@@ -87,33 +76,18 @@ def _parser() -> argparse.ArgumentParser:
         '--model', choices=sorted(KINDS), default='local', help='what learns (local)'
     )
     learning.add_argument(
-        '--experts', type=_whole(1, 1000), help='of the model; modes at most of the local one (5)'
+        '--experts',
+        type=whole_number(1, 1000),
+        help='of the model; modes at most of the local one (5)',
     )
     learning.add_argument(
-        '--samples', type=_whole(50, 1_000_000), default=6000, help='silhouettes (6000)'
+        '--samples', type=whole_number(50, 1_000_000), default=6000, help='silhouettes (6000)'
     )
     learning.add_argument(
         '--dynamics', action=argparse.BooleanOptionalAction, default=True,
         help='learn p(x_t | x_t-1, r_t) as well (yes)',
     )  # fmt: skip
     return parser
-
-
-def _whole(low: int, high: int = 2**63 - 1) -> Any:
-    """Reader of a whole number in a range."""
-
-    def read(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            value = low - 1
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(
-                f'wanted a whole number from {low} to {high}, saw {text!r}'
-            )
-        return value
-
-    return read
 
 
 def _train(options: argparse.Namespace) -> int:
@@ -213,7 +187,7 @@ def _sequence_or_warning(path: Path, body: Body) -> PoseSequence | None:
     try:
         return recorded_sequence(path, body)
     except (ValueError, OSError, np.linalg.LinAlgError) as error:
-        text = ' '.join(str(error).split()) or type(error).__name__
+        text = error_line(error)
         tqdm.write(f'train: skipped {path.name}: {text}', file=sys.stderr)
         return None
 

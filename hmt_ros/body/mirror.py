@@ -63,11 +63,16 @@ def root_rotation_dofs(skeleton: Skeleton) -> list[int]:
     Raises:
         ValueError: it has others.
     """
-    own = [j for j in skeleton.segment_dofs[0] if skeleton.dof_is_rotation[j]]
-    axes = ''.join('xyz'[skeleton.dof_axes[j]] for j in own)
+    own, axes = rotations_of(skeleton, 0)
     if axes != ROOT_AXES:
         raise ValueError(f'the root of {skeleton.name} turns about {axes!r}, wanted {ROOT_AXES!r}')
     return own
+
+
+def rotations_of(skeleton: Skeleton, segment: int) -> tuple[list[int], str]:
+    """The rotations of a segment, and what they turn about in this order, such as 'zyx'."""
+    own = [j for j in skeleton.segment_dofs[segment] if skeleton.dof_is_rotation[j]]
+    return own, ''.join('xyz'[skeleton.dof_axes[j]] for j in own)
 
 
 def root_rotations(body: Body, poses: Array) -> Array:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
+from hmt_ros.body.mirror import ROOT_AXES, rotations_of
 from hmt_ros.body.skeleton import Skeleton
 
 Array = NDArray[np.float64]
@@ -83,9 +84,8 @@ def _flips(trunk_dofs: int) -> list[tuple[bool, bool, bool]]:
 
 def _root_dofs(skeleton: Skeleton) -> tuple[int, ...] | None:
     """The rotations of the root, if they are about z, y and x in this order."""
-    own = [j for j in skeleton.segment_dofs[0] if skeleton.dof_is_rotation[j]]
-    axes = ''.join('xyz'[skeleton.dof_axes[j]] for j in own)
-    return tuple(own) if axes == 'zyx' else None
+    own, axes = rotations_of(skeleton, 0)
+    return tuple(own) if axes == ROOT_AXES else None
 
 
 def _trunk_dofs(skeleton: Skeleton) -> tuple[int, ...] | None:

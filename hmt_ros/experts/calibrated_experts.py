@@ -16,16 +16,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
-from hmt_ros.experts.conditional_experts import ConditionalExperts
 from hmt_ros.experts.gates import log_softmax
-from hmt_ros.experts.joint_experts import JointExperts
-from hmt_ros.experts.local_experts import LocalExperts
-from hmt_ros.experts.model_file import Arrays, check_header, header, nested, parameters_of, part
-from hmt_ros.experts.nearest_neighbours import NearestNeighbours
-from hmt_ros.experts.relevance_vector_regression import RelevanceVectorRegression
+from hmt_ros.experts.model_file import (
+    FAULTS,
+    Arrays,
+    check_header,
+    damaged,
+    header,
+    nested,
+    parameters_of,
+    part,
+)
+from hmt_ros.experts.stored_models import stored_model
 from hmt_ros.experts.training_pairs import checked_pairs
 
 if TYPE_CHECKING:
@@ -34,13 +39,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-MODELS: dict[str, type[ConditionalDensity]] = {
-    model.kind: model
-    for model in (
-        LocalExperts, ConditionalExperts, JointExperts, RelevanceVectorRegression,
-        NearestNeighbours,
-    )
-}  # fmt: skip
 FOLDS = 3
 # Samples of each fold that are left out, at most.
 LEFT_OUT = 500
@@ -180,18 +178,12 @@ class CalibratedExperts(ConditionalDensity):
         check_header(arrays, cls.kind, where)
         try:
             own = part('model', arrays)
-            kind = str(own['kind'])
-            if kind not in MODELS:
-                raise ValueError(f'a model of kind {kind!r}, wanted one of {sorted(MODELS)}')
-            result = cls(MODELS[kind].from_arrays(own, where), **parameters_of(arrays))
+            result = cls(stored_model(own, where), **parameters_of(arrays))
             result.n_inputs_, result.n_outputs_ = (int(n) for n in arrays['shape'])
             result._set_learned(arrays)
             result.components(np.zeros((1, result.n_inputs_)))
-        except (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError) as fault:
-            text = ' '.join(str(fault).split())
-            raise ValueError(
-                f'{where}: a damaged model file ({type(fault).__name__}: {text}); train it again'
-            ) from fault
+        except FAULTS as fault:
+            raise damaged(where, fault) from fault
         return result
 
     def _learned(self) -> Arrays:
@@ -227,7 +219,8 @@ def calibration(left_out: list[tuple[Components, Array]]) -> Calibration:
     candidates = [_added_noise(left_out, temperature) for temperature in TEMPERATURES]
     found = max(candidates, key=lambda one: one[0])[1]
     squares = np.concatenate([_squared_distances(found.of(c), z) for c, z in left_out])
-    wanted = float(chi2.ppf(COVERED, left_out[0][1].shape[1]))
+    # The quantile of a chi square distribution with a degree of freedom for each dimension.
+    wanted = float(2.0 * gammaincinv(left_out[0][1].shape[1] / 2.0, COVERED))
     factor = float(np.clip(np.quantile(squares, COVERED) / wanted, 1.0, LARGEST_FACTOR))
     return replace(found, factor=factor)
 

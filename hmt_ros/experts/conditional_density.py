@@ -21,8 +21,10 @@ from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
 from hmt_ros.experts.model_file import (
+    FAULTS,
     Arrays,
     check_header,
+    damaged,
     header,
     parameters_of,
     read_arrays,
@@ -184,11 +186,8 @@ class ConditionalDensity(ABC):
             model.n_inputs_, model.n_outputs_ = (int(n) for n in arrays['shape'])
             model._set_learned(arrays)
             model.components(np.zeros((1, model.n_inputs_)))
-        except (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError) as fault:
-            text = ' '.join(str(fault).split())
-            raise ValueError(
-                f'{where}: a damaged model file ({type(fault).__name__}: {text}); train it again'
-            ) from fault
+        except FAULTS as fault:
+            raise damaged(where, fault) from fault
         return model
 
     def save(self, path: str | Path) -> Path:

@@ -21,6 +21,9 @@ VERSION = 1
 
 Arrays = dict[str, NDArray[Any]]
 
+# What wrong arrays lead to, wherever they are looked at.
+FAULTS = (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError)
+
 # What every archive holds besides the arrays of its kind.
 _HEADER = ('format', 'version', 'kind', 'parameters')
 
@@ -70,6 +73,14 @@ def parameters_of(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     if not isinstance(result, dict):
         raise ValueError(f'parameters are a {type(result).__name__}, wanted a mapping')
     return result
+
+
+def damaged(where: str, fault: Exception) -> ValueError:
+    """What to raise from one of `FAULTS` of the arrays in a file."""
+    text = ' '.join(str(fault).split())
+    return ValueError(
+        f'{where}: a damaged model file ({type(fault).__name__}: {text}); train it again'
+    )
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:

@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.experts.calibrated_experts import MODELS as CALIBRATED_MODELS
 from hmt_ros.experts.calibrated_experts import CalibratedExperts
 from hmt_ros.experts.conditional_density import ConditionalDensity
 from hmt_ros.experts.density_propagation import propagate, reduced
 from hmt_ros.experts.model_file import (
+    FAULTS,
     Arrays,
+    damaged,
     header,
     nested,
     parameters_of,
@@ -38,6 +39,7 @@ from hmt_ros.experts.root_placement import (
     place_roots,
     placed_gaussians,
 )
+from hmt_ros.experts.stored_models import stored_model
 from hmt_ros.image.centred_view import centred_view
 from hmt_ros.image.contour import person_blob
 from hmt_ros.image.silhouette_descriptor import (
@@ -51,10 +53,6 @@ from hmt_ros.inference import GaussianMixture
 Array = NDArray[np.float64]
 
 KIND = 'pose_predictor'
-MODELS: dict[str, type[ConditionalDensity]] = {
-    **CALIBRATED_MODELS,
-    CalibratedExperts.kind: CalibratedExperts,
-}
 MAX_COMPONENTS = 8
 LIGHTEST = 1e-3  # weight below which a component is left out
 JITTER = 1e-9  # m^2 and rad^2, of a pose
@@ -287,11 +285,12 @@ class PosePredictor:
             descriptor = SilhouetteDescriptor.from_arrays(
                 parameters['descriptor'], part('descriptor', arrays)
             )
-            model = _model_of(part('model', arrays), where)
+            model = stored_model(part('model', arrays), where, CalibratedExperts)
             dynamics = part('dynamics', arrays)
             return cls(
                 body, descriptor, model, np.asarray(arrays['target_basis'], dtype=np.float64),
-                _model_of(dynamics, where) if dynamics else None, parameters['notes'],
+                stored_model(dynamics, where, CalibratedExperts) if dynamics else None,
+                parameters['notes'],
             )  # fmt: skip
         except _WrongBodyError as fault:
             raise ValueError(str(fault)) from None
@@ -299,11 +298,8 @@ class PosePredictor:
             raise ValueError(
                 f'{where}: trained for a body {parameters["body"]!r}, which does not ship: give it'
             ) from fault
-        except (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError) as fault:
-            text = ' '.join(str(fault).split())
-            raise ValueError(
-                f'{where}: a damaged model file ({type(fault).__name__}: {text}); train it again'
-            ) from fault
+        except FAULTS as fault:
+            raise damaged(where, fault) from fault
 
 
 class _WrongBodyError(ValueError):
@@ -326,13 +322,6 @@ def _check_fit(what: str, model: ConditionalDensity, inputs: int, outputs: int) 
             f'the {what} has {model.n_inputs_} inputs and {model.n_outputs_} outputs, wanted '
             f'{inputs} and {outputs}'
         )
-
-
-def _model_of(arrays: Arrays, where: str) -> ConditionalDensity:
-    kind = str(arrays['kind'])
-    if kind not in MODELS:
-        raise ValueError(f'a model of kind {kind!r}, wanted one of {sorted(MODELS)}')
-    return MODELS[kind].from_arrays(arrays, where)
 
 
 def _heaviest(mixture: GaussianMixture, count: int) -> GaussianMixture:

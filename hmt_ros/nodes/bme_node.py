@@ -7,19 +7,18 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
 from hmt_msgs.msg import PoseMixture
 from hmt_msgs.srv import PredictPose
-from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from hmt_ros.nodes.bme_parameters import BmeParameters
 from hmt_ros.nodes.bme_session import TOPICS, BmeSession, BmeState
-from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.nodes.camera_input import IMAGE
 from hmt_ros.nodes.handled import Output
-from hmt_ros.nodes.session_node import Input, SessionNode, first_line, run
+from hmt_ros.nodes.session_node import SessionNode, run
+from hmt_ros.nodes.subscribed_topic import SubscribedTopic, camera_info_topic, image_topic
 from msg_tools.cdr import serialise
+from msg_tools.error_line import error_line
 
 NAME = 'bme_node'
 _CHECKED = ('model_file', 'background_file', 'stature')
@@ -45,14 +44,9 @@ class BmeNode(SessionNode):
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         yield PredictPose, '~/predict_pose', self._on_predict_pose
 
-    def _wanted_inputs(self) -> Iterable[Input]:
-        qos = qos_profile_sensor_data
-        yield Input(CAMERA_INFO, 'camera_info', CameraInfo, 'sensor_msgs/msg/CameraInfo', qos)
-        if self._settings.image_transport == 'compressed':
-            kind = 'sensor_msgs/msg/CompressedImage'
-            yield Input(IMAGE, 'image/compressed', CompressedImage, kind, qos)
-        else:
-            yield Input(IMAGE, 'image', Image, 'sensor_msgs/msg/Image', qos)
+    def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
+        yield camera_info_topic()
+        yield image_topic(self._settings.image_transport)
 
     def _check_changed(self, settings: BmeParameters, changed: Mapping[str, Any]) -> None:
         if any(name in changed for name in _CHECKED):
@@ -71,7 +65,7 @@ class BmeNode(SessionNode):
                 raise ValueError('the request has no image: fill image or compressed_image')
             data = serialise(session.predict_once(image))
         except (ValueError, ArithmeticError) as error:
-            response.success, response.message = False, first_line(error)
+            response.success, response.message = False, error_line(error)
             return response
         response.success = True
         response.mixture = deserialize_message(data, PoseMixture)
@@ -80,15 +74,8 @@ class BmeNode(SessionNode):
     def _counts(self, state: BmeState) -> Counter[str]:
         return state.images
 
-    def _judgement(self, state: BmeState) -> tuple[bytes, str]:
-        rates = self._rates
-        if rates.dropped:
-            return DiagnosticStatus.WARN, f'late: {rates.dropped} images dropped in a second'
-        if rates.faults:
-            return DiagnosticStatus.WARN, state.last_fault
-        if state.wants:
-            return DiagnosticStatus.WARN, f'waits for {state.wants}'
-        return DiagnosticStatus.OK, f'{state.status}, {state.modes} modes'
+    def _summary(self, state: BmeState) -> str:
+        return f'{state.modes} modes'
 
     def _state_values(self, state: BmeState) -> list[tuple[str, str]]:
         return [

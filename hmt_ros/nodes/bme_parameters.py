@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
-from typing import Any
 
 from hmt_ros.image.background import BackgroundSettings
 from hmt_ros.nodes.declared_parameters import (
@@ -18,13 +17,10 @@ from hmt_ros.nodes.declared_parameters import (
     EFFECT,
     LIMITS,
     NEXT_CONFIGURE,
+    parameter_field,
 )
 from hmt_ros.nodes.filter_parameters import BACKGROUND_LIMITS, TRANSPORTS
 from hmt_ros.nodes.parameter_file import parameter_file_text
-
-
-def _parameter(default: Any, effect: str, limits: tuple[float, float] | None = None) -> Any:
-    return field(default=default, metadata={EFFECT: effect, LIMITS: limits})
 
 
 @dataclass(frozen=True)
@@ -52,18 +48,18 @@ class BmeParameters:
         background: settings of the background subtraction.
     """
 
-    model_file: str = _parameter('', NEXT_CONFIGURE)
-    background_file: str = _parameter('', NEXT_CONFIGURE)
-    background_images: int = _parameter(30, AT_ONCE, (1, 10_000))
-    stature: float = _parameter(0.0, NEXT_CONFIGURE, (0.0, 3.0))
-    least_height: int = _parameter(40, AT_ONCE, (1, 10_000))
-    propagate: bool = _parameter(False, AT_ONCE)
-    longest_interval: float = _parameter(0.5, AT_ONCE, (0.0, 60.0))
-    max_hypotheses: int = _parameter(5, AT_ONCE, (1, 64))
-    reset_on_time_jump: bool = _parameter(False, AT_ONCE)
-    image_transport: str = _parameter('raw', NEXT_CONFIGURE)
-    queue_size: int = _parameter(5, AT_ONCE, (1, 1000))
-    autostart: bool = _parameter(True, AT_LAUNCH)
+    model_file: str = parameter_field('', NEXT_CONFIGURE)
+    background_file: str = parameter_field('', NEXT_CONFIGURE)
+    background_images: int = parameter_field(30, AT_ONCE, (1, 10_000))
+    stature: float = parameter_field(0.0, NEXT_CONFIGURE, (0.0, 3.0))
+    least_height: int = parameter_field(40, AT_ONCE, (1, 10_000))
+    propagate: bool = parameter_field(False, AT_ONCE)
+    longest_interval: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
+    max_hypotheses: int = parameter_field(5, AT_ONCE, (1, 64))
+    reset_on_time_jump: bool = parameter_field(False, AT_ONCE)
+    image_transport: str = parameter_field('raw', NEXT_CONFIGURE)
+    queue_size: int = parameter_field(5, AT_ONCE, (1, 1000))
+    autostart: bool = parameter_field(True, AT_LAUNCH)
     background: BackgroundSettings = field(
         default_factory=BackgroundSettings,
         metadata={EFFECT: NEXT_CONFIGURE, LIMITS: BACKGROUND_LIMITS},

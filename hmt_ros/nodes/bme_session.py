@@ -35,12 +35,12 @@ from hmt_ros.image.contour import NoSilhouetteError
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes.bme_parameters import BmeParameters
 from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE, CameraInput, InTime, WaitingImage
-from hmt_ros.nodes.handled import Handled, HandlingLog, Output
+from hmt_ros.nodes.handled import Handled, Output
 from hmt_ros.nodes.picture_file import read_picture
 from hmt_ros.nodes.published_topic import PublishedTopic
+from hmt_ros.nodes.session import Session, entropy, everything
 from hmt_ros.tracking.dynamics import PoseRates
-from msg_tools import RosbagsMessages
-from msg_tools.cdr import serialise
+from msg_tools.error_line import error_line
 from msg_tools.headers import SECOND_NS, header_message, time_ns
 from msg_tools.images import decode_image
 from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
@@ -91,11 +91,7 @@ class _Previous(NamedTuple):
     stamp_ns: int
 
 
-def _everything(_topic: str) -> bool:
-    return True
-
-
-class BmeSession:
+class BmeSession(Session):
     """One camera, from the first message on.
 
     All methods but `predict_once` are to be called by one thread; `state` and `parameters` may be
@@ -115,18 +111,13 @@ class BmeSession:
         state: see `BmeState`.
     """
 
-    start = None
-
     def __init__(
         self,
         parameters: BmeParameters,
         publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = _everything,
+        wanted: Callable[[str], bool] = everything,
     ) -> None:
-        self.parameters = parameters
-        self._publish_output = publish
-        self._wanted = wanted
-        self._messages = RosbagsMessages()
+        super().__init__(parameters, publish, wanted)
         self._predictor, self._size_spread = _predictor_of(parameters)
         self._background = BackgroundModel(parameters.background)
         self._given: NDArray[np.uint8] | None = None
@@ -135,7 +126,6 @@ class BmeSession:
             self._background = BackgroundModel.from_image(self._given, parameters.background)
         # OpenCV's model computes in memory of its own.
         self._background_in_use = threading.Lock()
-        self._log = HandlingLog()
         self._input = CameraInput(self._log, 'the sequence')
         self._previous: _Previous | None = None
         self._weights = np.empty(0)
@@ -169,17 +159,6 @@ class BmeSession:
         self.state = self._present_state()
         return self._log.handled(source, stamp)
 
-    def refuse(self, source: str, text: str) -> Handled:
-        """Counts a message that could not even be read."""
-        self._log.begin()
-        self._log.fault('message', f'message of {source} can not be read: {text}')
-        self.state = self._present_state()
-        return self._log.handled(source, 0)
-
-    def count_dropped(self, images: int) -> None:
-        """Counts images that were dropped before they came here, because the node was late."""
-        self._input.count_dropped(images)
-
     def restart(self, start: None = None) -> None:
         """Forgets the images before; what is known of the background stays."""
         self._previous = None
@@ -194,23 +173,22 @@ class BmeSession:
         try:
             mixture = self._mixture_of(waiting, camera)
         except (ValueError, ArithmeticError) as error:
-            text = ' '.join(str(error).split()) or type(error).__name__
-            self._input.skip(
+            text = error_line(error)
+            self._log.skip(
                 'estimate', f'no prediction from the image of {waiting.stamp_ns} ns: {text}'
             )
             self._previous = None
             return
-        self._input.counts['predicted'] += 1
+        self._log.counts['predicted'] += 1
         if mixture is None:
-            self._input.counts['empty'] += 1
+            self._log.counts['empty'] += 1
             self._weights = np.empty(0)
         else:
             self._previous = _Previous(mixture, waiting.stamp_ns)
             self._weights = mixture.weights
         if self._wanted(PREDICTION):
             message = self._message(mixture, waiting.stamp_ns, self._input.frame_of(waiting))
-            self._log.published(PREDICTION, waiting.stamp_ns)
-            self._publish_output(Output(PREDICTION, waiting.stamp_ns, serialise(message)))
+            self._publish(PREDICTION, waiting.stamp_ns, message)
 
     def _mixture_of(self, waiting: WaitingImage, camera: Camera) -> GaussianMixture | None:
         """What the image says; None: nobody is seen."""
@@ -331,15 +309,14 @@ class BmeSession:
                 wants = f'{needed - learned} more images of the empty scene'
             else:
                 status, wants = 'predicting' if len(self._weights) else 'nobody', ''
-        positive = self._weights[self._weights > 0]
         return BmeState(
             status,
             wants,
             modes=len(self._weights),
-            entropy=abs(float(-(positive * np.log(positive)).sum())) if len(positive) else math.nan,
+            entropy=entropy(self._weights),
             height=self._height,
             support=self._support,
-            images=Counter(self._input.counts),
+            images=Counter(self._log.counts),
             faults=Counter(self._log.faults),
             last_fault=self._log.last_fault,
         )
@@ -350,7 +327,7 @@ def _predictor_of(parameters: BmeParameters) -> tuple[PosePredictor, float]:
     try:
         predictor = load_predictor(parameters.model_file or SHIPPED)
     except OSError as error:
-        raise ValueError(' '.join(str(error).split())) from error
+        raise ValueError(error_line(error)) from error
     if not parameters.stature:
         return predictor, SIZE_SPREAD
     body = predictor.body.with_stature(parameters.stature)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -44,14 +44,13 @@ class CameraInput:
     """What comes from a camera, and what of it waits.
 
     Args:
-        log: is told what can not be used.
+        log: is told what can not be used, and counts images.
         restarted: what starts anew when time jumps back or the calibration changes, 'the track'.
 
     Attributes:
         camera: None: no calibrated camera_info has come.
         waiting: images, the oldest first.
         newest: stamp of the last image, ns; None: there was none.
-        counts: number of images: 'received', 'skipped', 'dropped' and whatever the owner counts.
     """
 
     def __init__(self, log: HandlingLog, restarted: str) -> None:
@@ -60,7 +59,6 @@ class CameraInput:
         self.camera: Camera | None = None
         self.waiting: deque[WaitingImage] = deque()
         self.newest: int | None = None
-        self.counts: Counter[str] = Counter()
 
     def take_camera_info(self, message: Any) -> bool:
         """Takes a sensor_msgs/CameraInfo; whether it replaces another calibration."""
@@ -78,16 +76,16 @@ class CameraInput:
 
     def judge_stamp(self, stamp: int, reset_on_time_jump: bool) -> InTime:
         """Whether an image comes in time; it is counted, and told where it does not."""
-        self.counts['received'] += 1
+        self._log.counts['received'] += 1
         newest = self.newest
         if newest is None or stamp > newest:
             return InTime.NEXT
         text = f'image of {stamp} ns comes after one of {newest} ns'
         if stamp == newest:
-            self.skip('time stands still', f'{text}, wanted stamps that increase')
+            self._log.skip('time stands still', f'{text}, wanted stamps that increase')
             return InTime.SKIPPED
         if not reset_on_time_jump:
-            self.skip(
+            self._log.skip(
                 'time jumps back',
                 f'{text}: skipped; with reset_on_time_jump {self._restarted} would start anew',
             )
@@ -100,7 +98,7 @@ class CameraInput:
         try:
             picture = decode_image(message)
         except ImageError as error:
-            self.skip('image', str(error))
+            self._log.skip('image', str(error))
             return
         self.newest = stamp
         self.waiting.append(WaitingImage(picture, stamp, str(message.header.frame_id)))
@@ -111,7 +109,7 @@ class CameraInput:
         height, width = waiting.image.shape[:2]
         if (width, height) == (self.camera.width, self.camera.height):
             return True
-        self.skip(
+        self._log.skip(
             'size of the image',
             f'image has {width}x{height} pixels, wanted the {self.camera.width}x'
             f'{self.camera.height} of camera_info',
@@ -131,7 +129,7 @@ class CameraInput:
         known = []
         while len(self.waiting) > queue_size:
             dropped = self.waiting.popleft()
-            self.counts['dropped'] += 1
+            self._log.counts['dropped'] += 1
             if self.camera is None:
                 # An uncalibrated camera_info has been told already.
                 self._log.fault(
@@ -145,16 +143,6 @@ class CameraInput:
 
     def forget_images(self) -> None:
         """Time begins anew; images that still wait are dropped."""
-        self.counts['dropped'] += len(self.waiting)
+        self._log.counts['dropped'] += len(self.waiting)
         self.waiting.clear()
         self.newest = None
-
-    def count_dropped(self, images: int) -> None:
-        """Counts images that were dropped before they came here."""
-        self.counts['received'] += images
-        self.counts['dropped'] += images
-
-    def skip(self, kind: str, text: str) -> None:
-        """An image can not be used."""
-        self.counts['skipped'] += 1
-        self._log.fault(kind, text)

@@ -8,6 +8,7 @@ the settings is a parameter without being named a second time.
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import inspect
 import math
@@ -39,6 +40,17 @@ EFFECTS = {
 }
 
 _LARGEST_INTEGER = 2**31 - 1
+
+
+def parameter_field(default: Value, effect: str, limits: tuple[float, float] | None = None) -> Any:
+    """A field of a settings dataclass that is a parameter.
+
+    Args:
+        default: its value.
+        effect: one of `EFFECTS`.
+        limits: lowest and highest value; None: numbers keep the sign of the default.
+    """
+    return dataclasses.field(default=default, metadata={EFFECT: effect, LIMITS: limits})
 
 
 class ParameterError(ValueError):

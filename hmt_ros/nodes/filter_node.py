@@ -11,11 +11,11 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from hmt_msgs.msg import Body, Keypoints2D, PoseMixture
 from hmt_msgs.srv import Reset
 from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
+from sensor_msgs.msg import CompressedImage, JointState
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
-from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.nodes.camera_input import IMAGE
 from hmt_ros.nodes.filter_parameters import FilterParameters
 from hmt_ros.nodes.filter_session import (
     KEYPOINTS,
@@ -24,7 +24,13 @@ from hmt_ros.nodes.filter_session import (
     SessionState,
 )
 from hmt_ros.nodes.handled import Output
-from hmt_ros.nodes.session_node import RELIABLE, Input, SessionNode, run
+from hmt_ros.nodes.session_node import SessionNode, run
+from hmt_ros.nodes.subscribed_topic import (
+    RELIABLE,
+    SubscribedTopic,
+    camera_info_topic,
+    image_topic,
+)
 from hmt_ros.nodes.track_messages import TOPICS
 from hmt_ros.nodes.track_start import prepare_start
 
@@ -59,17 +65,13 @@ class FilterNode(SessionNode):
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         yield Reset, '~/reset', self._on_reset
 
-    def _wanted_inputs(self) -> Iterable[Input]:
-        qos = qos_profile_sensor_data
-        yield Input(CAMERA_INFO, 'camera_info', CameraInfo, 'sensor_msgs/msg/CameraInfo', qos)
-        yield Input(KEYPOINTS, 'keypoints', Keypoints2D, 'hmt_msgs/msg/Keypoints2D', qos)
+    def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
+        yield camera_info_topic()
+        kind = 'hmt_msgs/msg/Keypoints2D'
+        yield SubscribedTopic(KEYPOINTS, 'keypoints', Keypoints2D, kind, qos_profile_sensor_data)
         kind = 'hmt_msgs/msg/PoseMixture'
-        yield Input(PREDICTION, 'pose_prediction', PoseMixture, kind, RELIABLE)
-        if self._settings.image_transport == 'compressed':
-            kind = 'sensor_msgs/msg/CompressedImage'
-            yield Input(IMAGE, 'image/compressed', CompressedImage, kind, qos)
-        else:
-            yield Input(IMAGE, 'image', Image, 'sensor_msgs/msg/Image', qos)
+        yield SubscribedTopic(PREDICTION, 'pose_prediction', PoseMixture, kind, RELIABLE)
+        yield image_topic(self._settings.image_transport)
 
     def _check_changed(self, settings: FilterParameters, changed: Mapping[str, Any]) -> None:
         if any(name in changed for name in _FILES):
@@ -98,17 +100,13 @@ class FilterNode(SessionNode):
     def _counts(self, state: SessionState) -> Counter[str]:
         return state.images
 
+    def _summary(self, state: SessionState) -> str:
+        return f'{state.modes} modes'
+
     def _judgement(self, state: SessionState) -> tuple[bytes, str]:
-        rates = self._rates
         if state.status == 'lost':
             return DiagnosticStatus.WARN, f'lost: misfit {state.misfit:.2f}'
-        if rates.dropped:
-            return DiagnosticStatus.WARN, f'late: {rates.dropped} images dropped in a second'
-        if rates.faults:
-            return DiagnosticStatus.WARN, state.last_fault
-        if state.wants:
-            return DiagnosticStatus.WARN, f'waits for {state.wants}'
-        return DiagnosticStatus.OK, f'{state.status}, {state.modes} modes'
+        return super()._judgement(state)
 
     def _state_values(self, state: SessionState) -> list[tuple[str, str]]:
         return [

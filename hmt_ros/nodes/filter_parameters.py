@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
-from typing import Any
 
 from hmt_ros.image.background import BackgroundSettings
 from hmt_ros.nodes.declared_parameters import (
@@ -20,6 +19,7 @@ from hmt_ros.nodes.declared_parameters import (
     LIMITS,
     NEXT_CONFIGURE,
     NEXT_TRACK,
+    parameter_field,
 )
 from hmt_ros.nodes.parameter_file import parameter_file_text
 from hmt_ros.tracking import TrackerSettings
@@ -62,10 +62,6 @@ BACKGROUND_LIMITS = {
 }
 
 
-def _parameter(default: Any, effect: str, limits: tuple[float, float] | None = None) -> Any:
-    return field(default=default, metadata={EFFECT: effect, LIMITS: limits})
-
-
 @dataclass(frozen=True)
 class FilterParameters:
     """All parameters of the filter node.
@@ -102,23 +98,23 @@ class FilterParameters:
         background: settings of the background subtraction.
     """
 
-    subject_file: str = _parameter('', NEXT_TRACK)
-    background_file: str = _parameter('', NEXT_TRACK)
-    body_model: str = _parameter('human37', NEXT_TRACK)
-    random_seed: int = _parameter(0, NEXT_TRACK, (0, 2**31 - 1))
-    reset_on_time_jump: bool = _parameter(False, AT_ONCE)
-    image_transport: str = _parameter('raw', NEXT_CONFIGURE)
-    queue_size: int = _parameter(5, AT_ONCE, (1, 1000))
-    use_keypoints: bool = _parameter(False, AT_ONCE)
-    keypoint_sigma_px: float = _parameter(5.0, AT_ONCE, (0.01, 1000.0))
-    keypoints_timeout: float = _parameter(0.5, AT_ONCE, (0.0, 60.0))
-    use_predictions: bool = _parameter(False, AT_ONCE)
-    prediction_timeout: float = _parameter(0.5, AT_ONCE, (0.0, 60.0))
-    overlay_modes: int = _parameter(3, AT_ONCE, (0, 64))
-    overlay_quality: int = _parameter(85, AT_ONCE, (1, 100))
-    publish_tf: bool = _parameter(True, AT_ONCE)
-    frame_prefix: str = _parameter('', AT_ONCE)
-    autostart: bool = _parameter(True, AT_LAUNCH)
+    subject_file: str = parameter_field('', NEXT_TRACK)
+    background_file: str = parameter_field('', NEXT_TRACK)
+    body_model: str = parameter_field('human37', NEXT_TRACK)
+    random_seed: int = parameter_field(0, NEXT_TRACK, (0, 2**31 - 1))
+    reset_on_time_jump: bool = parameter_field(False, AT_ONCE)
+    image_transport: str = parameter_field('raw', NEXT_CONFIGURE)
+    queue_size: int = parameter_field(5, AT_ONCE, (1, 1000))
+    use_keypoints: bool = parameter_field(False, AT_ONCE)
+    keypoint_sigma_px: float = parameter_field(5.0, AT_ONCE, (0.01, 1000.0))
+    keypoints_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
+    use_predictions: bool = parameter_field(False, AT_ONCE)
+    prediction_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
+    overlay_modes: int = parameter_field(3, AT_ONCE, (0, 64))
+    overlay_quality: int = parameter_field(85, AT_ONCE, (1, 100))
+    publish_tf: bool = parameter_field(True, AT_ONCE)
+    frame_prefix: str = parameter_field('', AT_ONCE)
+    autostart: bool = parameter_field(True, AT_LAUNCH)
     tracker: TrackerSettings = field(
         default_factory=TrackerSettings,
         metadata={FLAT: True, EFFECT: NEXT_TRACK, LIMITS: _TRACKER_LIMITS},

@@ -30,13 +30,14 @@ from hmt_ros.image.observation import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE, CameraInput, InTime, WaitingImage
 from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.handled import Handled, HandlingLog, Output
+from hmt_ros.nodes.handled import Handled, Output
+from hmt_ros.nodes.session import Session, entropy, everything
 from hmt_ros.nodes.stamped_inputs import StampedInputs
 from hmt_ros.nodes.track_messages import Presentation, TrackedImage, track_messages
 from hmt_ros.nodes.track_start import TrackStart, prepare_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker
-from msg_tools import MessageError, RosbagsMessages
-from msg_tools.cdr import serialise
+from msg_tools import MessageError
+from msg_tools.error_line import error_line
 from msg_tools.headers import SECOND_NS, time_ns
 from msg_tools.keypoints import keypoints_of
 from msg_tools.pose_mixtures import pose_mixture_of
@@ -76,11 +77,7 @@ class SessionState:
     last_fault: str = ''
 
 
-def _everything(_topic: str) -> bool:
-    return True
-
-
-class FilterSession:
+class FilterSession(Session):
     """One person before one camera, from the first message on.
 
     All methods are to be called by one thread; `state` and `parameters` may be read and replaced by
@@ -104,14 +101,10 @@ class FilterSession:
         self,
         parameters: FilterParameters,
         publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = _everything,
+        wanted: Callable[[str], bool] = everything,
     ) -> None:
-        self.parameters = parameters
-        self._publish_output = publish
-        self._wanted = wanted
-        self._messages = RosbagsMessages()
+        super().__init__(parameters, publish, wanted)
         self.start = prepare_start(parameters)
-        self._log = HandlingLog()
         self._input = CameraInput(self._log, 'the track')
         self._tracker: Tracker | None = None
         self._shown_body: Body | None = None
@@ -144,17 +137,6 @@ class FilterSession:
         self._track_what_is_ready()
         self.state = self._present_state()
         return self._log.handled(source, stamp)
-
-    def refuse(self, source: str, text: str) -> Handled:
-        """Counts a message that could not even be read."""
-        self._log.begin()
-        self._log.fault('message', f'message of {source} can not be read: {text}')
-        self.state = self._present_state()
-        return self._log.handled(source, 0)
-
-    def count_dropped(self, images: int) -> None:
-        """Counts images that were dropped before they came here, because the node was late."""
-        self._input.count_dropped(images)
 
     def restart(self, start: TrackStart | None = None) -> None:
         """Drops the track; the next image starts a new one.
@@ -285,14 +267,14 @@ class FilterSession:
             if starts and posterior is not None:
                 self._tell_how_old_the_start_is(stamp)
             if posterior is not None and likelihood is not None:
-                self._publish(self._tracker, waiting, posterior, likelihood)
+                self._publish_track(self._tracker, waiting, posterior, likelihood)
         except (ValueError, ArithmeticError) as error:
-            text = ' '.join(str(error).split()) or type(error).__name__
+            text = error_line(error)
             if not starts:
-                self._input.skip('estimate', f'image of {stamp} ns can not be tracked: {text}')
+                self._log.skip('estimate', f'image of {stamp} ns can not be tracked: {text}')
                 return
             # The next image would fail as this one did, after as long a time.
-            self._input.skip('start', f'no track starts at the image of {stamp} ns: {text}')
+            self._log.skip('start', f'no track starts at the image of {stamp} ns: {text}')
             self.restart(replace(self.start, background=None, initial=None))
 
     def _tell_how_old_the_start_is(self, stamp_ns: int) -> None:
@@ -304,7 +286,7 @@ class FilterSession:
                 f'the joints that start the track were seen {age:.1f} s before its first image',
             )
 
-    def _publish(
+    def _publish_track(
         self,
         tracker: Tracker,
         waiting: WaitingImage,
@@ -332,14 +314,16 @@ class FilterSession:
             p.frame_prefix,
         )
 
-        def publish(topic: str, message: Any) -> None:
-            self._log.published(topic, waiting.stamp_ns)
-            self._publish_output(Output(topic, waiting.stamp_ns, serialise(message)))
-
-        track_messages(self._messages, track, presentation, self._wanted, publish)
+        track_messages(
+            self._messages,
+            track,
+            presentation,
+            self._wanted,
+            lambda topic, message: self._publish(topic, waiting.stamp_ns, message),
+        )
         self._shown_body = tracker.body
         self._weights = posterior.weights
-        self._input.counts['tracked'] += 1
+        self._log.counts['tracked'] += 1
 
     # What is told.
 
@@ -350,16 +334,15 @@ class FilterSession:
             status = (Status.WAITING if tracker is None else tracker.status).value
             wants = self._wants() if status == Status.WAITING.value else ''
         tracked = len(self._weights) > 0 and tracker is not None
-        positive = self._weights[self._weights > 0]
         return SessionState(
             status,
             wants,
             body=self._shown_body,
             modes=len(self._weights),
-            entropy=abs(float(-(positive * np.log(positive)).sum())) if tracked else math.nan,
+            entropy=entropy(self._weights),
             misfit=tracker.misfit if tracker is not None and tracked else math.nan,
             evaluations=tracker.evaluations if tracker is not None and tracked else 0,
-            images=Counter(self._input.counts),
+            images=Counter(self._log.counts),
             faults=Counter(self._log.faults),
             last_fault=self._log.last_fault,
         )

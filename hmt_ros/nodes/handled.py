@@ -42,14 +42,17 @@ class Handled:
 
 
 class HandlingLog:
-    """Collects what is to be told of the message that is being handled, and counts faults.
+    """Collects what is to be told of the message that is being handled, and counts.
 
     Attributes:
+        counts: number of the messages that are estimated from, over all of them: 'received', and of
+            these 'skipped', 'dropped' and whatever the owner counts.
         faults: number by kind, over all messages.
         last_fault: the newest; '' before the first.
     """
 
     def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
         self.faults: Counter[str] = Counter()
         self.last_fault = ''
         self.begin()
@@ -71,6 +74,16 @@ class HandlingLog:
         self.last_fault = text
         if self.faults[kind] == 1:
             self._warned.append(text)
+
+    def skip(self, kind: str, text: str) -> None:
+        """A message that would be estimated from can not be used."""
+        self.counts['skipped'] += 1
+        self.fault(kind, text)
+
+    def count_dropped(self, messages: int) -> None:
+        """Counts messages that were dropped before they came here."""
+        self.counts['received'] += messages
+        self.counts['dropped'] += messages
 
     def published(self, topic: str, stamp_ns: int) -> None:
         """A message was published."""

@@ -16,6 +16,7 @@ from hmt_ros.nodes.declared_parameters import (
     Value,
     declared_parameters,
 )
+from msg_tools.error_line import error_line
 
 _KEY = 'ros__parameters'
 _WIDTH = 100
@@ -98,7 +99,7 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
     except OSError as error:
         raise ParameterError(f'{path}: can not be read ({error.strerror})') from error
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise ParameterError(f'{path}: not YAML ({" ".join(str(error).split())})') from error
+        raise ParameterError(f'{path}: not YAML ({error_line(error)})') from error
     if document is None:
         return {}
     if not isinstance(document, dict):

@@ -12,7 +12,6 @@ player that waits for it feeds the node in lock step.
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import sys
@@ -22,7 +21,7 @@ import traceback
 from abc import abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -38,7 +37,6 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 
@@ -49,65 +47,21 @@ from hmt_ros.nodes.declared_parameters import (
     declared_parameters,
     with_values,
 )
+from hmt_ros.nodes.diagnostics import Rates, handled_message
 from hmt_ros.nodes.handled import Handled, Output
 from hmt_ros.nodes.input_queue import InputQueue, Waiting
 from hmt_ros.nodes.published_topic import SUBSCRIBERS, PublishedTopic
+from hmt_ros.nodes.session import Session
+from hmt_ros.nodes.subscribed_topic import LATCHED, RELIABLE, SubscribedTopic
 from msg_tools.cdr import deserialise
+from msg_tools.error_line import error_line
 
-RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-LATCHED = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
 # Small messages that wait while an estimate is made.
 SMALL_QUEUE = 100
 
 _RESTART = 'restart'
 # What a last estimate may take at the end, s; kernels that are being compiled are not waited for.
 _LAST_ESTIMATE = 5.0
-
-
-class Session(Protocol):
-    """What a node holds: takes messages, publishes through the function that it was made with.
-
-    Attributes:
-        parameters: of the node, may be replaced.
-        state: for diagnostics, replaced with every message.
-    """
-
-    parameters: Any
-    state: Any
-
-    def take(self, source: str, message: Any) -> Handled:
-        """Handles a message."""
-
-    def refuse(self, source: str, text: str) -> Handled:
-        """Counts a message that could not even be read."""
-
-    def count_dropped(self, messages: int) -> None:
-        """Counts messages that were dropped before they came here."""
-
-    def restart(self, start: Any = None) -> None:
-        """Starts the estimate anew."""
-
-
-class Input(NamedTuple):
-    """A subscribed topic.
-
-    Attributes:
-        source: what the session calls it.
-        topic: its name.
-        kind: generated class.
-        msgtype: for example 'sensor_msgs/msg/Image'.
-        qos: of the subscription.
-    """
-
-    source: str
-    topic: str
-    kind: type
-    msgtype: str
-    qos: QoSProfile
 
 
 class SessionNode(LifecycleNode):
@@ -174,12 +128,12 @@ class SessionNode(LifecycleNode):
         """Type, name and callback of the services."""
 
     @abstractmethod
-    def _wanted_inputs(self) -> Iterable[Input]:
+    def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         """The topics to subscribe to; the last is the one that gives the tempo."""
 
     @abstractmethod
-    def _judgement(self, state: Any) -> tuple[bytes, str]:
-        """Level and message of the diagnostics of an active node."""
+    def _summary(self, state: Any) -> str:
+        """What the present estimate is, in a few words, for the diagnostics."""
 
     @abstractmethod
     def _state_values(self, state: Any) -> list[tuple[str, str]]:
@@ -188,6 +142,18 @@ class SessionNode(LifecycleNode):
     @abstractmethod
     def _counts(self, state: Any) -> Counter[str]:
         """How many messages of `COUNTED` were 'received', 'dropped', and `DONE`."""
+
+    def _judgement(self, state: Any) -> tuple[bytes, str]:
+        """Level and message of the diagnostics of an active node."""
+        rates = self._rates
+        if rates.dropped:
+            late = f'late: {rates.dropped} {self.COUNTED_NAME} dropped in a second'
+            return DiagnosticStatus.WARN, late
+        if rates.faults:
+            return DiagnosticStatus.WARN, state.last_fault
+        if state.wants:
+            return DiagnosticStatus.WARN, f'waits for {state.wants}'
+        return DiagnosticStatus.OK, f'{state.status}, {self._summary(state)}'
 
     def _check_changed(self, settings: Any, changed: Mapping[str, Any]) -> None:
         """Raises ValueError where new values name something that can not be used."""
@@ -287,7 +253,7 @@ class SessionNode(LifecycleNode):
         self._close()
         return super().on_error(state)
 
-    def _subscribe(self, wanted: Input) -> None:
+    def _subscribe(self, wanted: SubscribedTopic) -> None:
         queue = self._queue
         assert queue is not None
 
@@ -333,7 +299,7 @@ class SessionNode(LifecycleNode):
                 return change(request, response)
             except RuntimeError as error:
                 wanted = request.transition.label or request.transition.id
-                self.get_logger().warn(f'transition {wanted} is not possible: {first_line(error)}')
+                self.get_logger().warn(f'transition {wanted} is not possible: {error_line(error)}')
                 response.success = False
                 return response
 
@@ -390,7 +356,7 @@ class SessionNode(LifecycleNode):
             message = deserialise(waiting.content, self._types[waiting.source])
         except Exception as error:  # noqa: BLE001
             # Bytes from outside meet generated code here, which does not say what it may raise.
-            handled = session.refuse(waiting.source, first_line(error))
+            handled = session.refuse(waiting.source, error_line(error))
         else:
             handled = session.take(waiting.source, message)
         if self._counts(session.state)[self.DONE] > done:
@@ -401,7 +367,7 @@ class SessionNode(LifecycleNode):
         for text in handled.warnings:
             self.get_logger().warn(f'{text} (more of the kind are counted in /diagnostics)')
         if self._handled.get_subscription_count():
-            self._handled.publish(_handled_message(handled))
+            self._handled.publish(handled_message(handled))
 
     def _publish(self, output: Output) -> None:
         self._outputs[output.topic].publish(output.data)
@@ -456,58 +422,6 @@ class SessionNode(LifecycleNode):
         self._diagnostics.publish(message)
 
 
-class Rates:
-    """What happened in the last period of diagnostics.
-
-    Args:
-        name: of what is counted.
-        done: what one calls those that were used.
-
-    Attributes:
-        dropped, faults: of the period.
-    """
-
-    def __init__(self, name: str, done: str) -> None:
-        self.dropped = 0
-        self.faults = 0
-        self._name, self._done = name, done
-        self._received = self._used = 0.0
-        self._latencies: list[float] = []
-        self._counts: Counter[str] = Counter()
-        self._began = time.monotonic()
-
-    def next_period(self, counts: Counter[str], latencies: list[float]) -> None:
-        """Ends a period.
-
-        Args:
-            counts: 'received', 'dropped', 'faults' and those used, of all time.
-            latencies: of the period, s.
-        """
-        now = time.monotonic()
-        # A node that was configured anew counts anew.
-        change = counts - self._counts
-        duration = max(now - self._began, 1e-3)
-        self._received = change['received'] / duration
-        self._used = change[self._done] / duration
-        self.dropped, self.faults = change['dropped'], change['faults']
-        self._latencies, self._counts, self._began = latencies, counts, now
-
-    def values(self) -> list[tuple[str, str]]:
-        """For diagnostics."""
-        known = self._latencies or [math.nan]
-        return [
-            (f'{self._name} received a second', f'{self._received:.1f}'),
-            (f'{self._name} {self._done} a second', f'{self._used:.1f}'),
-            ('latency, mean, ms', f'{1e3 * sum(known) / len(known):.1f}'),
-            ('latency, largest, ms', f'{1e3 * max(known):.1f}'),
-        ]
-
-
-def first_line(error: BaseException) -> str:
-    """The text of an error as one line."""
-    return ' '.join(str(error).split()) or type(error).__name__
-
-
 def run(name: str, make: Callable[[], SessionNode], args: list[str] | None = None) -> int:
     """Runs a node until it is told to stop; 0, or 1 where it could not start."""
     # The handlers of rclpy end the context under whatever is going on; ours let it come to its end.
@@ -518,7 +432,7 @@ def run(name: str, make: Callable[[], SessionNode], args: list[str] | None = Non
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make()
     except (ParameterException, ValueError, RuntimeError) as error:
-        sys.stderr.write(f'{name}: {first_line(error)}\n')
+        sys.stderr.write(f'{name}: {error_line(error)}\n')
         rclpy.try_shutdown()
         return 1
     executor = SingleThreadedExecutor()
@@ -534,21 +448,6 @@ def run(name: str, make: Callable[[], SessionNode], args: list[str] | None = Non
     node.destroy_node()
     rclpy.try_shutdown()
     return 0
-
-
-def _handled_message(handled: Handled) -> DiagnosticStatus:
-    values = [
-        ('stamp', handled.stamp_ns),
-        *(('fault', text) for text in handled.faults),
-        *(('warning', text) for text in handled.warnings),
-        *handled.published,
-    ]
-    return DiagnosticStatus(
-        level=DiagnosticStatus.WARN if handled.faults else DiagnosticStatus.OK,
-        name=handled.source,
-        message='; '.join(handled.faults),
-        values=[KeyValue(key=key, value=str(value)) for key, value in values],
-    )
 
 
 def _descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:

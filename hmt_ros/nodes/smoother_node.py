@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
 from hmt_msgs.msg import Body, PoseMixture, TrajectoryMixture
 from hmt_msgs.srv import SmoothWindow
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -21,7 +20,7 @@ from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
 from hmt_ros.nodes.handled import Output
-from hmt_ros.nodes.session_node import LATCHED, Input, SessionNode, first_line, run
+from hmt_ros.nodes.session_node import SessionNode, run
 from hmt_ros.nodes.smoothed_messages import TOPICS
 from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.nodes.smoother_session import (
@@ -31,7 +30,9 @@ from hmt_ros.nodes.smoother_session import (
     SmootherState,
     known_body,
 )
+from hmt_ros.nodes.subscribed_topic import LATCHED, SubscribedTopic
 from msg_tools.cdr import serialise
+from msg_tools.error_line import error_line
 from msg_tools.headers import time_ns
 
 NAME = 'smoother_node'
@@ -65,10 +66,10 @@ class SmootherNode(SessionNode):
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         yield SmoothWindow, '~/smooth_window', self._on_smooth_window
 
-    def _wanted_inputs(self) -> Iterable[Input]:
-        yield Input(BODY, 'body', Body, 'hmt_msgs/msg/Body', LATCHED)
+    def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
+        yield SubscribedTopic(BODY, 'body', Body, 'hmt_msgs/msg/Body', LATCHED)
         kind = 'hmt_msgs/msg/PoseMixture'
-        yield Input(MIXTURE, 'likelihood_mixture', PoseMixture, kind, _MIXTURES)
+        yield SubscribedTopic(MIXTURE, 'likelihood_mixture', PoseMixture, kind, _MIXTURES)
 
     def _check_changed(self, settings: SmootherParameters, changed: Mapping[str, Any]) -> None:
         if changed.get('body_model'):
@@ -93,7 +94,7 @@ class SmootherNode(SessionNode):
         try:
             data = await found
         except ValueError as error:
-            response.success, response.message = False, first_line(error)
+            response.success, response.message = False, error_line(error)
             return response
         response.success = True
         response.trajectories = deserialize_message(data, TrajectoryMixture)
@@ -102,18 +103,8 @@ class SmootherNode(SessionNode):
     def _counts(self, state: SmootherState) -> Counter[str]:
         return state.mixtures
 
-    def _judgement(self, state: SmootherState) -> tuple[bytes, str]:
-        rates = self._rates
-        if rates.dropped:
-            return DiagnosticStatus.WARN, f'late: {rates.dropped} mixtures dropped in a second'
-        if rates.faults:
-            return DiagnosticStatus.WARN, state.last_fault
-        if state.wants:
-            return DiagnosticStatus.WARN, f'waits for {state.wants}'
-        return (
-            DiagnosticStatus.OK,
-            f'{state.status}, {state.trajectories} trajectories of {state.window} poses',
-        )
+    def _summary(self, state: SmootherState) -> str:
+        return f'{state.trajectories} trajectories of {state.window} poses'
 
     def _state_values(self, state: SmootherState) -> list[tuple[str, str]]:
         return [

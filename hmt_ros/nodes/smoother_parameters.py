@@ -9,21 +9,23 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from hmt_ros.body.skeleton import Skeleton
-from hmt_ros.nodes.declared_parameters import AT_LAUNCH, AT_ONCE, EFFECT, LIMITS, NEXT_WINDOW
+from hmt_ros.nodes.declared_parameters import (
+    AT_LAUNCH,
+    AT_ONCE,
+    EFFECT,
+    LIMITS,
+    NEXT_WINDOW,
+    parameter_field,
+)
 from hmt_ros.nodes.parameter_file import parameter_file_text
 from hmt_ros.smoothing import LinearGaussianDynamics
 from hmt_ros.tracking.dynamics import MODELS, PoseRates
 
 METHODS = ('paths', 'variational')
-
-
-def _parameter(default: Any, effect: str, limits: tuple[float, float] | None = None) -> Any:
-    return field(default=default, metadata={EFFECT: effect, LIMITS: limits})
 
 
 @dataclass(frozen=True)
@@ -95,21 +97,21 @@ class SmootherParameters:
         dynamics: settings of the motion model.
     """
 
-    body_model: str = _parameter('', NEXT_WINDOW)
-    method: str = _parameter('paths', NEXT_WINDOW)
-    fixed_lag: int = _parameter(7, NEXT_WINDOW, (0, 1000))
-    window_length: int = _parameter(47, AT_ONCE, (1, 10_000))
-    max_trajectories: int = _parameter(16, NEXT_WINDOW, (1, 1024))
-    max_hypotheses: int = _parameter(8, AT_ONCE, (1, 1024))
-    through_modes: bool = _parameter(False, NEXT_WINDOW)
-    merge_distance: float = _parameter(1.75, NEXT_WINDOW, (0.0, 100.0))
-    error_correlation: float = _parameter(0.05, NEXT_WINDOW, (0.0, 100.0))
-    random_seed: int = _parameter(0, NEXT_WINDOW, (0, 2**31 - 1))
-    reset_on_time_jump: bool = _parameter(False, AT_ONCE)
-    longest_interval: float = _parameter(0.25, AT_ONCE, (0.0, 3600.0))
-    publish_covariances: bool = _parameter(False, AT_ONCE)
-    queue_size: int = _parameter(50, AT_ONCE, (1, 1000))
-    autostart: bool = _parameter(True, AT_LAUNCH)
+    body_model: str = parameter_field('', NEXT_WINDOW)
+    method: str = parameter_field('paths', NEXT_WINDOW)
+    fixed_lag: int = parameter_field(7, NEXT_WINDOW, (0, 1000))
+    window_length: int = parameter_field(47, AT_ONCE, (1, 10_000))
+    max_trajectories: int = parameter_field(16, NEXT_WINDOW, (1, 1024))
+    max_hypotheses: int = parameter_field(8, AT_ONCE, (1, 1024))
+    through_modes: bool = parameter_field(False, NEXT_WINDOW)
+    merge_distance: float = parameter_field(1.75, NEXT_WINDOW, (0.0, 100.0))
+    error_correlation: float = parameter_field(0.05, NEXT_WINDOW, (0.0, 100.0))
+    random_seed: int = parameter_field(0, NEXT_WINDOW, (0, 2**31 - 1))
+    reset_on_time_jump: bool = parameter_field(False, AT_ONCE)
+    longest_interval: float = parameter_field(0.25, AT_ONCE, (0.0, 3600.0))
+    publish_covariances: bool = parameter_field(False, AT_ONCE)
+    queue_size: int = parameter_field(50, AT_ONCE, (1, 1000))
+    autostart: bool = parameter_field(True, AT_LAUNCH)
     dynamics: SmootherDynamics = field(
         default_factory=SmootherDynamics,
         metadata={EFFECT: NEXT_WINDOW, LIMITS: {'velocity_time': (0.01, 100.0)}},

@@ -27,7 +27,8 @@ import numpy as np
 
 from hmt_ros.body import Body, load_body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.nodes.handled import Handled, HandlingLog, Output
+from hmt_ros.nodes.handled import Handled, Output
+from hmt_ros.nodes.session import Session, entropy, everything
 from hmt_ros.nodes.smoothed_messages import (
     SmoothedBody,
     final_messages,
@@ -38,8 +39,8 @@ from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow
 from hmt_ros.smoothing.mode_sequence import merge_close_modes
 from hmt_ros.smoothing.path_smoother import PathSmoother
-from msg_tools import MessageError, RosbagsMessages
-from msg_tools.cdr import serialise
+from msg_tools import MessageError
+from msg_tools.error_line import error_line
 from msg_tools.headers import SECOND_NS, time_ns
 from msg_tools.message_error import check_names
 from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
@@ -95,11 +96,7 @@ class KeptMixtures(NamedTuple):
     items: tuple[tuple[int, GaussianMixture], ...]
 
 
-def _everything(_topic: str) -> bool:
-    return True
-
-
-class SmootherSession:
+class SmootherSession(Session):
     """One person, from the first message on.
 
     All methods but `smooth_span` are to be called by one thread; `state`, `kept` and `parameters`
@@ -120,28 +117,21 @@ class SmootherSession:
         kept: for `smooth_span`.
     """
 
-    start = None
-
     def __init__(
         self,
         parameters: SmootherParameters,
         publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = _everything,
+        wanted: Callable[[str], bool] = everything,
     ) -> None:
         if parameters.body_model:
             known_body(parameters.body_model)
-        self.parameters = parameters
-        self._publish_output = publish
-        self._wanted = wanted
-        self._messages = RosbagsMessages()
+        super().__init__(parameters, publish, wanted)
         self._of: SmoothedBody | None = None
         self._window: SlidingWindow | None = None
         self._waiting: deque[Any] = deque()
         self._newest: int | None = None
         self._weights = np.empty(0)
-        self._mixtures: Counter[str] = Counter()
         self._gaps, self._longest_gap = 0, 0.0
-        self._log = HandlingLog()
         self.kept = KeptMixtures(None, ())
         self.state = self._present_state()
 
@@ -158,25 +148,13 @@ class SmootherSession:
         if source == BODY:
             self._take_body(message)
         else:
-            self._mixtures['received'] += 1
+            self._log.counts['received'] += 1
             self._waiting.append(message)
         self._smooth_what_is_ready()
         while len(self._waiting) > self.parameters.queue_size:
             self._drop(self._waiting.popleft())
         self.state = self._present_state()
         return self._log.handled(source, time_ns(message.header.stamp))
-
-    def refuse(self, source: str, text: str) -> Handled:
-        """Counts a message that could not even be read."""
-        self._log.begin()
-        self._log.fault('message', f'message of {source} can not be read: {text}')
-        self.state = self._present_state()
-        return self._log.handled(source, 0)
-
-    def count_dropped(self, mixtures: int) -> None:
-        """Counts mixtures that were dropped before they came here, because the node was late."""
-        self._mixtures['received'] += mixtures
-        self._mixtures['dropped'] += mixtures
 
     def finish(self) -> Handled:
         """The stream ends: publishes the poses that are still open; what comes begins a window."""
@@ -237,7 +215,7 @@ class SmootherSession:
             self._take_mixture(message, self._of)
 
     def _drop(self, message: Any) -> None:
-        self._mixtures['dropped'] += 1
+        self._log.counts['dropped'] += 1
         stamp = time_ns(message.header.stamp)
         what = 'no body has come' if self._of is None else 'no body that its joints are of has come'
         self._log.fault('no body', f'mixture of {stamp} ns is dropped: {what}')
@@ -265,12 +243,12 @@ class SmootherSession:
         try:
             update = self._window.step(stamp, used)
         except (ValueError, ArithmeticError) as error:
-            text = ' '.join(str(error).split()) or type(error).__name__
-            self._skip('estimate', f'mixture of {stamp} ns can not be smoothed: {text}')
+            text = error_line(error)
+            self._log.skip('estimate', f'mixture of {stamp} ns can not be smoothed: {text}')
             self._end_window()
             return
         self._newest = stamp
-        self._mixtures['smoothed'] += 1
+        self._log.counts['smoothed'] += 1
         self.kept = KeptMixtures(of, (*self.kept.items, (stamp, mixture))[-p.window_length :])
         self._weights = update.trajectories.weights
         window_messages(
@@ -294,7 +272,7 @@ class SmootherSession:
         except ValueError as error:
             text = str(error)
             kind = next((words for words in _FAULTS if words in text), 'mixture')
-            self._skip(kind, f'mixture of {stamp} ns: {text}')
+            self._log.skip(kind, f'mixture of {stamp} ns: {text}')
             return None
         if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
             self._log.note(
@@ -311,10 +289,10 @@ class SmootherSession:
             return True
         text = f'mixture of {stamp} ns comes after one of {newest} ns'
         if stamp == newest:
-            self._skip('time stands still', f'{text}, wanted stamps that increase')
+            self._log.skip('time stands still', f'{text}, wanted stamps that increase')
             return False
         if not self.parameters.reset_on_time_jump:
-            self._skip(
+            self._log.skip(
                 'time jumps back',
                 f'{text}: skipped; with reset_on_time_jump a new window would begin',
             )
@@ -359,10 +337,6 @@ class SmootherSession:
             publish=lambda topic, made: self._publish(topic, pose.stamp_ns, made),
         )
 
-    def _publish(self, topic: str, stamp: int, message: Any) -> None:
-        self._log.published(topic, stamp)
-        self._publish_output(Output(topic, stamp, serialise(message)))
-
     def smooth_span(self, from_ns: int = 0, to_ns: int = 0) -> Any:
         """Smooths the kept mixtures of a span of time, fully refined, all at once.
 
@@ -394,25 +368,20 @@ class SmootherSession:
 
     # What is told.
 
-    def _skip(self, kind: str, text: str) -> None:
-        self._mixtures['skipped'] += 1
-        self._log.fault(kind, text)
-
     def _present_state(self) -> SmootherState:
         status, wants = 'no body', 'body'
         if self._of is not None:
             smooths = self._newest is not None
             status, wants = ('smoothing', '') if smooths else ('waiting', 'likelihood_mixture')
-        positive = self._weights[self._weights > 0]
         return SmootherState(
             status,
             wants,
             window=0 if self._window is None else len(self._window.stamps_ns),
             trajectories=len(self._weights),
-            entropy=abs(float(-(positive * np.log(positive)).sum())) if len(positive) else math.nan,
+            entropy=entropy(self._weights),
             gaps=self._gaps,
             longest_gap=self._longest_gap,
-            mixtures=Counter(self._mixtures),
+            mixtures=Counter(self._log.counts),
             faults=Counter(self._log.faults),
             last_fault=self._log.last_fault,
         )
@@ -427,7 +396,7 @@ def known_body(name: str) -> Body:
     try:
         return load_body(name)
     except OSError as error:
-        text = ' '.join(str(error).split())
+        text = error_line(error)
         raise ValueError(f'{text}; body_model names it, or a file with it') from error
 
 

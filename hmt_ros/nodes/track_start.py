@@ -14,6 +14,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes.filter_parameters import FilterParameters
 from hmt_ros.nodes.picture_file import read_picture
 from hmt_ros.tracking import Subject, Tracker, read_subject
+from msg_tools.error_line import error_line
 from msg_tools.pose_mixtures import pose_mixture_of
 
 
@@ -89,7 +90,7 @@ def _body(model: str) -> Body:
     try:
         body = load_body(model)
     except OSError as error:
-        raise ValueError(f'body_model {model}: {" ".join(str(error).split())}') from error
+        raise ValueError(f'body_model {model}: {error_line(error)}') from error
     if not body.shapes:
         raise ValueError(f'body_model {model} has no flesh: wanted one such as human37')
     return body

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.special import logsumexp
-from scipy.stats import multivariate_t
+from scipy.linalg import solve_triangular
+from scipy.special import gammaln, logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.smoothing.dynamics import LinearGaussianDynamics
@@ -286,9 +286,12 @@ def _log_mode(mixture: GaussianMixture, k: int, freedom: float, x: Array) -> Arr
     """log density (N,) of one Gaussian (freedom 0) or Student mode."""
     if freedom == 0:
         return mixture[k].component_log_densities(x)[:, 0]
-    result: Array = np.atleast_1d(
-        multivariate_t.logpdf(x, mixture.means[k], mixture.covariances[k], df=freedom)
-    )
+    d = mixture.dimension
+    (factor,) = mixture[k].cholesky()
+    z = solve_triangular(factor, (x - mixture.means[k]).T, lower=True)
+    log_scale = gammaln(0.5 * (freedom + d)) - gammaln(0.5 * freedom)
+    log_scale -= 0.5 * d * np.log(freedom * np.pi) + np.log(np.diagonal(factor)).sum()
+    result: Array = log_scale - 0.5 * (freedom + d) * np.log1p((z * z).sum(0) / freedom)
     return result
 
 

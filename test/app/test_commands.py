@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -58,3 +59,44 @@ def test_module_is_the_command():
     )
     assert result.returncode == 1
     assert result.stderr.startswith('make-bag: ')
+
+
+def output_of_reader_that_leaves(lines, *command):
+    """The first lines of a program that nobody reads further, exit code and stderr."""
+    with subprocess.Popen(
+        [sys.executable, *command],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, 'PYTHONUNBUFFERED': '1' if lines else ''},
+    ) as process:
+        read = [process.stdout.readline() for _ in range(lines)]
+        process.stdout.close()
+        error = process.stderr.read()
+    return read, process.returncode, error
+
+
+MANY_LINES = """\
+import sys
+from hmt_ros.app.command_line import CommandParser, run_command
+def work(options):
+    for number in range(100_000):
+        print(number)
+    return 0
+sys.exit(run_command(CommandParser(prog='count'), work, []))
+"""
+
+
+def test_commands_end_quietly_when_nobody_reads_on():
+    found = output_of_reader_that_leaves(2, '-c', MANY_LINES)
+    assert found == (['0\n', '1\n'], 141, '')
+
+
+@pytest.mark.parametrize(
+    'command',
+    [('hmt_ros', '--help'), ('hmt_ros.app.evaluate', '--help'), ('benchmarks', '--help')],
+)
+def test_help_ends_quietly_when_nobody_reads_it(command):
+    """What is printed waits in a buffer until the command ends."""
+    assert output_of_reader_that_leaves(0, '-m', *command) == ([], 141, '')

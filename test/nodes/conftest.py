@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
+import subprocess
+import sys
 import time
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,6 +21,8 @@ import pytest
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes import bme_session, track_start
+from hmt_ros.nodes.declared_parameters import EFFECTS, declared_parameters
+from hmt_ros.nodes.parameter_file import read_parameter_file
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
 from msg_tools import RosbagsMessages
 from msg_tools.bodies import message_of_body
@@ -25,6 +32,7 @@ from msg_tools.headers import header_message
 from msg_tools.images import compressed_image_message, image_message
 from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
+ROOT = Path(__file__).resolve().parents[2]
 FRAME_NS = 100_000_000
 START_NS = 1_700_000_000_000_000_000
 PATIENCE = 60.0  # s
@@ -194,6 +202,12 @@ def stub_predictor(monkeypatch):
     monkeypatch.setattr(StubPredictor, 'asked', [])
     monkeypatch.setattr(StubPredictor, 'fault', None)
     return StubPredictor
+
+
+@pytest.fixture
+def outputs():
+    """What a session publishes."""
+    return []
 
 
 @pytest.fixture(scope='session')
@@ -391,6 +405,23 @@ class World:
         ).result
         return result.successful, result.reason
 
+    def assert_described(self, defaults):
+        """Parameters are those of the file, with their descriptions; all of them by name."""
+        file = ROOT / 'hmt_ros' / 'config' / f'{self.name}.yaml'
+        declared = {p.name: p for p in declared_parameters(defaults)}
+        assert sorted(read_parameter_file(file, self.name)) == sorted(declared)
+        for name, parameter in declared.items():
+            description = self.node.describe_parameter(name).description
+            assert description == f'{parameter.description} {EFFECTS[parameter.effect]}'
+        return declared
+
+    def assert_refused(self, *cases):
+        """Every case, values and a part of the reason, is refused."""
+        for values, reason in cases:
+            good, why = self.set(**values)
+            assert not good
+            assert reason in why, why
+
     def warnings(self):
         """Texts that the node has logged as warnings or worse.
 
@@ -432,3 +463,59 @@ def world_of(capfd):
     yield make
     for one in worlds:
         one.close()
+
+
+class Executable:
+    """A node in a process of its own.
+
+    Args:
+        name: of the node.
+        arguments: behind --ros-args.
+    """
+
+    def __init__(self, name, *arguments):
+        self.process = subprocess.Popen(
+            [sys.executable, '-m', f'hmt_ros.nodes.{name}', '--ros-args', *arguments],
+            cwd=ROOT,
+            env=dict(os.environ),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def stop_at(self, text, number=signal.SIGINT):
+        """Sends a signal when the node says a text; all lines of a node that ends well."""
+        lines = []
+        for line in self.process.stdout:
+            lines.append(line)
+            if text in line:
+                self.process.send_signal(number)
+        assert self.process.wait(PATIENCE) == 0
+        return lines
+
+    def refusal(self):
+        """The only line of a node that does not start."""
+        output, _ = self.process.communicate(timeout=PATIENCE)
+        assert self.process.returncode == 1
+        (line,) = output.splitlines()
+        return line
+
+
+@pytest.fixture
+def executable():
+    """Starts executables, and ends them."""
+    started = []
+
+    def start(*arguments):
+        started.append(Executable(*arguments))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.process.kill()
+        one.process.communicate()
+
+
+def values_of(handled, key):
+    """Values of a key of what a node tells of a message."""
+    return [value.value for value in handled.values if value.key == key]

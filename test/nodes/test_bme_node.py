@@ -1,22 +1,16 @@
 """The BME node itself, over DDS."""
 
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from hmt_ros.nodes.bme_parameters import BmeParameters
-from hmt_ros.nodes.declared_parameters import EFFECTS, declared_parameters
-from hmt_ros.nodes.parameter_file import read_parameter_file
+from test.nodes.conftest import values_of
 
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / 'hmt_ros' / 'config' / 'bme_node.yaml'
-PATIENCE = 60.0  # s
 
 
 @pytest.fixture
@@ -39,10 +33,6 @@ def running(world, somebody):
     one = world().start()
     one.send('camera_info', somebody.info())
     return one
-
-
-def values_of(handled, key):
-    return [value.value for value in handled.values if value.key == key]
 
 
 def test_images_become_predictions(running, somebody):
@@ -76,20 +66,13 @@ def test_one_image_is_predicted_on_demand(running, somebody):
 
 
 def test_parameters_are_those_of_the_file(running):
-    descriptors = {p.name: p for p in declared_parameters(BmeParameters())}
-    assert sorted(read_parameter_file(CONFIG, 'bme_node')) == sorted(descriptors)
-    for name, declared in descriptors.items():
-        descriptor = running.node.describe_parameter(name)
-        assert descriptor.description == f'{declared.description} {EFFECTS[declared.effect]}'
-    for values, reason in (
+    running.assert_described(BmeParameters())
+    running.assert_refused(
         ({'max_hypotheses': 0}, 'out of range'),
         ({'background_file': 'nowhere.png'}, 'nowhere.png: can not be read'),
         ({'image_transport': 'pigeon'}, "saw 'pigeon'"),
         ({'autostart': False}, 'read-only'),
-    ):
-        good, why = running.set(**values)
-        assert not good
-        assert reason in why, why
+    )
     assert running.set(max_hypotheses=1, queue_size=3) == (True, '')
     assert running.node._session.parameters.max_hypotheses == 1
     assert running.node._queue._limits['image'] == 3
@@ -144,38 +127,13 @@ def test_lifecycle(world, somebody):
     assert one.state == 'unconfigured'
 
 
-def test_a_model_that_is_none_is_told(tmp_path):
+def test_a_model_that_is_none_is_told(tmp_path, executable):
     path = tmp_path / 'model.npz'
     path.write_bytes(b'garbage')
-    node = start_node('-p', f'model_file:={path}')
-    try:
-        line = next(line for line in node.stdout if 'model.npz' in line)
-        assert '[ERROR]' in line
-    finally:
-        node.send_signal(signal.SIGINT)
-        assert node.wait(PATIENCE) == 0
+    lines = executable('bme_node', '-p', f'model_file:={path}').stop_at('model.npz')
+    assert '[ERROR]' in next(line for line in lines if 'model.npz' in line)
 
 
-def start_node(*arguments):
-    return subprocess.Popen(
-        [sys.executable, '-m', 'hmt_ros.nodes.bme_node', '--ros-args', *arguments],
-        cwd=ROOT,
-        env=dict(os.environ),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-def test_ends_cleanly():
-    node = start_node('--params-file', str(CONFIG))
-    lines = []
-    try:
-        for line in node.stdout:
-            lines.append(line)
-            if 'images from /image' in line:
-                node.send_signal(signal.SIGINT)
-        assert node.wait(PATIENCE) == 0
-    finally:
-        node.kill()
-    assert len(lines) == 1, lines
+def test_ends_cleanly(executable):
+    node = executable('bme_node', '--params-file', str(CONFIG))
+    assert len(node.stop_at('images from /image')) == 1

@@ -1,9 +1,5 @@
 """The rules of the session, with a predictor that costs nothing."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -17,13 +13,7 @@ from msg_tools.cdr import deserialise
 from msg_tools.images import compressed_image_message, image_message
 from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
 
-ROOT = Path(__file__).resolve().parents[2]
 FRAME_NS = 100_000_000
-
-
-@pytest.fixture
-def outputs():
-    return []
 
 
 @pytest.fixture
@@ -37,15 +27,6 @@ def session(stub_predictor, background_file, outputs):
 
 def predictions(outputs):
     return [deserialise(output.data, 'hmt_msgs/msg/PoseMixture') for output in outputs]
-
-
-def test_runs_without_ros():
-    program = (
-        'import sys\n'
-        'sys.modules["rclpy"] = sys.modules["hmt_msgs"] = None\n'
-        'import hmt_ros.nodes.bme_session, hmt_ros.nodes.bme_parameters\n'
-    )
-    subprocess.run([sys.executable, '-c', program], cwd=ROOT, check=True)
 
 
 def test_every_image_has_a_prediction(session, outputs, somebody, stub_predictor):

@@ -1,9 +1,6 @@
 """The node itself, over DDS; with a tracker that costs nothing."""
 
-import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -11,17 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.nodes.declared_parameters import EFFECTS, declared_parameters
 from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.parameter_file import read_parameter_file
 from hmt_ros.nodes.track_messages import TOPICS
 from msg_tools.cdr import serialise
+from test.nodes.conftest import PATIENCE, values_of
 
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml'
-PATIENCE = 60.0  # s
 
 
 @pytest.fixture
@@ -46,7 +41,7 @@ def running(world):
 
 
 def faults(handled):
-    return [value.value for value in handled.values if value.key == 'fault']
+    return values_of(handled, 'fault')
 
 
 def published(handled):
@@ -82,20 +77,18 @@ def test_images_become_messages(running, small_camera):
 
 
 def test_parameters_are_those_of_the_file(running):
-    descriptors = {p.name: p for p in declared_parameters(FilterParameters())}
     of_ros = ('use_sim_time', 'start_type_description_service')
     names = [
         name
         for name in running.node._parameters
         if name not in of_ros and not name.startswith('qos_overrides.')
     ]
-    assert sorted(names) == sorted(read_parameter_file(CONFIG, 'filter_node'))
-    for name in names:
-        declared = descriptors[name]
+    parameters = running.assert_described(FilterParameters())
+    assert sorted(names) == sorted(parameters)
+    for name, declared in parameters.items():
         if name != 'subject_file':
             assert running.node.get_parameter(name).value == declared.default
         descriptor = running.node.describe_parameter(name)
-        assert descriptor.description == f'{declared.description} {EFFECTS[declared.effect]}'
         ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
         assert [(r.from_value, r.to_value) for r in ranges] == (
             [declared.limits] if declared.limits else []
@@ -103,7 +96,7 @@ def test_parameters_are_those_of_the_file(running):
 
 
 def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
-    for values, reason in (
+    running.assert_refused(
         ({'max_hypotheses': 0}, 'out of range. Min: 1, Max: 64, value: 0'),
         ({'max_hypotheses': 20}, 'max_hypotheses <= candidates, saw 20 and 16'),
         ({'proposals': 'guess'}, "saw 'guess'"),
@@ -112,10 +105,7 @@ def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
         ({'body_model': 'nobody'}, "no body 'nobody'"),
         ({'autostart': False}, 'read-only'),
         ({'max_hypotheses': 8.0}, 'type'),
-    ):
-        good, why = running.set(**values)
-        assert not good
-        assert reason in why, why
+    )
     before = FilterParameters()
     assert running.node._settings.tracker == before.tracker
     assert running.set(max_hypotheses=20, candidates=24, queue_size=2) == (True, '')
@@ -339,30 +329,11 @@ def test_diagnostics(running, small_camera):
 # The executable.
 
 
-def start_node(*arguments, **environment):
-    return subprocess.Popen(
-        [sys.executable, '-m', 'hmt_ros.nodes.filter_node', '--ros-args', *arguments],
-        cwd=ROOT,
-        env={**os.environ, **environment},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_ends_cleanly(number, subject_file):
-    node = start_node('-p', f'subject_file:={subject_file}', '--params-file', str(CONFIG))
-    lines = []
-    try:
-        for line in node.stdout:
-            lines.append(line)
-            if 'images from /image' in line:
-                node.send_signal(number)
-        assert node.wait(PATIENCE) == 0
-    finally:
-        node.kill()
-    assert len(lines) == 1, lines
+def test_ends_cleanly(number, subject_file, executable):
+    file = f'subject_file:={subject_file}'
+    node = executable('filter_node', '-p', file, '--params-file', str(CONFIG))
+    assert len(node.stop_at('images from /image', number)) == 1
 
 
 @pytest.mark.parametrize(
@@ -372,10 +343,7 @@ def test_ends_cleanly(number, subject_file):
         (('-p', 'proposals:=guess'), "saw 'guess'"),
     ],
 )
-def test_wrong_arguments_are_one_line(arguments, message):
-    node = start_node(*arguments)
-    output, _ = node.communicate(timeout=PATIENCE)
-    assert node.returncode == 1
-    (line,) = output.splitlines()
+def test_wrong_arguments_are_one_line(arguments, message, executable):
+    line = executable('filter_node', *arguments).refusal()
     assert line.startswith('filter_node: ')
     assert message in line

@@ -1,9 +1,6 @@
 """The rules of the session, with a tracker that costs nothing."""
 
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,14 +16,8 @@ from msg_tools.cdr import deserialise
 from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
 from test.nodes.conftest import Likelihoods
 
-ROOT = Path(__file__).resolve().parents[2]
 MIXTURES = ['pose_mixture', 'likelihood_mixture']
 ONE_IMAGE = [*MIXTURES, 'joint_states', '/tf', 'markers', 'overlay/compressed']
-
-
-@pytest.fixture
-def outputs():
-    return []
 
 
 @pytest.fixture
@@ -42,15 +33,6 @@ def session(stub_tracker, subject_file, outputs):
 def tracked(outputs):
     """Stamps of the images that were tracked."""
     return [output.stamp_ns for output in outputs if output.topic == 'pose_mixture']
-
-
-def test_runs_without_ros():
-    program = (
-        'import sys\n'
-        'sys.modules["rclpy"] = sys.modules["hmt_msgs"] = None\n'
-        'import hmt_ros.nodes.filter_session, hmt_ros.nodes.filter_parameters\n'
-    )
-    subprocess.run([sys.executable, '-c', program], cwd=ROOT, check=True)
 
 
 def test_images_become_messages_in_their_order(session, outputs, small_camera):

@@ -1,27 +1,21 @@
 """The smoother node itself, over DDS."""
 
-import os
-import signal
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
 import pytest
 
-from hmt_ros.nodes.declared_parameters import EFFECTS, declared_parameters
-from hmt_ros.nodes.parameter_file import read_parameter_file
 from hmt_ros.nodes.smoothed_messages import TOPICS
 from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.nodes.smoother_session import SmootherSession
 from msg_tools.cdr import serialise
 from msg_tools.headers import time_ns
+from test.nodes.conftest import PATIENCE, values_of
 
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / 'hmt_ros' / 'config' / 'smoother_node.yaml'
-PATIENCE = 60.0  # s
 FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
 
 
@@ -45,10 +39,6 @@ def running(world, likelihoods):
     one = world().start()
     one.send('body', likelihoods.body_message())
     return one
-
-
-def values_of(handled, key):
-    return [value.value for value in handled.values if value.key == key]
 
 
 def published(handled):
@@ -99,22 +89,14 @@ def test_mixtures_become_smoothed_poses(running, likelihoods):
 
 
 def test_parameters_are_those_of_the_file(running):
-    descriptors = {p.name: p for p in declared_parameters(SmootherParameters())}
-    assert sorted(read_parameter_file(CONFIG, 'smoother_node')) == sorted(descriptors)
-    for name, declared in descriptors.items():
-        assert running.node.has_parameter(name)
-        descriptor = running.node.describe_parameter(name)
-        assert descriptor.description == f'{declared.description} {EFFECTS[declared.effect]}'
-    for values, reason in (
+    running.assert_described(SmootherParameters())
+    running.assert_refused(
         ({'fixed_lag': -1}, 'out of range'),
         ({'method': 'guess'}, "saw 'guess'"),
         ({'body_model': 'nobody'}, "no body 'nobody'"),
         ({'dynamics__knee': 0.0}, 'dynamics.knee must be positive'),
         ({'autostart': False}, 'read-only'),
-    ):
-        good, why = running.set(**values)
-        assert not good
-        assert reason in why, why
+    )
     assert running.set(queue_size=3, max_hypotheses=2) == (True, '')
     assert running.node._session.parameters.max_hypotheses == 2
     assert running.node._queue._limits['likelihood_mixture'] == 3
@@ -238,37 +220,14 @@ def test_queue_holds_what_was_published(running, likelihoods):
     assert values_of(second, 'fault') == []
 
 
-def start_node(*arguments):
-    return subprocess.Popen(
-        [sys.executable, '-m', 'hmt_ros.nodes.smoother_node', '--ros-args', *arguments],
-        cwd=ROOT,
-        env=dict(os.environ),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
+def test_ends_cleanly(executable):
+    node = executable('smoother_node', '--params-file', str(CONFIG))
+    assert len(node.stop_at('mixtures from /likelihood_mixture')) == 1
 
 
-def test_ends_cleanly():
-    node = start_node('--params-file', str(CONFIG))
-    lines = []
-    try:
-        for line in node.stdout:
-            lines.append(line)
-            if 'mixtures from /likelihood_mixture' in line:
-                node.send_signal(signal.SIGINT)
-        assert node.wait(PATIENCE) == 0
-    finally:
-        node.kill()
-    assert len(lines) == 1, lines
-
-
-def test_parameter_file_reaches_the_node(tmp_path):
+def test_parameter_file_reaches_the_node(tmp_path, executable):
     path = tmp_path / 'smoother.yaml'
     path.write_text(CONFIG.read_text().replace('fixed_lag: 7', 'fixed_lag: -7'))
-    node = start_node('--params-file', str(path))
-    output, _ = node.communicate(timeout=PATIENCE)
-    assert node.returncode == 1
-    (line,) = output.splitlines()
+    line = executable('smoother_node', '--params-file', str(path)).refusal()
     assert line.startswith('smoother_node: ')
     assert 'fixed_lag' in line

@@ -1,9 +1,5 @@
 """The rules of the session that smooths."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -16,15 +12,9 @@ from msg_tools.cdr import deserialise
 from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
 from msg_tools.trajectory_mixtures import trajectory_mixture_of
 
-ROOT = Path(__file__).resolve().parents[2]
 LAG = 2
 WINDOW = ['trajectory_mixture', 'trajectory_markers']
 FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
-
-
-@pytest.fixture
-def outputs():
-    return []
 
 
 @pytest.fixture
@@ -58,15 +48,6 @@ def smoothed(outputs):
 def read(outputs, topic):
     kind = TOPICS[topic].msgtype
     return [deserialise(output.data, kind) for output in outputs if output.topic == topic]
-
-
-def test_runs_without_ros():
-    program = (
-        'import sys\n'
-        'sys.modules["rclpy"] = sys.modules["hmt_msgs"] = None\n'
-        'import hmt_ros.nodes.smoother_session\n'
-    )
-    subprocess.run([sys.executable, '-c', program], cwd=ROOT, check=True)
 
 
 def test_poses_become_final_after_the_lag(running, outputs, likelihoods):

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal, multivariate_t
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.smoothing import LinearGaussianDynamics
-from hmt_ros.smoothing.embedded_network import embedded_network, sampled_network
+from hmt_ros.smoothing.embedded_network import _log_mode, embedded_network, sampled_network
 from hmt_ros.smoothing.mode_sequence import ModeSequence, merge_close_modes
 from hmt_ros.smoothing.paths import (
     diverse_subset,
@@ -64,6 +64,16 @@ def test_sampled_values_meet_those_in_closed_form(modes, walk):
     )
     for a, b in zip((*found.nodes, *found.links), (*exact.nodes, *exact.links)):
         np.testing.assert_allclose(a, b, atol=0.08)
+
+
+def test_student_modes_have_the_density_of_scipy():
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(3, 3))
+    mixture = GaussianMixture([1.0], [[0.3, -1.0, 2.0]], [root @ root.T + np.eye(3)])
+    x = rng.normal(size=(50, 3), scale=4.0)
+    for freedom in (1.0, 4.0, 30.0):
+        wanted = multivariate_t.logpdf(x, mixture.means[0], mixture.covariances[0], df=freedom)
+        np.testing.assert_allclose(_log_mode(mixture, 0, freedom, x), wanted, rtol=1e-12)
 
 
 def test_student_modes_against_quadrature():

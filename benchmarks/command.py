@@ -1,0 +1,73 @@
+"""What the benchmarks have in common as commands: options, stages, and what is printed."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
+
+from tqdm import tqdm
+
+from benchmarks.clips import rounded
+from benchmarks.machine import description
+
+Item = TypeVar('Item')
+
+
+def benchmark_parser(name: str, text: str | None, *, quick: str) -> argparse.ArgumentParser:
+    """A parser with the options that every benchmark takes.
+
+    Args:
+        name: of the benchmark.
+        text: what it measures.
+        quick: what --quick does.
+    """
+    parser = argparse.ArgumentParser(prog=f'python -m benchmarks {name}', description=text)
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser.add_argument('--quick', action='store_true', help=quick)
+    return parser
+
+
+def add_choice(
+    parser: argparse.ArgumentParser, stages: Sequence[str], metavar: str = 'STAGE'
+) -> None:
+    """Adds --only, some of the stages."""
+    parser.add_argument(
+        '--only', nargs='+', choices=stages, default=stages, metavar=metavar,
+        help=f'some of {", ".join(stages)}',
+    )  # fmt: skip
+
+
+def show(result: dict[str, Any], text: Callable[[dict[str, Any]], str], *, as_json: bool) -> int:
+    """Prints what was measured; the exit code."""
+    print(json.dumps(rounded(result), indent=1) if as_json else text(result))
+    return 0
+
+
+def run_stages(
+    benchmark: str, stages: Mapping[str, Callable[[], Any]], only: Sequence[str]
+) -> dict[str, Any]:
+    """What stages measure, in their order, with the machine that they ran on."""
+    chosen = [name for name in stages if name in only]
+    result: dict[str, Any] = {'machine': description()}
+    for name in told(benchmark, chosen):
+        result[name] = stages[name]()
+    return result
+
+
+def told(
+    benchmark: str, items: Iterable[Item], name: Callable[[Item], str] = str
+) -> Iterator[Item]:
+    """The items, with a line on stderr where each begins: minutes may pass until the next."""
+    chosen = list(items)
+    start = time.monotonic()
+    for number, item in enumerate(chosen, 1):
+        minutes, seconds = divmod(round(time.monotonic() - start), 60)
+        spent = f'{minutes}:{seconds:02d}'
+        # Not through a bar that another part may be showing.
+        line = f'{benchmark}: {name(item)}, {number} of {len(chosen)}, at {spent}'
+        tqdm.write(line, file=sys.stderr)
+        yield item

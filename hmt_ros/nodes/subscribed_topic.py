@@ -1,0 +1,51 @@
+"""Topics that nodes subscribe to, and the quality of service of what they publish."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
+
+RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+
+class SubscribedTopic(NamedTuple):
+    """A subscribed topic.
+
+    Attributes:
+        source: what the session calls it.
+        topic: its name.
+        kind: generated class.
+        msgtype: for example 'sensor_msgs/msg/Image'.
+        qos: of the subscription.
+    """
+
+    source: str
+    topic: str
+    kind: type
+    msgtype: str
+    qos: QoSProfile
+
+
+def camera_info_topic() -> SubscribedTopic:
+    """The calibration of a camera."""
+    kind = 'sensor_msgs/msg/CameraInfo'
+    return SubscribedTopic(CAMERA_INFO, 'camera_info', CameraInfo, kind, qos_profile_sensor_data)
+
+
+def image_topic(image_transport: str) -> SubscribedTopic:
+    """The images of a camera, 'raw' or 'compressed'."""
+    if image_transport == 'compressed':
+        kind = 'sensor_msgs/msg/CompressedImage'
+        return SubscribedTopic(
+            IMAGE, 'image/compressed', CompressedImage, kind, qos_profile_sensor_data
+        )
+    return SubscribedTopic(IMAGE, 'image', Image, 'sensor_msgs/msg/Image', qos_profile_sensor_data)
