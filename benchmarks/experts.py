@@ -18,7 +18,7 @@ from hmt_ros.image.renderer import render_silhouettes
 
 STAGES = ('toy', 'oracle', 'learning', 'motion', 'clips', 'start', 'speed')
 SAMPLES = 6000
-PROPAGATED = ('local',)
+PROPAGATED = tuple(COLUMNS)
 MILLISECONDS = {'descriptor': 5.0, 'prediction': 1.0}
 
 

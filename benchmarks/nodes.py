@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -13,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.clips import find_clips, rounded, table
-from benchmarks.machine import description, on_machine
+from benchmarks.clips import find_clips, table
+from benchmarks.command import benchmark_parser, run_stages, show
+from benchmarks.machine import on_machine
 from hmt_ros.app.live_node import LiveNode, LiveNodeError, Player
 from hmt_ros.nodes import bme_session
 from hmt_ros.nodes.bme_parameters import BmeParameters
@@ -31,19 +30,11 @@ KEPT = 0.99  # share of the images whose results came
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = argparse.ArgumentParser(prog='python -m benchmarks nodes', description=__doc__)
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument(
-        '--seconds', type=float, default=SECONDS, help='that are measured (default: %(default)g)'
-    )
+    parser = benchmark_parser('nodes', __doc__, quick='two seconds')
     parser.add_argument('--model', default='', help='of bme_node; usual: the one that ships')
     options = parser.parse_args(argv)
-    result = measure(options.seconds, options.model)
-    if options.json:
-        print(json.dumps(rounded(result), indent=1))
-    else:
-        print(as_text(result))
-    return 0
+    result = measure(2.0 if options.quick else SECONDS, options.model)
+    return show(result, as_text, as_json=options.json)
 
 
 def page() -> str:
@@ -61,13 +52,16 @@ def measure(seconds: float = SECONDS, model: str = '') -> dict[str, Any]:
         background_file=str(folder / 'background.png'),
         model_file=model,
     )
-    try:
-        found = followed(
-            'bme_node', parameters, bme_session.TOPICS, bme_session.PREDICTION, folder, seconds
-        )
-    except LiveNodeError as error:
-        return {'machine': description(), 'bme_node': f'skipped: {error}'}
-    return {'machine': description(), 'bme_node': found}
+
+    def predicted() -> dict[str, Any] | str:
+        try:
+            return followed(
+                'bme_node', parameters, bme_session.TOPICS, bme_session.PREDICTION, folder, seconds
+            )
+        except LiveNodeError as error:
+            return f'skipped: {error}'
+
+    return run_stages('nodes', {'bme_node': predicted}, ('bme_node',))
 
 
 def followed(
