@@ -257,11 +257,11 @@ def pair_log_densities(
 ) -> Array:
     """log N(a_i; b_j, A_i + B_j), shape (P,), of pairs (P, 2) of indices i, j."""
     result = np.empty(len(pairs))
+    # Arrays of one kind: for others, read-only ones for example, another kernel would be compiled.
     a, big_a, b, big_b = (
-        np.ascontiguousarray(x, dtype=np.float64)
-        for x in (means_a, covariances_a, means_b, covariances_b)
+        np.require(x, np.float64, 'CW') for x in (means_a, covariances_a, means_b, covariances_b)
     )
-    pairs = np.ascontiguousarray(pairs, dtype=np.int64)
+    pairs = np.require(pairs, np.int64, 'CW')
     edges = np.linspace(0, len(pairs), PARTS + 1).astype(int)
 
     def work(part: int) -> None:
