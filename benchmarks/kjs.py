@@ -312,7 +312,7 @@ def optimise(body: Body, energy: Any, poses: Array) -> Minimum:
     return minimise(
         energy, poses, body.lower, body.upper,
         step_scale=np.where(body.skeleton.dof_is_rotation, 0.4, 0.3),
-        damping=1.0, max_iterations=ITERATIONS,
+        damping=1e-3, max_iterations=ITERATIONS, tolerance=1e-8,
     )  # fmt: skip
 
 

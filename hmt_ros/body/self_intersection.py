@@ -32,12 +32,14 @@ class _Axes(NamedTuple):
         centres: (B, 3) of the axes in the segments' frames, m.
         halves: (B,) half lengths of the axes, m.
         radii: (B, 3) along x, y and, for the caps, z, m.
+        reaches: (B,) from the middle to the farthest point, m.
     """
 
     segments: NDArray[np.int64]
     centres: Array
     halves: Array
     radii: Array
+    reaches: Array
 
 
 def self_intersection_energy(
@@ -67,11 +69,13 @@ def _axes_of(body: Body) -> _Axes:
     parts = body.flesh.parts
     radii = np.array([p.radii for p in parts]).reshape(-1, 3)
     mean = radii[:, :2].mean(1)
+    halves = np.maximum(radii[:, 2] - mean, 0.0)
     return _Axes(
         np.array([p.segment for p in parts], dtype=np.int64),
         np.array([p.centre for p in parts]).reshape(-1, 3),
-        np.maximum(radii[:, 2] - mean, 0.0),
+        halves,
         np.column_stack([radii[:, :2], mean]),
+        halves + radii[:, :2].max(1, initial=0.0),
     )
 
 
@@ -155,6 +159,28 @@ def _overlap(parts, i, j, columns, origins):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _place_centres(parts, columns, origins, centres):  # type: ignore[no-untyped-def]
+    """Fills the middles (B, 3) of the parts in the camera frame."""
+    for i in range(len(parts.segments)):
+        s = parts.segments[i]
+        for x in range(3):
+            total = origins[s, x]
+            for k in range(3):
+                total += columns[s, k, x] * parts.centres[i, k]
+            centres[i, x] = total
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _far(parts, i, j, centres):  # type: ignore[no-untyped-def]
+    """Whether two parts are too far from each other to overlap by more than is tolerated."""
+    x = centres[i, 0] - centres[j, 0]
+    y = centres[i, 1] - centres[j, 1]
+    z = centres[i, 2] - centres[j, 2]
+    reach = parts.reaches[i] + parts.reaches[j] - TOLERANCE
+    return x * x + y * y + z * z > reach * reach
+
+
+@njit(cache=True, nogil=True)
 def _add_overlaps(  # type: ignore[no-untyped-def]
     parts, first, second, columns, origins, dof_axes, dof_origins, is_rotation, moves, sigma,
     value, gradient, hessian,
@@ -162,9 +188,13 @@ def _add_overlaps(  # type: ignore[no-untyped-def]
     """Adds energy, gradient and Gauss-Newton Hessian of all pairs that overlap, pose by pose."""
     d = dof_axes.shape[1]
     row = np.zeros(d)
+    centres = np.empty((len(parts.segments), 3))
     for n in range(len(value)):
+        _place_centres(parts, columns[n], origins[n], centres)
         for pair in range(len(first)):
             i, j = first[pair], second[pair]
+            if _far(parts, i, j, centres):
+                continue
             p0, p1, p2, q0, q1, q2, d0, d1, d2, depth = _overlap(
                 parts, i, j, columns[n], origins[n]
             )
