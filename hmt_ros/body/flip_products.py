@@ -194,7 +194,8 @@ class FlipProduct:
 
     def _half(self, half: list[int]) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
         """Sums (E,) and choices (E, chains) of a group, trunk by trunk, best first; and bounds."""
-        sums, picks, bounds = [], [], [0]
+        sums, bounds = [np.empty(0)], [0]
+        picks = [np.empty((0, len(half)), dtype=np.int64)]
         tables = dict(zip(combinations(range(len(self.chains)), 2), self.allowed, strict=True))
         for t in range(len(self.trunks)):
             total, chosen = np.zeros(1), np.zeros((1, 0), dtype=np.int64)
@@ -446,12 +447,14 @@ class _Pruning:
         """The chain that carries a part, -1: the trunk."""
         skeleton = self.body.skeleton
         owners = set()
-        for segment in skeleton.joint_segments[skeleton.joint_index(part)]:
-            found = [c for c, name in enumerate(self.chains) if segment in skeleton.chains[name]]
-            owners.add(found[0] if found else -1)
+        for joint in skeleton.joint_index(part):
+            segment = skeleton.joint_segments[joint]
+            if not np.any(skeleton.joint_offsets[joint]):
+                segment = skeleton.parents[segment]  # which has it at its end
+            owners |= {c for c, x in enumerate(self.chains) if segment in skeleton.chains[x]}
         if len(owners) > 1:
             raise ValueError(f'joints {part} of a depth order belong to different chains')
-        return int(owners.pop())
+        return int(owners.pop()) if owners else -1
 
 
 def _crossing(body: Body, pose: Array, order: DepthOrder) -> tuple[float, float]:
