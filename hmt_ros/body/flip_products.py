@@ -293,7 +293,7 @@ def _torso_flips(body: Body, poses: Array, slack: float) -> tuple[Array, Index]:
     seen = before[parents]
     flips = solve_joint_positions(
         body, flips, seen, JOINTS, free_dofs=free, along_rays=True, sigma=0.005,
-        max_iterations=ITERATIONS,
+        max_iterations=ITERATIONS, tolerance=1e-3,
     ).x  # fmt: skip
     torsos = body.joint_positions(flips)[:, which]
     near = _off_rays(torsos, seen).max(1) <= slack
@@ -352,7 +352,7 @@ def _reached(
     starts[:, dofs] = poses[:, dofs]
     solved = solve_joint_positions(
         body, starts, seen, names, free_dofs=[body.dof_names[j] for j in dofs], along_rays=True,
-        sigma=0.005, max_iterations=ITERATIONS,
+        sigma=0.005, max_iterations=ITERATIONS, tolerance=1e-3,
     ).x  # fmt: skip
     misses = _off_rays(body.joint_positions(solved)[:, own], seen).max(1)
     near = np.flatnonzero(misses <= slack)

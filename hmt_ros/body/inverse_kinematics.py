@@ -31,6 +31,7 @@ def solve_joint_positions(
     free_dofs: Sequence[str] | None = None,
     along_rays: bool = False,
     max_iterations: int = 60,
+    tolerance: float = 1e-6,
 ) -> Minimum:
     """Poses nearest to given joint positions, for a batch of N problems.
 
@@ -48,6 +49,8 @@ def solve_joint_positions(
         free_dofs: degrees of freedom that may change; all when None.
         along_rays: a target stands for its ray: only the distance of the joint to it counts, not
             how far away it is.
+        max_iterations: at most.
+        tolerance: decrease of the energy below which it is enough.
     """
     skeleton = body.skeleton
     names = skeleton.joint_names if joint_names is None else tuple(joint_names)
@@ -102,5 +105,5 @@ def solve_joint_positions(
     return minimise(
         energy, start, limits_low, limits_high,
         step_scale=np.where(skeleton.dof_is_rotation, 0.5, 0.3),
-        damping=1.0, max_iterations=max_iterations,
+        damping=1.0, max_iterations=max_iterations, tolerance=tolerance,
     )  # fmt: skip
