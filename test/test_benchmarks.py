@@ -65,7 +65,8 @@ def test_the_tree_that_is_timed_has_1024_leaves(body):
     assert 'most probable first' in flips.as_text(result)
 
 
-def test_jumps_are_minima_and_cheap():
+def test_jumps_are_minima_and_cheap(monkeypatch):
+    monkeypatch.setattr(kjs, 'RUNS', 1)
     result = kjs.measure(count=40, frontal=1)
     rows = {(r['sampler'], r['scale']): r for r in result['rows']}
     assert len(rows) == len(kjs.PARTITIONS) + 2 * len(kjs.SCALES)
