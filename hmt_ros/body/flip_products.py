@@ -398,19 +398,20 @@ class _Pruning:
         if not (np.isfinite(most_overlap) and self.body.shapes):
             return tables
         frames, rows = self._frames()
+        placed = frames.by_pose()
         own = [self.body.chains[chain] for chain in self.chains]
         limbs = {s for segments in own for s in segments}
         trunk = [s for s in range(len(self.body.skeleton.parents)) if s not in limbs]
         for c, leaf_rows in enumerate(rows):
             flat = leaf_rows.ravel()
-            depth = deepest_overlaps(self.body, frames, flat, own[c], flat, [*trunk, *own[c]])
+            depth = deepest_overlaps(self.body, *placed, flat, own[c], flat, [*trunk, *own[c]])
             deep = depth.reshape(leaf_rows.shape) > most_overlap
             deep[: len(self.given), 0] = False
             self.log_priors[c][deep] = -np.inf
         for (i, j), table in zip(pairs, tables, strict=True):
             first = np.broadcast_to(rows[i][:, :, None], table.shape).ravel()
             second = np.broadcast_to(rows[j][:, None, :], table.shape).ravel()
-            depth = deepest_overlaps(self.body, frames, first, own[i], second, own[j])
+            depth = deepest_overlaps(self.body, *placed, first, own[i], second, own[j])
             table &= depth.reshape(table.shape) <= most_overlap
             table[: len(self.given), 0, 0] = True
         return tables

@@ -67,7 +67,8 @@ def self_intersection_energy(
 
 def deepest_overlaps(
     body: Body,
-    frames: Frames,
+    columns: Array,
+    origins: Array,
     rows: Index,
     segments: Collection[int],
     other_rows: Index,
@@ -79,14 +80,14 @@ def deepest_overlaps(
 
     Args:
         body: whose parts; neighbours along the skeleton are left out.
-        frames: of N poses.
+        columns, origins: (N, S, 3, 3), (N, S, 3) of N poses, as `Frames.by_pose` gives them.
         rows, other_rows: (M,) poses that are compared.
         segments: of the first pose.
         other_segments: of the second.
 
     Returns:
         (M,) the largest overlap of two parts, m; at least 0.
-    """  # fmt: skip
+    """
     first, second = _pairs(body)
     carrier = np.array([p.segment for p in body.flesh.parts], dtype=np.intp)
     one, two = np.isin(carrier, list(segments)), np.isin(carrier, list(other_segments))
@@ -99,7 +100,7 @@ def deepest_overlaps(
         ]
     )
     result = np.zeros(len(rows))
-    _deepest(_axes_of(body), pairs, *frames.by_pose(), rows, other_rows, result)
+    _deepest(_axes_of(body), pairs, columns, origins, rows, other_rows, result)
     return result
 
 

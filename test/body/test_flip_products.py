@@ -111,8 +111,8 @@ def test_leaves_that_intersect_are_pruned_and_no_others(body, pose):
     def deepest(poses):
         everything = range(len(body.skeleton.parents))
         rows = np.arange(len(poses))
-        frames = forward(body.skeleton, poses)
-        return deepest_overlaps(body, frames, rows, everything, rows, everything)
+        placed = forward(body.skeleton, poses).by_pose()
+        return deepest_overlaps(body, *placed, rows, everything, rows, everything)
 
     free = full_body_flips(body, pose, torso=False, most_overlap=np.inf).most_probable(ALL)
     depth = deepest(free.poses)
