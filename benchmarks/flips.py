@@ -145,21 +145,23 @@ def poses_with_most_leaves(body: Body) -> NDArray[np.float64]:
 
 def memory_of_enumeration() -> float:
     """Peak resident memory of a process of its own that does it, MB."""
+    # Not getrusage: a process that another starts inherits its peak from it.
     code = (
         'from benchmarks.flips import MOST_LEAVES, poses_with_most_leaves\n'
-        'from benchmarks.machine import peak_memory\n'
+        'from pathlib import Path\n'
         'from hmt_ros.body import load_body\n'
         'from hmt_ros.body.flip_products import full_body_flips\n'
         "body = load_body('human37')\n"
         'product = full_body_flips(body, poses_with_most_leaves(body))\n'
         'assert len(product.most_probable(MOST_LEAVES).poses) == MOST_LEAVES\n'
-        'print(peak_memory())\n'
+        "status = Path('/proc/self/status').read_text('utf-8').splitlines()\n"
+        "print(next(x.split()[1] for x in status if x.startswith('VmHWM')))\n"
     )
     root = Path(__file__).resolve().parents[1]
     done = subprocess.run(
         [sys.executable, '-c', code], cwd=root, check=True, capture_output=True, text=True
     )
-    return float(done.stdout) / 1e6
+    return 1024.0 * float(done.stdout) / 1e6
 
 
 def random_poses(body: Body, count: int, seed: int) -> NDArray[np.float64]:

@@ -40,6 +40,8 @@ APART = 0.01  # m: minima of which no joint differs by as much are one
 ALIKE = 10.0  # nats above the start, within which a minimum explains the image as well
 ITERATIONS = 200
 RUNS = 3  # of each row, for the CPU time
+COUNTS = ('samples', 'unconverged', 'minima', 'alike')
+RATIOS = ('minima_per_sample', 'alike_per_sample', 'minima_per_cpu_s')
 SCALES = (1.0, 4.0, 8.0, 16.0, 0.0)  # 0: Cauchy tails
 MOST_LEAVES = 4000
 PARTITIONS: dict[str, tuple[str, ...] | None] = {
@@ -142,8 +144,8 @@ def measure(count: int = 2000, frontal: int = FRONTAL, seed: int = 0) -> dict[st
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """Tables for people."""
     head = [
-        'sampler', 'scale', 'samples', 'minima', 'alike', 'distance', 'optimised', 'deviations',
-        'optimised', 'cost', 'optimised', 'CPU s', 'minima / s',
+        'sampler', 'scale', *COUNTS, 'distance', 'optimised', 'deviations', 'optimised',
+        'cost', 'optimised', 'CPU s', 'minima / s',
     ]  # fmt: skip
     rows = [head]
     for r in result['rows']:
@@ -151,12 +153,12 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
                  for i in (0, 1)]  # fmt: skip
         costs = [f'{abs(cost):.3f}' if cost < 10 else f'{cost:.0f}' for cost in r['cost']]
         rows.append(
-            [r['sampler'], r['scale'], str(r['samples']), str(r['minima']), str(r['alike']), *pairs,
+            [r['sampler'], r['scale'], *(str(r[x]) for x in COUNTS), *pairs,
              *costs, f'{r["cpu_s"]:.2f}', f'{r["minima_per_cpu_s"]:.0f}']
         )  # fmt: skip
-    ratios = [['kinematic jumps', 'minima per sample', 'per CPU second', 'raw cost']]
+    ratios = [['kinematic jumps', 'minima per sample', 'alike', 'minima per CPU s', 'raw cost']]
     ratios += [
-        [name, f'{r["minima_per_sample"]:.1f}', f'{r["minima_per_cpu_s"]:.1f}', f'{r["cost"]:.2g}']
+        [name, *(f'{r[x]:.1f}' for x in RATIOS), f'{r["cost"]:.2g}']
         for name, r in result['ratios'].items()
     ]
     others = [['frontal poses as drawn', 'poses', 'leaves', 'minima', 'share', 'least', 'most']]
@@ -232,6 +234,7 @@ def minima_of(body: Body, optimised: Minimum) -> NDArray[np.intp]:
 
 def row(setting: Setting, found: Samples) -> dict[str, Any]:
     """What the table says about samples; medians of raw and of optimised ones."""
+    joints = setting.body.joint_positions(found.optimised.x[np.argsort(found.optimised.value)])
     optimised = found.optimised.value - setting.start.value[0]
     converged = found.optimised.status == Status.CONVERGED
     distances = [distances_from(setting, x) for x in (found.raw, found.optimised.x[converged])]
@@ -241,6 +244,7 @@ def row(setting: Setting, found: Samples) -> dict[str, Any]:
         'scale': found.scale,
         'samples': len(found.raw),
         'minima': len(found.minima),
+        'distinct_with_unconverged': len(distinct_poses(joints, APART).kept),
         'alike': int((optimised[found.minima] < ALIKE).sum()),
         'unconverged': int((~converged).sum()),
         'distance': [float(np.median(d)) for d, _ in distances],
@@ -250,6 +254,7 @@ def row(setting: Setting, found: Samples) -> dict[str, Any]:
         'drawing_cpu_s': found.drawing,
         'cpu_s': seconds,
         'minima_per_sample': len(found.minima) / len(found.raw),
+        'alike_per_sample': (optimised[found.minima] < ALIKE).sum() / len(found.raw),
         'minima_per_cpu_s': len(found.minima) / seconds,
     }
 
@@ -270,10 +275,7 @@ def ratios(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     random = [r for r in rows if r['scale']]
     return {
         r['sampler']: {
-            **{
-                key: r[key] / max(max(x[key] for x in spread), 1e-9)
-                for key in ('minima_per_sample', 'minima_per_cpu_s')
-            },
+            **{key: r[key] / max(max(x[key] for x in spread), 1e-9) for key in RATIOS},
             'cost': r['cost'][0] / min(x['cost'][0] for x in random),
         }
         for r in jumps
