@@ -16,6 +16,7 @@ USAGE = """usage: python -m benchmarks [NAME [options]]
   experts    conditional densities: a toy, motions of people apart, clips, speed
   tracking   accuracy, calibration and speed of the tracker on clips with known truth
   flips      time per leaf of the interpretation trees
+  kjs        kinematic jumps against random sampling at finding minima
   kernels    the compiled likelihood against vectorised numpy
   nodes      images at the rate of a camera, through DDS
   smoothing  exactness, speed and peers of the smoother
@@ -27,12 +28,13 @@ Without a name all of them run. Every benchmark takes --json and --help.
 def main(argv: list[str]) -> int:
     """Runs one benchmark, or all; the exit code is that of the first that fails."""
     # Only now: they import numpy.
-    from benchmarks import experts, flips, kernels, nodes, smoothing, tracking
+    from benchmarks import experts, flips, kernels, kjs, nodes, smoothing, tracking
 
     benchmarks = {
         'experts': experts.main,
         'flips': flips.main,
         'kernels': kernels.main,
+        'kjs': kjs.main,
         'nodes': nodes.main,
         'smoothing': smoothing.main,
         'tracking': tracking.main,

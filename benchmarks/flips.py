@@ -5,7 +5,10 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import subprocess
+import sys
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,10 +17,12 @@ from numpy.typing import NDArray
 from benchmarks.clips import rounded, table
 from benchmarks.machine import best_time, description, dgemm_rate, on_machine
 from hmt_ros.body import Body, load_body
+from hmt_ros.body.flip_products import full_body_flips
 from hmt_ros.body.interpretation_tree import enumerate_flips, flip_counts
 
 CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg')
 LEAVES = 1024
+MODES, MOST_LEAVES = 96, 100_000
 # The yardstick: a microsecond a leaf on a core that makes so many operations per second in dgemm.
 YARDSTICK_RATE = 58e9
 
@@ -55,7 +60,22 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
                 f'{entry["us_per_leaf_at_yardstick"]:.2f}',
             ]
         )
-    return f'{table(rows, markdown=markdown)}\n\ndgemm: {result["dgemm_gflops"]:.1f} GF/s.'
+    whole = result['whole_body']
+    steps = [['whole bodies', 'us per leaf', f'at {YARDSTICK_RATE / 1e9:.0f} GF/s']]
+    scaled = whole['us_per_leaf_at_yardstick']
+    steps += [[x, f'{us:.2f}', f'{scaled[x]:.2f}'] for x, us in whole['us_per_leaf'].items()]
+    steps.append(
+        ['all', f'{sum(whole["us_per_leaf"].values()):.2f}', f'{sum(scaled.values()):.2f}']
+    )
+    parts = [
+        table(rows, markdown=markdown),
+        table(steps, markdown=markdown),
+        f'Whole bodies: the {whole["leaves"]} most probable leaves of {whole["poses"]} poses of '
+        f'human37, {whole["trunks"]} trunks with those that are flipped; '
+        f'peak memory of the process {whole["peak_mb"]:.0f} MB.',
+        f'dgemm: {result["dgemm_gflops"]:.1f} GF/s.',
+    ]
+    return '\n\n'.join(parts)
 
 
 def measure(seconds: float = 1.0) -> dict[str, Any]:
@@ -78,7 +98,70 @@ def measure(seconds: float = 1.0) -> dict[str, Any]:
             'us_per_leaf': 1e6 * spent / leaves,
             'us_per_leaf_at_yardstick': 1e6 * spent / leaves * rate / YARDSTICK_RATE,
         }
-    return {'machine': description(), 'cases': cases, 'dgemm_gflops': rate / 1e9}
+    return {
+        'machine': description(),
+        'cases': cases,
+        'whole_body': whole_body(seconds, rate),
+        'dgemm_gflops': rate / 1e9,
+    }
+
+
+def whole_body(seconds: float, rate: float) -> dict[str, Any]:
+    """Times of the most probable leaves of whole bodies, step by step, and the memory they take."""
+    body = load_body('human37')
+    poses = poses_with_most_leaves(body)
+    steps = {}
+    torso = best_time(partial(full_body_flips, body, poses), seconds=seconds, least=1)
+    pruned = partial(full_body_flips, body, poses, torso=False)
+    trees = partial(full_body_flips, body, poses, torso=False, most_overlap=np.inf)
+    steps['trees of all chains'] = best_time(trees, seconds=seconds)
+    steps['pruning by self-intersection'] = (
+        best_time(pruned, seconds=seconds) - steps['trees of all chains']
+    )
+    steps['torsos by inverse kinematics'] = torso - sum(steps.values())
+    product = full_body_flips(body, poses)
+    leaves = len(product.most_probable(MOST_LEAVES).poses)
+    steps['enumeration, most probable first'] = best_time(
+        partial(product.most_probable, MOST_LEAVES), seconds=seconds
+    )
+    return {
+        'poses': len(poses),
+        'trunks': len(product.trunks),
+        'leaves': leaves,
+        'us_per_leaf': {name: 1e6 * spent / leaves for name, spent in steps.items()},
+        'us_per_leaf_at_yardstick': {
+            name: 1e6 * spent / leaves * rate / YARDSTICK_RATE for name, spent in steps.items()
+        },
+        'peak_mb': memory_of_enumeration(),
+    }
+
+
+def poses_with_most_leaves(body: Body) -> NDArray[np.float64]:
+    """Of random poses those with most leaves, so many that they have 100,000."""
+    poses = random_poses(body, 4000, seed=0)
+    counts = np.prod([flip_counts(body, poses, chain) for chain in body.chains], axis=0)
+    return poses[np.argsort(-counts, kind='stable')[:MODES]]
+
+
+def memory_of_enumeration() -> float:
+    """Peak resident memory of a process of its own that does it, MB."""
+    # Not getrusage: a process that another starts inherits its peak from it.
+    code = (
+        'from benchmarks.flips import MOST_LEAVES, poses_with_most_leaves\n'
+        'from pathlib import Path\n'
+        'from hmt_ros.body import load_body\n'
+        'from hmt_ros.body.flip_products import full_body_flips\n'
+        "body = load_body('human37')\n"
+        'product = full_body_flips(body, poses_with_most_leaves(body))\n'
+        'assert len(product.most_probable(MOST_LEAVES).poses) == MOST_LEAVES\n'
+        "status = Path('/proc/self/status').read_text('utf-8').splitlines()\n"
+        "print(next(x.split()[1] for x in status if x.startswith('VmHWM')))\n"
+    )
+    root = Path(__file__).resolve().parents[1]
+    done = subprocess.run(
+        [sys.executable, '-c', code], cwd=root, check=True, capture_output=True, text=True
+    )
+    return 1024.0 * float(done.stdout) / 1e6
 
 
 def random_poses(body: Body, count: int, seed: int) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
     python docs/generate.py filter_node smoother_node bme_node
                                            tables of parameters in nodes.md
     python docs/generate.py flips          times in flips.md
+    python docs/generate.py kjs            minima that samples find in sampling.md (minutes)
     python docs/generate.py kernels        times in likelihood.md
     python docs/generate.py smoothing      exactness and speed in smoothing.md (minutes)
     python docs/generate.py experts        experts.md (a quarter of an hour)
@@ -29,6 +30,7 @@ PAGES = {
     'bme_node': 'nodes.md',
     'flips': 'flips.md',
     'kernels': 'likelihood.md',
+    'kjs': 'sampling.md',
     'smoothing': 'smoothing.md',
     'experts': 'experts.md',
     'tracking': 'tracking.md',
@@ -64,11 +66,12 @@ def part(name: str) -> str:
     """The content of a part."""
     if PAGES[name] == 'nodes.md':
         return parameter_table(name)
-    from benchmarks import experts, flips, kernels, smoothing, tracking
+    from benchmarks import experts, flips, kernels, kjs, smoothing, tracking
 
     pages = {
         'flips': flips,
         'kernels': kernels,
+        'kjs': kjs,
         'smoothing': smoothing,
         'experts': experts,
         'tracking': tracking,

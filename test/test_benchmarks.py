@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import flips, kernels, tracking
+from benchmarks import flips, kernels, kjs, tracking
 from benchmarks.__main__ import main
 from benchmarks.clips import find_clips, read_clip, rounded, table
 from benchmarks.command import run_stages
@@ -60,6 +60,38 @@ def test_the_tree_that_is_timed_has_1024_leaves(body):
     assert (first['poses'], first['leaves']) == (1, 1024)
     assert all(case['us_per_leaf'] > 0 for case in result['cases'].values())
     assert result['dgemm_gflops'] > 0
+    whole = result['whole_body']
+    assert whole['leaves'] == flips.MOST_LEAVES
+    assert whole['trunks'] > whole['poses']
+    assert set(whole['us_per_leaf']) == set(whole['us_per_leaf_at_yardstick'])
+    assert 50 < whole['peak_mb'] < 600
+    assert 'most probable first' in flips.as_text(result)
+
+
+def test_jumps_are_minima_and_cheap(monkeypatch):
+    monkeypatch.setattr(kjs, 'RUNS', 1)
+    result = kjs.measure(count=40, frontal=1)
+    rows = {(r['sampler'], r['scale']): r for r in result['rows']}
+    assert len(rows) == len(kjs.PARTITIONS) + 2 * len(kjs.SCALES)
+    arms, calves = (rows[name, ''] for name in list(kjs.PARTITIONS)[:2])
+    assert arms['minima'] >= 0.99 * arms['samples'] > 100
+    assert calves['minima'] >= 0.95 * calves['samples'] > 100
+    random = [r for r in rows.values() if r['scale']]
+    assert arms['cost'][0] < 0.01 * min(r['cost'][0] for r in random)
+    assert all(r['samples'] == 40 and r['minima'] + r['unconverged'] <= 40 for r in random)
+    assert all(r['alike'] <= r['minima'] for r in rows.values())
+    text = kjs.as_text(result, markdown=True)
+    assert text.count('| CSS') == text.count('| SS') == len(kjs.SCALES)
+
+
+def test_the_pose_of_the_jumps_has_its_links_out_of_the_image_plane():
+    human34 = load_body('human34')
+    pose = kjs.chosen_pose(human34)
+    assert kjs.out_of_plane(human34, pose[None])[0] > kjs.OUT_OF_PLANE
+    # A leg that hangs straight down, seen from far away, is in the plane.
+    pose[:] = 0.0
+    pose[2] = 40.0
+    assert kjs.out_of_plane(human34, pose[None])[0] < 0.03
 
 
 def test_compiled_and_vectorised_code_compute_the_same():
@@ -211,7 +243,8 @@ def test_command_line(capsys, tmp_path):
     assert 'tracking' in capsys.readouterr().out
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
-        "benchmarks: no 'flops', wanted one of experts, flips, kernels, nodes, smoothing, tracking"
+        "benchmarks: no 'flops', wanted one of experts, flips, kernels, kjs, nodes, smoothing, "
+        'tracking'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1

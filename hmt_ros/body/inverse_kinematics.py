@@ -29,7 +29,9 @@ def solve_joint_positions(
     sigma: ArrayLike = 0.01,
     prior_weight: float = 1e-3,
     free_dofs: Sequence[str] | None = None,
+    along_rays: bool = False,
     max_iterations: int = 60,
+    tolerance: float = 1e-6,
 ) -> Minimum:
     """Poses nearest to given joint positions, for a batch of N problems.
 
@@ -45,6 +47,10 @@ def solve_joint_positions(
         sigma: standard deviation of the targets, scalar, (J',) or (N, J'), m.
         prior_weight: weight of the body's soft prior.
         free_dofs: degrees of freedom that may change; all when None.
+        along_rays: a target stands for its ray: only the distance of the joint to it counts, not
+            how far away it is.
+        max_iterations: at most.
+        tolerance: decrease of the energy below which it is enough.
     """
     skeleton = body.skeleton
     names = skeleton.joint_names if joint_names is None else tuple(joint_names)
@@ -66,13 +72,17 @@ def solve_joint_positions(
         limits_low[:, frozen] = limits_high[:, frozen] = start[:, frozen]
     segments = np.repeat(skeleton.joint_segments[which], 3)
     offsets = skeleton.joint_offsets[which]
-    axes = np.tile(np.eye(3), (len(which), 1))
+    axes = np.tile(np.eye(3), (len(goal), len(which), 1, 1))
+    if along_rays:
+        rays = goal / np.maximum(np.linalg.norm(goal, axis=2, keepdims=True), 1e-12)
+        axes -= rays[..., :, None] * rays[..., None, :]
 
     def energy(x: Array, problem: Index) -> tuple[Array, Array, Array]:
         frames = forward(skeleton, x)
         joints = frames.points(skeleton.joint_segments[which], offsets)
         w = weight[problem].T
-        error = joints - goal[problem].transpose(1, 2, 0)
+        across = axes[problem].transpose(1, 2, 3, 0)
+        error = np.einsum('jikn,jkn->jin', across, joints - goal[problem].transpose(1, 2, 0))
         value = 0.5 * np.einsum('jn,jin,jin->n', w, error, error)
         weights = np.repeat(w, 3, axis=0)
         gradient, hessian = assemble(
@@ -80,7 +90,7 @@ def solve_joint_positions(
             *segment_sums(
                 segments,
                 np.repeat(joints, 3, axis=0),
-                np.broadcast_to(axes[:, :, None], (*axes.shape, len(x))),
+                across.reshape(-1, 3, len(x)),
                 weights * error.reshape(-1, len(x)),
                 weights,
                 len(skeleton.parents),
@@ -95,5 +105,5 @@ def solve_joint_positions(
     return minimise(
         energy, start, limits_low, limits_high,
         step_scale=np.where(skeleton.dof_is_rotation, 0.5, 0.3),
-        damping=1.0, max_iterations=max_iterations,
+        damping=1.0, max_iterations=max_iterations, tolerance=tolerance,
     )  # fmt: skip

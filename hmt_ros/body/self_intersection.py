@@ -6,6 +6,7 @@ that connects the axes where they are nearest; the overlap is penalised quadrati
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -32,12 +33,14 @@ class _Axes(NamedTuple):
         centres: (B, 3) of the axes in the segments' frames, m.
         halves: (B,) half lengths of the axes, m.
         radii: (B, 3) along x, y and, for the caps, z, m.
+        reaches: (B,) from the middle to the farthest point, m.
     """
 
     segments: NDArray[np.int64]
     centres: Array
     halves: Array
     radii: Array
+    reaches: Array
 
 
 def self_intersection_energy(
@@ -62,16 +65,76 @@ def self_intersection_energy(
     return value, gradient, hessian
 
 
+def deepest_overlaps(
+    body: Body,
+    columns: Array,
+    origins: Array,
+    rows: Index,
+    segments: Collection[int],
+    other_rows: Index,
+    other_segments: Collection[int],
+) -> Array:
+    """By how much parts on some segments of a pose overlap parts on others of another pose.
+
+    Limbs whose trunks are alike are so compared without a pose for each of their combinations.
+
+    Args:
+        body: whose parts; neighbours along the skeleton are left out.
+        columns, origins: (N, S, 3, 3), (N, S, 3) of N poses, as `Frames.by_pose` gives them.
+        rows, other_rows: (M,) poses that are compared.
+        segments: of the first pose.
+        other_segments: of the second.
+
+    Returns:
+        (M,) the largest overlap of two parts, m; at least 0.
+    """
+    first, second = _pairs(body)
+    carrier = np.array([p.segment for p in body.flesh.parts], dtype=np.intp)
+    one, two = np.isin(carrier, list(segments)), np.isin(carrier, list(other_segments))
+    straight, turned = one[first] & two[second], one[second] & two[first]
+    # A pair whose parts are on both sides either way is looked at both ways, if poses differ.
+    pairs = np.concatenate(
+        [
+            np.stack([first, second], axis=1)[straight],
+            np.stack([second, first], axis=1)[turned],
+        ]
+    )
+    result = np.zeros(len(rows))
+    _deepest(_axes_of(body), pairs, columns, origins, rows, other_rows, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _deepest(parts, pairs, columns, origins, rows, other_rows, result):  # type: ignore[no-untyped-def]
+    """Fills the largest overlaps of all pairs of parts."""
+    centres = np.empty((len(columns), len(parts.segments), 3))
+    for n in range(len(columns)):
+        _place_centres(parts, columns[n], origins[n], centres[n])
+    for m in range(len(rows)):
+        a, b = rows[m], other_rows[m]
+        for pair in range(len(pairs)):
+            i, j = pairs[pair, 0], pairs[pair, 1]
+            gap = 0.0
+            for x in range(3):
+                gap += (centres[a, i, x] - centres[b, j, x]) ** 2
+            if gap > (parts.reaches[i] + parts.reaches[j]) ** 2:
+                continue
+            found = _overlap(parts, i, j, columns[a], origins[a], columns[b], origins[b])
+            result[m] = max(result[m], found[9])
+
+
 @lru_cache(maxsize=64)
 def _axes_of(body: Body) -> _Axes:
     parts = body.flesh.parts
     radii = np.array([p.radii for p in parts]).reshape(-1, 3)
     mean = radii[:, :2].mean(1)
+    halves = np.maximum(radii[:, 2] - mean, 0.0)
     return _Axes(
         np.array([p.segment for p in parts], dtype=np.int64),
         np.array([p.centre for p in parts]).reshape(-1, 3),
-        np.maximum(radii[:, 2] - mean, 0.0),
+        halves,
         np.column_stack([radii[:, :2], mean]),
+        halves + radii[:, :2].max(1, initial=0.0),
     )
 
 
@@ -101,18 +164,19 @@ def _pairs(body: Body) -> tuple[Index, Index]:
     columns, origins = forward(body.skeleton, rest[None]).by_pose()
     axes = _axes_of(body)
     apart = [
-        _overlap(axes, i, j, columns[0], origins[0])[9] < TOLERANCE
+        _overlap(axes, i, j, columns[0], origins[0], columns[0], origins[0])[9] < TOLERANCE
         for i, j in zip(first, second, strict=True)
     ]
     return first[apart], second[apart]
 
 
 @njit(cache=True, nogil=True)
-def _overlap(parts, i, j, columns, origins):  # type: ignore[no-untyped-def]
+def _overlap(parts, i, j, columns, origins, others, starts):  # type: ignore[no-untyped-def]
     """Nearest points p and q of the axes of two parts, the direction between, and the overlap.
 
-    The axes are middle + s axis, s in [-1, 1]; all ten numbers are scalars, as small arrays would
-    cost more than the arithmetic.
+    The first part is placed by columns and origins, the second by others and starts. The axes are
+    middle + s axis, s in [-1, 1]; all ten numbers are scalars, as small arrays would cost more than
+    the arithmetic.
     """
     a, b = parts.segments[i], parts.segments[j]
     c0 = c1 = c2 = e0 = e1 = e2 = 0.0
@@ -120,14 +184,14 @@ def _overlap(parts, i, j, columns, origins):  # type: ignore[no-untyped-def]
         c0 += columns[a, k, 0] * parts.centres[i, k]
         c1 += columns[a, k, 1] * parts.centres[i, k]
         c2 += columns[a, k, 2] * parts.centres[i, k]
-        e0 += columns[b, k, 0] * parts.centres[j, k]
-        e1 += columns[b, k, 1] * parts.centres[j, k]
-        e2 += columns[b, k, 2] * parts.centres[j, k]
+        e0 += others[b, k, 0] * parts.centres[j, k]
+        e1 += others[b, k, 1] * parts.centres[j, k]
+        e2 += others[b, k, 2] * parts.centres[j, k]
     c0, c1, c2 = c0 + origins[a, 0], c1 + origins[a, 1], c2 + origins[a, 2]
-    e0, e1, e2 = e0 + origins[b, 0], e1 + origins[b, 1], e2 + origins[b, 2]
+    e0, e1, e2 = e0 + starts[b, 0], e1 + starts[b, 1], e2 + starts[b, 2]
     h, g = parts.halves[i], parts.halves[j]
     u0, u1, u2 = columns[a, 2, 0] * h, columns[a, 2, 1] * h, columns[a, 2, 2] * h
-    v0, v1, v2 = columns[b, 2, 0] * g, columns[b, 2, 1] * g, columns[b, 2, 2] * g
+    v0, v1, v2 = others[b, 2, 0] * g, others[b, 2, 1] * g, others[b, 2, 2] * g
     w0, w1, w2 = c0 - e0, c1 - e1, c2 - e2
     uu = u0 * u0 + u1 * u1 + u2 * u2
     uv = u0 * v0 + u1 * v1 + u2 * v2
@@ -144,14 +208,41 @@ def _overlap(parts, i, j, columns, origins):  # type: ignore[no-untyped-def]
     away = max(distance, SMALL)
     d0, d1, d2 = d0 / away, d1 / away, d2 / away
     reach = 0.0
-    for part, segment in ((i, a), (j, b)):
-        total = 0.0
-        for k in range(3):
-            x = columns[segment, k, 0] * d0 + columns[segment, k, 1] * d1
-            x = (x + columns[segment, k, 2] * d2) * parts.radii[part, k]
-            total += x * x
-        reach += np.sqrt(total)
+    total = 0.0
+    for k in range(3):
+        x = columns[a, k, 0] * d0 + columns[a, k, 1] * d1
+        x = (x + columns[a, k, 2] * d2) * parts.radii[i, k]
+        total += x * x
+    reach += np.sqrt(total)
+    total = 0.0
+    for k in range(3):
+        x = others[b, k, 0] * d0 + others[b, k, 1] * d1
+        x = (x + others[b, k, 2] * d2) * parts.radii[j, k]
+        total += x * x
+    reach += np.sqrt(total)
     return p0, p1, p2, q0, q1, q2, d0, d1, d2, reach - distance
+
+
+@njit(cache=True, nogil=True)
+def _place_centres(parts, columns, origins, centres):  # type: ignore[no-untyped-def]
+    """Fills the middles (B, 3) of the parts in the camera frame."""
+    for i in range(len(parts.segments)):
+        s = parts.segments[i]
+        for x in range(3):
+            total = origins[s, x]
+            for k in range(3):
+                total += columns[s, k, x] * parts.centres[i, k]
+            centres[i, x] = total
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _far(parts, i, j, centres):  # type: ignore[no-untyped-def]
+    """Whether two parts are too far from each other to overlap by more than is tolerated."""
+    x = centres[i, 0] - centres[j, 0]
+    y = centres[i, 1] - centres[j, 1]
+    z = centres[i, 2] - centres[j, 2]
+    reach = parts.reaches[i] + parts.reaches[j] - TOLERANCE
+    return x * x + y * y + z * z > reach * reach
 
 
 @njit(cache=True, nogil=True)
@@ -162,11 +253,15 @@ def _add_overlaps(  # type: ignore[no-untyped-def]
     """Adds energy, gradient and Gauss-Newton Hessian of all pairs that overlap, pose by pose."""
     d = dof_axes.shape[1]
     row = np.zeros(d)
+    centres = np.empty((len(parts.segments), 3))
     for n in range(len(value)):
+        _place_centres(parts, columns[n], origins[n], centres)
         for pair in range(len(first)):
             i, j = first[pair], second[pair]
+            if _far(parts, i, j, centres):
+                continue
             p0, p1, p2, q0, q1, q2, d0, d1, d2, depth = _overlap(
-                parts, i, j, columns[n], origins[n]
+                parts, i, j, columns[n], origins[n], columns[n], origins[n]
             )
             overlap = (depth - TOLERANCE) / sigma
             if overlap <= 0.0:

@@ -179,17 +179,17 @@ class ImageLikelihood:
         if explained is None:
             explained = np.full((1, samples), np.inf)
         own = np.full(n, -1) if which is None else which
-        columns, origins = frames.by_pose()
-        placement = Placement(columns, origins, *frames.dofs_by_pose())
         textures = textures or no_textures()
+        if any(term.weight > 0 for term in terms):
+            placement = Placement(*frames.by_pose(), *frames.dofs_by_pose())
 
-        def work(first: int, last: int) -> None:
-            add_energies(
-                first, last, self._model, terms, evidence, textures, own, placement, explained,
-                energies, costs, gradient, hessian,
-            )  # fmt: skip
+            def work(first: int, last: int) -> None:
+                add_energies(
+                    first, last, self._model, terms, evidence, textures, own, placement, explained,
+                    energies, costs, gradient, hessian,
+                )  # fmt: skip
 
-        _in_threads(work, n)
+            _in_threads(work, n)
         result = {
             name: energies[:, i] for i, name in enumerate(TERMS) if getattr(terms, name).weight > 0
         }

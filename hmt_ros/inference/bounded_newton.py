@@ -17,7 +17,8 @@ from enum import IntEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg.lapack import dposv
+
+from hmt_ros.inference.box_step import DAMPING_LIMIT, box_steps
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -25,8 +26,6 @@ Index = NDArray[np.intp]
 # objective(x (n, d), problem (n,)) -> value (n,), gradient (n, d), Hessian (n, d, d); `problem`
 # says which of the N problems each row belongs to, as converged ones are left out.
 Objective = Callable[[Array, Index], tuple[Array, Array, Array]]
-
-DAMPING_LIMIT = 1e12
 
 
 class Status(IntEnum):
@@ -101,9 +100,8 @@ def minimise(
         if len(active) == 0:
             break
         start, low, high = x[active], lower[active], upper[active]
-        step, predicted = _steps(
-            start, gradient[active], hessian[active], low, high, lam[active], metric
-        )
+        step, predicted = np.empty_like(start), np.empty(len(active))
+        box_steps(x, gradient, hessian, lower, upper, lam, metric, active, step, predicted)
         done = predicted < tolerance
         if done.any():
             status[active[done]] = Status.CONVERGED
@@ -146,101 +144,3 @@ def _resting(x: Array, gradient: Array, lower: Array, upper: Array) -> NDArray[n
     """Variables on a limit with a gradient that pushes them outwards."""
     result: NDArray[np.bool_] = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
     return result
-
-
-def _steps(
-    x: Array, gradient: Array, hessian: Array, lower: Array, upper: Array, lam: Array, metric: Array
-) -> tuple[Array, Array]:
-    """Damped Newton steps, projected onto the box, and the decrease that the model predicts."""
-    low, high = lower - x, upper - x
-    resting = _resting(x, gradient, lower, upper)
-    step = -gradient
-    damped = hessian.copy()
-    damped.reshape(len(x), -1)[:, :: x.shape[1] + 1] += lam[:, None] * metric
-    # Most steps stay inside the box; only the others need an active set.
-    inside = np.logical_not(resting.any(axis=1))
-    for i in np.flatnonzero(inside):
-        _, step[i], info = dposv(damped[i], step[i], overwrite_a=True)
-        inside[i] = info == 0
-    inside &= ((step >= low) & (step <= high)).all(1)
-    for i in np.flatnonzero(~inside):
-        step[i], lam[i] = _box_step(gradient[i], hessian[i], low[i], high[i], lam[i], metric)
-    curvature = np.einsum('ni,nij,nj->n', step, hessian, step)
-    predicted = -(np.einsum('ni,ni->n', gradient, step) + 0.5 * curvature)
-    for k in np.flatnonzero(predicted <= 0):
-        downhill = np.where(resting[k], 0.0, -gradient[k])
-        step[k], predicted[k] = _gradient_step(
-            x[k], downhill, hessian[k], lower[k], upper[k], metric
-        )
-    return step, predicted
-
-
-def _box_step(
-    gradient: Array, hessian: Array, low: Array, high: Array, shift: float, metric: Array
-) -> tuple[Array, float]:
-    """Minimiser of the damped quadratic model in the box low <= step <= high, and the damping used.
-
-    An active set: what the step on the free variables drives across a limit is put on it, the
-    others are solved again, and what pulls away from its limit is set free.
-    """
-    bound = ((low >= 0) & (gradient > 0)) | ((high <= 0) & (gradient < 0))
-    step = np.where(bound, np.clip(0.0, low, high), 0.0)
-    diagonal = np.arange(len(gradient))
-    best, best_gain = np.zeros_like(step), -np.inf
-    for _ in range(3 * len(gradient) + 3):
-        free, held = ~bound, bool(bound.any())
-        while True:
-            damped = hessian.copy()
-            damped[diagonal, diagonal] += shift * metric
-            right = -gradient
-            if held:
-                right = right - damped[:, bound] @ step[bound]
-                right[bound] = 0.0
-                damped[bound] = 0.0
-                damped[:, bound] = 0.0
-                damped[diagonal[bound], diagonal[bound]] = 1.0
-            _, solution, info = dposv(damped, right, overwrite_a=True)
-            if info == 0 or shift > DAMPING_LIMIT:
-                break
-            # Not positive definite: the least shift that Gershgorin asks for is far too careful.
-            shift = max(4.0 * shift, 1e-3 * float(np.abs(hessian).max() / metric.min()))
-        step = np.where(free, solution, step)
-        across = free & ((step < low) | (step > high))
-        if not held and not across.any():
-            return step, shift
-        step = np.clip(step, low, high)
-        slope = gradient + hessian @ step
-        gain = -float(gradient @ step + 0.5 * step @ (slope - gradient))
-        if gain > best_gain:
-            best, best_gain = step, gain
-        if across.any():
-            bound = bound | across
-            continue
-        slope = slope + shift * metric * step
-        away = bound & (low < high)
-        away &= ((step <= low) & (slope < 0)) | ((step >= high) & (slope > 0))
-        if not away.any():
-            return step, shift
-        bound = bound.copy()
-        bound[np.argmax(np.where(away, np.abs(slope), -1.0))] = False
-    return best, shift
-
-
-def _gradient_step(
-    x: Array, downhill: Array, hessian: Array, lower: Array, upper: Array, metric: Array
-) -> tuple[Array, float]:
-    """A step that gains where the projection onto the box has spoilt the Newton step.
-
-    Steepest descent in the metric, projected, with the length that the quadratic model asks for.
-    """
-    direction = downhill / metric
-    curvature = float(direction @ hessian @ direction)
-    slope = float(direction @ downhill)
-    length = slope / curvature if curvature > 0 else 1.0
-    for _ in range(60):
-        step = np.clip(x + length * direction, lower, upper) - x
-        gain = float(downhill @ step) - 0.5 * float(step @ hessian @ step)
-        if gain > 0 or slope <= 0:
-            break
-        length *= 0.5
-    return step, gain

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.distinct_poses import distinct_poses
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.tracking.proposals import chain_dofs
@@ -79,41 +79,16 @@ def distinct_alternatives(
     moved = _chain_joints(skeleton, chain)
     frames = forward(skeleton, poses)
     joints = frames.points(skeleton.joint_segments[moved], skeleton.joint_offsets[moved])
-    result = np.array(penalties, dtype=np.float64, order='C')
-    kept = _merge(joints, result, float(apart), int(most))
-    return Alternatives(chain, angles[kept], result[:, kept])
+    kept, owner = distinct_poses(joints.transpose(2, 0, 1), apart, most)
+    least = np.full((len(kept), len(penalties)), np.inf)
+    np.minimum.at(least, owner[owner >= 0], penalties[:, owner >= 0].T)
+    return Alternatives(chain, angles[kept], np.ascontiguousarray(least.T))
 
 
 @lru_cache(maxsize=256)
 def _chain_joints(skeleton: Skeleton, chain: str) -> Index:
     """The joints that the segments of a chain carry."""
     return np.flatnonzero(np.isin(skeleton.joint_segments, skeleton.chains[chain]))
-
-
-@njit(cache=True, nogil=True)
-def _merge(joints, penalties, apart, most):  # type: ignore[no-untyped-def]
-    """Which of the A configurations with joints (P, 3, A) stay; lowers their penalties (G, A)."""
-    kept, count = np.empty(joints.shape[2], dtype=np.int64), 0
-    for i in range(joints.shape[2]):
-        nearest, least = -1, apart
-        for place in range(count):
-            k = kept[place]
-            gap = 0.0
-            for j in range(joints.shape[0]):
-                x = joints[j, 0, k] - joints[j, 0, i]
-                y = joints[j, 1, k] - joints[j, 1, i]
-                z = joints[j, 2, k] - joints[j, 2, i]
-                gap = max(gap, x * x + y * y + z * z)
-            gap = np.sqrt(gap)
-            if gap < least:
-                nearest, least = k, gap
-        if nearest >= 0:
-            for g in range(len(penalties)):
-                penalties[g, nearest] = min(penalties[g, nearest], penalties[g, i])
-        elif count < most:
-            kept[count] = i
-            count += 1
-    return kept[:count]
 
 
 def best_combinations(

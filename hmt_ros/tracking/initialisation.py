@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.distinct_poses import distinct_poses
 from hmt_ros.body.interpretation_tree import enumerate_flips
 from hmt_ros.body.kinematics import forward, joint_length_jacobians, point_jacobians
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
@@ -255,15 +256,7 @@ def _distinct(solved: Minimum, body: Body, count: int) -> Minimum:
     """The best minima whose joints differ by more than 3 cm somewhere."""
     order = np.argsort(solved.value, kind='stable')
     order = order[np.isfinite(solved.value[order])]
-    joints = body.joint_positions(solved.x)
-    kept: list[int] = []
-    for i in order:
-        gaps = [np.linalg.norm(joints[i] - joints[j], axis=1).max() for j in kept]
-        if not gaps or min(gaps) > 0.03:
-            kept.append(int(i))
-        if len(kept) == count:
-            break
-    k = np.array(kept, dtype=np.intp)
+    k = order[distinct_poses(body.joint_positions(solved.x[order]), 0.03, count).kept]
     return Minimum(
         solved.x[k], solved.value[k], solved.gradient[k], solved.hessian[k], solved.free[k],
         solved.status[k], solved.iterations[k],

@@ -186,3 +186,24 @@ def test_what_does_not_fit_is_refused(small):
         solve_joint_positions(small, pose, joints[:, :1], ['tail'])
     with pytest.raises(KeyError, match='no degree of freedom'):
         solve_joint_positions(small, pose, joints, free_dofs=['tail'])
+
+
+def test_targets_along_rays_leave_the_distance_free():
+    """The joints come onto the rays; how far away they are does not count."""
+    body = load_body('human34')
+    start = np.tile(body.prior_mean, (4, 1))
+    start[:, :3] = [0.0, 0.1, 3.0]
+    rng = np.random.default_rng(0)
+    goal = np.clip(start + 0.1 * rng.normal(size=start.shape), body.lower, body.upper)
+    names = ('left_knee', 'left_ankle', 'right_wrist', 'head')
+    which = body.skeleton.joint_index(names)
+    seen = body.joint_positions(goal)[:, which]
+    nearer = seen * rng.uniform(0.5, 2.0, (4, 4, 1))
+    found, same = (
+        solve_joint_positions(body, start, x, names, along_rays=True, prior_weight=1e-6).x
+        for x in (seen, nearer)
+    )
+    joints = body.joint_positions(found)[:, which]
+    rays = seen / np.linalg.norm(seen, axis=2, keepdims=True)
+    assert np.linalg.norm(np.cross(joints, rays), axis=2).max() < 1e-4
+    assert np.abs(same - found).max() < 1e-6

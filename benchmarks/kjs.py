@@ -1,0 +1,372 @@
+"""kjs: kinematic jumps against random sampling at finding minima, Table 1 of KJS."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.clips import rounded, table
+from benchmarks.machine import description, dgemm_rate, on_machine
+from hmt_ros.body import Body, Camera, enumerate_flips, load_body
+from hmt_ros.body.distinct_poses import distinct_poses
+from hmt_ros.body.flip_products import full_body_flips
+from hmt_ros.body.interpretation_tree import flip_counts
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.self_intersection import self_intersection_energy
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
+from hmt_ros.image.observation import Keypoints, Observation
+from hmt_ros.inference.bounded_newton import Minimum, Status, minimise
+from hmt_ros.tracking.proposals import covariance_scaled_samples, spherical_samples
+
+Array = NDArray[np.float64]
+
+CAMERA = Camera(1000.0, 1000.0, 480.0, 360.0, 960, 720)
+DISTANCE = 3.0  # m, of the pelvis
+SIGMA = 1.0  # px, of an image joint
+# The soft prior only holds what the image leaves open, as the stabilisers of the paper do.
+PRIOR_WEIGHT = 0.01
+OUT_OF_PLANE = np.radians(10.0)
+DRAWN = 20_000  # poses from which the one of the table is chosen
+FRONTAL = 20  # poses that are taken as they are drawn
+APART = 0.01  # m: minima of which no joint differs by as much are one
+ALIKE = 10.0  # nats above the start, within which a minimum explains the image as well
+ITERATIONS = 200
+RUNS = 3  # of each row, for the CPU time
+COUNTS = ('samples', 'unconverged', 'minima', 'alike')
+RATIOS = ('minima_per_sample', 'alike_per_sample', 'minima_per_cpu_s')
+SCALES = (1.0, 4.0, 8.0, 16.0, 0.0)  # 0: Cauchy tails
+MOST_LEAVES = 4000
+PARTITIONS: dict[str, tuple[str, ...] | None] = {
+    'both arms, left calf': ('left_arm', 'right_arm', 'left_leg'),
+    'both calves, right arm': ('left_leg', 'right_leg', 'right_arm'),
+    'four limbs and neck': ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck'),
+    'full body': None,  # torso, limbs and neck
+}
+LINKS = (
+    ('shoulder', 'elbow'), ('elbow', 'wrist'), ('wrist', 'hand'),
+    ('hip', 'knee'), ('knee', 'ankle'), ('ankle', 'toe'),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """A person before a camera, the joints in the image, and the minimum that sampling starts from.
+
+    Attributes:
+        body: of the person.
+        energy: value, gradient and Hessian at poses.
+        start: the minimum next to the true pose.
+        covariance: (d, d) inverse Hessian there.
+    """
+
+    body: Body
+    energy: Callable[[Array, Any], tuple[Array, Array, Array]]
+    start: Minimum
+    covariance: Array
+
+    @property
+    def pose(self) -> Array:
+        """Of the start, (d,)."""
+        result: Array = self.start.x[0]
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Samples before and after optimisation.
+
+    Attributes:
+        sampler, scale: what they are of.
+        raw: (N, d) as they were drawn.
+        costs: (N,) of those, above the start.
+        optimised: what came of them.
+        minima: indices of the distinct minima, best first.
+        drawing, optimising: CPU time, s.
+    """
+
+    sampler: str
+    scale: str
+    raw: Array
+    costs: Array
+    optimised: Minimum
+    minima: NDArray[np.intp]
+    drawing: float
+    optimising: float
+
+
+def main(argv: list[str]) -> int:
+    """Runs the benchmark."""
+    parser = argparse.ArgumentParser(prog='python -m benchmarks kjs', description=__doc__)
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser.add_argument('--samples', type=int, default=2000, help='random samples a row')
+    parser.add_argument('--frontal', type=int, default=FRONTAL, help='poses taken as drawn')
+    parser.add_argument('--seed', type=int, default=0, help='of the random samples')
+    options = parser.parse_args(argv)
+    result = measure(options.samples, options.frontal, options.seed)
+    print(json.dumps(rounded(result), indent=1) if options.json else as_text(result))
+    return 0
+
+
+def page() -> str:
+    """The part of the documentation that this benchmark writes."""
+    result = measure()
+    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
+
+
+def measure(count: int = 2000, frontal: int = FRONTAL, seed: int = 0) -> dict[str, Any]:
+    """All rows of the table at one pose, and kinematic jumps at others."""
+    body = load_body('human34')
+    setting = setting_of(body, chosen_pose(body))
+    # Compiled code is read before anything is timed.
+    for found in all_samples(setting, 4, seed):
+        row(setting, found)
+    rows = [row(setting, found) for found in all_samples(setting, count, seed)]
+    return {
+        'machine': description(),
+        'dgemm_gflops': dgemm_rate() / 1e9,
+        'trees': {
+            chain: int(flip_counts(body, setting.start.x, chain)[0]) for chain in body.chains
+        },
+        'rows': rows,
+        'ratios': ratios(rows),
+        'frontal': frontal_rows(body, frontal),
+    }
+
+
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+    """Tables for people."""
+    head = [
+        'sampler', 'scale', *COUNTS, 'distance', 'optimised', 'deviations', 'optimised',
+        'cost', 'optimised', 'CPU s', 'minima / s',
+    ]  # fmt: skip
+    rows = [head]
+    for r in result['rows']:
+        pairs = [f'{r[name][i]:.{digits}f}' for name, digits in (('distance', 2), ('deviations', 1))
+                 for i in (0, 1)]  # fmt: skip
+        costs = [f'{abs(cost):.3f}' if cost < 10 else f'{cost:.0f}' for cost in r['cost']]
+        rows.append(
+            [r['sampler'], r['scale'], *(str(r[x]) for x in COUNTS), *pairs,
+             *costs, f'{r["cpu_s"]:.2f}', f'{r["minima_per_cpu_s"]:.0f}']
+        )  # fmt: skip
+    ratios = [['kinematic jumps', 'minima per sample', 'alike', 'minima per CPU s', 'raw cost']]
+    ratios += [
+        [name, *(f'{r[x]:.1f}' for x in RATIOS), f'{r["cost"]:.2g}']
+        for name, r in result['ratios'].items()
+    ]
+    others = [['frontal poses as drawn', 'poses', 'leaves', 'minima', 'share', 'least', 'most']]
+    others += [
+        [r['sampler'], str(r['poses']), str(r['leaves']), str(r['minima']),
+         *(f'{100 * r[key]:.0f} %' for key in ('share', 'least', 'most'))]
+        for r in result['frontal']
+    ]  # fmt: skip
+    trees = ', '.join(f'{chain} {count}' for chain, count in result['trees'].items())
+    parts = [
+        table(rows, left=2, markdown=markdown),
+        'Against the best row of CSS; raw cost: of CSS and SS:',
+        table(ratios, markdown=markdown),
+        table(others, markdown=markdown),
+        f'Leaves of the chains at the start: {trees}. dgemm: {result["dgemm_gflops"]:.1f} GF/s.',
+    ]
+    return '\n\n'.join(parts)
+
+
+def all_samples(setting: Setting, count: int, seed: int) -> Iterator[Samples]:
+    """Kinematic jumps over all partitions, then random samples of all widths."""
+    for name in PARTITIONS:
+        yield kinematic_jumps(setting, name)
+    body, mean, covariance = setting.body, setting.start.x, setting.covariance[None]
+    for sampler, draw in (('CSS', covariance_scaled_samples), ('SS', spherical_samples)):
+        for scale in SCALES:
+            drawing = partial(draw, body, mean, covariance, count, scale)
+            yield sampled(
+                setting, sampler, f'{scale:.0f}' if scale else 'Cauchy',
+                lambda d=drawing: d(np.random.default_rng(seed))[0],
+            )  # fmt: skip
+
+
+def kinematic_jumps(setting: Setting, name: str) -> Samples:
+    """All leaves of the product of the trees of some chains; of the whole body the most probable.
+
+    Nothing is pruned but by the limits, as the optimiser is to say what is a minimum.
+    """
+    chains = PARTITIONS[name]
+
+    def draw() -> Array:
+        if chains is not None:
+            return enumerate_flips(setting.body, CAMERA, setting.pose, chains)[0]
+        product = full_body_flips(setting.body, setting.pose, most_overlap=np.inf)
+        return product.most_probable(MOST_LEAVES).poses
+
+    return sampled(setting, name, '', draw)
+
+
+def sampled(setting: Setting, sampler: str, scale: str, draw: Callable[[], Array]) -> Samples:
+    """Draws samples and optimises them, some times over, of which the fastest counts."""
+    times = []
+    for _ in range(RUNS):
+        start = time.process_time()
+        raw = draw()
+        drawn = time.process_time()
+        optimised = optimise(setting.body, setting.energy, raw)
+        times.append((drawn - start, time.process_time() - drawn))
+    drawing, optimising = min(times, key=sum)
+    costs = setting.energy(raw, None)[0] - setting.start.value[0]
+    return Samples(
+        sampler, scale, raw, costs, optimised, minima_of(setting.body, optimised), drawing,
+        optimising,
+    )  # fmt: skip
+
+
+def minima_of(body: Body, optimised: Minimum) -> NDArray[np.intp]:
+    """The distinct minima among poses that have converged, best first."""
+    order = np.argsort(optimised.value, kind='stable')
+    order = order[optimised.status[order] == Status.CONVERGED]
+    return order[distinct_poses(body.joint_positions(optimised.x[order]), APART).kept]
+
+
+def row(setting: Setting, found: Samples) -> dict[str, Any]:
+    """What the table says about samples; medians of raw and of optimised ones."""
+    joints = setting.body.joint_positions(found.optimised.x[np.argsort(found.optimised.value)])
+    optimised = found.optimised.value - setting.start.value[0]
+    converged = found.optimised.status == Status.CONVERGED
+    distances = [distances_from(setting, x) for x in (found.raw, found.optimised.x[converged])]
+    seconds = found.drawing + found.optimising
+    return {
+        'sampler': found.sampler,
+        'scale': found.scale,
+        'samples': len(found.raw),
+        'minima': len(found.minima),
+        'distinct_with_unconverged': len(distinct_poses(joints, APART).kept),
+        'alike': int((optimised[found.minima] < ALIKE).sum()),
+        'unconverged': int((~converged).sum()),
+        'distance': [float(np.median(d)) for d, _ in distances],
+        'deviations': [float(np.median(m)) for _, m in distances],
+        'cost': [float(np.median(found.costs)), float(np.median(optimised[converged]))],
+        'evaluations': int(found.optimised.iterations.sum()),
+        'drawing_cpu_s': found.drawing,
+        'cpu_s': seconds,
+        'minima_per_sample': len(found.minima) / len(found.raw),
+        'alike_per_sample': (optimised[found.minima] < ALIKE).sum() / len(found.raw),
+        'minima_per_cpu_s': len(found.minima) / seconds,
+    }
+
+
+def distances_from(setting: Setting, poses: Array) -> tuple[Array, Array]:
+    """Distances (N,) of poses from the start: m and rad together, and standard deviations."""
+    offset = poses - setting.pose
+    turns = setting.body.skeleton.dof_is_rotation
+    offset[:, turns] -= 2 * np.pi * np.round(offset[:, turns] / (2 * np.pi))
+    mahalanobis = np.einsum('ni,ij,nj->n', offset, setting.start.hessian[0], offset)
+    return np.linalg.norm(offset, axis=1), np.sqrt(mahalanobis)
+
+
+def ratios(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Rows of kinematic jumps against the best of CSS in each column; in cost, of SS too."""
+    jumps = [r for r in rows if not r['scale']]
+    spread = [r for r in rows if r['sampler'] == 'CSS']
+    random = [r for r in rows if r['scale']]
+    return {
+        r['sampler']: {
+            **{key: r[key] / max(max(x[key] for x in spread), 1e-9) for key in RATIOS},
+            'cost': r['cost'][0] / min(x['cost'][0] for x in random),
+        }
+        for r in jumps
+    }
+
+
+def frontal_rows(body: Body, count: int) -> list[dict[str, Any]]:
+    """Distinct minima of kinematic jumps at poses of the prior, whatever their links."""
+    poses = drawn_poses(body)[:count]
+    rows = []
+    for name in PARTITIONS:
+        leaves, minima = [], []
+        for pose in poses:
+            found = kinematic_jumps(setting_of(body, pose), name)
+            leaves.append(len(found.raw))
+            minima.append(len(found.minima))
+        shares = np.array(minima) / np.array(leaves)
+        rows.append(
+            {
+                'sampler': name,
+                'poses': len(poses),
+                'leaves': sum(leaves),
+                'minima': sum(minima),
+                'share': sum(minima) / sum(leaves),
+                'least': float(shares.min()),
+                'most': float(shares.max()),
+            }
+        )
+    return rows
+
+
+def setting_of(body: Body, pose: Array) -> Setting:
+    """The joints of a pose as the camera sees them, and the minimum next to it."""
+    pixels = CAMERA.project(body.joint_positions(pose[None]))[0]
+    n = len(pixels)
+    keypoints = Keypoints(
+        body.joint_names, pixels, np.tile(SIGMA**2 * np.eye(2), (n, 1, 1)), np.ones(n)
+    )
+    settings = LikelihoodSettings(joints=TermSettings(1.0, 1.0, np.inf), prior_weight=PRIOR_WEIGHT)
+    likelihood = ImageLikelihood(body, CAMERA, settings)
+    observation = Observation(keypoints=keypoints)
+
+    def energy(x: Array, _: Any) -> tuple[Array, Array, Array]:
+        return likelihood.energy(x, observation)
+
+    start = optimise(body, energy, pose[None])
+    return Setting(body, energy, start, np.linalg.inv(start.hessian[0]))
+
+
+def optimise(body: Body, energy: Any, poses: Array) -> Minimum:
+    """Minima next to poses (N, d), within the limits."""
+    return minimise(
+        energy, poses, body.lower, body.upper,
+        step_scale=np.where(body.skeleton.dof_is_rotation, 0.4, 0.3),
+        damping=1e-3, max_iterations=ITERATIONS, tolerance=1e-8,
+    )  # fmt: skip
+
+
+def drawn_poses(body: Body, count: int = DRAWN) -> Array:
+    """Poses (n, d) of the prior that face the camera and in which no parts intersect."""
+    rng = np.random.default_rng(0)
+    sigma = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 0.0)
+    poses = body.prior_mean + sigma * rng.normal(size=(count, body.dimension))
+    poses = np.clip(poses, body.lower, body.upper)
+    poses[:, body.skeleton.dof_index(['root_tx', 'root_ty', 'root_tz'])] = 0.0, 0.1, DISTANCE
+    poses[:, body.dof_names.index('root_z')] = 0.0
+    overlap, _, _ = self_intersection_energy(body, forward(body.skeleton, poses))
+    return poses[overlap == 0.0]
+
+
+def chosen_pose(body: Body) -> Array:
+    """The pose of the table.
+
+    Of those drawn whose links all leave the image plane, the one with most leaves.
+    """
+    poses = drawn_poses(body)
+    poses = poses[out_of_plane(body, poses) > OUT_OF_PLANE]
+    leaves = np.prod([flip_counts(body, poses, chain) for chain in body.chains], axis=0)
+    result: Array = poses[np.argmax(leaves)]
+    return result
+
+
+def out_of_plane(body: Body, poses: Array) -> Array:
+    """The least angle (N,) between a link of the limbs and the plane across its ray, rad."""
+    joints = body.joint_positions(poses)
+    angles = []
+    for side in ('left', 'right'):
+        for names in LINKS:
+            a, b = body.skeleton.joint_index([f'{side}_{name}' for name in names])
+            link, ray = joints[:, b] - joints[:, a], joints[:, b]
+            sine = (link * ray).sum(1) / np.linalg.norm(link, axis=1) / np.linalg.norm(ray, axis=1)
+            angles.append(np.abs(np.arcsin(sine)))
+    least: Array = np.min(angles, axis=0)
+    return least

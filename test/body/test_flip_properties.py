@@ -1,0 +1,187 @@
+"""What holds for every leaf, of one chain and of the whole body, at poses that hypothesis draws."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from hmt_ros.body import Body, load_body
+from hmt_ros.body.flip_products import full_body_flips
+from hmt_ros.body.interpretation_tree import enumerate_flips
+
+BODY = load_body('human34')
+NAMES = BODY.dof_names
+LIMITED = np.minimum(BODY.upper, np.pi) - np.maximum(BODY.lower, -np.pi)
+TURNS = BODY.skeleton.dof_is_rotation
+ARM = ('left_shoulder', 'left_elbow', 'left_wrist', 'left_hand')
+TORSO = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
+SLACK = 0.03
+# All joint angles may take all values.
+FREE = replace(
+    BODY,
+    skeleton=replace(
+        BODY.skeleton,
+        lower=np.where(TURNS, -np.pi, BODY.lower),
+        upper=np.where(TURNS, np.pi, BODY.upper),
+    ),
+)
+
+
+@st.composite
+def poses(draw, fixed=()):
+    """Poses within the limits, 2 to 5 m before the camera; some angles may be given."""
+    share = np.array(draw(st.lists(st.floats(0, 1), min_size=34, max_size=34)))
+    pose = np.where(TURNS, np.maximum(BODY.lower, -np.pi) + share * LIMITED, share - 0.5)
+    pose[2] += 3.5
+    pose = np.clip(pose, BODY.lower, BODY.upper)  # rounding
+    for name, value in dict(fixed).items():
+        pose[NAMES.index(name)] = value
+    # A pose within the limits may still put a joint behind the camera, which then has no image.
+    assume((BODY.joint_positions(pose[None])[..., 2] > 0.1).all())
+    return pose
+
+
+def leaves_of(pose, kind):
+    """Leaves (N, d) and which of them are on the trunk of the pose."""
+    if kind == 'body':
+        found = full_body_flips(BODY, pose, slack=SLACK).most_probable(3000)
+        return found.poses, found.trunks == 0
+    leaves, _ = enumerate_flips(BODY, None, pose, kind)
+    return leaves, np.ones(len(leaves), dtype=bool)
+
+
+def bones(body: Body, found):
+    joints = body.joint_positions(found)
+    return np.stack(
+        [np.linalg.norm(joints[:, a] - joints[:, b], axis=1) for a, b in body.skeleton.bones]
+    )
+
+
+def off_rays(found, pose, names=None):
+    """Distances (N, J) of joints from the rays of those of a pose."""
+    seen, joints = BODY.joint_positions(pose[None]), BODY.joint_positions(found)
+    if names is not None:
+        which = BODY.skeleton.joint_index(names)
+        seen, joints = seen[:, which], joints[:, which]
+    rays = seen / np.linalg.norm(seen, axis=2, keepdims=True)
+    return np.linalg.norm(np.cross(joints, rays), axis=2)
+
+
+def check_leaves(pose, kind):
+    """Image, lengths and limits hold, and the given pose is one of the leaves."""
+    found, given_trunk = leaves_of(pose, kind)
+    assert np.abs(found - pose).max(1).min() == 0.0
+    assert np.abs(bones(BODY, found) - bones(BODY, pose[None])).max() < 1e-9
+    assert (found >= BODY.lower).all()
+    assert (found <= BODY.upper).all()
+    # Near the straight limb angles follow from places only to the root of the rounding.
+    assert off_rays(found[given_trunk], pose).max() < 1e-6
+    if not given_trunk.all():
+        turned = found[~given_trunk]
+        assert off_rays(turned, pose, TORSO).max() <= SLACK
+        # A limb hangs where the torso has it, within the slack of its own ray.
+        assert off_rays(turned, pose).max() <= 2 * SLACK
+    return found
+
+
+@pytest.mark.parametrize('kind', ['left_arm', 'right_leg', 'neck', 'body'])
+@settings(max_examples=40, deadline=None)
+@given(pose=poses())
+def test_image_lengths_and_limits_hold_for_every_leaf(kind, pose):
+    check_leaves(pose, kind)
+
+
+@pytest.mark.parametrize('kind', ['left_arm', 'body'])
+@settings(max_examples=20, deadline=None)
+@given(pose=poses(fixed={'left_elbow': 0.0}))
+def test_straight_elbow(kind, pose):
+    """The twist of the upper arm is free: it stays, or has what the hand asks for."""
+    check_leaves(pose, kind)
+
+
+@pytest.mark.parametrize('kind', ['left_arm', 'body'])
+@settings(max_examples=20, deadline=None)
+@given(
+    pose=poses(
+        fixed={'left_elbow': 0.0, 'left_wrist_x': 0.0, 'left_wrist_y': 0.0, 'left_shoulder_z': 0.4}
+    )
+)
+def test_straight_arm(kind, pose):
+    """Elbow and hand in line: no joint says anything about the twist."""
+    found = check_leaves(pose, kind)
+    straight = np.abs(found[:, NAMES.index('left_elbow')]) < 1e-9
+    assert straight.any()
+
+
+@pytest.mark.parametrize('kind', ['left_arm', 'body'])
+@settings(max_examples=20, deadline=None)
+@given(pose=poses(), sign=st.sampled_from([-1.0, 1.0]))
+def test_gimbal(kind, pose, sign):
+    """cos b = 0 at the shoulder, where the first and the third angle turn about one axis."""
+    wide = NAMES.index('left_shoulder_y')
+    pose[wide] = np.clip(sign * np.pi / 2, BODY.lower[wide], BODY.upper[wide])
+    assume((BODY.joint_positions(pose[None])[..., 2] > 0.1).all())
+    check_leaves(pose, kind)
+
+
+def test_gimbal_itself():
+    """The upper arm along the axis of its first angle exactly, with limits that let it there."""
+    pose = np.array(BODY.prior_mean)
+    pose[2] = 3.0
+    pose[NAMES.index('left_shoulder_y')] = np.pi / 2
+    pose[NAMES.index('left_shoulder_x')] = 0.7
+    found = full_body_flips(FREE, pose, ['left_arm'], torso=False).most_probable(100).poses
+    assert len(found) >= 2
+    assert np.isfinite(found).all()
+    assert off_rays(found, pose).max() < 1e-6
+    upright = np.abs(np.cos(found[:, NAMES.index('left_shoulder_y')])) < 1e-6
+    assert np.allclose(found[upright, NAMES.index('left_shoulder_x')], 0.7)
+
+
+def test_ray_that_misses():
+    """A flipped parent takes the child's ray away from its sphere: that branch has no leaves."""
+    pose = np.array(BODY.prior_mean)
+    pose[2] = 3.0
+    rng = np.random.default_rng(0)
+    missed = 0
+    arm = [j for s in BODY.chains['left_arm'] for j in BODY.skeleton.segment_dofs[s]]
+    for _ in range(200):
+        pose[arm] = rng.uniform(BODY.lower[arm], BODY.upper[arm])
+        places = BODY.joint_positions(pose[None])[0, BODY.skeleton.joint_index(ARM)]
+        start, elbow, wrist, _ = places
+        ray = elbow / np.linalg.norm(elbow)
+        other = 2 * (start @ ray) * ray - elbow  # the elbow's other place on its ray
+        ray = wrist / np.linalg.norm(wrist)
+        reach = np.linalg.norm(wrist - elbow)
+        if np.linalg.norm(other - (other @ ray) * ray) <= reach:
+            continue
+        missed += 1
+        found = full_body_flips(BODY, pose, ['left_arm'], torso=False).most_probable(100).poses
+        elbows = BODY.joint_positions(found)[:, BODY.skeleton.joint_index(['left_elbow'])[0]]
+        assert np.abs(elbows - elbow).max() < 1e-6
+        assert off_rays(found, pose).max() < 1e-6
+    assert missed > 10
+
+
+def test_joint_behind_the_camera():
+    """With the camera inside the sphere of a link one of its two places lies behind: no leaf."""
+    rng = np.random.default_rng(1)
+    which = BODY.skeleton.joint_index(ARM)
+    inside = 0
+    for _ in range(400):
+        pose = rng.uniform(FREE.lower, FREE.upper)
+        pose[:3] = *rng.uniform(-0.3, 0.3, 2), 0.4
+        places = FREE.joint_positions(pose[None])[:, which]
+        if places[..., 2].min() < 0.01:
+            continue
+        inside += np.linalg.norm(places[0, 0]) < np.linalg.norm(places[0, 1] - places[0, 0])
+        product = full_body_flips(FREE, pose, ['left_arm'], torso=False, most_overlap=np.inf)
+        found = FREE.joint_positions(product.most_probable(100).poses)[:, which]
+        assert ((found * places).sum(2) > 0).all()
+        if np.linalg.norm(places[0, 0]) < np.linalg.norm(places[0, 1] - places[0, 0]):
+            assert len(found) <= 4
+    assert inside > 5
