@@ -259,9 +259,10 @@ def pair_log_densities(
     result = np.empty(len(pairs))
     # Arrays of one kind: for others, read-only ones for example, another kernel would be compiled.
     a, big_a, b, big_b = (
-        np.require(x, np.float64, 'CW') for x in (means_a, covariances_a, means_b, covariances_b)
+        np.require(x, np.float64, ('C', 'W'))
+        for x in (means_a, covariances_a, means_b, covariances_b)
     )
-    pairs = np.require(pairs, np.int64, 'CW')
+    pairs = np.require(pairs, np.int64, ('C', 'W'))
     edges = np.linspace(0, len(pairs), PARTS + 1).astype(int)
 
     def work(part: int) -> None:
