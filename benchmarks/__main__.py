@@ -16,6 +16,7 @@ USAGE = """usage: python -m benchmarks [NAME [options]]
   flips      time per leaf of the interpretation trees
   kernels    the compiled likelihood against vectorised numpy
   smoothing  exactness, speed and peers of the smoother
+  votes      which chain to flip or to search, by the vote that chooses it
 
 Without a name all of them run. Every benchmark takes --json and --help.
 """
@@ -24,7 +25,7 @@ Without a name all of them run. Every benchmark takes --json and --help.
 def main(argv: list[str]) -> int:
     """Runs one benchmark, or all; the exit code is that of the first that fails."""
     # Only now: they import numpy.
-    from benchmarks import experts, flips, kernels, smoothing, tracking
+    from benchmarks import experts, flips, kernels, smoothing, tracking, votes
 
     benchmarks = {
         'experts': experts.main,
@@ -32,6 +33,7 @@ def main(argv: list[str]) -> int:
         'kernels': kernels.main,
         'smoothing': smoothing.main,
         'tracking': tracking.main,
+        'votes': votes.main,
     }
     if argv and argv[0] in ('-h', '--help'):
         print(USAGE, end='')

@@ -26,7 +26,8 @@ from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.tracking.candidates import Candidates, relative_joints
 from hmt_ros.tracking.chain_product import Alternatives, best_combinations, distinct_alternatives
 from hmt_ros.tracking.chain_search import ChainSearch
-from hmt_ros.tracking.proposals import chain_dofs, chain_votes
+from hmt_ros.tracking.chain_votes import chain_votes
+from hmt_ros.tracking.proposals import chain_dofs
 from hmt_ros.tracking.pruning import choose_hypotheses
 from hmt_ros.tracking.tracker_settings import TrackerSettings
 
@@ -103,7 +104,13 @@ class KinematicJumps:
             lead = int(group[0])
             pose, lead_row = base.x[lead], int(sources.texture_rows[lead])
             found = self._search(
-                pose, covariances[sources.parents[lead]], observation, textures, lead_row, rng
+                pose,
+                covariances[sources.parents[lead]],
+                observation,
+                textures,
+                lead_row,
+                base.x,
+                rng,
             )
             log_weights = sources.log_priors[group]
             alternatives = [
@@ -201,6 +208,7 @@ class KinematicJumps:
         observation: Observation,
         textures: Textures | None,
         row: int,
+        known: Array,
         rng: np.random.Generator,
     ) -> dict[str, Array]:
         """Configurations of some chains, chosen by vote, that fit the image."""
@@ -209,7 +217,9 @@ class KinematicJumps:
         count = min(self.settings.searched_chains, len(names))
         if count == 0:
             return {}
-        votes = chain_votes(self.body, covariance[None], names, self.settings.vote)[0]
+        votes = chain_votes(
+            self.body, covariance[None], names, self.settings.vote, pose[None], known
+        )[0]
         chosen = rng.choice(len(names), size=count, replace=False, p=votes)
         result = {}
         for i in sorted(chosen):

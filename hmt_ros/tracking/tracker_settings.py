@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import ObservationSettings
 from hmt_ros.tracking.chain_search import ChainSearchSettings
+from hmt_ros.tracking.chain_votes import VOTES
 from hmt_ros.tracking.dynamics import DynamicsSettings
-from hmt_ros.tracking.proposals import PROPOSALS, VOTES
+from hmt_ros.tracking.proposals import PROPOSALS
 
 REWEIGHTINGS = ('ancestry', 'bhattacharyya')
 
