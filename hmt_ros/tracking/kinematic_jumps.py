@@ -141,7 +141,9 @@ class KinematicJumps:
             edges: dict[str, Array] = {}
             if s.edge_jumps > 0 and again:
                 covariance = covariances[sources.parents[lead]]
-                edges = self._on_other_edges(pose, covariance, observation, excess, rng)
+                edges = self._on_other_edges(
+                    pose, covariance, observation, textures, lead_row, excess, rng
+                )
             log_weights = sources.log_priors[group]
             alternatives = [
                 self._alternatives(base.x[group], chain, found.get(chain), edges.get(chain))
@@ -266,16 +268,26 @@ class KinematicJumps:
         pose: Array,
         covariance: Array,
         observation: Observation,
+        textures: Textures | None,
+        row: int,
         excess: dict[str, float],
         rng: np.random.Generator,
     ) -> dict[str, Array]:
-        """Configurations of limbs on other edges, where a limb costs much and is uncertain."""
-        result = {}
+        """Configurations of limbs on other edges, where a limb costs much and is uncertain.
+
+        Only those that by themselves take the surprise out of the image.
+        """
+        s, result = self.settings, {}
         for chain, share in excess.items():
             jumps = self._edge_jumps[chain]
             deviation, width = jumps.deviation(pose, covariance)
-            if rng.random() < share * displaced(width, deviation):
-                result[chain] = jumps.find(pose, observation, self.settings.edge_jumps)
+            if not rng.random() < share * displaced(width, deviation):
+                continue
+            found = jumps.find(pose, observation, s.edge_jumps)
+            poses = np.repeat(pose[None], len(found) + 1, axis=0)
+            poses[1:, jumps.dofs] = found
+            value = self.evaluate(poses, observation, textures, np.full(len(poses), row))
+            result[chain] = found[value[1:] < value[0] - s.surprise]
         return result
 
     def _excess(self, pose: Array, observation: Observation, *, learn: bool) -> dict[str, float]:
