@@ -142,7 +142,7 @@ class KinematicJumps:
             if s.edge_jumps > 0 and again:
                 covariance = covariances[sources.parents[lead]]
                 edges = self._on_other_edges(
-                    pose, covariance, observation, textures, lead_row, excess, rng
+                    pose, covariance, observation, textures, lead_row, excess
                 )
             log_weights = sources.log_priors[group]
             alternatives = [
@@ -158,7 +158,7 @@ class KinematicJumps:
             for pair in PAIRS:
                 if not set(pair) <= set(self.body.chains):
                     continue
-                if not self._may_be_exchanged(pose, pair, excess, rng):
+                if not self._may_be_exchanged(pose, pair, excess):
                     continue
                 swapped = self._swap(pose, pair)
                 if swapped is None:
@@ -271,7 +271,6 @@ class KinematicJumps:
         textures: Textures | None,
         row: int,
         excess: dict[str, float],
-        rng: np.random.Generator,
     ) -> dict[str, Array]:
         """Configurations of limbs on other edges, where a limb costs much and is uncertain.
 
@@ -281,7 +280,7 @@ class KinematicJumps:
         for chain, share in excess.items():
             jumps = self._edge_jumps[chain]
             deviation, width = jumps.deviation(pose, covariance)
-            if not rng.random() < share * displaced(width, deviation):
+            if not self.votes.drawn(share * displaced(width, deviation)):
                 continue
             found = jumps.find(pose, observation, s.edge_jumps)
             poses = np.repeat(pose[None], len(found) + 1, axis=0)
@@ -302,7 +301,7 @@ class KinematicJumps:
         return excess
 
     def _may_be_exchanged(
-        self, pose: Array, pair: tuple[str, str], excess: dict[str, float], rng: np.random.Generator
+        self, pose: Array, pair: tuple[str, str], excess: dict[str, float]
     ) -> bool:
         """Whether the votes ask for two limbs to be exchanged."""
         if not self.settings.voted_swaps or not excess:
@@ -314,7 +313,7 @@ class KinematicJumps:
         width = max(self._edge_jumps[chain].width(pose) for chain in pair)
         near = exchanged(np.linalg.norm(pixels[0] - pixels[1], axis=1), 2.0 * width)
         share = max(near, *(excess[chain] for chain in pair), self.settings.jump_probability)
-        return bool(rng.random() < share)
+        return self.votes.drawn(share)
 
     def _alternatives(
         self, modes: Array, chain: str, found: Array | None, edges: Array | None

@@ -10,6 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from math import erfc, exp, isfinite, sqrt
 
+import numpy as np
+
+# Stream of random numbers of a seed.
+OF_VOTES = 11
 # How far the usual cost follows that of the last image, and what it takes over at most, as a
 # multiple of itself: what is unusual is not learned at once.
 GAIN = 0.1
@@ -21,10 +25,21 @@ NOISE = 0.02
 
 
 class LimbVotes:
-    """What the contours of the limbs usually cost."""
+    """What the contours of the limbs usually cost, and chance to draw by.
 
-    def __init__(self) -> None:
+    Votes have random numbers of their own: where none is followed, all else is as without them.
+
+    Args:
+        seed: of the random numbers.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
         self.usual: dict[str, float] = {}
+        self._rng = np.random.default_rng([seed, OF_VOTES])
+
+    def drawn(self, probability: float) -> bool:
+        """True with a probability."""
+        return bool(self._rng.random() < probability)
 
     def excess(self, residuals: Mapping[str, float]) -> dict[str, float]:
         """Votes 0 to 1 by how much more than usual limbs cost; a limb that is new has none."""

@@ -121,7 +121,7 @@ class Tracker:
         self._bad_images = 0
         self._flesh = FleshFit(body)
         self._usual_energy = np.inf
-        self._limb_votes = LimbVotes()
+        self._limb_votes = LimbVotes(seed)
         self.status = Status.WAITING
         self.misfit = 0.0
         self.evaluations = 0
@@ -146,7 +146,7 @@ class Tracker:
         self._bad_images = 0
         self._flesh = FleshFit(self.body)
         self._usual_energy = np.inf
-        self._limb_votes = LimbVotes()
+        self._limb_votes = LimbVotes(self._seed)
         self.__dict__.pop('_jumps', None)
         self.status = Status.WAITING
 
