@@ -20,6 +20,7 @@ USAGE = """usage: python -m benchmarks [NAME [options]]
   kernels    the compiled likelihood against vectorised numpy
   nodes      images at the rate of a camera, through DDS
   smoothing  exactness, speed and peers of the smoother
+  votes      which chain to flip or to search, by the vote that chooses it
 
 Without a name all of them run. Every benchmark takes --json and --help.
 """
@@ -28,7 +29,7 @@ Without a name all of them run. Every benchmark takes --json and --help.
 def main(argv: list[str]) -> int:
     """Runs one benchmark, or all; the exit code is that of the first that fails."""
     # Only now: they import numpy.
-    from benchmarks import experts, flips, kernels, kjs, nodes, smoothing, tracking
+    from benchmarks import experts, flips, kernels, kjs, nodes, smoothing, tracking, votes
 
     benchmarks = {
         'experts': experts.main,
@@ -38,6 +39,7 @@ def main(argv: list[str]) -> int:
         'nodes': nodes.main,
         'smoothing': smoothing.main,
         'tracking': tracking.main,
+        'votes': votes.main,
     }
     if argv and argv[0] in ('-h', '--help'):
         print(USAGE, end='')

@@ -8,6 +8,7 @@
     python docs/generate.py smoothing      exactness and speed in smoothing.md (minutes)
     python docs/generate.py experts        experts.md (a quarter of an hour)
     python docs/generate.py tracking       accuracy and speed in tracking.md (minutes)
+    python docs/generate.py votes          votes for chains in tracking.md (minutes)
 
 Such a part stands between `<!-- begin NAME -->` and `<!-- end -->`.
 """
@@ -34,6 +35,7 @@ PAGES = {
     'smoothing': 'smoothing.md',
     'experts': 'experts.md',
     'tracking': 'tracking.md',
+    'votes': 'tracking.md',
 }
 
 
@@ -66,7 +68,7 @@ def part(name: str) -> str:
     """The content of a part."""
     if PAGES[name] == 'nodes.md':
         return parameter_table(name)
-    from benchmarks import experts, flips, kernels, kjs, smoothing, tracking
+    from benchmarks import experts, flips, kernels, kjs, smoothing, tracking, votes
 
     pages = {
         'flips': flips,
@@ -75,6 +77,7 @@ def part(name: str) -> str:
         'smoothing': smoothing,
         'experts': experts,
         'tracking': tracking,
+        'votes': votes,
     }
     return pages[name].page()
 

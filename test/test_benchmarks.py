@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import flips, kernels, kjs, tracking
+from benchmarks import flips, kernels, kjs, tracking, votes
 from benchmarks.__main__ import main
 from benchmarks.clips import find_clips, read_clip, rounded, table
 from benchmarks.command import run_stages
@@ -230,6 +230,20 @@ def test_where_clips_come_from(tmp_path, monkeypatch):
     assert find_clips(None) == ([shared / 'mine'], 'development clips')
 
 
+def test_votes():
+    """Every vote finds minima, none more than it draws; films are tracked."""
+    for vote in votes.VOTES:
+        one = votes.new_minima('human34', vote, 0, 3, 6)
+        assert 0 <= one['plausible_per_sample'] <= one['minima_per_sample'] < 1
+        assert one == votes.new_minima('human34', vote, 0, 3, 6)
+    film = votes.filmed('walk', 0, 2)
+    tracked = [votes.tracked(film, vote, 0) for vote in ('minima', votes.ALL)]
+    assert all(one['best_mm'] < 150 for one in tracked)
+    assert tracked[0]['evaluations'] < tracked[1]['evaluations']
+    summary = votes._summary([{'best_mm': 1.0}, {'best_mm': 3.0}])
+    assert summary == {'best_mm': 2.0, 'best_mm_error': 1.0}
+
+
 def test_tables():
     rows = [['name', 'a'], ['long name', '1'], ['b', '22']]
     assert table(rows).splitlines() == ['name        a', 'long name   1', 'b          22']
@@ -244,7 +258,7 @@ def test_command_line(capsys, tmp_path):
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
         "benchmarks: no 'flops', wanted one of experts, flips, kernels, kjs, nodes, smoothing, "
-        'tracking'
+        'tracking, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1

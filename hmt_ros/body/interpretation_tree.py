@@ -126,6 +126,52 @@ def rehang_chain(
     return result, parents
 
 
+def chain_points(body: Body, poses: ArrayLike, chain: str) -> Array:
+    """Where a chain of K links starts and where its links end, (N, K + 1, 3) m.
+
+    Raises:
+        KeyError, ValueError: as `enumerate_flips`.
+    """
+    links = _chain(body.skeleton, chain)
+    frames = forward(body.skeleton, np.array(poses, dtype=np.float64, ndmin=2))
+    root = frames.origins[links.segments[:1]]
+    points: Array = np.concatenate([root, _ends(frames, links)]).transpose(2, 0, 1)
+    return points
+
+
+def place_chain(
+    body: Body, poses: ArrayLike, chain: str, points: ArrayLike, *, slack: float = 0.1
+) -> tuple[Array, Index]:
+    """Poses whose chain is seen where it is wanted, in all ways that lengths and limits allow.
+
+    Args:
+        body: the body.
+        poses: (N, d) whose trunk the chain hangs on.
+        chain: name, of K links.
+        points: (N, K, 3) on the rays through which the ends of the links are to be seen; the first
+            way is the one whose ends lie before or behind their parents as these do.
+        slack: a ray that misses its sphere by less than this touches it, m.
+
+    Returns:
+        poses (M, d), equal to the given ones outside the chain, and the index (M,) of each.
+
+    Raises:
+        KeyError, ValueError: as `enumerate_flips`, and points of another shape.
+    """
+    links = _chain(body.skeleton, chain)
+    q = np.array(poses, dtype=np.float64, ndmin=2, order='C')
+    wanted = np.asarray(points, dtype=np.float64)
+    shape = (len(q), len(links.lengths), 3)
+    if wanted.shape != shape:
+        raise ValueError(f'chain {chain} wants points of shape {shape}, saw {wanted.shape}')
+    targets = np.ascontiguousarray(wanted.transpose(1, 2, 0))
+    angles, valid = _grown(forward(body.skeleton, q), q, links, targets, slack)
+    parents, choice = np.nonzero(valid)
+    result = q[parents]
+    result[:, links.dofs] = angles[parents, choice]
+    return result, parents
+
+
 def flip_counts(body: Body, poses: ArrayLike, chain: str) -> Index:
     """Number of leaves (N,) that the tree of one chain has at each pose."""
     q = np.array(poses, dtype=np.float64, ndmin=2, order='C')

@@ -9,7 +9,7 @@ that stand for all become candidates.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.interpretation_tree import enumerate_flips, rehang_chain
+from hmt_ros.body.interpretation_tree import chain_points, enumerate_flips, rehang_chain
 from hmt_ros.body.torso_flips import flip_torso
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures, with_swapped_sides
@@ -26,7 +26,10 @@ from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.tracking.candidates import Candidates, relative_joints
 from hmt_ros.tracking.chain_product import Alternatives, best_combinations, distinct_alternatives
 from hmt_ros.tracking.chain_search import ChainSearch
-from hmt_ros.tracking.proposals import chain_dofs, chain_votes
+from hmt_ros.tracking.chain_votes import chain_votes
+from hmt_ros.tracking.edge_jumps import EdgeJumps
+from hmt_ros.tracking.limb_votes import LimbVotes, displaced, exchanged
+from hmt_ros.tracking.proposals import chain_dofs
 from hmt_ros.tracking.pruning import choose_hypotheses
 from hmt_ros.tracking.tracker_settings import TrackerSettings
 
@@ -71,6 +74,7 @@ class KinematicJumps:
         settings: of the tracker.
         evaluate: energies (N,) of poses (N, d) in an image, with textures and their rows (N,).
         count: told how many evaluations were made besides.
+        votes: what the limbs usually cost; learns.
     """
 
     body: Body
@@ -78,12 +82,22 @@ class KinematicJumps:
     settings: TrackerSettings
     evaluate: Callable[[Array, Observation, Textures | None, Index], Array]
     count: Callable[[int], None]
+    votes: LimbVotes = field(default_factory=LimbVotes)
 
     @cached_property
     def _searches(self) -> dict[str, ChainSearch]:
         s = self.settings
         return {
             chain: ChainSearch(self.body, self.camera, s.likelihood, chain, s.search)
+            for chain in CHAINS[:4]
+            if chain in self.body.chains
+        }
+
+    @cached_property
+    def _edge_jumps(self) -> dict[str, EdgeJumps]:
+        s = self.settings
+        return {
+            chain: EdgeJumps(self.body, self.camera, s.likelihood, chain)
             for chain in CHAINS[:4]
             if chain in self.body.chains
         }
@@ -95,19 +109,44 @@ class KinematicJumps:
         covariances: Array,
         observation: Observation,
         rng: np.random.Generator,
+        *,
+        again: bool = False,
     ) -> Candidates:
-        """Candidates of kinematic jump sampling, from optima and how each of them came about."""
+        """Candidates of kinematic jump sampling, from optima and how each of them came about.
+
+        Args:
+            base: optima of the image, and
+            sources: what each of them started from.
+            covariances: (K, d, d) of the predictions, which the parents of the sources index.
+            observation: of the image.
+            rng: source of randomness.
+            again: whether the image was searched before, and surprised: other edges are looked for.
+        """
         s, textures = self.settings, sources.textures
         everything: list[tuple[Array, Index, Array, Array, Index]] = []
+        first = int(np.argmin(base.value))
         for group in self._groups(base)[:MOST_GROUPS]:
             lead = int(group[0])
             pose, lead_row = base.x[lead], int(sources.texture_rows[lead])
             found = self._search(
-                pose, covariances[sources.parents[lead]], observation, textures, lead_row, rng
+                pose,
+                covariances[sources.parents[lead]],
+                observation,
+                textures,
+                lead_row,
+                base.x,
+                rng,
             )
+            excess = self._excess(pose, observation, learn=lead == first and not again)
+            edges: dict[str, Array] = {}
+            if s.edge_jumps > 0 and again:
+                covariance = covariances[sources.parents[lead]]
+                edges = self._on_other_edges(
+                    pose, covariance, observation, textures, lead_row, excess
+                )
             log_weights = sources.log_priors[group]
             alternatives = [
-                self._alternatives(base.x[group], chain, found.get(chain))
+                self._alternatives(base.x[group], chain, found.get(chain), edges.get(chain))
                 for chain in CHAINS
                 if chain in self.body.chains
             ]
@@ -118,6 +157,8 @@ class KinematicJumps:
             weight = np.array([np.logaddexp.reduce(log_weights) + np.log(s.jump_probability)])
             for pair in PAIRS:
                 if not set(pair) <= set(self.body.chains):
+                    continue
+                if not self._may_be_exchanged(pose, pair, excess):
                     continue
                 swapped = self._swap(pose, pair)
                 if swapped is None:
@@ -201,6 +242,7 @@ class KinematicJumps:
         observation: Observation,
         textures: Textures | None,
         row: int,
+        known: Array,
         rng: np.random.Generator,
     ) -> dict[str, Array]:
         """Configurations of some chains, chosen by vote, that fit the image."""
@@ -209,7 +251,9 @@ class KinematicJumps:
         count = min(self.settings.searched_chains, len(names))
         if count == 0:
             return {}
-        votes = chain_votes(self.body, covariance[None], names, self.settings.vote)[0]
+        votes = chain_votes(
+            self.body, covariance[None], names, self.settings.vote, pose[None], known
+        )[0]
         chosen = rng.choice(len(names), size=count, replace=False, p=votes)
         result = {}
         for i in sorted(chosen):
@@ -219,8 +263,65 @@ class KinematicJumps:
             self.count(own.samples + own.refined * own.iterations)
         return result
 
-    def _alternatives(self, modes: Array, chain: str, found: Array | None) -> Alternatives:
-        """Configurations of a chain in a group: the modes' own, what was found, and all flips."""
+    def _on_other_edges(
+        self,
+        pose: Array,
+        covariance: Array,
+        observation: Observation,
+        textures: Textures | None,
+        row: int,
+        excess: dict[str, float],
+    ) -> dict[str, Array]:
+        """Configurations of limbs on other edges, where a limb costs much and is uncertain.
+
+        Only those that by themselves take the surprise out of the image.
+        """
+        s, result = self.settings, {}
+        for chain, share in excess.items():
+            jumps = self._edge_jumps[chain]
+            deviation, width = jumps.deviation(pose, covariance)
+            if not self.votes.drawn(share * displaced(width, deviation)):
+                continue
+            found = jumps.find(pose, observation, s.edge_jumps)
+            poses = np.repeat(pose[None], len(found) + 1, axis=0)
+            poses[1:, jumps.dofs] = found
+            value = self.evaluate(poses, observation, textures, np.full(len(poses), row))
+            result[chain] = found[value[1:] < value[0] - s.surprise]
+        return result
+
+    def _excess(self, pose: Array, observation: Observation, *, learn: bool) -> dict[str, float]:
+        """By how much more than usual the contours of the limbs cost."""
+        s = self.settings
+        if observation.edges is None or not (s.edge_jumps > 0 or s.voted_swaps):
+            return {}
+        residuals = {c: jumps.residual(pose, observation) for c, jumps in self._edge_jumps.items()}
+        excess = self.votes.excess(residuals)
+        if learn:
+            self.votes.learn(residuals)
+        return excess
+
+    def _may_be_exchanged(
+        self, pose: Array, pair: tuple[str, str], excess: dict[str, float]
+    ) -> bool:
+        """Whether the votes ask for two limbs to be exchanged."""
+        if not self.settings.voted_swaps or not excess:
+            return True
+        pixels = [
+            self.camera.project(chain_points(self.body, pose[None], chain)[0, 1:3])
+            for chain in pair
+        ]
+        width = max(self._edge_jumps[chain].width(pose) for chain in pair)
+        near = exchanged(np.linalg.norm(pixels[0] - pixels[1], axis=1), 2.0 * width)
+        share = max(near, *(excess[chain] for chain in pair), self.settings.jump_probability)
+        return self.votes.drawn(share)
+
+    def _alternatives(
+        self, modes: Array, chain: str, found: Array | None, edges: Array | None
+    ) -> Alternatives:
+        """Configurations of a chain in a group.
+
+        The modes' own, what was found, all flips, and what lies on other edges.
+        """
         s = self.settings
         own = chain_dofs(self.body, chain)
         jump = -np.log(s.jump_probability)
@@ -243,9 +344,15 @@ class KinematicJumps:
         flips, parents = flips[~first], parents[~first]
         angles.append(flips[:, own])
         penalties.append(np.full((len(modes), len(flips)), jump))
+        most = s.alternatives
+        if edges is not None and len(edges):
+            # After all others, for which there is as much room as without.
+            angles.append(edges)
+            penalties.append(np.full((len(modes), len(edges)), -np.log(s.edge_probability)))
+            most += len(edges)
         return distinct_alternatives(
             self.body, modes[0], chain, np.concatenate(angles), np.concatenate(penalties, axis=1),
-            apart=0.08, most=s.alternatives,
+            apart=0.08, most=most,
         )  # fmt: skip
 
     def _torso_flips(

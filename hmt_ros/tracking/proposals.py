@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +11,6 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 PROPOSALS = ('kjs', 'css', 'ss')
-VOTES = ('trace', 'eigenvalue', 'uniform')
 
 
 def spherical_samples(
@@ -48,33 +45,6 @@ def covariance_scaled_samples(
         means[:, None] + np.einsum('kij,knj->kni', factors, noise), body.lower, body.upper
     )
     return samples
-
-
-def chain_votes(
-    body: Body, covariances: Array, chains: Sequence[str], vote: str = 'trace'
-) -> Array:
-    """Probabilities (K, C) with which each mode's chains are chosen, by their local uncertainty.
-
-    'trace': the trace of the block of the covariance that belongs to the rotations of the chain,
-    which equals the sum over the eigenvectors of eigenvalue times squared length inside the chain;
-    'eigenvalue': the largest eigenvalue of that block; 'uniform': all alike.
-
-    Raises:
-        ValueError: an unknown vote.
-    """
-    if vote not in VOTES:
-        raise ValueError(f'vote must be one of {VOTES}, saw {vote!r}')
-    result = np.ones((len(covariances), len(chains)))
-    if vote != 'uniform':
-        for i, chain in enumerate(chains):
-            own = chain_dofs(body, chain)
-            block = covariances[:, own[:, None], own]
-            if vote == 'trace':
-                result[:, i] = np.einsum('kii->k', block)
-            else:
-                result[:, i] = np.linalg.eigvalsh(block)[:, -1]
-    shares: Array = result / result.sum(1, keepdims=True)
-    return shares
 
 
 def chain_dofs(body: Body, chain: str) -> Index:

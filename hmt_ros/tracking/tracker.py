@@ -36,6 +36,9 @@ from hmt_ros.tracking.initialisation import (
     start_from_keypoints,
 )
 from hmt_ros.tracking.kinematic_jumps import KinematicJumps
+from hmt_ros.tracking.limb_votes import LimbVotes
+from hmt_ros.tracking.misfit import unexplained_keypoints, unexplained_outline
+from hmt_ros.tracking.mode_covariances import free_covariances, resting
 from hmt_ros.tracking.pose_prediction import PosePrediction
 from hmt_ros.tracking.proposals import covariance_scaled_samples, spherical_samples
 from hmt_ros.tracking.pruning import choose_hypotheses, inherited_log_weights
@@ -46,12 +49,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Image = NDArray[np.uint8]
 
-# An outline or a keypoint further away than this from where it should be is unexplained, in sigmas.
-UNEXPLAINED = 4.0
 # Keypoints from which a lost track starts anew.
 FEWEST_KEYPOINTS = 6
-# Largest standard deviation of a mode: where an image shows nothing, rad or m.
-WIDEST = 2.0
 # Around all joints of all modes, as a fraction of their extent: where the silhouette may be.
 REGION_MARGIN = 0.3
 # How far the usual energy follows that of the last image.
@@ -143,6 +142,7 @@ class Tracker:
         self._other_way: Tracker | None = None
         self._evidence = 0.0
         self._undecided_until = 0
+        self._limb_votes = LimbVotes(seed)
         self.status = Status.WAITING
         self.misfit = 0.0
         self.evaluations = 0
@@ -168,6 +168,8 @@ class Tracker:
         self._flesh = FleshFit(self.body)
         self._usual_energy = np.inf
         self._other_way = None
+        self._limb_votes = LimbVotes(self._seed)
+        self.__dict__.pop('_jumps', None)
         self.status = Status.WAITING
 
     def step(
@@ -257,8 +259,8 @@ class Tracker:
         """
         m, body = self.modes, self.body
         value, gradient, hessian = self._likelihood.energy(m.poses, observation, None, None)
-        free = ~_resting(m.poses, gradient, body)
-        covariances = _covariances(hessian, free)
+        free = ~resting(m.poses, gradient, body)
+        covariances = free_covariances(hessian, free)
         step = -np.einsum('kij,kj->ki', covariances, np.where(free, gradient, 0.0))
         limit = 3.0 * np.sqrt(np.einsum('kii->ki', m.covariances))
         step = np.clip(step, -limit, limit)
@@ -404,7 +406,7 @@ class Tracker:
         if lost[0] > lost[1] or (lost[0] == lost[1] and ahead < 0):
             for name in (
                 '_modes', '_flesh', '_usual_energy', '_least_energy', '_bad_images',
-                '_outline_costs', '_rng', 'misfit', 'status',
+                '_outline_costs', '_limb_votes', '_rng', 'misfit', 'status',
             ):  # fmt: skip
                 setattr(self, name, getattr(other, name))
             self._use_body(other.body)
@@ -490,7 +492,9 @@ class Tracker:
             base, sources = self._search_around(
                 solved, candidates, covariances, precisions, observation
             )
-            more = self._jumps.propose(base, sources, covariances, observation, self._rng)
+            more = self._jumps.propose(
+                base, sources, covariances, observation, self._rng, again=True
+            )
             solved = joined_minima(solved, self._solve(more, precisions, observation))
             candidates = joined_candidates(candidates, more)
         self._learn_usual_energy(float(solved.value.min()))
@@ -671,7 +675,7 @@ class Tracker:
         if predicted is not None:
             rows = usable[kept.chosen]
             weights = weights + inherited_log_weights(
-                solved.x[rows], _covariances(solved.hessian[rows], solved.free[rows]),
+                solved.x[rows], free_covariances(solved.hessian[rows], solved.free[rows]),
                 np.argsort(-weights, kind='stable'), predicted,
             )  # fmt: skip
             weights -= np.logaddexp.reduce(weights)
@@ -683,7 +687,7 @@ class Tracker:
         frames = forward(self.body.skeleton, poses)
         textures = self._textures(frames, observation)
         image = self._likelihood.image_energy(frames, observation, derivatives=False)
-        filtered = _covariances(solved.hessian[rows], solved.free[rows])
+        filtered = free_covariances(solved.hessian[rows], solved.free[rows])
         covariances = filtered
         if _shows_shape(observation):
             covariances = self._honest_covariances(poses, frames, solved.free[rows], observation)
@@ -709,35 +713,20 @@ class Tracker:
         _, _, hessian = self._likelihood.energy(poses, observation)
         shape = self._likelihood.image_energy(frames, replace(observation, keypoints=None))
         assert shape.hessian is not None
-        return _covariances(hessian - (1.0 - self.settings.image_trust) * shape.hessian, free)
+        return free_covariances(hessian - (1.0 - self.settings.image_trust) * shape.hessian, free)
 
     def _judge(self, observation: Observation) -> None:
         """Whether the track is lost: how much of the image no mode explains."""
         s = self.settings
-        shares = [0.0]
-        if self._outline_costs.size:
-            t = s.likelihood.coverage
-            most = 0.5 * t.weight / self._outline_costs.shape[1] * t.scale**2
-            limit = UNEXPLAINED**2 / (UNEXPLAINED**2 + t.scale**2)
-            shares.append(float((self._outline_costs > limit * most).mean(1).min()))
+        self.misfit = unexplained_outline(self._outline_costs, s.likelihood.coverage)
         if observation.keypoints is not None:
-            shares.append(self._unexplained_keypoints(observation.keypoints))
-        self.misfit = max(shares)
+            of_keypoints = unexplained_keypoints(
+                self.body, self.camera, self._own.poses, observation.keypoints,
+                s.likelihood.joints.sigma,
+            )  # fmt: skip
+            self.misfit = max(self.misfit, of_keypoints)
         self._bad_images = self._bad_images + 1 if self.misfit > s.lost_misfit else 0
         self.status = Status.LOST if self._bad_images >= s.lost_images else Status.TRACKING
-
-    def _unexplained_keypoints(self, keypoints: Keypoints) -> float:
-        """Share of the keypoints that the best mode does not explain."""
-        seen = np.flatnonzero(np.isfinite(keypoints.pixels).all(1))
-        if len(seen) == 0:
-            return 0.0
-        which = self.body.skeleton.joint_index([keypoints.names[i] for i in seen])
-        pixels = self.camera.project(self.body.joint_positions(self._own.poses)[:, which])
-        error = pixels - keypoints.pixels[seen]
-        precisions = np.linalg.inv(keypoints.covariances[seen])
-        sigma = self.settings.likelihood.joints.sigma
-        distance = np.einsum('kna,nab,knb->kn', error, precisions, error) / sigma**2
-        return float((~(distance < UNEXPLAINED**2)).mean(1).min())
 
     # Energies.
 
@@ -756,7 +745,9 @@ class Tracker:
 
     @cached_property
     def _jumps(self) -> KinematicJumps:
-        return KinematicJumps(self.body, self.camera, self.settings, self._value, self._count)
+        return KinematicJumps(
+            self.body, self.camera, self.settings, self._value, self._count, self._limb_votes
+        )
 
     def _count(self, evaluations: int) -> None:
         self.evaluations += evaluations
@@ -869,25 +860,3 @@ def _shows_shape(observation: Observation) -> bool:
 
 def _inverses(matrices: Array) -> Array:
     return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
-
-
-def _resting(poses: Array, gradient: Array, body: Body) -> NDArray[np.bool_]:
-    at_lower = (poses <= body.lower) & (gradient > 0)
-    result: NDArray[np.bool_] = at_lower | ((poses >= body.upper) & (gradient < 0))
-    return result
-
-
-def _covariances(hessians: Array, free: NDArray[np.bool_]) -> Array:
-    """Inverse Hessians on the free variables.
-
-    A variable at its limit has a deviation of 3 degrees, and none one above `WIDEST`.
-    """
-    h = hessians.copy()
-    rows, dofs = np.nonzero(~free)
-    h[rows, dofs, :] = 0.0
-    h[rows, :, dofs] = 0.0
-    h[rows, dofs, dofs] = 0.05**-2.0
-    diagonal = np.arange(h.shape[1])
-    h[:, diagonal, diagonal] += WIDEST**-2.0
-    result = np.linalg.inv(0.5 * (h + h.transpose(0, 2, 1)))
-    return 0.5 * (result + result.transpose(0, 2, 1))

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import ObservationSettings
 from hmt_ros.tracking.chain_search import ChainSearchSettings
+from hmt_ros.tracking.chain_votes import VOTES
 from hmt_ros.tracking.dynamics import DynamicsSettings
-from hmt_ros.tracking.proposals import PROPOSALS, VOTES
+from hmt_ros.tracking.proposals import PROPOSALS
 
 REWEIGHTINGS = ('ancestry', 'bhattacharyya')
 
@@ -31,11 +32,17 @@ class TrackerSettings:
             comes from and of its jumps, or 'bhattacharyya', the weight of the nearest mode before
             (KJS 5.1).
         exploration: power of the weights when candidates are chosen; below 1 favours unlikely ones.
-        vote: how chains are chosen for search: 'trace', 'eigenvalue' or 'uniform'.
+        vote: how chains are chosen for search: 'trace', 'eigenvalue', 'uniform', 'depth' or
+            'minima'.
         searched_chains: chains searched in an image.
+        edge_jumps: other image edges that are looked for in an image that is searched again, for a
+            limb whose contour costs more than usual; 0: none.
+        voted_swaps: whether arms, and legs, are only exchanged where they lie over each other or
+            cost more than usual, and otherwise with jump_probability; else in every image.
         surprise: an image whose least energy exceeds the usual one by this is searched again.
         rounds: of search in such an image at most.
         jump_probability: of a flip of one chain from one image to the next.
+        edge_probability: of a limb on another image edge than in the image before.
         prediction_probability: of a pose that a regression predicts from the image, and not the
             images before.
         facing_trial: seconds that both ways to face are followed at most, where a track starts from
@@ -66,9 +73,12 @@ class TrackerSettings:
     exploration: float = 0.5
     vote: str = 'trace'
     searched_chains: int = 4
+    edge_jumps: int = 0
+    voted_swaps: bool = False
     surprise: float = 6.0
     rounds: int = 3
     jump_probability: float = 0.1
+    edge_probability: float = 0.02
     prediction_probability: float = 0.01
     facing_trial: float = 2.0
     base_iterations: int = 6
@@ -105,6 +115,6 @@ class TrackerSettings:
                 raise ValueError(f'{name} must be at least {bound}, saw {getattr(self, name)}')
         if not self.tails > 0:
             raise ValueError(f'tails must be positive, saw {self.tails}')
-        for name in ('jump_probability', 'prediction_probability'):
+        for name in ('jump_probability', 'edge_probability', 'prediction_probability'):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f'{name} must lie in (0, 1), saw {getattr(self, name)}')

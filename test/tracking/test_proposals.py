@@ -10,7 +10,6 @@ from scipy import stats
 
 from hmt_ros.tracking.proposals import (
     chain_dofs,
-    chain_votes,
     covariance_scaled_samples,
     spherical_samples,
 )
@@ -121,55 +120,3 @@ def test_chains_own_their_degrees_of_freedom(human32):
         'left_shoulder_x', 'left_shoulder_y', 'left_shoulder_z',
         'left_elbow', 'left_wrist_x', 'left_wrist_y',
     }  # fmt: skip
-
-
-def test_votes_by_trace_are_those_of_the_eigenvectors(human32, modes):
-    """Sum over eigenvectors of eigenvalue times squared length inside the chain."""
-    _, covariances = modes
-    votes = chain_votes(human32, covariances, CHAINS)
-    for k in range(2):
-        values, vectors = np.linalg.eigh(covariances[k])
-        shares = []
-        for chain in CHAINS:
-            inside = vectors[chain_dofs(human32, chain)]
-            shares.append((values * (inside**2).sum(0)).sum())
-        assert np.allclose(votes[k], np.array(shares) / np.sum(shares), rtol=1e-10)
-
-
-def test_votes_by_the_largest_eigenvalue(human32, modes):
-    """Found by power iteration on the block of the chain."""
-    _, covariances = modes
-    votes = chain_votes(human32, covariances, CHAINS, 'eigenvalue')
-    for k in range(2):
-        largest = []
-        for chain in CHAINS:
-            own = chain_dofs(human32, chain)
-            block = covariances[k][own][:, own]
-            x = np.ones(len(own))
-            for _ in range(3000):
-                x = block @ x
-                x /= np.linalg.norm(x)
-            largest.append(x @ block @ x)
-        assert np.allclose(votes[k], np.array(largest) / np.sum(largest), rtol=1e-6)
-
-
-def test_uniform_votes(human32, modes):
-    votes = chain_votes(human32, modes[1], CHAINS[:4], 'uniform')
-    assert np.array_equal(votes, np.full((2, 4), 0.25))
-
-
-def test_an_uncertain_chain_gets_the_votes(human32):
-    covariance = 1e-4 * np.eye(32)[None]
-    own = chain_dofs(human32, 'right_arm')
-    covariance[:, own, own] = 1e-2
-    for vote, share in (('trace', 100 * 6 / (100 * 6 + 3 * 6 + 2)), ('eigenvalue', 100 / 104)):
-        votes = chain_votes(human32, covariance, CHAINS, vote)
-        assert votes[0, CHAINS.index('right_arm')] == pytest.approx(share, rel=1e-12)
-        assert votes.sum() == pytest.approx(1.0, rel=1e-12)
-
-
-def test_what_is_unknown_is_refused(human32, modes):
-    with pytest.raises(ValueError, match=r"vote must be one of .*trace.*saw 'loud'"):
-        chain_votes(human32, modes[1], CHAINS, 'loud')
-    with pytest.raises(KeyError, match='tail'):
-        chain_votes(human32, modes[1], ('tail',))

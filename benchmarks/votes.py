@@ -1,0 +1,339 @@
+"""votes: which chain of the body to flip, or to search, by the vote that chooses it (KJS 5).
+
+New minima: from the optimum of the joints' likelihood at a random pose, a mode that is known, a
+chain by vote, a covariance-scaled sample and all leaves of its tree, each optimised; again, until
+the budget is spent. Two optima are one when no joint, seen from the pelvis, differs by more than
+5 cm.
+
+Tracking: procedural motions, rendered; one chain is searched an image, where the tracker searches
+up to four.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from benchmarks.clips import rounded, table
+from benchmarks.flips import random_poses
+from benchmarks.machine import description, on_machine
+from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body.interpretation_tree import enumerate_flips
+from hmt_ros.body.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
+from hmt_ros.body.viewpoint import Viewpoint
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
+from hmt_ros.image.observation import Keypoints, Observation
+from hmt_ros.image.renderer import render_frames
+from hmt_ros.image.scene import Scene
+from hmt_ros.inference.bounded_newton import Minimum, minimise
+from hmt_ros.tracking import Subject, Tracker, TrackerSettings
+from hmt_ros.tracking.chain_votes import VOTES, chain_votes
+from hmt_ros.tracking.evaluation import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score
+from hmt_ros.tracking.proposals import covariance_scaled_samples
+
+Array = NDArray[np.float64]
+
+BODIES = ('human34', 'human37')
+CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg')
+OFF = TermSettings(0.0, 1.0, 1.0)
+ONLY_JOINTS = LikelihoodSettings(
+    containment=OFF, coverage=OFF, edges=OFF, intensity=OFF, motion=OFF
+)
+SIGMA = 2.0  # px, of the joints
+SAME = 0.05  # m
+PLAUSIBLE = 4.6  # of energy above the best, ln 100: a hundredth of its probability
+WIDEST = 1.0  # standard deviation of what the joints do not determine, rad or m
+ALL = 'all four'
+# Streams of random numbers of a seed.
+OF_POSES, OF_JUMPS, OF_CLICKS = 1, 2, 3
+
+
+def main(argv: list[str]) -> int:
+    """Runs the benchmark."""
+    options = _parser().parse_args(argv)
+    result = measure(options)
+    if options.json:
+        print(json.dumps(rounded(result), indent=1))
+    else:
+        print(as_text(result))
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='python -m benchmarks votes',
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser.add_argument('--seeds', type=int, default=6, metavar='N', help='of random poses')
+    parser.add_argument('--poses', type=int, default=32, metavar='N', help='a seed and body')
+    parser.add_argument('--budget', type=int, default=12, metavar='N', help='samples a pose')
+    parser.add_argument('--films', type=int, default=3, metavar='N', help='a motion; their seeds')
+    parser.add_argument('--images', type=int, default=16, metavar='N', help='a film, at 10 Hz')
+    parser.add_argument(
+        '--parts', nargs='+', choices=('minima', 'tracking'), default=['minima', 'tracking']
+    )
+    parser.add_argument('--quick', action='store_true', help='one seed, few poses and images')
+    return parser
+
+
+def page() -> str:
+    """The part of the documentation that this benchmark writes."""
+    result = measure(_parser().parse_args([]))
+    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """Everything that was asked for."""
+    if options.quick:
+        options.seeds, options.poses, options.budget = 1, 4, 12
+        options.films, options.images = 1, 4
+    seeds = range(options.seeds)
+    films = range(options.films)
+    result: dict[str, Any] = {'machine': description(), 'films': options.films}
+    result['seeds'] = options.seeds
+    hidden = not sys.stderr.isatty()
+    if 'minima' in options.parts:
+        bar = tqdm(total=len(BODIES) * len(VOTES) * len(seeds), desc='minima', disable=hidden)
+        with bar:
+            result['minima'] = {}
+            for name in BODIES:
+                found: dict[str, Any] = {}
+                for vote in VOTES:
+                    runs = []
+                    for seed in seeds:
+                        runs.append(new_minima(name, vote, seed, options.poses, options.budget))
+                        bar.update()
+                    found[vote] = _summary(runs)
+                result['minima'][name] = found
+    if 'tracking' in options.parts:
+        runs_of: dict[str, dict[str, list[dict[str, float]]]] = {}
+        votes = (*VOTES, ALL)
+        total = len(PROCEDURAL_MOTIONS) * len(films) * len(votes)
+        with tqdm(total=total, desc='tracking', disable=hidden) as bar:
+            for motion in PROCEDURAL_MOTIONS:
+                for seed in films:
+                    film = filmed(motion, seed, options.images)
+                    for vote in votes:
+                        one = tracked(film, vote, seed)
+                        runs_of.setdefault(motion, {}).setdefault(vote, []).append(one)
+                        bar.update()
+        result['tracking'] = {
+            motion: {vote: _summary(runs) for vote, runs in found.items()}
+            for motion, found in runs_of.items()
+        }
+        result['tracking']['together'] = {
+            vote: _summary([run for found in runs_of.values() for run in found[vote]])
+            for vote in votes
+        }
+    return result
+
+
+def _summary(runs: list[dict[str, float]]) -> dict[str, float]:
+    """Means over runs, and standard errors of the means."""
+    result: dict[str, float] = {}
+    for key in runs[0]:
+        values = np.array([run[key] for run in runs])
+        result[key] = float(values.mean())
+        result[f'{key}_error'] = (
+            float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
+        )
+    return result
+
+
+# New minima.
+
+
+@dataclass(eq=False)
+class _Known:
+    """Minima that are known of one pose, and samples that were spent."""
+
+    poses: list[Array]
+    covariances: list[Array]
+    joints: list[Array]
+    energies: list[float]
+    samples: int = 0
+
+
+def new_minima(name: str, vote: str, seed: int, count: int, budget: int) -> dict[str, float]:
+    """New minima per optimised sample, and new ones that are plausible, over random poses.
+
+    Args:
+        name: of the body.
+        vote: that chooses the chain.
+        seed: of poses and samples; every vote has the same poses.
+        count: of the poses.
+        budget: samples a pose.
+    """
+    body = load_body(name)
+    camera = Camera(550.0, 550.0, 319.5, 239.5, 640, 480)
+    poses = random_poses(
+        body, count, seed=int(np.random.default_rng([seed, OF_POSES]).integers(2**31))
+    )
+    rng = np.random.default_rng([seed, OF_JUMPS])
+    likelihood = ImageLikelihood(body, camera, ONLY_JOINTS)
+    pixels = camera.project(body.joint_positions(poses))
+    joints = len(body.joint_names)
+    seen = [
+        Observation(
+            keypoints=Keypoints(
+                body.joint_names,
+                own,
+                np.tile(SIGMA**2 * np.eye(2), (joints, 1, 1)),
+                np.ones(joints),
+            )
+        )
+        for own in pixels
+    ]
+    known = []
+    for pose, observation in zip(poses, seen, strict=True):
+        solved = _optimised(likelihood, pose[None], observation)
+        known.append(_Known([], [], [], []))
+        _add(known[-1], body, solved)
+    for own, observation in zip(known, seen, strict=True):
+        while own.samples < budget:
+            k = int(rng.integers(len(own.poses)))
+            pose, covariance = own.poses[k][None], own.covariances[k][None]
+            votes = chain_votes(body, covariance, CHAINS, vote, pose, np.array(own.poses))[0]
+            chain = CHAINS[int(rng.choice(len(CHAINS), p=votes))]
+            drawn = covariance_scaled_samples(body, pose, covariance, 1, 1.0, rng)[0]
+            leaves, _ = enumerate_flips(body, camera, drawn, chain)
+            _add(own, body, _optimised(likelihood, leaves, observation))
+            own.samples += len(leaves)
+    samples = sum(own.samples for own in known)
+    minima = sum(len(own.poses) - 1 for own in known)
+    plausible = sum(
+        int((np.array(own.energies) < min(own.energies) + PLAUSIBLE).sum()) - 1 for own in known
+    )
+    return {'minima_per_sample': minima / samples, 'plausible_per_sample': plausible / samples}
+
+
+def _optimised(likelihood: ImageLikelihood, poses: Array, observation: Observation) -> Minimum:
+    body = likelihood.body
+    return minimise(
+        lambda x, _: likelihood.energy(x, observation),
+        poses, body.lower, body.upper, step_scale=0.3, max_iterations=40, tolerance=1e-3,
+    )  # fmt: skip
+
+
+def _add(known: _Known, body: Body, solved: Minimum) -> None:
+    """Adds the optima that are new."""
+    joints = body.joint_positions(solved.x)
+    joints -= joints[:, :1]
+    for i in np.argsort(solved.value, kind='stable'):
+        if not np.isfinite(solved.value[i]):
+            continue
+        gaps = [np.linalg.norm(joints[i] - own, axis=1).max() for own in known.joints]
+        if gaps and min(gaps) < SAME:
+            continue
+        hessian = solved.hessian[i].copy()
+        resting = ~solved.free[i]
+        hessian[resting] = hessian[:, resting] = 0.0
+        hessian[resting, resting] = 1e4
+        known.poses.append(solved.x[i])
+        known.covariances.append(np.linalg.inv(hessian + WIDEST**-2.0 * np.eye(len(hessian))))
+        known.joints.append(joints[i])
+        known.energies.append(float(solved.value[i]))
+
+
+# Tracking.
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """A rendered motion: body, camera, (T, d) poses, images, the empty scene, and the start."""
+
+    body: Body
+    camera: Camera
+    poses: Array
+    images: list[NDArray[np.uint8]]
+    empty: NDArray[np.uint8]
+    subject: Subject
+
+
+def filmed(motion: str, seed: int, images: int) -> Film:
+    """A procedural motion, rendered at 10 Hz."""
+    body = load_body('human37')
+    camera = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
+    view = Viewpoint(distance=4.0)
+    poses = procedural_motion(motion, body, images / 10.0, 10.0, 100 + seed, viewpoint=view)
+    scene = Scene(viewpoint=view, seed=100 + seed)
+    shown = [frame.image for frame in render_frames(body, poses, camera, scene)]
+    pixels = camera.project(body.joint_positions(poses[:1]))[0]
+    rng = np.random.default_rng([seed, OF_CLICKS])
+    clicks = pixels + rng.normal(size=pixels.shape)
+    n = len(pixels)
+    keypoints = Keypoints(body.joint_names, clicks, np.tile(np.eye(2), (n, 1, 1)), np.ones(n))
+    return Film(
+        body, camera, poses, shown, np.rint(scene.background(camera)).astype(np.uint8),
+        Subject(0, keypoints, dict(body.segment_lengths)),
+    )  # fmt: skip
+
+
+def tracked(film: Film, vote: str, seed: int) -> dict[str, float]:
+    """Errors of a track in which one chain is searched an image, by vote, or all of them."""
+    if vote == ALL:
+        settings = TrackerSettings(searched_chains=len(CHAINS))
+    else:
+        settings = TrackerSettings(searched_chains=1, vote=vote)
+    background = BackgroundModel.from_image(film.empty)
+    tracker = Tracker(film.body, film.camera, settings, background, seed)
+    tracker.reset(film.subject)
+    mixtures, evaluations = [], []
+    for i, image in enumerate(film.images):
+        posterior, _ = tracker.step(image, i * 100_000_000)
+        assert posterior is not None
+        mixtures.append(posterior)
+        evaluations.append(tracker.evaluations)
+    where = film.body.skeleton.joint_index((ORIGIN, *EVALUATED_JOINTS))
+    true = film.body.joint_positions(film.poses)[:, where]
+    summary = score(joint_mixtures(tracker.body, mixtures), true[:, 1:] - true[:, :1]).summary()
+    return {
+        'best_mm': summary['best_mm'],
+        'heaviest_mm': summary['heaviest_mm'],
+        'evaluations': float(np.mean(evaluations[1:])),
+    }
+
+
+# Reports.
+
+
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+    """Tables for people."""
+    parts = [
+        f'{result["seeds"]} seeds of random poses, {result["films"]} films of each motion; '
+        'mean and its standard error.'
+    ]
+    if 'minima' in result:
+        rows = [['body', 'vote', 'new minima per sample', 'of them plausible']]
+        for name, found in result['minima'].items():
+            for vote, one in found.items():
+                rows.append(
+                    [name, vote]
+                    + [_with_error(one, f'{key}_per_sample', 3) for key in ('minima', 'plausible')]
+                )
+        parts.append(table(rows, left=2, markdown=markdown))
+    if 'tracking' in result:
+        rows = [['motion', 'searched', 'best of 8, mm', 'heaviest, mm', 'evaluations']]
+        for motion, found in result['tracking'].items():
+            for vote, one in found.items():
+                rows.append(
+                    [motion, vote if vote == ALL else f'one, {vote}']
+                    + [_with_error(one, f'{key}_mm', 1) for key in ('best', 'heaviest')]
+                    + [f'{one["evaluations"]:.0f}']
+                )
+        parts.append(table(rows, left=2, markdown=markdown))
+    return '\n\n'.join(parts)
+
+
+def _with_error(one: dict[str, float], key: str, digits: int) -> str:
+    return f'{one[key]:.{digits}f} +- {one[f"{key}_error"]:.{digits}f}'

@@ -1,0 +1,123 @@
+"""Which chain of the body is worth a jump: votes from the local uncertainty (KJS 5).
+
+The paper's vote reads the covariance alone, and leaves open how good it is. Here stand beside it a
+vote that reads only what one camera can not see, and one that counts what a jump brings: leaves of
+the chain's interpretation tree that are not known yet. `python -m benchmarks votes` compares them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.interpretation_tree import enumerate_flips
+from hmt_ros.tracking.candidates import relative_joints
+from hmt_ros.tracking.proposals import chain_dofs
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+VOTES = ('trace', 'eigenvalue', 'uniform', 'depth', 'minima')
+
+# Poses are different minima from this distance of a joint, m.
+APART = 0.08
+# Minima that a sample of a chain finds without a flip, on average over the chains: what is left to
+# vote for where no flip is new.
+WITHOUT_FLIP = 0.1
+
+
+def chain_votes(
+    body: Body,
+    covariances: Array,
+    chains: Sequence[str],
+    vote: str = 'trace',
+    poses: Array | None = None,
+    known: Array | None = None,
+) -> Array:
+    """Probabilities (K, C) with which each mode's chains are chosen.
+
+    'trace': the trace of the block of the covariance that belongs to the rotations of the chain,
+    which equals the sum over the eigenvectors of eigenvalue times squared length inside the chain;
+    'eigenvalue': the largest eigenvalue of that block; 'uniform': all alike; 'depth': variance of
+    the depths of the chain's joints, which the image does not show; 'minima': the share of the
+    leaves of the chain's interpretation tree that are minima which are not known yet, plus a little
+    by its trace, for those that no flip reaches.
+
+    Args:
+        body: with the chains.
+        covariances: (K, d, d) of the modes.
+        chains: names.
+        vote: one of `VOTES`.
+        poses: (K, d) of the modes, which 'depth' and 'minima' read.
+        known: (M, d) minima that are not new to 'minima'; None: the pose of each mode alone.
+
+    Raises:
+        ValueError: an unknown vote, or one that needs poses without them.
+    """
+    if vote not in VOTES:
+        raise ValueError(f'vote must be one of {VOTES}, saw {vote!r}')
+    result = np.ones((len(covariances), len(chains)))
+    if vote in ('trace', 'eigenvalue', 'minima'):
+        for i, chain in enumerate(chains):
+            own = chain_dofs(body, chain)
+            block = covariances[:, own[:, None], own]
+            if vote == 'eigenvalue':
+                result[:, i] = np.linalg.eigvalsh(block)[:, -1]
+            else:
+                result[:, i] = np.einsum('kii->k', block)
+    if vote in ('depth', 'minima'):
+        if poses is None:
+            raise ValueError(f'vote {vote!r} needs the poses of the modes')
+        if vote == 'depth':
+            each = [depth_variances(body, poses, covariances, chain) for chain in chains]
+            result = np.stack(each, axis=1)
+        else:
+            result *= WITHOUT_FLIP / result.mean(1, keepdims=True)
+            result += np.stack(
+                [shares_of_new_minima(body, poses, c, known) for c in chains], axis=1
+            )
+    shares: Array = result / result.sum(1, keepdims=True)
+    return shares
+
+
+def depth_variances(body: Body, poses: Array, covariances: Array, chain: str) -> Array:
+    """Sum (K,) of the variances of the depths of a chain's joints, m^2; the trunk is given.
+
+    A joint that moves along its ray is seen where it was: this is the covariance projected onto
+    the displacements that leave the image as it is.
+    """
+    own = chain_dofs(body, chain)
+    moved = np.isin(body.skeleton.joint_segments, body.skeleton.chains[chain])
+    joints = body.joint_positions(poses)[:, moved]
+    rays = joints / np.linalg.norm(joints, axis=2, keepdims=True)
+    along = np.einsum('kjx,kjxd->kjd', rays, body.joint_jacobians(poses)[:, moved][..., own])
+    block = covariances[:, own[:, None], own]
+    variances: Array = np.einsum('kjd,kde,kje->k', along, block, along)
+    return variances
+
+
+def shares_of_new_minima(body: Body, poses: Array, chain: str, known: Array | None = None) -> Array:
+    """Share (K,) of the leaves of a chain's interpretation tree that are new minima.
+
+    Leaves are within the limits; the pose itself is one of them. A leaf is new when some joint,
+    seen from the pelvis, is further than `APART` from where it is in every pose that is known. The
+    share, not the number: every leaf costs an optimisation.
+
+    Args:
+        body: with the chain.
+        poses: (K, d).
+        chain: name.
+        known: (M, d); None: none but the pose itself.
+    """
+    leaves, parents = enumerate_flips(body, None, poses, chain)
+    joints, before = (relative_joints(body, x) for x in (leaves, poses))
+    new = np.linalg.norm(joints - before[parents], axis=2).max(1) > APART
+    if known is not None and len(known):
+        gaps = joints[:, None] - relative_joints(body, known)[None]
+        new &= (np.linalg.norm(gaps, axis=3).max(2) > APART).all(1)
+    count = np.bincount(parents, weights=new, minlength=len(poses))
+    share: Array = count / np.bincount(parents, minlength=len(poses))
+    return share

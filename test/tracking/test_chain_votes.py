@@ -1,0 +1,139 @@
+"""Votes against eigenvectors, differences of depth, and the leaves of the trees."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmt_ros.body.interpretation_tree import enumerate_flips, flip_counts
+from hmt_ros.tracking.chain_votes import (
+    VOTES,
+    chain_votes,
+    depth_variances,
+    shares_of_new_minima,
+)
+from hmt_ros.tracking.proposals import chain_dofs
+
+CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
+
+
+@pytest.fixture(scope='module')
+def modes(human32):
+    """Means (2, d) in the middle of the limits and correlated covariances (2, d, d)."""
+    d = human32.dimension
+    rng = np.random.default_rng(0)
+    means = np.tile(0.5 * (human32.lower + human32.upper), (2, 1))
+    root = rng.normal(size=(2, d, d)) * np.array([0.02, 0.05])[:, None, None] / np.sqrt(d)
+    root = np.exp(rng.normal(0, 0.5, (2, d)))[:, :, None] * root
+    return means, root @ root.transpose(0, 2, 1) + 1e-6 * np.eye(d)
+
+
+def test_votes_by_trace_are_those_of_the_eigenvectors(human32, modes):
+    """Sum over eigenvectors of eigenvalue times squared length inside the chain."""
+    _, covariances = modes
+    votes = chain_votes(human32, covariances, CHAINS)
+    for k in range(2):
+        values, vectors = np.linalg.eigh(covariances[k])
+        shares = []
+        for chain in CHAINS:
+            inside = vectors[chain_dofs(human32, chain)]
+            shares.append((values * (inside**2).sum(0)).sum())
+        assert np.allclose(votes[k], np.array(shares) / np.sum(shares), rtol=1e-10)
+
+
+def test_votes_by_the_largest_eigenvalue(human32, modes):
+    """Found by power iteration on the block of the chain."""
+    _, covariances = modes
+    votes = chain_votes(human32, covariances, CHAINS, 'eigenvalue')
+    for k in range(2):
+        largest = []
+        for chain in CHAINS:
+            own = chain_dofs(human32, chain)
+            block = covariances[k][own][:, own]
+            x = np.ones(len(own))
+            for _ in range(3000):
+                x = block @ x
+                x /= np.linalg.norm(x)
+            largest.append(x @ block @ x)
+        assert np.allclose(votes[k], np.array(largest) / np.sum(largest), rtol=1e-6)
+
+
+def test_uniform_votes(human32, modes):
+    votes = chain_votes(human32, modes[1], CHAINS[:4], 'uniform')
+    assert np.array_equal(votes, np.full((2, 4), 0.25))
+
+
+def test_an_uncertain_chain_gets_the_votes(human32):
+    covariance = 1e-4 * np.eye(32)[None]
+    own = chain_dofs(human32, 'right_arm')
+    covariance[:, own, own] = 1e-2
+    for vote, share in (('trace', 100 * 6 / (100 * 6 + 3 * 6 + 2)), ('eigenvalue', 100 / 104)):
+        votes = chain_votes(human32, covariance, CHAINS, vote)
+        assert votes[0, CHAINS.index('right_arm')] == pytest.approx(share, rel=1e-12)
+        assert votes.sum() == pytest.approx(1.0, rel=1e-12)
+
+
+def test_votes_are_probabilities(human32, motion):
+    covariances = np.tile(1e-2 * np.eye(32), (len(motion), 1, 1))
+    for vote in VOTES:
+        votes = chain_votes(human32, covariances, CHAINS, vote, motion, motion)
+        assert votes.shape == (12, 5)
+        assert (votes > 0).all()
+        assert np.allclose(votes.sum(1), 1.0, rtol=1e-12)
+
+
+def test_depth_variances_are_those_of_samples(human32, motion):
+    """Of a chain that is moved by little, joint by joint along its ray."""
+    rng = np.random.default_rng(0)
+    own = chain_dofs(human32, 'left_leg')
+    root = 1e-4 * rng.normal(size=(32, 32))
+    covariance = root @ root.T
+    poses = np.tile(motion[3], (20_000, 1))
+    poses[:, own] += rng.multivariate_normal(
+        np.zeros(len(own)), covariance[np.ix_(own, own)], 20_000
+    )
+    joints = human32.joint_positions(poses)
+    mean = human32.joint_positions(motion[3:4])[0]
+    ray = mean / np.linalg.norm(mean, axis=1)[:, None]
+    wanted = np.einsum('njx,jx->nj', joints, ray).var(axis=0).sum()
+    found = depth_variances(human32, motion[3:4], covariance[None], 'left_leg')
+    assert found[0] == pytest.approx(wanted, rel=0.05)
+
+
+def test_shares_of_new_minima(human32, motion):
+    """Leaves that are not the pose; none is left when all leaves are known."""
+    for chain in CHAINS[:4]:
+        leaves, parents = enumerate_flips(human32, None, motion, chain)
+        joints = human32.joint_positions(leaves)
+        joints -= joints[:, :1]
+        first = np.array([joints[parents == k][0] for k in range(len(motion))])
+        apart = np.linalg.norm(joints - first[parents], axis=2).max(1) > 0.08
+        counts = flip_counts(human32, motion, chain)
+        wanted = [apart[parents == k].sum() / counts[k] for k in range(len(motion))]
+        assert np.allclose(shares_of_new_minima(human32, motion, chain), wanted)
+        assert not shares_of_new_minima(human32, motion, chain, leaves).any()
+        if apart.any():
+            some = leaves[apart][:1]
+            assert shares_of_new_minima(human32, motion, chain, some).sum() < sum(wanted)
+
+
+def test_known_minima_get_no_votes(human32, motion):
+    covariance = 1e-2 * np.eye(32)[None]
+    shares = [[shares_of_new_minima(human32, p[None], c)[0] for c in CHAINS] for p in motion]
+    k, i = np.unravel_index(np.argmax(shares), np.shape(shares))
+    pose = motion[k : k + 1]
+    leaves, _ = enumerate_flips(human32, None, pose, CHAINS[i])
+    before = chain_votes(human32, covariance, CHAINS, 'minima', pose)[0]
+    after = chain_votes(human32, covariance, CHAINS, 'minima', pose, leaves)[0]
+    assert before[i] == max(before)
+    assert after[i] < 0.5 * before[i]
+
+
+def test_what_is_unknown_is_refused(human32, modes):
+    with pytest.raises(ValueError, match=r"vote must be one of .*trace.*saw 'loud'"):
+        chain_votes(human32, modes[1], CHAINS, 'loud')
+    with pytest.raises(KeyError, match='tail'):
+        chain_votes(human32, modes[1], ('tail',))
+    for vote in ('depth', 'minima'):
+        with pytest.raises(ValueError, match=f"vote '{vote}' needs the poses"):
+            chain_votes(human32, modes[1], CHAINS, vote)
