@@ -10,6 +10,8 @@ from typing import Any
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.tracking import tracker as tracker_module
 from hmt_ros.tracking.kinematic_jumps import KinematicJumps
+from hmt_ros.tracking.mixture_filter import MixtureFilter
+from hmt_ros.tracking.pose_energy import PoseEnergy
 from hmt_ros.tracking.tracker import Tracker
 
 # Part of the tracker -> name of the stage; time in a part that another part calls is its own.
@@ -17,15 +19,15 @@ STAGES: tuple[tuple[Any, str, str], ...] = (
     (BackgroundModel, 'silhouette', 'background'),
     (tracker_module, 'observe', 'observation'),
     (Tracker, '_begin', 'start of the track'),
-    (Tracker, '_follow_motion', 'motion'),
+    (PoseEnergy, 'follow_motion', 'motion'),
     (KinematicJumps, 'propose', 'combinations'),
-    (Tracker, '_samples', 'samples'),
+    (MixtureFilter, '_samples', 'samples'),
     (KinematicJumps, '_search', 'chain search'),
     (KinematicJumps, '_rate', 'rating'),
-    (Tracker, '_minimise', 'candidates'),
-    (Tracker, '_keep', 'keeping'),
-    (Tracker, '_fit_flesh', 'flesh'),
-    (Tracker, 'likelihood_mixture', 'likelihood modes'),
+    (PoseEnergy, 'minimise', 'candidates'),
+    (MixtureFilter, '_keep', 'keeping'),
+    (MixtureFilter, '_fit_flesh', 'flesh'),
+    (MixtureFilter, 'likelihood_mixture', 'likelihood modes'),
 )
 # In these, minimisation is part of the stage.
 WHOLE = ('motion', 'start of the track', 'flesh')
