@@ -151,7 +151,10 @@ def film_strip(
             )
         if source.camera_info is not None:
             info = next(bag.messages([source.camera_info])).message
-            result.camera = camera_from_info(info, result.size)
+            try:
+                result.camera = camera_from_info(info, result.size)
+            except ValueError as error:
+                raise ValueError(f'{source.bag}: {source.camera_info}: {error}') from error
     return result
 
 

@@ -147,7 +147,9 @@ def draw_weights(path: Path, track: RecordedTrack, truth: Truth | None) -> None:
         axes = figure.subplots(2 if known else 1, 1, squeeze=False, sharex=True)[:, 0]
         colours = mpl.colormaps['cividis'](np.linspace(0.95, 0.1, most))
         axes[0].stackplot(seconds, weights, colors=colours, linewidth=0.4, edgecolor='white')
-        axes[0].set(ylim=(0, 1), ylabel='weight', xlim=(seconds[0], seconds[-1]))
+        axes[0].set(ylim=(0, 1), ylabel='weight')
+        if len(seconds) > 1:
+            axes[0].set_xlim(seconds[0], seconds[-1])
         axes[0].set_title(f'weights of the {most} modes, heaviest at the bottom', loc='left')
         if truth is not None:
             _draw_errors(axes[1], track, truth, seconds)

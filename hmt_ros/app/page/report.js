@@ -248,28 +248,37 @@ function tellScores() {
   element('each').setAttribute('aria-label', 'Calibration for each joint alone; the numbers stand in the table');
 }
 
-// Playing.
+// Playing: a timer waits for the time of the next image; those that come too late are skipped.
 
-let playing = null;
+let timer = null;
+let due = 0;
 
-function play(on) {
-  const button = element('play');
-  button.textContent = on ? 'Pause' : 'Play';
-  button.setAttribute('aria-pressed', on);
-  playing = on ? { seconds: shown.time === LAST ? TIMES[0] : TIMES[shown.time], before: null } : null;
-  if (on) requestAnimationFrame(step);
+/** For how long a time is shown, ms. */
+function duration(time) {
+  const seconds = time < LAST ? TIMES[time + 1] - TIMES[time] : TIMES[LAST] / Math.max(LAST, 1) || 1;
+  return (1000 * seconds) / Number(element('speed').value);
 }
 
-function step(now) {
-  if (!playing) return;
-  if (playing.before !== null) playing.seconds += ((now - playing.before) / 1000) * Number(element('speed').value);
-  playing.before = now;
-  const length = TIMES[LAST] + (LAST > 0 ? TIMES[LAST] / LAST : 1);
-  if (playing.seconds > length) playing.seconds = TIMES[0];
-  let time = 0;
-  while (time < LAST && TIMES[time + 1] <= playing.seconds + 1e-6) time += 1;
-  if (time !== shown.time) goTo(time);
-  requestAnimationFrame(step);
+function play(on) {
+  clearTimeout(timer);
+  timer = null;
+  element('play').textContent = on ? 'Pause' : 'Play';
+  element('play').setAttribute('aria-pressed', on);
+  if (!on) return;
+  if (shown.time === LAST) goTo(0);
+  due = performance.now() + duration(shown.time);
+  timer = setTimeout(step, duration(shown.time));
+}
+
+function step() {
+  const now = performance.now();
+  let { time } = shown;
+  do {
+    time = time < LAST ? time + 1 : 0;
+    due += duration(time);
+  } while (due <= now);
+  goTo(time);
+  timer = setTimeout(step, due - performance.now());
 }
 
 /** What stands behind # in the address: frame=10&yaw=30&pitch=5&zoom=1.5&show=0,1,truth,trajectories. */
@@ -294,10 +303,10 @@ function readAddress() {
 
 element('time').max = LAST;
 element('time').addEventListener('input', () => goTo(Number(element('time').value)));
-element('play').addEventListener('click', () => play(!playing));
+element('play').addEventListener('click', () => play(timer === null));
 element('follow').checked = space.follow;
 element('follow').addEventListener('change', () => { space.follow = element('follow').checked; space.draw(); });
-element('together').addEventListener('change', () => { space.together = element('together').checked; space.draw(); });
+element('align').addEventListener('change', () => { space.together = element('align').checked; space.draw(); });
 document.querySelectorAll('[data-look]').forEach((button) => button.addEventListener('click', () => {
   const [yaw, pitch] = button.dataset.look.split(' ').map(Number);
   space.turn(yaw, pitch);
@@ -308,7 +317,7 @@ document.addEventListener('keydown', (event) => {
   const free = !['INPUT', 'BUTTON', 'SELECT', 'CANVAS'].includes(event.target.tagName);
   if (!free || event.ctrlKey || event.metaKey || event.altKey) return;
   const keys = {
-    ' ': () => play(!playing), ArrowLeft: () => goTo(shown.time - 1), ArrowRight: () => goTo(shown.time + 1),
+    ' ': () => play(timer === null), ArrowLeft: () => goTo(shown.time - 1), ArrowRight: () => goTo(shown.time + 1),
   };
   if (keys[event.key]) { event.preventDefault(); keys[event.key](); }
 });
