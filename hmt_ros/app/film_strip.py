@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.app.recorded_input import COMPRESSED, RAW, recorded_input
+from hmt_ros.app.recorded_input import CAMERA_INFO_TYPE, COMPRESSED, RAW, recorded_input
 from hmt_ros.body import Camera
 from msg_tools import BagError, BagReader
 from msg_tools.camera_info import camera_from_info
@@ -65,7 +65,8 @@ def image_source(
 ) -> ImageSource | None:
     """Where the images are that a bag of mixtures is of; None: there are none.
 
-    Those of `images`; else those that `out` has itself; else what the tracker drew there.
+    Those of `images`; else those that `out` has itself, with calibration; else what the tracker
+    drew there.
 
     Args:
         out: bag of the mixtures.
@@ -85,9 +86,14 @@ def image_source(
                 for topic in bag.topics.values()
                 if topic.msgtype in (RAW, COMPRESSED) and topic.message_count
             ]
-            recorded = [name for name in found if not name.endswith(OVERLAY)]
-            if not recorded:
-                return ImageSource(path, found[0], None) if found else None
+            drawn = [name for name in found if name.endswith(OVERLAY)]
+            recorded = [name for name in found if name not in drawn]
+            calibrated = any(
+                topic.msgtype == CAMERA_INFO_TYPE and topic.message_count
+                for topic in bag.topics.values()
+            )
+            if not recorded or not calibrated:
+                return ImageSource(path, drawn[0], None) if drawn else None
             if len(recorded) == 1:
                 image_topic = recorded[0]
         chosen = recorded_input(bag, image_topic, camera_info_topic)

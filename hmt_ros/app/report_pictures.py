@@ -92,7 +92,7 @@ def draw_pictures(
 def draw_calibration(path: Path, scores: dict[str, TopicScores]) -> None:
     """Coverage of the highest-density regions over their probability."""
     with mpl.rc_context(STYLE):
-        figure = Figure((7.6, 4.2), dpi=110, layout='constrained')
+        figure = Figure((7.6, 4.8), dpi=110, layout='constrained')
         axes: Any = figure.subplots(1, 2, sharey=True)
         for number, (name, topic) in enumerate(scores.items()):
             pair = topic.scores.levels, topic.scores.joint_levels

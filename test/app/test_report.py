@@ -310,6 +310,21 @@ def test_without_images_and_truth(made, tmp_path):
     assert names == {'report.html', 'side_views.png', 'weights.png', 'free_energy.png'}
 
 
+def test_images_that_the_bag_has_itself(body, poses, made, tmp_path):
+    out = tmp_path / 'out'
+    with BagWriter(out) as bag, BagReader(made.images) as images, BagReader(made.out) as mixtures:
+        for reader in (images, mixtures):
+            for stored in reader.messages():
+                bag.write(stored.topic, stored.log_time_ns, stored.message)
+        picture = np.zeros((240, 320, 3), np.uint8)
+        message = compressed_image_message(MESSAGES, picture, STAMPS[0], FRAME_ID)
+        bag.write('overlay/compressed', STAMPS[0], message)
+    found = data_of(make(out, tmp_path / 'report'))
+    assert found['images']['drawn_on'] is False
+    assert len(found['images']['jpegs']) == FRAMES
+    assert found['layers'][0]['pixels'] is not None
+
+
 def test_what_the_tracker_drew_stands_in_for_images(body, poses, tmp_path):
     out = write_out(tmp_path / 'out', body, poses, overlay=True)
     found = data_of(make(out, tmp_path / 'report'))
@@ -478,6 +493,9 @@ def test_images_that_do_not_fit(made, tmp_path, capsys):
     other = write_images(tmp_path / 'other', [stamp + 1 for stamp in STAMPS])
     line = fails(tmp_path, capsys, made.out, '--images', other)
     assert 'is it the bag that was tracked?' in line
+    cut = tmp_path / 'cut.mcap'
+    cut.write_bytes((made.images / 'in.mcap').read_bytes()[:-200])
+    assert str(cut) in fails(tmp_path, capsys, made.out, '--images', cut)
 
 
 def test_only_reports_are_replaced(made, page, tmp_path, capsys):
@@ -656,6 +674,7 @@ def test_layers_modes_and_play(page, tmp_path):
         get('show-truth').click(); look('without truth'); get('show-truth').click();
         get('show-trajectories').click(); look('ways'); get('show-trajectories').click();
         get('align').click(); look('aligned'); get('align').click();
+        look('image with', 'image'); get('with-modes').click(); look('image without', 'image');
         seen.rows = document.querySelectorAll('#modes tbody tr').length;
         document.querySelector('#modes button').click(); look('alone');
         document.querySelector('#modes button').click(); look('all');
@@ -678,6 +697,7 @@ def test_layers_modes_and_play(page, tmp_path):
     views = ['first', 'both', 'without truth', 'ways', 'aligned', 'alone']
     assert len({seen[name] for name in views}) == len(views)
     assert seen['again'] == seen['all'] == seen['first']
+    assert seen['image with'] != seen['image without']
     assert seen['rows'] == 3
     assert seen['trajectories'] == TRAJECTORIES
     assert seen['errors'] is True

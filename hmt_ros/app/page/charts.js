@@ -140,10 +140,13 @@ function weightsChart(weightsAt) {
     draw(context, u, v) {
       let most = 1;
       TIMES.forEach((_, t) => { most = Math.max(most, weightsAt(t).length); });
+      let edge = -1;
       TIMES.forEach((time, t) => {
         const before = t > 0 ? 0.5 * (TIMES[t - 1] + time) : x[0];
         const after = t < LAST ? 0.5 * (TIMES[t + 1] + time) : x[1];
         const [from, to] = [Math.round(u(before)), Math.round(u(after))];
+        if (to <= edge) return; // nothing of it would be seen
+        edge = to;
         let sum = 0;
         weightsAt(t).forEach((weight, rank) => {
           context.fillStyle = rankColour(rank, most);

@@ -185,6 +185,7 @@ function tell() {
   parts.push(`first stamp ${report.start_ns} ns`);
   element('facts').textContent = `${parts.join('; ')}.`;
   if (report.images) {
+    element('with-modes').closest('div').hidden = report.images.drawn_on;
     element('image-caption').textContent = report.images.drawn_on
       ? 'What the tracker drew: the heaviest modes on the image.'
       : 'The modes on the image that they explain.';
@@ -212,10 +213,10 @@ function tellFreeEnergy() {
 const COLUMNS = [
   ['frames', (s) => fixed(s.frames)], ['missing', (s) => fixed(s.missing)], ['modes', (s) => fixed(s.modes, 1)],
   ['heaviest, mm', (s) => fixed(s.heaviest_mm)], ['best of K, mm', (s) => fixed(s.best_mm)],
-  ['expected, mm', (s) => fixed(s.expected_mm)], ['under 150 mm', (s) => percent(s.fraction_tracked)],
+  ['expected, mm', (s) => fixed(s.expected_mm)], ['under 150\u00a0mm', (s) => percent(s.fraction_tracked)],
   ['-log p', (s) => fixed(s.negative_log_likelihood, 1)],
-  ['all joints 50 %', (s) => percent(s.coverage_50)], ['all joints 90 %', (s) => percent(s.coverage_90)],
-  ['each joint 50 %', (s) => percent(s.joint_coverage_50)], ['each joint 90 %', (s) => percent(s.joint_coverage_90)],
+  ['all joints 50\u00a0%', (s) => percent(s.coverage_50)], ['all joints 90\u00a0%', (s) => percent(s.coverage_90)],
+  ['each joint 50\u00a0%', (s) => percent(s.joint_coverage_50)], ['each joint 90\u00a0%', (s) => percent(s.joint_coverage_90)],
 ];
 
 function tellScores() {
@@ -304,6 +305,10 @@ function readAddress() {
 element('time').max = LAST;
 element('time').addEventListener('input', () => goTo(Number(element('time').value)));
 element('play').addEventListener('click', () => play(timer === null));
+element('with-modes').addEventListener('change', () => {
+  film.withModes = element('with-modes').checked;
+  film.draw();
+});
 element('follow').checked = space.follow;
 element('follow').addEventListener('change', () => { space.follow = element('follow').checked; space.draw(); });
 element('align').addEventListener('change', () => { space.together = element('align').checked; space.draw(); });

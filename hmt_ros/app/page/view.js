@@ -184,7 +184,7 @@ class Space {
     const project = this.projection(width, height);
     context.lineCap = 'round';
     context.lineJoin = 'round';
-    this.drawFloor(context, project);
+    this.drawFloor(context, project, width, height);
     if (shown.trajectories) this.drawWays(context, project);
     const segments = [];
     const root = this.lastRoot() || this.centre;
@@ -221,7 +221,7 @@ class Space {
   }
 
   /** A grid of half metres under the feet, and an arrow to the camera. */
-  drawFloor(context, project) {
+  drawFloor(context, project, width, height) {
     const root = this.follow ? this.lastRoot() || this.centre : this.centre;
     const middle = [Math.round(2 * root[0]) / 2, Math.round(2 * root[2]) / 2];
     const reach = Math.ceil(2 * Math.min(this.radius, 4)) / 2;
@@ -255,7 +255,8 @@ class Space {
     context.stroke();
     context.font = '12px system-ui, sans-serif';
     context.textAlign = 'center';
-    context.fillText('to the camera', tip[0], tip[1] + 15);
+    const [u, v] = [Math.max(45, Math.min(width - 45, tip[0])), Math.max(14, Math.min(height - 8, tip[1] + 15))];
+    context.fillText('to the camera', u, v);
   }
 
   /** The ways of hands, feet, head and pelvis along the trajectories of the present window. */
@@ -293,6 +294,7 @@ class Space {
 class Film {
   constructor(canvas) {
     this.canvas = canvas;
+    this.withModes = true;
     this.pictures = new Map();
     this.last = null;
   }
@@ -328,7 +330,7 @@ class Film {
     context.rect(left, top, w, h);
     context.clip();
     context.lineCap = 'round';
-    modesNow().forEach((mode) => this.drawMode(context, mode, left, top, w));
+    if (this.withModes) modesNow().forEach((mode) => this.drawMode(context, mode, left, top, w));
     context.restore();
   }
 
