@@ -96,20 +96,26 @@ class RecordedMixtures:
 
     @property
     def stamps(self) -> list[int]:
-        """All times of poses and ends of windows, increasing."""
+        """All times of poses, increasing; those in windows where no pose stands alone."""
         stamps = {moment.stamp_ns for layer in self.layers for moment in layer.track.moments}
-        stamps.update(window.stamp_ns for topic in self.trajectories for window in topic.windows)
+        windows = [window for topic in self.trajectories for window in topic.windows]
+        stamps.update(window.stamp_ns for window in windows)
+        if not self.layers:
+            stamps.update(stamp for window in windows for stamp in window.stamps_ns)
         return sorted(stamps)
 
     def at(self, stamps: Iterable[int]) -> RecordedMixtures:
-        """The mixtures at some times only."""
+        """The mixtures at some times only; of windows those that end then, or else the last."""
         wanted = set(stamps)
         return RecordedMixtures(
             [
                 replace(layer, track=replace(layer.track, moments=_at(layer.track.moments, wanted)))
                 for layer in self.layers
             ],
-            [replace(topic, windows=_at(topic.windows, wanted)) for topic in self.trajectories],
+            [
+                replace(topic, windows=_at(topic.windows, wanted) or topic.windows[-1:])
+                for topic in self.trajectories
+            ],
         )
 
 

@@ -12,6 +12,7 @@ from hmt_ros.app.bag_scores import chosen_topics, score_bag
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
 from hmt_ros.app.film_strip import FilmStrip, ImageSource, film_strip, image_source
 from hmt_ros.app.new_folder import FolderKind
+from hmt_ros.app.recorded_bodies import BODY
 from hmt_ros.app.recorded_mixtures import RecordedMixtures, read_mixtures
 from hmt_ros.app.report_page import Content, data_size, page_html
 from hmt_ros.app.report_pictures import PICTURES, draw_pictures, shown_in_pictures
@@ -137,20 +138,14 @@ def _reported(options: argparse.Namespace) -> str:
 
 def _content(options: argparse.Namespace, source: ImageSource | None, bar: tqdm) -> Content:
     """What is to be shown."""
-
-    def expect(path: Path, topics: list[str]) -> None:
-        with BagReader(path) as bag:
-            bar.total = (bar.total or 0) + bag.message_count(topics)
-        bar.refresh()
-
     truth = _truth(options)
     with BagReader(options.bag) as bag:
         topics = chosen_topics(bag, options.topic)
-    expect(options.bag, topics)
-    if truth is not None:
-        expect(options.bag, topics)
+        bodies = [topic.name for topic in bag.topics.values() if topic.msgtype == BODY]
+        bar.total = bag.message_count({*topics, *bodies}) * (1 if truth is None else 2)
     if source is not None:
-        expect(source.bag, [source.topic])
+        with BagReader(source.bag) as bag:
+            bar.total += bag.message_count([source.topic])
     everything = read_mixtures(
         options.bag, topics=topics, body_model=options.body, progress=bar.update
     )
@@ -168,6 +163,12 @@ def _content(options: argparse.Namespace, source: ImageSource | None, bar: tqdm)
     notes = []
     if len(stamps) < len(everything.stamps):
         notes.append(f'{len(stamps)} of {len(everything.stamps)} times are shown')
+    notes += [
+        f'the trajectories on {topic.topic} are not drawn and have no errors: the bag does not '
+        'tell of which body they are'
+        for topic in everything.trajectories
+        if not topic.ends
+    ]
     notes += [
         f'{name} has no likelihood and no coverage: {topic.note}'
         for name, topic in scores.items()
@@ -192,15 +193,16 @@ def _truth(options: argparse.Namespace) -> Truth | None:
 
 
 def _with_truth(mixtures: RecordedMixtures, truth: Truth) -> list[str]:
-    """Topics that can be scored; all, where none can be."""
+    """Topics that can be scored; all, where none can be, so that it is told why."""
     stamps = {
         layer.topic: {moment.stamp_ns for moment in layer.track.moments}
         for layer in mixtures.layers
     }
     for topic in mixtures.trajectories:
-        stamps[topic.topic] = {stamp for window in topic.windows for stamp in window.stamps_ns}
+        if topic.ends:  # without a body there are no joints
+            stamps[topic.topic] = {stamp for window in topic.windows for stamp in window.stamps_ns}
     known = [name for name, own in stamps.items() if not own.isdisjoint(truth.joints)]
-    return known or list(stamps)
+    return known or [part.topic for part in (*mixtures.layers, *mixtures.trajectories)]
 
 
 def _shown(mixtures: RecordedMixtures, most: int) -> list[int]:

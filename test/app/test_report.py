@@ -344,6 +344,28 @@ def test_chosen_topics_and_fewer_times(made, tmp_path):
     assert found['notes'] == [f'4 of {FRAMES} times are shown']
 
 
+def test_one_window_over_the_whole_time(body, poses, tmp_path):
+    """Trajectories that stand alone: their own times are shown."""
+    rng = np.random.default_rng(0)
+    means = poses + 0.1 * rng.normal(size=(2, *poses.shape))
+    content = TrajectoryMixture(
+        np.array([0.25, 0.75]), means, None, np.zeros(2), np.ones(2), tuple(STAMPS), STAMPS[-1],
+        np.array([2.0, 1.0]), body.name, body.dof_names, FRAME_ID,
+    )  # fmt: skip
+    for with_body in (True, False):
+        with BagWriter(tmp_path / f'out{with_body}') as bag:
+            if with_body:
+                bag.write('body', START_NS, message_of_body(MESSAGES, body, START_NS, FRAME_ID))
+            message = trajectory_mixture_message(MESSAGES, content)
+            bag.write('trajectory_mixture', STAMPS[-1], message)
+        data = data_of(make(tmp_path / f'out{with_body}', tmp_path / f'report{with_body}'))
+        assert np.allclose(data['times'], np.arange(FRAMES) / 10)
+        (window,) = data['trajectories'][0]['windows']
+        assert window['weights'] == [0.75, 0.25]
+        assert (window['ways'] is not None) == with_body
+        assert len(data['notes']) == (0 if with_body else 1)
+
+
 def test_mixtures_without_covariances_and_missing_frames(body, poses, tmp_path):
     def change(message):
         for component in message.components:
@@ -722,7 +744,14 @@ def test_pages_with_less_in_them(made, body, poses, tmp_path):
     assert min(seen['space drawn'], seen['weights drawn']) > 1000
 
     ways = make(made.out, tmp_path / 'ways', '--topic', 'trajectory_mixture')
-    assert visit(ways, "look('space');", tmp_path)['space drawn'] > 1000
+    seen = visit(
+        ways,
+        "look('space'); get('time').value = 3; get('time').dispatchEvent(new Event('input'));"
+        "look('later');",
+        tmp_path,
+    )
+    assert seen['space drawn'] > 1000
+    assert seen['space'] != seen['later']
 
     single = make(
         made.out,

@@ -268,6 +268,8 @@ class Space {
       if (!now || !now.ways) return;
       const [steps, ends] = [now.times.length, topic.ends.length];
       const count = now.ways.length / (3 * steps * ends);
+      const away = now.times.map((time) => Math.abs(time - TIMES[shown.time]));
+      const present = away.indexOf(Math.min(...away));
       for (let m = count - 1; m >= 0; m -= 1) {
         context.globalAlpha = FAINTEST + (0.9 - FAINTEST) * (now.weights[m] / now.weights[0]);
         for (let e = 0; e < ends; e += 1) {
@@ -279,7 +281,7 @@ class Space {
           context.beginPath();
           points.forEach(([u, v], t) => { if (t) context.lineTo(u, v); else context.moveTo(u, v); });
           context.stroke();
-          const [u, v] = points[steps - 1];
+          const [u, v] = points[present];
           context.beginPath();
           context.arc(u, v, m === 0 ? 3 : 2, 0, 2 * Math.PI);
           context.fill();
