@@ -20,7 +20,7 @@ setup(
     maintainer_email='hmt-ros@example.com',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*', 'msg_tools', 'msg_tools.*']),
     package_data={
-        PACKAGE: ['config/*.yaml', 'body/models/*.yaml', 'experts/models/*.npz'],
+        PACKAGE: ['config/*.yaml', 'body/models/*.yaml', 'experts/models/*.npz', 'app/page/*'],
         # The message definitions are read by whoever works on bags without ROS.
         'msg_tools': ['hmt_msgs/msg/*.msg', 'hmt_msgs/srv/*.srv'],
     },
@@ -60,6 +60,7 @@ setup(
             'replay = hmt_ros.app.replay:main',
             'make-bag = hmt_ros.app.make_bag:main',
             'train = hmt_ros.app.train:main',
+            'report = hmt_ros.app.report:main',
             'evaluate = hmt_ros.app.evaluate:main',
         ],
     },

@@ -136,8 +136,9 @@ def test_marked_commands_run(workplace, capsys):
             module = importlib.import_module(COMMANDS[words[3]][0])
             assert module.main(words[4:]) == 0, capsys.readouterr().err
             ran.append(words[3])
-    assert ran == ['make-bag', 'replay', 'evaluate', 'evaluate']
+    assert ran == ['make-bag', 'replay', 'evaluate', 'evaluate', 'report']
     assert '"fraction_tracked"' in capsys.readouterr().out
+    assert (workplace / 'reach_report' / 'report.html').is_file()
 
 
 def test_subject_file_of_the_readme():

@@ -240,7 +240,7 @@ def test_data_files_are_installed() -> None:
     for package in ('hmt_ros', 'msg_tools'):
         sources = {
             path.relative_to(ROOT)
-            for suffix in ('yaml', 'msg', 'srv')
+            for suffix in ('yaml', 'msg', 'srv', 'html', 'css', 'js')
             for path in (ROOT / package).rglob(f'*.{suffix}')
         }
         assert {path for path in sources if not (site / path).is_file()} == set()

@@ -13,6 +13,7 @@ COMMANDS = {
     'replay': ('hmt_ros.app.replay', 'track the person in a bag, into a new bag'),
     'make-bag': ('hmt_ros.app.make_bag', 'render a motion into a bag with ground truth'),
     'train': ('hmt_ros.app.train', 'learn to predict poses from silhouettes'),
+    'report': ('hmt_ros.app.report', 'pictures and a page with a 3D view of the mixtures in a bag'),
     'evaluate': ('hmt_ros.app.evaluate', 'errors and calibration of mixtures against ground truth'),
 }
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.app.recorded_bodies import BODY, SAME_PLACE, RecordedBodies
+from hmt_ros.app.recorded_track import bare_mixture
 from hmt_ros.app.truth import POSE_MIXTURE, Truth, is_truth, mixture_topics
-from hmt_ros.body import Body, load_body
+from hmt_ros.body import Body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking.evaluation import (
     BATCH,
@@ -29,16 +30,12 @@ from hmt_ros.tracking.evaluation import (
 )
 from msg_tools import BagMessage, BagReader
 from msg_tools.headers import time_ns
-from msg_tools.message_error import check_weights
-from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_of
+from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
 from msg_tools.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_of
 
 Array = NDArray[np.float64]
 
-BODY = 'hmt_msgs/msg/Body'
 TRAJECTORY_MIXTURE = 'hmt_msgs/msg/TrajectoryMixture'
-# Positions of joints in a message agree with the body's kinematics up to this, m.
-SAME_PLACE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -194,13 +191,13 @@ def score_bag(
         ValueError: no mixtures, messages that can not be understood, or no frame that has a truth.
     """
     with BagReader(path) as bag:
-        names = _chosen(bag, list(topics))
+        names = chosen_topics(bag, topics)
         joints = _common_joints(truth)
         found = {
             name: _Topic(name, truth, joints, model_sigma, np.random.default_rng(seed))
             for name in names
         }
-        bodies = _Bodies(body_model)
+        bodies = RecordedBodies(body_model)
         carriers = [topic.name for topic in bag.topics.values() if topic.msgtype == BODY]
         for stored in bag.messages([*carriers, *names]):
             if stored.msgtype == BODY:
@@ -214,7 +211,12 @@ def score_bag(
         return {name: topic.finish() for name, topic in found.items()}
 
 
-def _chosen(bag: BagReader, wanted: list[str]) -> list[str]:
+def chosen_topics(bag: BagReader, wanted: Iterable[str]) -> list[str]:
+    """Topics of a bag with mixtures other than ground truth; those that are wanted, or all.
+
+    Raises:
+        ValueError: there are none, or one that is wanted has no mixtures.
+    """
     poses = [name for name in mixture_topics(bag) if not is_truth(bag, name)]
     trajectories = [
         topic.name
@@ -253,69 +255,7 @@ def _indices(names: tuple[str, ...], joints: tuple[str, ...], source: str) -> ND
     return np.array([names.index(name) for name in (ORIGIN, *joints)], dtype=np.intp)
 
 
-class _Bodies:
-    """The bodies that a bag has described so far, by the namespace of their topic."""
-
-    def __init__(self, model: str | None) -> None:
-        self._model = model
-        self._known: dict[str, Body] = {}
-        self._measured: dict[str, Body] = {}
-
-    def learn(self, stored: BagMessage) -> None:
-        """Takes a message about a body; a model that is not known leaves the body unknown."""
-        message = stored.message
-        name = str(message.name) if self._model is None else self._model
-        lengths = dict(
-            zip(map(str, message.segment_names), map(float, message.segment_lengths), strict=False)
-        )
-        try:
-            body = load_body(name)
-        except FileNotFoundError:
-            if self._model is not None:
-                raise
-            return
-        try:
-            self._known[_namespace(stored.topic)] = body.with_segment_lengths(lengths)
-        except KeyError as error:
-            raise ValueError(f'topic {stored.topic}: {error.args[0]}') from error
-
-    def of(self, topic: str, dof_names: tuple[str, ...]) -> Body | None:
-        """The body whose poses a topic carries, None: not known."""
-        body = self._known.get(_namespace(topic))
-        if body is None and len(self._known) == 1:
-            body = next(iter(self._known.values()))
-        return body if body is not None and body.dof_names == dof_names else None
-
-    def of_pose(self, topic: str, content: PoseMixture) -> Body | None:
-        """The body of a mixture: that of the bag, or one of the lengths that its joints tell."""
-        known = self.of(topic, content.dof_names)
-        for body in (known, self._measured.get(topic)):
-            if body is not None and _is_there(body, content):
-                return body
-        try:
-            body = load_body(self._model or content.body_model).with_joints_at(
-                content.mixture.means, content.joint_names, content.joint_positions
-            )
-        except (FileNotFoundError, ValueError):
-            return known
-        if body.dof_names != content.dof_names:
-            return known
-        self._measured[topic] = body
-        return body
-
-
-def _is_there(body: Body, content: PoseMixture) -> bool:
-    if content.joint_names != body.joint_names or content.dof_names != body.dof_names:
-        return False
-    computed = body.joint_positions(content.mixture.means)
-    return bool(np.abs(computed - content.joint_positions).max() <= SAME_PLACE)
-
-
-def _namespace(topic: str) -> str:
-    return topic.lstrip('/').rpartition('/')[0]
-
-
-def _read_pose(stored: BagMessage, topic: _Topic, bodies: _Bodies) -> None:
+def _read_pose(stored: BagMessage, topic: _Topic, bodies: RecordedBodies) -> None:
     message = stored.message
     _check_frame(topic, str(message.header.frame_id))
     names = tuple(str(name) for name in message.joint_names)
@@ -332,31 +272,15 @@ def _read_pose(stored: BagMessage, topic: _Topic, bodies: _Bodies) -> None:
                 content.joint_positions, names, body,
             )  # fmt: skip
         else:
-            pose = _bare_pose(message, names)
+            weights, positions, names = bare_mixture(message)
+            pose = _Pose(time_ns(message.header.stamp), weights, None, positions, names, None)
             topic.kind = MixtureKind(int(message.kind)).name.lower()
     except ValueError as error:
         raise ValueError(f'{stored.topic} at {stored.log_time_ns} ns: {error}') from error
     topic.take(pose)
 
 
-def _bare_pose(message: Any, names: tuple[str, ...]) -> _Pose:
-    """A mixture whose covariances are unknown."""
-    components = message.components
-    weights = np.array([component.weight for component in components], dtype=np.float64)
-    if not components:
-        raise ValueError('mixture has no components')
-    check_weights(weights, 'mixture')
-    for k, component in enumerate(components):
-        if len(component.joint_positions) != len(names):
-            raise ValueError(
-                f'mixture: component {k} has {len(component.joint_positions)} joint_positions, '
-                f'wanted {len(names)}'
-            )
-    positions = np.array([[(p.x, p.y, p.z) for p in c.joint_positions] for c in components])
-    return _Pose(time_ns(message.header.stamp), weights, None, positions, names, None)
-
-
-def _read_trajectories(stored: BagMessage, topic: _Topic, bodies: _Bodies) -> None:
+def _read_trajectories(stored: BagMessage, topic: _Topic, bodies: RecordedBodies) -> None:
     """Takes the marginals of a window; those of an older window hold where no newer one reaches."""
     try:
         content = trajectory_mixture_of(stored.message)

@@ -17,7 +17,7 @@ from hmt_ros.app.bag_scores import score_bag
 from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.evaluate import as_text
 from hmt_ros.app.pictures import draw_overlays, draw_overview, draw_side_views, draw_weights
-from hmt_ros.app.recorded_track import RecordedTrack, read_images, read_track
+from hmt_ros.app.recorded_track import RecordedTrack, read_images, read_track, spread
 from hmt_ros.app.truth import Truth, read_truth, truth_of, truth_topic
 from msg_tools import BagReader
 
@@ -87,7 +87,7 @@ def draw(
         track: what was tracked.
         truth: None: not known.
     """
-    few, many = _spread(track, IN_OVERVIEW), _spread(track, ON_SHEETS)
+    few, many = spread(track, IN_OVERVIEW), spread(track, ON_SHEETS)
     camera, images = read_images(source, {*few, *many})
     pictures = [
         (folder / 'overview.png', 'images with the heaviest modes, and the same from the side'),
@@ -101,13 +101,6 @@ def draw(
     draw_side_views(side_views, track, many, truth)
     draw_weights(weights, track, truth)
     return pictures
-
-
-def _spread(track: RecordedTrack, count: int) -> list[int]:
-    """Stamps spread evenly over a track."""
-    last = len(track.moments) - 1
-    chosen = np.unique(np.rint((np.arange(count) + 0.5) / count * last).astype(int))
-    return [track.moments[i].stamp_ns for i in chosen]
 
 
 def _truth(source: Path, target: Path) -> Truth | None:

@@ -21,10 +21,10 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from PIL import Image as Picture
 
-from hmt_ros.app.recorded_track import Moment, RecordedTrack
+from hmt_ros.app.recorded_track import Moment, RecordedTrack, mode_errors
 from hmt_ros.app.truth import Truth
 from hmt_ros.body import Camera
-from hmt_ros.tracking.evaluation import EVALUATED_JOINTS, LOST, ORIGIN
+from hmt_ros.tracking.evaluation import LOST, ORIGIN
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -101,7 +101,7 @@ def draw_overview(
             left=0.65 / width, right=1 - 0.1 / width, top=1 - 0.25 / figure.get_figheight(),
             bottom=0.75 / figure.get_figheight(), wspace=0.06, hspace=0.06,
         )  # fmt: skip
-        _save(figure, path)
+        save_picture(figure, path)
 
 
 def draw_overlays(
@@ -147,27 +147,23 @@ def draw_weights(path: Path, track: RecordedTrack, truth: Truth | None) -> None:
         axes = figure.subplots(2 if known else 1, 1, squeeze=False, sharex=True)[:, 0]
         colours = mpl.colormaps['cividis'](np.linspace(0.95, 0.1, most))
         axes[0].stackplot(seconds, weights, colors=colours, linewidth=0.4, edgecolor='white')
-        axes[0].set(ylim=(0, 1), ylabel='weight', xlim=(seconds[0], seconds[-1]))
+        axes[0].set(ylim=(0, 1), ylabel='weight')
+        if len(seconds) > 1:
+            axes[0].set_xlim(seconds[0], seconds[-1])
         axes[0].set_title(f'weights of the {most} modes, heaviest at the bottom', loc='left')
         if truth is not None:
             _draw_errors(axes[1], track, truth, seconds)
         axes[-1].set_xlabel('s')
-        _save(figure, path)
+        save_picture(figure, path)
 
 
 def _draw_errors(axes: Any, track: RecordedTrack, truth: Truth, seconds: Array) -> None:
-    names = [x for x in EVALUATED_JOINTS if x in truth.joint_names and x in track.joint_names]
-    own = [track.joint_names.index(name) for name in (ORIGIN, *names)]
-    true = [truth.joint_names.index(name) for name in (ORIGIN, *names)]
+    errors = mode_errors(track, truth)
     curves = np.full((3, len(seconds)), np.nan)
     for t, moment in enumerate(track.moments):
-        if moment.stamp_ns not in truth.joints:
-            continue
-        seen = moment.joints[:, own]
-        there = truth.joints[moment.stamp_ns][true]
-        offset = (seen - seen[:, :1])[:, 1:] - (there - there[:1])[1:]
-        error = 1e3 * np.linalg.norm(offset, axis=2).mean(1)
-        curves[:, t] = error[0], error.min(), moment.weights @ error
+        if moment.stamp_ns in errors:
+            error = 1e3 * errors[moment.stamp_ns]
+            curves[:, t] = error[0], error.min(), moment.weights @ error
     styles = (
         ('heaviest mode', '#d55e00', '-'),
         ('best of all', '#009e73', '-'),
@@ -209,7 +205,7 @@ def _draw_sheet(
             left=0.04, right=0.99, top=1 - 0.5 / height, bottom=0.4 / height, wspace=0.08,
             hspace=0.25 / (cell * ratio),
         )  # fmt: skip
-        _save(figure, path)
+        save_picture(figure, path)
 
 
 def _draw_on_image(
@@ -327,7 +323,7 @@ def _side_bounds(
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_picture(figure: Figure, path: Path) -> None:
     """Writes a PNG of 256 colours, a third of the size of one of all colours."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()

@@ -10,7 +10,7 @@ from hmt_ros.nodes.filter_session import KEYPOINTS
 from msg_tools import BagError, BagMessage, BagReader, Topic
 
 RAW, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
-_CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 _KEYPOINTS = 'hmt_msgs/msg/Keypoints2D'
 _POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
 
@@ -89,7 +89,7 @@ def _image_topic(bag: BagReader, name: str | None) -> Topic:
 
 
 def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
-    kinds = (_CAMERA_INFO,)
+    kinds = (CAMERA_INFO_TYPE,)
     if name is not None:
         return bag.find_topic(kinds, name)
     # /camera/image_raw/compressed has its calibration in /camera/camera_info.

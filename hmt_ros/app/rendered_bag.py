@@ -9,12 +9,8 @@ need: `background.png` (the empty scene), `subject.yaml` (joints as clicked in t
 from __future__ import annotations
 
 import math
-import os
-import shutil
 import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from hmt_ros.app.new_folder import FolderKind
 from hmt_ros.body import Body, Camera
 from hmt_ros.image.renderer import render_frames
 from hmt_ros.image.scene import Scene
@@ -188,31 +185,7 @@ def subject_text(take: Take, camera: Camera, pixels: Array, seed: int) -> str:
     return '\n'.join(lines) + '\n'
 
 
-@contextmanager
-def new_bag_folder(target: Path, *, overwrite: bool) -> Iterator[Path]:
-    """A folder to write the bag to, which comes to its place when all is written, or not at all."""
-    target = target.absolute()
-    _check_target(target, overwrite)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    around = Path(tempfile.mkdtemp(prefix=f'.{target.name}.', suffix='.partial', dir=target.parent))
-    try:
-        yield around / target.name
-        _check_target(target, overwrite)
-        if target.exists():
-            target.rename(around / 'replaced')
-        (around / target.name).rename(target)
-    finally:
-        shutil.rmtree(around, ignore_errors=True)
-
-
-def _check_target(target: Path, overwrite: bool) -> None:
-    if not os.path.lexists(target):
-        return
-    if not overwrite:
-        raise ValueError(f'{target} exists; give another name, or --overwrite')
-    names = sorted(path.name for path in target.iterdir()) if target.is_dir() else []
-    own = ('metadata.yaml', f'{target.name}.mcap', *FILES_BESIDE)
-    foreign = [name for name in names if name not in own]
-    if target.is_symlink() or 'metadata.yaml' not in names or foreign:
-        what = f'it has {foreign[0]}' if foreign else 'it is not the folder of a bag'
-        raise ValueError(f'{target} is not replaced: {what}; give another name')
+def new_bag_folder(target: Path, *, overwrite: bool) -> AbstractContextManager[Path]:
+    """Where to write the bag to; it comes to its place when all is written, or not at all."""
+    files = (f'{target.absolute().name}.mcap', *FILES_BESIDE)
+    return FolderKind('a bag', 'metadata.yaml', files).new(target, overwrite=overwrite)

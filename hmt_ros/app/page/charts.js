@@ -1,0 +1,256 @@
+// Curves over time, and others: a frame with ticks, what is drawn in it, and where a click leads to.
+
+const MARGIN = { left: 52, right: 10, top: 10, bottom: 34 };
+
+/** Steps of 1, 2 or 5 times a power of ten between two limits, about as many as are wanted. */
+function ticks(low, high, count) {
+  const rough = (high - low) / count;
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].map((x) => x * power).find((x) => x >= rough);
+  const result = [];
+  for (let i = Math.ceil(low / step - 1e-9); i * step <= high + 1e-9 * step; i += 1) result.push(i * step);
+  return { values: result, digits: Math.max(0, -Math.floor(Math.log10(step) + 1e-9)) };
+}
+
+/** A chart on a canvas. `describe` returns {x: [low, high], y: [low, high], labels: [x, y], draw}. */
+class Chart {
+  constructor(canvas, describe, onSeek) {
+    this.canvas = canvas;
+    this.describe = describe;
+    if (!onSeek) return;
+    const seek = (event) => {
+      const [low, high] = this.describe().x;
+      const inside = canvas.clientWidth - MARGIN.left - MARGIN.right;
+      const share = (event.clientX - canvas.getBoundingClientRect().left - MARGIN.left) / inside;
+      onSeek(low + Math.max(0, Math.min(1, share)) * (high - low));
+    };
+    let down = false;
+    canvas.addEventListener('pointerdown', (event) => {
+      down = true;
+      if (event.isTrusted) canvas.setPointerCapture(event.pointerId);
+      seek(event);
+    });
+    canvas.addEventListener('pointermove', (event) => { if (down) seek(event); });
+    ['pointerup', 'pointercancel'].forEach((kind) => canvas.addEventListener(kind, () => { down = false; }));
+  }
+
+  draw() {
+    if (!this.canvas.clientWidth) return;
+    const { context, width, height } = prepared(this.canvas);
+    const { x, y, labels, draw } = this.describe();
+    const [left, right] = [MARGIN.left, width - MARGIN.right];
+    const [top, bottom] = [MARGIN.top, height - MARGIN.bottom];
+    const u = (value) => left + ((value - x[0]) / (x[1] - x[0])) * (right - left);
+    const v = (value) => bottom - ((value - y[0]) / (y[1] - y[0])) * (bottom - top);
+    context.font = '12px system-ui, sans-serif';
+    context.lineWidth = 1;
+    context.strokeStyle = colour('grid');
+    context.fillStyle = colour('muted');
+    context.textAlign = 'right';
+    context.textBaseline = 'middle';
+    const rows = ticks(y[0], y[1], 5);
+    rows.values.forEach((value) => {
+      context.beginPath();
+      context.moveTo(left, v(value));
+      context.lineTo(right, v(value));
+      context.stroke();
+      context.fillText(value.toFixed(rows.digits), left - 6, v(value));
+    });
+    context.textAlign = 'center';
+    context.textBaseline = 'top';
+    const columns = ticks(x[0], x[1], 6);
+    columns.values.forEach((value) => context.fillText(value.toFixed(columns.digits), u(value), bottom + 4));
+    context.fillText(labels[0], (left + right) / 2, bottom + 19);
+    context.save();
+    context.beginPath();
+    context.rect(left, top - 2, right - left, bottom - top + 4);
+    context.clip();
+    draw(context, u, v);
+    context.restore();
+    context.strokeStyle = colour('axis');
+    context.setLineDash([]);
+    context.beginPath();
+    context.moveTo(left, top);
+    context.lineTo(left, bottom);
+    context.lineTo(right, bottom);
+    context.stroke();
+    context.save();
+    context.translate(11, (top + bottom) / 2);
+    context.rotate(-Math.PI / 2);
+    context.textAlign = 'center';
+    context.textBaseline = 'middle';
+    context.fillText(labels[1], 0, 0);
+    context.restore();
+  }
+}
+
+/** A line through points, broken where a value is null. */
+function curve(context, u, v, xs, values, look) {
+  context.strokeStyle = look.colour;
+  context.fillStyle = look.colour;
+  context.lineWidth = look.width || 1.8;
+  context.setLineDash(look.dash || []);
+  context.beginPath();
+  let open = false;
+  values.forEach((value, i) => {
+    if (value === null) { open = false; return; }
+    if (open) context.lineTo(u(xs[i]), v(value)); else context.moveTo(u(xs[i]), v(value));
+    open = true;
+  });
+  context.stroke();
+  context.setLineDash([]);
+  if (values.filter((value) => value !== null).length > 1 && !look.dots) return;
+  values.forEach((value, i) => {
+    if (value === null) return;
+    context.beginPath();
+    context.arc(u(xs[i]), v(value), 2.5, 0, 2 * Math.PI);
+    context.fill();
+  });
+}
+
+/** From the first time to the last, and something on both sides where there is but one. */
+function timeRange() {
+  return LAST > 0 ? [TIMES[0], TIMES[LAST]] : [TIMES[0] - 0.5, TIMES[0] + 0.5];
+}
+
+/** The present time, as an upright line. */
+function drawNow(context, u, v, y) {
+  context.strokeStyle = colour('ink');
+  context.lineWidth = 1.2;
+  context.setLineDash([]);
+  context.beginPath();
+  context.moveTo(u(TIMES[shown.time]), v(y[0]));
+  context.lineTo(u(TIMES[shown.time]), v(y[1]));
+  context.stroke();
+}
+
+/** A colour from the accent, for the heaviest, to a faint one. */
+function rankColour(rank, count) {
+  const [from, to] = ['accent', 'faint'].map((name) => colour(name).match(/[0-9a-f]{2}/gi).map((x) => parseInt(x, 16)));
+  const share = count > 1 ? Math.sqrt(rank / (count - 1)) : 0;
+  return `rgb(${from.map((x, c) => Math.round(x + share * (to[c] - x))).join(',')})`;
+}
+
+/** Weights over time of what is chosen: those of each time as a column, the heaviest at the bottom. */
+function weightsChart(weightsAt) {
+  const x = timeRange();
+  const y = [0, 1];
+  return {
+    x, y, labels: ['time, s', 'weight'],
+    draw(context, u, v) {
+      let most = 1;
+      TIMES.forEach((_, t) => { most = Math.max(most, weightsAt(t).length); });
+      let edge = -1;
+      TIMES.forEach((time, t) => {
+        const before = t > 0 ? 0.5 * (TIMES[t - 1] + time) : x[0];
+        const after = t < LAST ? 0.5 * (TIMES[t + 1] + time) : x[1];
+        const [from, to] = [Math.round(u(before)), Math.round(u(after))];
+        if (to <= edge) return; // nothing of it would be seen
+        edge = to;
+        let sum = 0;
+        weightsAt(t).forEach((weight, rank) => {
+          context.fillStyle = rankColour(rank, most);
+          context.fillRect(from, v(sum + weight), Math.max(to - from, 1), v(sum) - v(sum + weight));
+          context.fillStyle = colour('panel');
+          context.fillRect(from, v(sum + weight), Math.max(to - from, 1), 0.6);
+          sum += weight;
+        });
+      });
+      drawNow(context, u, v, y);
+    },
+  };
+}
+
+/** Errors of a layer over time. */
+const ERRORS = [
+  { name: 'heaviest mode', series: 'series-1', dash: [] },
+  { name: 'best of all', series: 'series-2', dash: [] },
+  { name: 'expected', series: 'muted', dash: [2, 3] },
+];
+function errorCurves(layer) {
+  const curves = [[], [], []];
+  TIMES.forEach((_, t) => {
+    const errors = layer.errors_mm[t];
+    curves[0].push(errors ? errors[0] : null);
+    curves[1].push(errors ? Math.min(...errors) : null);
+    curves[2].push(errors ? errors.reduce((sum, x, k) => sum + x * layer.weights[t][k], 0) : null);
+  });
+  return curves;
+}
+
+function errorsChart(layer) {
+  const curves = errorCurves(layer);
+  const highest = Math.max(...curves.flat().filter((x) => x !== null));
+  const y = [0, Math.max(1.08 * highest, 20)];
+  return {
+    x: timeRange(), y, labels: ['time, s', 'mean joint error, mm'],
+    draw(context, u, v) {
+      curve(context, u, v, timeRange(), [report.lost_mm, report.lost_mm], { colour: colour('axis'), width: 1 });
+      if (report.lost_mm < y[1]) {
+        context.fillStyle = colour('muted');
+        context.textAlign = 'right';
+        context.textBaseline = 'bottom';
+        context.fillText('lost', u(timeRange()[1]) - 2, v(report.lost_mm) - 1);
+      }
+      ERRORS.forEach(({ series, dash }, i) => {
+        curve(context, u, v, TIMES, curves[i], { colour: colour(series), dash });
+      });
+      drawNow(context, u, v, y);
+    },
+  };
+}
+
+/** A range about values, which need not differ. */
+function around(values) {
+  const [low, high] = [Math.min(...values), Math.max(...values)];
+  const room = 0.06 * (high - low) || 0.5;
+  return [low - room, high + room];
+}
+
+/** Free energy of the windows of all topics when their iterations ended. */
+function freeEnergyChart() {
+  const last = trajectories.map((topic) => topic.windows.filter((w) => w.free_energy.length).map((w) => ({
+    time: w.times[w.times.length - 1], value: w.free_energy[w.free_energy.length - 1],
+  })));
+  const y = around(last.flat().map((w) => w.value));
+  return {
+    x: timeRange(), y, labels: ['end of the window, s', 'free energy, nats'],
+    draw(context, u, v) {
+      last.forEach((windows, i) => {
+        const look = { colour: colour(`series-${i % 6}`), dots: windows.length < 80 };
+        curve(context, u, v, windows.map((w) => w.time), windows.map((w) => w.value), look);
+      });
+      drawNow(context, u, v, y);
+    },
+  };
+}
+
+/** Free energy in the iterations of the present windows. */
+function iterationsChart() {
+  const traces = trajectories.map((topic) => (topic.at[shown.time] || { free_energy: [] }).free_energy);
+  const values = traces.flat();
+  const most = Math.max(...traces.map((trace) => trace.length));
+  return {
+    x: [0, Math.max(most - 1, 1)], y: values.length ? around(values) : [0, 1],
+    labels: ['iteration', 'free energy, nats'],
+    draw(context, u, v) {
+      traces.forEach((trace, i) => curve(
+        context, u, v, trace.map((_, step) => step), trace, { colour: colour(`series-${i % 6}`), dots: trace.length < 40 },
+      ));
+    },
+  };
+}
+
+/** Coverage of regions over their probability. */
+function calibrationChart(which) {
+  return {
+    x: [0, 1], y: [0, 1], labels: ['probability of the region', 'share of truths in it'],
+    draw(context, u, v) {
+      curve(context, u, v, [0, 1], [0, 1], { colour: colour('axis'), width: 1 });
+      Object.values(report.scores.topics).forEach((topic, i) => {
+        const covered = topic.calibration[which];
+        if (covered) curve(context, u, v, report.scores.probabilities, covered, { colour: colour(`series-${i % 6}`) });
+      });
+    },
+  };
+}

@@ -1,0 +1,343 @@
+// The page: what is chosen, what is told in words, and what happens when something changes.
+
+const element = (id) => document.getElementById(id);
+
+/** A new element with a text and attributes. */
+function made(tag, text = '', attributes = {}) {
+  const result = document.createElement(tag);
+  result.textContent = text;
+  Object.entries(attributes).forEach(([name, value]) => result.setAttribute(name, value));
+  return result;
+}
+
+const percent = (share) => (share === null ? '-' : `${Math.round(100 * share)} %`);
+const fixed = (value, digits = 0) => (value === null ? '-' : value.toFixed(digits));
+
+const space = new Space(element('space'));
+const film = report.images ? new Film(element('image')) : null;
+
+/** What weights can be shown of: layers, then mixtures over trajectories. */
+const choices = [
+  ...layers.map((layer, index) => ({
+    name: `${layer.kind} (${layer.topic})`, layer, index, weightsAt: (t) => layer.weights[t], what: 'modes',
+  })),
+  ...trajectories.map((topic, index) => ({
+    name: `trajectories (${topic.topic})`, layer: null, index: layers.length + index,
+    weightsAt: (t) => (topic.at[t] ? topic.at[t].weights : []), what: 'trajectories',
+  })),
+];
+const chosen = () => choices[shown.chosen];
+const errorsKnown = () => Boolean(chosen().layer && chosen().layer.errors_mm);
+
+const hasFreeEnergy = trajectories.some((topic) => topic.windows.some((w) => w.free_energy.length));
+const calibrated = report.scores
+  && Object.values(report.scores.topics).some((topic) => topic.calibration.together);
+
+const seek = (seconds) => goTo(nearest(seconds));
+const charts = {
+  weights: new Chart(element('weights'), () => weightsChart(chosen().weightsAt), seek),
+  errors: new Chart(element('errors'), () => errorsChart(chosen().layer), seek),
+  freeEnergy: new Chart(element('free-energy'), freeEnergyChart, seek),
+  iterations: new Chart(element('iterations'), iterationsChart),
+  together: new Chart(element('together'), () => calibrationChart('together')),
+  each: new Chart(element('each'), () => calibrationChart('each')),
+};
+
+function drawAll() {
+  space.draw();
+  if (film) film.draw();
+  charts.weights.draw();
+  if (errorsKnown()) charts.errors.draw();
+  if (hasFreeEnergy) { charts.freeEnergy.draw(); charts.iterations.draw(); }
+  tellTime();
+  tellModes();
+}
+
+function drawCalibration() {
+  if (calibrated) { charts.together.draw(); charts.each.draw(); }
+}
+
+function goTo(time) {
+  shown.time = Math.max(0, Math.min(LAST, time));
+  element('time').value = shown.time;
+  drawAll();
+}
+
+function tellTime() {
+  const now = `${TIMES[shown.time].toFixed(2)} s, ${shown.time + 1} of ${LAST + 1}`;
+  element('clock').value = now;
+  element('time').setAttribute('aria-valuetext', now);
+}
+
+/** The table of the modes at the present time; a click shows one alone. */
+function tellModes() {
+  const { layer, weightsAt, what } = chosen();
+  const weights = weightsAt(shown.time);
+  const errors = errorsKnown() ? layer.errors_mm[shown.time] : null;
+  element('modes').caption.textContent = `${what === 'modes' ? 'Modes' : 'Trajectories'} at this time`;
+  const head = made('tr');
+  ['', 'weight', '', ...(errorsKnown() ? ['error, mm'] : [])].forEach((text) => head.append(made('th', text, { scope: 'col' })));
+  element('modes').tHead.replaceChildren(head);
+  const rows = weights.slice(0, 16).map((weight, rank) => {
+    const row = made('tr');
+    const first = made('td');
+    if (layer) {
+      const alone = shown.alone === rank;
+      const button = made('button', `${rank + 1}`, {
+        type: 'button', 'aria-pressed': alone, 'aria-label': `show mode ${rank + 1} alone`,
+      });
+      button.addEventListener('click', () => {
+        shown.alone = alone ? null : rank;
+        drawAll();
+        const again = element('modes').querySelectorAll('button')[rank];
+        if (again) again.focus();
+      });
+      first.append(button);
+    } else {
+      first.textContent = rank + 1;
+    }
+    const bar = made('td', '', { class: 'bar' });
+    bar.append(made('span'));
+    bar.firstChild.style.width = `${100 * weight}%`;
+    row.append(first, made('td', `${(100 * weight).toFixed(1)} %`), bar);
+    if (errorsKnown()) row.append(made('td', errors ? fixed(errors[rank]) : '-'));
+    return row;
+  });
+  element('modes').tBodies[0].replaceChildren(...rows);
+  const entropy = weights.reduce((sum, w) => sum - (w > 0 ? w * Math.log(w) : 0), 0);
+  const more = weights.length > 16 ? `; ${weights.length - 16} more` : '';
+  element('modes-caption').textContent = weights.length
+    ? `${weights.length} ${what}, which share the weight as ${Math.exp(entropy).toFixed(1)} equal ones would${more}`
+      + `${layer ? '. Press a number to see that mode alone.' : ''}`
+    : 'Nothing at this time.';
+}
+
+function choose(index) {
+  shown.chosen = index;
+  shown.alone = null;
+  const { name, what } = chosen();
+  element('weights').setAttribute('aria-label', `Weights of ${name} over time`);
+  element('weights-caption').textContent = `Weights of the ${what}, heaviest at the bottom. A click leads to its time.`;
+  element('errors-figure').hidden = !errorsKnown();
+  if (errorsKnown()) {
+    const keys = ERRORS.map(({ name: text, series }) => {
+      const key = made('span');
+      key.append(swatch(series), ` ${text}  `);
+      return key;
+    });
+    element('errors-caption').replaceChildren(
+      ...keys, `of ${name}; pelvis on pelvis, mean over ${report.scores ? 'the evaluated' : 'the'} joints.`,
+    );
+    element('errors').setAttribute('aria-label', `Errors of ${name} over time`);
+  }
+  drawAll();
+}
+
+function swatch(...names) {
+  const result = made('span', '', { class: 'swatches', 'aria-hidden': 'true' });
+  names.forEach((name) => {
+    const part = made('span', '', { class: 'swatch' });
+    if (name === 'ink') part.classList.add('dashed'); else part.style.background = `var(--${name})`;
+    result.append(part);
+  });
+  return result;
+}
+
+/** A box to tick. */
+function box(id, text, ticked, colours_, change) {
+  const label = made('label');
+  const input = made('input', '', { type: 'checkbox', id });
+  input.checked = ticked;
+  input.addEventListener('change', () => { change(input.checked); drawAll(); });
+  label.append(input, swatch(...colours_), text);
+  return label;
+}
+
+function buildLayers() {
+  const place = element('layers');
+  layers.forEach((layer, index) => {
+    if (index === 0) shown.layers.add(index);
+    place.append(box(
+      `layer-${index}`, `${layer.kind} (${layer.topic})`, index === 0,
+      [`${layer.style}-left`, `${layer.style}-right`],
+      (ticked) => { if (ticked) shown.layers.add(index); else shown.layers.delete(index); },
+    ));
+  });
+  if (trajectories.some((topic) => topic.windows.some((w) => w.ways))) {
+    shown.trajectories = !layers.length;
+    place.append(box(
+      'show-trajectories', 'ways along the trajectories', shown.trajectories, ['trajectories'],
+      (ticked) => { shown.trajectories = ticked; },
+    ));
+  }
+  if (truth) {
+    shown.truth = true;
+    place.append(box('show-truth', 'truth', true, ['ink'], (ticked) => { shown.truth = ticked; }));
+  }
+  place.append(made('span', 'Left limbs have the first colour, right limbs the second; the fainter a mode, the smaller its weight.', { class: 'muted' }));
+}
+
+function tell() {
+  const modes = layers.length
+    ? layers[0].weights.reduce((sum, w) => sum + w.length, 0) / layers[0].weights.length : 0;
+  const parts = [`${LAST + 1} times over ${TIMES[LAST].toFixed(2)} s`];
+  if (layers.length) parts.push(`${modes.toFixed(1)} modes at a time in ${layers[0].topic}`);
+  parts.push(`first stamp ${report.start_ns} ns`);
+  element('facts').textContent = `${parts.join('; ')}.`;
+  if (report.images) {
+    element('with-modes').closest('div').hidden = report.images.drawn_on;
+    element('image-caption').textContent = report.images.drawn_on
+      ? 'What the tracker drew: the heaviest modes on the image.'
+      : 'The modes on the image that they explain.';
+  } else {
+    element('image-figure').hidden = true;
+    element('stage').classList.add('without-image');
+  }
+  element('notes-section').hidden = !report.notes.length;
+  element('notes').append(...report.notes.map((note) => made('li', note)));
+}
+
+function tellFreeEnergy() {
+  element('free-energy-section').hidden = !trajectories.length;
+  element('free-energy-figures').hidden = !hasFreeEnergy;
+  if (!hasFreeEnergy) {
+    element('no-free-energy').hidden = false;
+    element('no-free-energy').textContent = 'None was recorded: the smoother took the most probable paths in closed form. '
+      + 'replay --set smoother.method=variational refines them, and records it.';
+  }
+  element('free-energy').setAttribute('aria-label', 'Free energy of each window over time');
+  element('iterations').setAttribute('aria-label', 'Free energy in the iterations of the present window');
+  element('iterations-caption').textContent = 'In the iterations of the window at this time.';
+}
+
+const COLUMNS = [
+  ['frames', (s) => fixed(s.frames)], ['missing', (s) => fixed(s.missing)], ['modes', (s) => fixed(s.modes, 1)],
+  ['heaviest, mm', (s) => fixed(s.heaviest_mm)], ['best of K, mm', (s) => fixed(s.best_mm)],
+  ['expected, mm', (s) => fixed(s.expected_mm)], ['under 150\u00a0mm', (s) => percent(s.fraction_tracked)],
+  ['-log p', (s) => fixed(s.negative_log_likelihood, 1)],
+  ['all joints 50\u00a0%', (s) => percent(s.coverage_50)], ['all joints 90\u00a0%', (s) => percent(s.coverage_90)],
+  ['each joint 50\u00a0%', (s) => percent(s.joint_coverage_50)], ['each joint 90\u00a0%', (s) => percent(s.joint_coverage_90)],
+];
+
+function tellScores() {
+  element('scores-section').hidden = !report.scores;
+  if (!report.scores) return;
+  element('scores-about').textContent = `Against ${report.scores.truth}, ${report.scores.truth_frames} frames. `
+    + 'Errors are mean distances of joints, pelvis on pelvis. The last four columns tell how often the truth lies '
+    + 'in the smallest region that holds 50 or 90 percent of the probability: honest mixtures cover 50 and 90 percent, '
+    + 'less means too sure, more too vague.';
+  const head = made('tr');
+  ['topic', ...COLUMNS.map(([name]) => name)].forEach((name) => head.append(made('th', name, { scope: 'col' })));
+  element('scores').tHead.append(head);
+  Object.entries(report.scores.topics).forEach(([name, scores]) => {
+    const row = made('tr');
+    row.append(made('th', name, { scope: 'row' }), ...COLUMNS.map(([, cell]) => made('td', cell(scores))));
+    element('scores').tBodies[0].append(row);
+  });
+  element('calibration-figures').hidden = !calibrated;
+  const key = element('calibration-key');
+  Object.entries(report.scores.topics).forEach(([name, scores], i) => {
+    if (!scores.calibration.together) return;
+    const line = made('div');
+    line.append(swatch(`series-${i % 6}`), name);
+    key.append(line);
+  });
+  const line = made('div');
+  line.append(swatch('axis'), 'honest');
+  key.append(line);
+  element('together').setAttribute('aria-label', 'Calibration for all joints together; the numbers stand in the table');
+  element('each').setAttribute('aria-label', 'Calibration for each joint alone; the numbers stand in the table');
+}
+
+// Playing: a timer waits for the time of the next image; those that come too late are skipped.
+
+let timer = null;
+let due = 0;
+
+/** For how long a time is shown, ms. */
+function duration(time) {
+  const seconds = time < LAST ? TIMES[time + 1] - TIMES[time] : TIMES[LAST] / Math.max(LAST, 1) || 1;
+  return (1000 * seconds) / Number(element('speed').value);
+}
+
+function play(on) {
+  clearTimeout(timer);
+  timer = null;
+  element('play').textContent = on ? 'Pause' : 'Play';
+  element('play').setAttribute('aria-pressed', on);
+  if (!on) return;
+  if (shown.time === LAST) goTo(0);
+  due = performance.now() + duration(shown.time);
+  timer = setTimeout(step, duration(shown.time));
+}
+
+function step() {
+  const now = performance.now();
+  let { time } = shown;
+  do {
+    time = time < LAST ? time + 1 : 0;
+    due += duration(time);
+  } while (due <= now);
+  goTo(time);
+  timer = setTimeout(step, due - performance.now());
+}
+
+/** What stands behind # in the address: frame=10&yaw=30&pitch=5&zoom=1.5&show=0,1,truth,trajectories. */
+function readAddress() {
+  const given = new URLSearchParams(window.location.hash.slice(1));
+  const number = (name, otherwise) => {
+    const value = Number.parseFloat(given.get(name));
+    return Number.isFinite(value) ? value : otherwise;
+  };
+  space.yaw = number('yaw', space.yaw);
+  space.pitch = Math.max(-89, Math.min(89, number('pitch', space.pitch)));
+  space.zoom = Math.max(0.3, Math.min(8, number('zoom', space.zoom)));
+  if (given.has('show')) {
+    const names = given.get('show').split(',');
+    document.querySelectorAll('#layers input').forEach((input) => {
+      const wanted = names.includes(input.id.replace(/^(layer|show)-/, ''));
+      if (input.checked !== wanted) input.click();
+    });
+  }
+  goTo(Math.round(number('frame', shown.time)));
+}
+
+element('time').max = LAST;
+element('time').addEventListener('input', () => goTo(Number(element('time').value)));
+element('play').addEventListener('click', () => play(timer === null));
+element('with-modes').addEventListener('change', () => {
+  film.withModes = element('with-modes').checked;
+  film.draw();
+});
+element('follow').checked = space.follow;
+element('follow').addEventListener('change', () => { space.follow = element('follow').checked; space.draw(); });
+element('align').addEventListener('change', () => { space.together = element('align').checked; space.draw(); });
+document.querySelectorAll('[data-look]').forEach((button) => button.addEventListener('click', () => {
+  const [yaw, pitch] = button.dataset.look.split(' ').map(Number);
+  space.turn(yaw, pitch);
+}));
+element('chosen').append(...choices.map(({ name, index }) => made('option', name, { value: index })));
+element('chosen').addEventListener('change', () => choose(Number(element('chosen').value)));
+document.addEventListener('keydown', (event) => {
+  const free = !['INPUT', 'BUTTON', 'SELECT', 'CANVAS'].includes(event.target.tagName);
+  if (!free || event.ctrlKey || event.metaKey || event.altKey) return;
+  const keys = {
+    ' ': () => play(timer === null), ArrowLeft: () => goTo(shown.time - 1), ArrowRight: () => goTo(shown.time + 1),
+  };
+  if (keys[event.key]) { event.preventDefault(); keys[event.key](); }
+});
+window.addEventListener('hashchange', readAddress);
+
+tell();
+buildLayers();
+tellFreeEnergy();
+tellScores();
+choose(0);
+readAddress();
+new ResizeObserver(() => { drawAll(); drawCalibration(); }).observe(document.body);
+window.matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => {
+  colours.clear();
+  drawAll();
+  drawCalibration();
+});
+drawCalibration();

@@ -1,0 +1,369 @@
+// What is drawn of the person: skeletons in space, which turn, and skeletons on the image.
+
+const FAINTEST = 0.12;
+const DASHES = { likelihood: [5, 3], prediction: [2, 3] };
+
+/** What is shown: indices of layers, truth, trajectories; of one layer a single mode, or all. */
+const shown = {
+  time: 0, layers: new Set(), truth: false, trajectories: false, chosen: 0, alone: null,
+};
+
+/** Strength of a mode, and null where it is not drawn. */
+function strength(index, rank, weights) {
+  if (shown.alone !== null && index === shown.chosen) return rank === shown.alone ? 1 : null;
+  return FAINTEST + (1 - FAINTEST) * (weights[0] > 0 ? weights[rank] / weights[0] : 1);
+}
+
+/** Modes to be drawn at the present time, the faintest first: {layer, offset, strength, rank}. */
+function modesNow() {
+  const result = [];
+  layers.forEach((layer, index) => {
+    if (!shown.layers.has(index)) return;
+    const weights = layer.weights[shown.time];
+    for (let rank = weights.length - 1; rank >= 0; rank -= 1) {
+      const own = strength(index, rank, weights);
+      if (own !== null) {
+        result.push({
+          figure: layer, style: layer.style, offset: layer.starts[shown.time] + rank, strength: own,
+          dash: DASHES[layer.style] || [], width: rank === 0 || shown.alone === rank ? 3 : 2, ink: null,
+        });
+      }
+    }
+  });
+  if (truth && shown.truth && truth.starts[shown.time] >= 0) {
+    result.push({
+      figure: truth, style: '', offset: truth.starts[shown.time], strength: 1, dash: [5, 4], width: 1.5,
+      ink: 'ink',
+    });
+  }
+  return result;
+}
+
+/** The 3D view: turns about the vertical (yaw) and tilts (pitch), in degrees; zoom 1 shows all. */
+class Space {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.follow = false;
+    this.together = false;
+    this.measure();
+    this.reset();
+    this.listen();
+  }
+
+  /** Where the person is on the whole, and how much room all heaviest modes take. */
+  measure() {
+    const low = [Infinity, Infinity, Infinity];
+    const high = [-Infinity, -Infinity, -Infinity];
+    const floor = [];
+    this.roots = TIMES.map(() => null);
+    const figure = layers[0] || truth;
+    TIMES.forEach((_, t) => {
+      const offset = this.heaviest(figure, t);
+      if (offset < 0) return;
+      const joints = figure.joints.length;
+      const at = (joint, axis) => figure.positions[(offset * joints + joint) * 3 + axis];
+      this.roots[t] = [0, 1, 2].map((axis) => at(figure.root, axis));
+      let lowest = Infinity;
+      for (let joint = 0; joint < joints; joint += 1) {
+        for (let axis = 0; axis < 3; axis += 1) {
+          low[axis] = Math.min(low[axis], at(joint, axis));
+          high[axis] = Math.max(high[axis], at(joint, axis));
+        }
+        lowest = Math.min(lowest, at(joint, 1));
+      }
+      floor.push(lowest);
+    });
+    if (!floor.length) {
+      const ways = trajectories.flatMap((topic) => topic.windows.map((w) => w.ways).filter(Boolean));
+      ways.forEach((way) => way.forEach((x, i) => {
+        low[i % 3] = Math.min(low[i % 3], x);
+        high[i % 3] = Math.max(high[i % 3], x);
+      }));
+      if (!ways.length) { low.fill(-1); high.fill(1); }
+      floor.push(low[1]);
+    }
+    floor.sort((a, b) => a - b);
+    this.floor = floor[Math.floor(floor.length * 0.1)];
+    this.centre = low.map((x, axis) => 0.5 * (x + high[axis]));
+    this.radius = Math.max(0.5 * Math.hypot(...low.map((x, axis) => high[axis] - x)), 0.5);
+    const roots = this.roots.filter(Boolean);
+    const range = [0, 2].map((axis) => {
+      const values = roots.map((root) => root[axis]);
+      return values.length ? Math.max(...values) - Math.min(...values) : 0;
+    });
+    this.follow = Math.max(...range) > 1.5;
+    if (this.follow) this.radius = Math.max(Math.min(this.radius, 1.3), 0.5);
+  }
+
+  heaviest(figure, t) {
+    if (!figure) return -1;
+    if (figure === truth) return truth.starts[t];
+    return figure.weights[t].length ? figure.starts[t] : -1;
+  }
+
+  reset() {
+    this.yaw = 40;
+    this.pitch = 12;
+    this.zoom = 1;
+  }
+
+  turn(yaw, pitch) {
+    this.yaw = ((yaw + 180) % 360 + 360) % 360 - 180;
+    this.pitch = Math.max(-89, Math.min(89, pitch));
+    this.draw();
+  }
+
+  magnify(factor) {
+    this.zoom = Math.max(0.3, Math.min(8, this.zoom * factor));
+    this.draw();
+  }
+
+  listen() {
+    const { canvas } = this;
+    let from = null;
+    canvas.addEventListener('pointerdown', (event) => {
+      from = { x: event.clientX, y: event.clientY, yaw: this.yaw, pitch: this.pitch };
+      // A pointer that a program made up can not be captured, and need not.
+      if (event.isTrusted) canvas.setPointerCapture(event.pointerId);
+    });
+    canvas.addEventListener('pointermove', (event) => {
+      if (!from) return;
+      this.turn(from.yaw + 0.5 * (event.clientX - from.x), from.pitch + 0.4 * (event.clientY - from.y));
+    });
+    ['pointerup', 'pointercancel'].forEach((kind) => canvas.addEventListener(kind, () => { from = null; }));
+    canvas.addEventListener('wheel', (event) => {
+      event.preventDefault();
+      this.magnify(Math.exp(-0.0015 * event.deltaY));
+    }, { passive: false });
+    canvas.addEventListener('dblclick', () => { this.reset(); this.draw(); });
+    const keys = {
+      ArrowLeft: () => this.turn(this.yaw - 5, this.pitch),
+      ArrowRight: () => this.turn(this.yaw + 5, this.pitch),
+      ArrowUp: () => this.turn(this.yaw, this.pitch + 5),
+      ArrowDown: () => this.turn(this.yaw, this.pitch - 5),
+      '+': () => this.magnify(1.15),
+      '=': () => this.magnify(1.15),
+      '-': () => this.magnify(1 / 1.15),
+      0: () => { this.reset(); this.draw(); },
+    };
+    canvas.addEventListener('keydown', (event) => {
+      if (!keys[event.key] || event.ctrlKey || event.metaKey || event.altKey) return;
+      event.preventDefault();
+      keys[event.key]();
+    });
+  }
+
+  /** The projection of the present view: point (x, y, z) to [u, v, depth]. */
+  projection(width, height) {
+    const yaw = (this.yaw * Math.PI) / 180;
+    const pitch = (this.pitch * Math.PI) / 180;
+    const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
+    const distance = 3.2 * this.radius;
+    const scale = (0.6 * Math.min(width, height) * this.zoom * distance) / this.radius;
+    const root = this.follow ? this.lastRoot() : null;
+    const centre = root || this.centre;
+    return (x, y, z) => {
+      const [dx, dy, dz] = [x - centre[0], y - centre[1], z - centre[2]];
+      const right = cy * dx - sy * dz;
+      const ahead = sy * dx + cy * dz;
+      const up = cp * dy - sp * ahead;
+      const near = sp * dy + cp * ahead;
+      const depth = Math.max(distance - near, 0.05 * distance);
+      return [width / 2 + (scale * right) / depth, height / 2 - (scale * up) / depth, depth];
+    };
+  }
+
+  /** Where the person is now, or was last seen. */
+  lastRoot() {
+    for (let t = shown.time; t >= 0; t -= 1) if (this.roots[t]) return this.roots[t];
+    return this.roots.find(Boolean) || null;
+  }
+
+  draw() {
+    const { context, width, height } = prepared(this.canvas);
+    const project = this.projection(width, height);
+    context.lineCap = 'round';
+    context.lineJoin = 'round';
+    this.drawFloor(context, project, width, height);
+    if (shown.trajectories) this.drawWays(context, project);
+    const segments = [];
+    const root = this.lastRoot() || this.centre;
+    modesNow().forEach((mode) => {
+      const { figure, offset } = mode;
+      const joints = figure.joints.length;
+      const points = [];
+      const first = (offset * joints + figure.root) * 3;
+      const shift = root.map((x, axis) => (this.together ? x - figure.positions[first + axis] : 0));
+      for (let joint = 0; joint < joints; joint += 1) {
+        const i = (offset * joints + joint) * 3;
+        points.push(project(...shift.map((x, axis) => x + figure.positions[i + axis])));
+      }
+      figure.bones.forEach(([a, b, side]) => segments.push({
+        from: points[a], to: points[b], depth: 0.5 * (points[a][2] + points[b][2]), mode, side,
+      }));
+      if (!figure.bones.length) {
+        points.forEach((point) => segments.push({ from: point, to: point, depth: point[2], mode, side: 'trunk' }));
+      }
+    });
+    segments.sort((a, b) => b.depth - a.depth);
+    segments.forEach(({ from, to, mode, side }) => {
+      context.globalAlpha = mode.strength;
+      context.setLineDash(mode.dash);
+      context.lineWidth = mode.width * (this.radius * 3.2) / (0.5 * (from[2] + to[2]));
+      context.strokeStyle = colour(mode.ink || `${mode.style}-${side}`);
+      context.beginPath();
+      context.moveTo(from[0], from[1]);
+      context.lineTo(to[0], to[1]);
+      context.stroke();
+    });
+    context.globalAlpha = 1;
+    context.setLineDash([]);
+  }
+
+  /** A grid of half metres under the feet, and an arrow to the camera. */
+  drawFloor(context, project, width, height) {
+    const root = this.follow ? this.lastRoot() || this.centre : this.centre;
+    const middle = [Math.round(2 * root[0]) / 2, Math.round(2 * root[2]) / 2];
+    const reach = Math.ceil(2 * Math.min(this.radius, 4)) / 2;
+    context.strokeStyle = colour('grid');
+    context.lineWidth = 1;
+    context.beginPath();
+    for (let i = -reach; i <= reach + 1e-6; i += 0.5) {
+      [[[i, -reach], [i, reach]], [[-reach, i], [reach, i]]].forEach((ends) => {
+        ends.forEach(([x, z], end) => {
+          const [u, v] = project(middle[0] + x, this.floor, middle[1] + z);
+          if (end) context.lineTo(u, v); else context.moveTo(u, v);
+        });
+      });
+    }
+    context.stroke();
+    // The camera is at the origin.
+    const away = Math.hypot(root[0], root[2]);
+    if (away < 1e-3) return;
+    const [tail, head] = [0.4 * this.radius, 0.7 * this.radius];
+    const [dx, dz] = [-root[0] / away, -root[2] / away];
+    const place = (along, aside) => project(
+      root[0] + along * dx - aside * dz, this.floor, root[2] + along * dz + aside * dx,
+    );
+    const tip = place(head, 0);
+    context.strokeStyle = colour('axis');
+    context.fillStyle = colour('muted');
+    context.beginPath();
+    [place(tail, 0), tip, place(head - 0.12, 0.08), tip, place(head - 0.12, -0.08)].forEach(([u, v], i) => {
+      if (i) context.lineTo(u, v); else context.moveTo(u, v);
+    });
+    context.stroke();
+    context.font = '12px system-ui, sans-serif';
+    context.textAlign = 'center';
+    const [u, v] = [Math.max(45, Math.min(width - 45, tip[0])), Math.max(14, Math.min(height - 8, tip[1] + 15))];
+    context.fillText('to the camera', u, v);
+  }
+
+  /** The ways of hands, feet, head and pelvis along the trajectories of the present window. */
+  drawWays(context, project) {
+    context.strokeStyle = colour('trajectories');
+    context.fillStyle = colour('trajectories');
+    trajectories.forEach((topic) => {
+      const now = topic.at[shown.time];
+      if (!now || !now.ways) return;
+      const [steps, ends] = [now.times.length, topic.ends.length];
+      const count = now.ways.length / (3 * steps * ends);
+      const away = now.times.map((time) => Math.abs(time - TIMES[shown.time]));
+      const present = away.indexOf(Math.min(...away));
+      for (let m = count - 1; m >= 0; m -= 1) {
+        context.globalAlpha = FAINTEST + (0.9 - FAINTEST) * (now.weights[m] / now.weights[0]);
+        for (let e = 0; e < ends; e += 1) {
+          context.lineWidth = m === 0 ? 2 : 1.2;
+          const points = now.times.map((_, t) => {
+            const i = ((m * steps + t) * ends + e) * 3;
+            return project(now.ways[i], now.ways[i + 1], now.ways[i + 2]);
+          });
+          context.beginPath();
+          points.forEach(([u, v], t) => { if (t) context.lineTo(u, v); else context.moveTo(u, v); });
+          context.stroke();
+          const [u, v] = points[present];
+          context.beginPath();
+          context.arc(u, v, m === 0 ? 3 : 2, 0, 2 * Math.PI);
+          context.fill();
+        }
+      }
+    });
+    context.globalAlpha = 1;
+  }
+}
+
+/** The image of the present time with the modes on it. */
+class Film {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.withModes = true;
+    this.pictures = new Map();
+    this.last = null;
+  }
+
+  /** A picture, which may still be on its way; those that follow are fetched too. */
+  picture(index) {
+    const known = this.pictures.get(index);
+    if (known) return known;
+    const jpeg = report.images.jpegs[index];
+    if (!jpeg) return null;
+    const picture = new Image();
+    picture.onload = () => { if (shown.time === index) this.draw(); };
+    picture.src = `data:image/jpeg;base64,${jpeg}`;
+    this.pictures.set(index, picture);
+    // The oldest are decoded anew when they are wanted again.
+    if (this.pictures.size > 64) this.pictures.delete(this.pictures.keys().next().value);
+    return picture;
+  }
+
+  draw() {
+    const { context, width, height } = prepared(this.canvas);
+    const { images } = report;
+    const scale = Math.min(width / images.width, height / images.height);
+    const [w, h] = [images.width * scale, images.height * scale];
+    const [left, top] = [(width - w) / 2, (height - h) / 2];
+    const picture = this.picture(shown.time);
+    for (let ahead = 1; ahead <= 4; ahead += 1) if (shown.time + ahead <= LAST) this.picture(shown.time + ahead);
+    if (picture && picture.complete && picture.naturalWidth) this.last = picture;
+    // Until a picture is there the one before stays, so that nothing flickers.
+    if (picture && this.last) context.drawImage(this.last, left, top, w, h);
+    context.save();
+    context.beginPath();
+    context.rect(left, top, w, h);
+    context.clip();
+    context.lineCap = 'round';
+    if (this.withModes) modesNow().forEach((mode) => this.drawMode(context, mode, left, top, w));
+    context.restore();
+  }
+
+  drawMode(context, mode, left, top, width) {
+    const { figure, offset } = mode;
+    if (!figure.pixels) return;
+    const joints = figure.joints.length;
+    const half = 0.5 / report.images.width;
+    const at = (joint) => [0, 1].map((axis) => figure.pixels[(offset * joints + joint) * 2 + axis] + half);
+    context.setLineDash(mode.dash);
+    const line = (a, b) => {
+      context.beginPath();
+      context.moveTo(left + a[0] * width, top + a[1] * width);
+      context.lineTo(left + b[0] * width, top + b[1] * width);
+      context.stroke();
+    };
+    figure.bones.forEach(([a, b, side]) => {
+      const [from, to] = [at(a), at(b)];
+      if ([...from, ...to].some(Number.isNaN)) return;
+      if (mode.strength > 0.9 && !mode.ink) {
+        context.globalAlpha = 0.75;
+        context.lineWidth = mode.width + 2;
+        context.strokeStyle = '#ffffff';
+        line(from, to);
+      }
+      context.globalAlpha = mode.strength;
+      context.lineWidth = mode.width;
+      context.strokeStyle = mode.ink ? '#000000' : colour(`${mode.style}-${side}`);
+      line(from, to);
+    });
+    context.globalAlpha = 1;
+    context.setLineDash([]);
+  }
+}
