@@ -11,6 +11,7 @@ from hmt_ros.app.printing import until_nobody_reads
 # Command: (module, what it does). A module is imported when its command is given.
 COMMANDS = {
     'replay': ('hmt_ros.app.replay', 'track the person in a bag, into a new bag'),
+    'recover': ('hmt_ros.app.recover', 'save what is whole in a damaged bag'),
     'make-bag': ('hmt_ros.app.make_bag', 'render a motion into a bag with ground truth'),
     'train': ('hmt_ros.app.train', 'learn to predict poses from silhouettes'),
     'evaluate': ('hmt_ros.app.evaluate', 'errors and calibration of mixtures against ground truth'),
