@@ -10,6 +10,7 @@ calls write the same bytes.
 from __future__ import annotations
 
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator
@@ -26,7 +27,7 @@ from msg_tools.stored_message import Channel
 
 LIBRARY = 'hmt_ros'
 CHUNK_BYTES = 2**20
-PARTIAL = '.partial'
+_PARTIAL = '.partial'
 _SUFFIXES = ('.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 
 
@@ -63,7 +64,7 @@ class BagFolder:
         self._start: int | None = None
         self._end = 0
         self._folder: Path | None = self.path.with_name(
-            f'.{self.path.name}.{secrets.token_hex(4)}{PARTIAL}'
+            f'.{self.path.name}.{secrets.token_hex(4)}{_PARTIAL}'
         )
         self._file: BinaryIO | None = None
         self._handed_over = 0
@@ -262,6 +263,15 @@ class BagFolder:
             'custom_data': None,
             'ros_distro': 'jazzy',
         }
+
+
+def unfinished_folders(path: Path) -> list[Path]:
+    """Hidden folders of a bag whose writers were killed, or still write."""
+    path = path.absolute()
+    if not path.parent.is_dir():
+        return []
+    pattern = re.compile(rf'\.{re.escape(path.name)}\.[0-9a-f]{{8}}{re.escape(_PARTIAL)}')
+    return [folder for folder in sorted(path.parent.iterdir()) if pattern.fullmatch(folder.name)]
 
 
 def _sync_folder(folder: Path) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from msg_tools.bag_error import BagError, reason
-from msg_tools.bag_folder import PARTIAL, BagFolder
+from msg_tools.bag_folder import BagFolder, unfinished_folders
 from msg_tools.bag_metadata import FILE_NAME, read_file_names, recorded_quality_of_service
 from msg_tools.decompression import ZSTD_MAGIC, DecompressionError, decompress_file
 from msg_tools.mcap_salvage import (
@@ -171,9 +171,7 @@ def _files(source: Path) -> tuple[list[Path], list[str]]:
 
 def _unfinished(source: Path) -> Path:
     """The hidden folder of a bag that was not completed."""
-    pattern = re.compile(rf'\.{re.escape(source.name)}\.[0-9a-f]+{re.escape(PARTIAL)}')
-    parent = source.absolute().parent
-    found = [path for path in sorted(parent.iterdir()) if pattern.fullmatch(path.name)]
+    found = unfinished_folders(source)
     if not found:
         raise BagError(f'{source} is not there')
     if len(found) > 1:

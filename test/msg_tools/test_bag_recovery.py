@@ -336,7 +336,7 @@ def test_what_can_not_be_recovered(tmp_path: Path, messages: RosbagsMessages) ->
     (tmp_path / 'text').write_text('Hello, this is no bag')
     with pytest.raises(BagError, match='text is not a bag'):
         recover_bag(tmp_path / 'text', target)
-    for name in ('.twice.0a.partial', '.twice.0b.partial'):
+    for name in ('.twice.0123456a.partial', '.twice.0123456b.partial'):
         (tmp_path / name).mkdir()
     with pytest.raises(BagError, match='twice was begun several times: name one of'):
         recover_bag(tmp_path / 'twice', target)
