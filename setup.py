@@ -58,6 +58,7 @@ setup(
             'smoother_node = hmt_ros.nodes.smoother_node:main',
             'bme_node = hmt_ros.nodes.bme_node:main',
             'replay = hmt_ros.app.replay:main',
+            'recover = hmt_ros.app.recover:main',
             'make-bag = hmt_ros.app.make_bag:main',
             'train = hmt_ros.app.train:main',
             'report = hmt_ros.app.report:main',

@@ -13,6 +13,7 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
 
 USAGE = """usage: python -m benchmarks [NAME [options]]
 
+  bags       reading, memory, and what replay adds to the estimate
   experts    conditional densities: a toy, motions of people apart, clips, speed
   tracking   accuracy, calibration and speed of the tracker on clips with known truth
   flips      time per leaf of the interpretation trees
@@ -29,9 +30,10 @@ Without a name all of them run. Every benchmark takes --json and --help.
 def main(argv: list[str]) -> int:
     """Runs one benchmark, or all; the exit code is that of the first that fails."""
     # Only now: they import numpy.
-    from benchmarks import experts, flips, kernels, kjs, nodes, smoothing, tracking, votes
+    from benchmarks import bags, experts, flips, kernels, kjs, nodes, smoothing, tracking, votes
 
     benchmarks = {
+        'bags': bags.main,
         'experts': experts.main,
         'flips': flips.main,
         'kernels': kernels.main,

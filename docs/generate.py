@@ -6,6 +6,7 @@
     python docs/generate.py kjs            minima that samples find in sampling.md (minutes)
     python docs/generate.py kernels        times in likelihood.md
     python docs/generate.py smoothing      exactness and speed in smoothing.md (minutes)
+    python docs/generate.py bags           rates and memory in bags.md (minutes)
     python docs/generate.py experts        experts.md (a quarter of an hour)
     python docs/generate.py tracking       accuracy and speed in tracking.md (minutes)
     python docs/generate.py votes          votes for chains in tracking.md (minutes)
@@ -29,6 +30,7 @@ PAGES = {
     'filter_node': 'nodes.md',
     'smoother_node': 'nodes.md',
     'bme_node': 'nodes.md',
+    'bags': 'bags.md',
     'flips': 'flips.md',
     'kernels': 'likelihood.md',
     'kjs': 'sampling.md',
@@ -68,9 +70,10 @@ def part(name: str) -> str:
     """The content of a part."""
     if PAGES[name] == 'nodes.md':
         return parameter_table(name)
-    from benchmarks import experts, flips, kernels, kjs, smoothing, tracking, votes
+    from benchmarks import bags, experts, flips, kernels, kjs, smoothing, tracking, votes
 
     pages = {
+        'bags': bags,
         'flips': flips,
         'kernels': kernels,
         'kjs': kjs,

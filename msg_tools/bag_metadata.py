@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import yaml
+from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
 
 from msg_tools.bag_error import BagError, reason
 
@@ -15,6 +17,13 @@ MAX_BYTES = 2**24
 
 # No deadline, no lifespan: what rmw writes for an infinite duration.
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}
+
+_POLICIES: dict[str, type[Enum]] = {
+    'history': QosHistory,
+    'reliability': QosReliability,
+    'durability': QosDurability,
+    'liveliness': QosLiveliness,
+}
 
 
 def read_file_names(folder: Path) -> list[str]:
@@ -68,6 +77,35 @@ def quality_of_service(latched: bool) -> list[dict[str, Any]]:
             'avoid_ros_namespace_conventions': False,
         }
     ]
+
+
+def recorded_quality_of_service(text: str) -> list[dict[str, Any]]:
+    """Offered QoS as a bag of any version has it, with the names that the present version wants.
+
+    Args:
+        text: YAML, with numbers in bags of ROS 2 Iron and before.
+
+    Returns:
+        Nothing where the text can not be understood: players then offer what is usual.
+    """
+    try:
+        profiles = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError):
+        return []
+    if not isinstance(profiles, list) or not all(isinstance(x, dict) for x in profiles):
+        return []
+    found = []
+    for recorded in profiles:
+        profile = dict(quality_of_service(False)[0])
+        for name, usual in profile.items():
+            value = recorded.get(name, usual)
+            if name in _POLICIES and isinstance(value, int):
+                numbers = {policy.value: policy.name.lower() for policy in _POLICIES[name]}
+                value = numbers.get(value, 'unknown')
+            if isinstance(value, type(usual)):
+                profile[name] = value
+        found.append(profile)
+    return found
 
 
 def as_yaml(document: Any) -> str:

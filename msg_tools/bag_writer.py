@@ -1,9 +1,7 @@
-"""Writing a bag that rosbag2 plays: a folder with an MCAP file and its metadata, or nothing at all.
+"""Writing a bag of our own messages, which rosbag2 plays: whole or not at all.
 
-The bag is written into a hidden folder beside its place and moved there when it is complete and on
-the disk; after an error nothing is left behind. The same calls write the same bytes. Chunks, data
-and summary have checksums. Time is what the caller says, the stamp of the message: log time and
-publish time are the same.
+Time is what the caller says, the stamp of the message: log time and publish time are the same. See
+`msg_tools.bag_folder` for what becomes of a bag that is not completed.
 
     with BagWriter('out') as bag:
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
@@ -13,34 +11,20 @@ publish time are the same.
 from __future__ import annotations
 
 import os
-import secrets
-import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
-
-from mcap.writer import CompressionType, Writer
+from typing import Any, NamedTuple
 
 from msg_tools.bag_error import BagError, reason
-from msg_tools.bag_metadata import FILE_NAME, VERSION, as_yaml, quality_of_service
+from msg_tools.bag_folder import BagFolder
+from msg_tools.bag_metadata import quality_of_service
 from msg_tools.cdr import serialise
+from msg_tools.stored_message import Channel
 from msg_tools.typestore import typestore
 
-LIBRARY = 'hmt_ros'
-CHUNK_BYTES = 2**20
-_SUFFIXES = ('.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 
-
-@dataclass
-class _Topic:
-    name: str
+class _Topic(NamedTuple):
     msgtype: str
     channel: int
-    latched: bool
-    message_count: int = 0
 
 
 class BagWriter:
@@ -55,29 +39,9 @@ class BagWriter:
     """
 
     def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        self.path = Path(path).absolute()
-        self._overwrite = overwrite
-        self._check_target()
+        self._folder = BagFolder(path, overwrite=overwrite)
+        self.path = self._folder.path
         self._topics: dict[str, _Topic] = {}
-        self._schemas: dict[str, int] = {}
-        self._start: int | None = None
-        self._end = 0
-        self._folder: Path | None = self.path.with_name(
-            f'.{self.path.name}.{secrets.token_hex(4)}.partial'
-        )
-        self._file: BinaryIO | None = None
-        with self._dropping_on_error():
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._folder.mkdir()
-            self._file = (self._folder / self._file_name).open('xb')
-            self._writer = Writer(
-                self._file,
-                chunk_size=CHUNK_BYTES,
-                compression=CompressionType.ZSTD,
-                enable_crcs=True,
-                enable_data_crcs=True,
-            )
-            self._writer.start(profile='ros2', library=LIBRARY)
 
     def __enter__(self) -> BagWriter:
         return self
@@ -109,22 +73,13 @@ class BagWriter:
             raise BagError(f'{self.path}: topic {name} can not have the unknown type {msgtype!r}')
         if name in self._topics:
             raise BagError(f'{self.path}: topic {name} is there already')
-        with self._dropping_on_error():
-            schema = self._schemas.get(msgtype)
-            if schema is None:
-                definition, _ = store.generate_msgdef(msgtype, ros_version=2)
-                schema = self._writer.register_schema(msgtype, 'ros2msg', definition.encode())
-                self._schemas[msgtype] = schema
-            channel = self._writer.register_channel(
-                name,
-                'cdr',
-                schema,
-                {
-                    'offered_qos_profiles': as_yaml(quality_of_service(latched)),
-                    'topic_type_hash': store.hash_rihs01(msgtype),
-                },
-            )
-        self._topics[name] = _Topic(name, msgtype, channel, latched)
+        definition, _ = store.generate_msgdef(msgtype, ros_version=2)
+        channel = self._folder.add_channel(
+            Channel(name, msgtype, 'cdr', 'ros2msg', definition.encode()),
+            quality_of_service(latched),
+            store.hash_rihs01(msgtype),
+        )
+        self._topics[name] = _Topic(msgtype, channel)
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Writes a message of `typestore()`; announces its topic where that has not been done.
@@ -161,11 +116,7 @@ class BagWriter:
             raise BagError(
                 f'{self.path}: stamp {stamp_ns} ns of a message of {topic} is not a time'
             )
-        with self._dropping_on_error():
-            self._writer.add_message(known.channel, stamp_ns, data, stamp_ns)
-        known.message_count += 1
-        self._start = stamp_ns if self._start is None else min(self._start, stamp_ns)
-        self._end = max(self._end, stamp_ns)
+        self._folder.add_message(known.channel, stamp_ns, data, stamp_ns)
 
     def close(self) -> None:
         """Completes the bag and moves it to its place; does nothing when that has been done.
@@ -173,123 +124,8 @@ class BagWriter:
         Raises:
             BagError: the disk is full, or the place is taken meanwhile; nothing is left behind.
         """
-        if self._folder is None or self._file is None:
-            return
-        with self._dropping_on_error():
-            information = self._information()
-            self._writer.add_metadata('rosbag2', {'serialized_metadata': as_yaml(information)})
-            self._writer.finish()  # type: ignore[no-untyped-call]
-            self._file.flush()
-            os.fsync(self._file.fileno())
-            self._file.close()
-            with (self._folder / FILE_NAME).open('x', encoding='utf-8') as file:
-                file.write(as_yaml({'rosbag2_bagfile_information': information}))
-                file.flush()
-                os.fsync(file.fileno())
-            _sync_folder(self._folder)
-            self._move_into_place(self._folder)
-        self._folder = None
+        self._folder.close()
 
     def abort(self) -> None:
         """Drops everything that was written."""
-        folder, self._folder = self._folder, None
-        if folder is None:
-            return
-        if self._file is not None:
-            # Closing writes what is buffered, and fails again on a full disk: nothing is to be
-            # saved.
-            with suppress(OSError):
-                self._file.close()
-        shutil.rmtree(folder, ignore_errors=True)
-
-    @property
-    def _file_name(self) -> str:
-        return f'{self.path.name}.mcap'
-
-    @contextmanager
-    def _dropping_on_error(self) -> Iterator[None]:
-        if self._folder is None:
-            raise BagError(f'{self.path} is closed')
-        try:
-            yield
-        except OSError as error:
-            self.abort()
-            raise BagError(f'{self.path} can not be written: {reason(error)}') from error
-        except BaseException:
-            self.abort()
-            raise
-
-    def _check_target(self) -> None:
-        """The place must be free, or hold a bag that may be replaced."""
-        if self.path.name in ('', '..'):
-            raise BagError(f'{self.path} is not the name of a folder')
-        if not os.path.lexists(self.path):
-            return
-        if not self._overwrite:
-            raise BagError(f'{self.path} exists; give another name, or ask to overwrite it')
-        try:
-            names = sorted(path.name for path in self.path.iterdir())
-        except OSError as error:
-            raise BagError(f'{self.path} can not be replaced: {reason(error)}') from error
-        foreign = [name for name in names if name != FILE_NAME and not name.endswith(_SUFFIXES)]
-        if self.path.is_symlink() or (names and FILE_NAME not in names) or foreign:
-            what = f'it has {foreign[0]}' if foreign else 'it is not the folder of a bag'
-            raise BagError(f'{self.path} is not replaced: {what}; give another name')
-
-    def _move_into_place(self, folder: Path) -> None:
-        self._check_target()
-        aside = folder.with_suffix('.replaced')
-        replaces = self.path.exists()
-        if replaces:
-            self.path.rename(aside)
-        try:
-            folder.rename(self.path)
-        except BaseException:
-            if replaces:
-                aside.rename(self.path)
-            raise
-        _sync_folder(self.path.parent)
-        if replaces:
-            shutil.rmtree(aside, ignore_errors=True)
-
-    def _information(self) -> dict[str, Any]:
-        """Content of metadata.yaml, as rosbag2 of Jazzy writes it."""
-        start = 2**63 - 1 if self._start is None else self._start
-        span = {
-            'duration': {'nanoseconds': max(0, self._end - start)},
-            'starting_time': {'nanoseconds_since_epoch': start},
-            'message_count': sum(topic.message_count for topic in self._topics.values()),
-        }
-        store = typestore()
-        return {
-            'version': VERSION,
-            'storage_identifier': 'mcap',
-            **span,
-            'topics_with_message_count': [
-                {
-                    'topic_metadata': {
-                        'name': topic.name,
-                        'type': topic.msgtype,
-                        'serialization_format': 'cdr',
-                        'offered_qos_profiles': quality_of_service(topic.latched),
-                        'type_description_hash': store.hash_rihs01(topic.msgtype),
-                    },
-                    'message_count': topic.message_count,
-                }
-                for topic in self._topics.values()
-            ],
-            'compression_format': '',
-            'compression_mode': '',
-            'relative_file_paths': [self._file_name],
-            'files': [{'path': self._file_name, **span}],
-            'custom_data': None,
-            'ros_distro': 'jazzy',
-        }
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        self._folder.abort()

@@ -7,7 +7,9 @@ are deleted: every array speaks about all ranks.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from copy import copy
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -68,23 +70,10 @@ def skeleton_markers(
     order = np.argsort(-heavy, kind='stable')[:ranks]
     header = header_message(messages, stamp_ns, frame_id)
 
-    def marker(rank: int, key: int, **fields: Any) -> Any:
-        return messages.create(
-            'visualization_msgs/msg/Marker',
-            header=header,
-            ns=f'{namespace}_{rank}',
-            id=key,
-            # Viewers complain about an orientation of zero length.
-            pose=messages.create('geometry_msgs/msg/Pose'),
-            **fields,
-        )
-
+    marker = _markers(messages, header, namespace)
     markers = []
     for rank, mode in enumerate(order):
-        points = [
-            messages.create('geometry_msgs/msg/Point', x=x, y=y, z=z)
-            for x, y, z in positions[mode].tolist()
-        ]
+        points = messages.points(positions[mode])
         color = _color(messages, rank, heavy[mode], heavy[order[0]])
         markers.append(
             marker(
@@ -166,45 +155,50 @@ def trajectory_markers(
     ends = _ends(joint_names, edges)
     shown = [index for index, name in enumerate(joint_names) if name in traced]
     header = header_message(messages, stamp_ns, frame_id)
+    marker = _markers(messages, header, namespace)
+    scale = messages.create('geometry_msgs/msg/Vector3', x=line_width)
     order = np.argsort(-heavy, kind='stable')[:ranks]
     markers = []
     for rank, at in enumerate(order):
-        paths = positions[at][:, shown]
+        places = [messages.points(positions[at, :, joint]) for joint in shown]
         # Pairs of neighbouring positions, joint by joint.
-        pieces = np.stack([paths[:-1], paths[1:]], axis=1).transpose(2, 0, 1, 3).reshape(-1, 3)
+        pieces = [place for path in places for pair in pairwise(path) for place in pair]
+        newest = messages.points(positions[at, -1])
         color = _color(messages, rank, heavy[at], heavy[order[0]])
-        for key, points in ((0, pieces), (1, positions[at, -1][ends])):
+        for key, points in ((0, pieces), (1, [newest[i] for i in ends])):
             markers.append(
-                messages.create(
-                    'visualization_msgs/msg/Marker',
-                    header=header,
-                    ns=f'{namespace}_{rank}',
-                    id=key,
+                marker(
+                    rank,
+                    key,
                     # One point alone is no line.
-                    action=_ADD if len(points) else _DELETE,
+                    action=_ADD if points else _DELETE,
                     type=_LINE_LIST,
-                    pose=messages.create('geometry_msgs/msg/Pose'),
-                    scale=messages.create('geometry_msgs/msg/Vector3', x=line_width),
+                    scale=scale,
                     color=color,
-                    points=[
-                        messages.create('geometry_msgs/msg/Point', x=x, y=y, z=z)
-                        for x, y, z in points.tolist()
-                    ],
+                    points=points,
                 )
             )
     for rank in range(len(order), ranks):
-        markers.extend(
-            messages.create(
-                'visualization_msgs/msg/Marker',
-                header=header,
-                ns=f'{namespace}_{rank}',
-                id=key,
-                pose=messages.create('geometry_msgs/msg/Pose'),
-                action=_DELETE,
-            )
-            for key in (0, 1)
-        )
+        markers.extend(marker(rank, key, action=_DELETE) for key in (0, 1))
     return messages.create('visualization_msgs/msg/MarkerArray', markers=markers)
+
+
+def _markers(messages: MessageFactory, header: Any, namespace: str) -> Callable[..., Any]:
+    """Maker of the markers of one array, which share what is the same in all of them."""
+    blank = messages.create(
+        'visualization_msgs/msg/Marker',
+        header=header,
+        # Viewers complain about an orientation of zero length.
+        pose=messages.create('geometry_msgs/msg/Pose'),
+    )
+
+    def marker(rank: int, key: int, **fields: Any) -> Any:
+        made = copy(blank)
+        for name, value in {'ns': f'{namespace}_{rank}', 'id': key, **fields}.items():
+            setattr(made, name, value)
+        return made
+
+    return marker
 
 
 def _ends(joint_names: Sequence[str], edges: Sequence[tuple[str, str]]) -> list[int]:

@@ -136,7 +136,7 @@ class McapFile:
             raise BagError(f'{self._name} can not be read: {reason(error)}') from error
         except DamageError as damage:
             raise BagError(
-                f'{self._name} {damage}; `mcap recover` makes a bag of what is whole'
+                f'{self._name} {damage}; `python -m hmt_ros recover` makes a bag of what is whole'
             ) from None
 
     # Finding the blocks

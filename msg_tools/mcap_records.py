@@ -22,8 +22,13 @@ SCHEMA = 3
 CHANNEL = 4
 MESSAGE = 5
 CHUNK = 6
+MESSAGE_INDEX = 7
+ATTACHMENT = 9
 STATISTICS = 11
+METADATA = 12
 DATA_END = 15
+
+FOOTER_BYTES = RECORD.size + 20
 
 # These are read whole, and small; a larger one is damage.
 _READ_WHOLE = (HEADER, FOOTER, SCHEMA, CHANNEL, STATISTICS, DATA_END)
@@ -83,6 +88,15 @@ class Fields:
             return self.block().decode()
         except UnicodeDecodeError:
             raise DamageError(f'is damaged at byte {self._offset}: a name is not UTF-8') from None
+
+    def texts(self) -> dict[str, str]:
+        """Texts by name."""
+        entries = Fields(self.block(), self._offset)
+        found: dict[str, str] = {}
+        while entries._at < len(entries._body):
+            name = entries.text()
+            found[name] = entries.text()
+        return found
 
     def statistics(self) -> Counter[int] | None:
         """Messages of each channel; None where the writer gave only their total."""

@@ -18,6 +18,8 @@ from rosbags.interfaces import Nodetype
 
 from msg_tools.typestore import typestore
 
+_POINT = 'geometry_msgs/msg/Point'
+
 
 class MessageFactory(Protocol):
     """Makes messages by the name of their type, for example 'hmt_msgs/msg/PoseMixture'."""
@@ -27,6 +29,9 @@ class MessageFactory(Protocol):
 
         Numpy arrays are converted to what the field wants.
         """
+
+    def points(self, positions: NDArray[np.float64]) -> list[Any]:
+        """geometry_msgs/Point of positions (N, 3): as `create`, of which there would be many."""
 
 
 class RosbagsMessages:
@@ -57,6 +62,11 @@ class RosbagsMessages:
             else:
                 values[name] = np.ascontiguousarray(fields[name], dtype=dtype)
         return typestore().types[msgtype](**values)
+
+    def points(self, positions: NDArray[np.float64]) -> list[Any]:
+        """See `MessageFactory.points`."""
+        point = typestore().types[_POINT]
+        return [point(x, y, z) for x, y, z in positions.tolist()]
 
 
 class GeneratedMessages:
@@ -89,6 +99,11 @@ class GeneratedMessages:
             elif kind == 'octet' and isinstance(value, int):
                 fields[name] = bytes([value])
         return self._classes[msgtype](**fields)
+
+    def points(self, positions: NDArray[np.float64]) -> list[Any]:
+        """See `MessageFactory.points`."""
+        point = self._classes[_POINT]
+        return [point(x=x, y=y, z=z) for x, y, z in positions.tolist()]
 
 
 _TYPE_CODES = {

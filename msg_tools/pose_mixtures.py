@@ -109,10 +109,7 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
             covariance=mixture.covariances[k].reshape(-1),
             log_likelihood=float(content.log_likelihoods[k]),
             degrees_of_freedom=float(content.degrees_of_freedom[k]),
-            joint_positions=[
-                messages.create('geometry_msgs/msg/Point', x=x, y=y, z=z)
-                for x, y, z in content.joint_positions[k].tolist()
-            ],
+            joint_positions=messages.points(content.joint_positions[k]),
         )
         for k in np.argsort(-mixture.weights, kind='stable')
     ]

@@ -140,9 +140,7 @@ def ground_truth(
         mean=pose,
         covariance=np.empty(0),
         log_likelihood=math.nan,
-        joint_positions=[
-            messages.create('geometry_msgs/msg/Point', x=x, y=y, z=z) for x, y, z in joints.tolist()
-        ],
+        joint_positions=messages.points(joints),
     )
     return messages.create(
         'hmt_msgs/msg/PoseMixture',

@@ -18,7 +18,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
 
-from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages, bag_writer
+from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages, bag_folder
 from msg_tools.headers import header_message
 from msg_tools.typestore import typestore
 
@@ -280,7 +280,7 @@ def test_failure_while_closing(
         return refuse() if path.suffix == '.partial' else rename(path, target)
 
     if step == 'fsync':
-        monkeypatch.setattr(bag_writer.os, 'fsync', refuse)
+        monkeypatch.setattr(bag_folder.os, 'fsync', refuse)
     else:
         rename = Path.rename
         monkeypatch.setattr(Path, 'rename', lambda a, b: refuse_the_new_folder(a, b, rename))

@@ -1,0 +1,356 @@
+"""bags: how fast they are read, what replay adds to the estimate, and memory with a large bag."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag2 import Reader
+
+from benchmarks.clips import find_clips, table
+from benchmarks.command import add_choice, benchmark_parser, run_stages, show
+from benchmarks.machine import forget_peak, on_machine, peak_memory, resident_memory
+from hmt_ros.app import replay
+from hmt_ros.experts.pose_predictor import PosePredictor
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.nodes import smoother_session
+from hmt_ros.smoothing import SlidingWindow, TrajectoryMixture
+from hmt_ros.tracking import Tracker
+from msg_tools import BagReader, BagWriter, RosbagsMessages, typestore
+from msg_tools.headers import header_message
+
+STAGES = ('reading', 'memory', 'replay')
+ROUNDS = 5
+LEAST_RATE = 0.5  # of the rate of rosbags
+MOST_ADDED = 0.1  # of the time of the estimate
+MOST_GROWTH = 32e6  # bytes of memory, from a twentieth of a bag to its end
+LARGE = 2_000_000_000  # bytes
+QUICK_LARGE = 200_000_000
+PICTURE_BYTES = 100_000
+# What estimates: all else that replay does is added by it.
+ESTIMATORS: tuple[tuple[Any, str], ...] = (
+    (Tracker, 'step'),
+    (smoother_session, 'merge_close_modes'),
+    (SlidingWindow, 'step'),
+    (SlidingWindow, 'finish'),
+    (TrajectoryMixture, 'marginal'),
+    (GaussianMixture, 'reduce'),
+    (BackgroundModel, 'learn'),
+    (BackgroundModel, 'silhouette'),
+    (PosePredictor, 'observe'),
+)
+
+
+def main(argv: list[str]) -> int:
+    """Runs the benchmark."""
+    parser = benchmark_parser('bags', __doc__, quick='small bags')
+    add_choice(parser, STAGES)
+    options = parser.parse_args(argv)
+    result = measure(quick=options.quick, only=options.only)
+    return show(result, as_text, as_json=options.json)
+
+
+def page() -> str:
+    """The part of the documentation that this benchmark writes."""
+    result = measure()
+    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
+
+
+def measure(*, quick: bool = False, only: tuple[str, ...] = STAGES) -> dict[str, Any]:
+    """All stages, on bags in a temporary folder."""
+    with tempfile.TemporaryDirectory(prefix='benchmark_bags.') as name:
+        folder = Path(name)
+        stages = {
+            'reading': lambda: reading(folder, 0.02 if quick else 1.0),
+            'memory': lambda: memory(folder, QUICK_LARGE if quick else LARGE),
+            'replay': lambda: replayed(folder),
+        }
+        return run_stages('bags', stages, only)
+
+
+# Reading
+
+
+def reading(folder: Path, scale: float = 1.0, rounds: int = ROUNDS) -> list[dict[str, Any]]:
+    """Rates of our reader and of rosbags, on the same files, one after the other."""
+    found = []
+    cases = {
+        'images of 100 kB': pictures(folder / 'pictures', scale * 2e8),
+        'joint states of 1 kB': states(folder / 'states', round(scale * 5e4)),
+    }
+    for what, path in cases.items():
+        for how, functions in (
+            ('as bytes', (_our_bytes, _their_bytes)),
+            ('as messages', (_our_messages, _their_messages)),
+        ):
+            seconds = _in_turn(functions, path, rounds)
+            count, size = functions[0](path)
+            found.append(
+                {
+                    'what': what,
+                    'how': how,
+                    'messages': count,
+                    'mb': size / 1e6,
+                    'ours_mb_per_s': size / 1e6 / seconds[0],
+                    'rosbags_mb_per_s': size / 1e6 / seconds[1],
+                    'ratio': seconds[1] / seconds[0],
+                    'wanted': f'at least {LEAST_RATE:g}',
+                    'met': seconds[1] / seconds[0] >= LEAST_RATE,
+                }
+            )
+    return found
+
+
+def _in_turn(functions: tuple[Callable[[Path], Any], ...], path: Path, rounds: int) -> list[float]:
+    """Shortest times, s, of functions that run in turn, so that what else goes on hits all."""
+    best = [np.inf] * len(functions)
+    for _ in range(rounds):
+        for i, function in enumerate(functions):
+            start = time.perf_counter()
+            function(path)
+            best[i] = min(best[i], time.perf_counter() - start)
+    return best
+
+
+def _our_bytes(path: Path) -> tuple[int, int]:
+    count = size = 0
+    with BagReader(path) as bag:
+        for stored in bag.messages():
+            count += 1
+            size += len(stored.data)
+    return count, size
+
+
+def _their_bytes(path: Path) -> tuple[int, int]:
+    count = size = 0
+    with Reader(path) as bag:
+        for _, _, data in bag.messages():
+            count += 1
+            size += len(data)
+    return count, size
+
+
+def _our_messages(path: Path) -> tuple[int, int]:
+    count = size = 0
+    with BagReader(path) as bag:
+        for stored in bag.messages():
+            count += stored.message.header.stamp.sec > 0
+            size += len(stored.data)
+    return count, size
+
+
+def _their_messages(path: Path) -> tuple[int, int]:
+    count = size = 0
+    store = typestore()
+    with Reader(path) as bag:
+        for connection, _, data in bag.messages():
+            message: Any = store.deserialize_cdr(data, connection.msgtype)
+            count += message.header.stamp.sec > 0
+            size += len(data)
+    return count, size
+
+
+def pictures(path: Path, size: float) -> Path:
+    """A bag with so many bytes of what can not be compressed, as pictures are."""
+    messages = RosbagsMessages()
+    rng = np.random.default_rng(0)
+    with BagWriter(path) as bag:
+        for i in range(max(10, round(size / PICTURE_BYTES))):
+            stamp = 10**18 + i * 33_333_333
+            picture = messages.create(
+                'sensor_msgs/msg/CompressedImage',
+                header=header_message(messages, stamp, 'camera'),
+                format='jpeg',
+                data=rng.integers(0, 256, PICTURE_BYTES, dtype=np.uint8),
+            )
+            bag.write('image/compressed', stamp, picture)
+    return path
+
+
+def states(path: Path, count: int) -> Path:
+    """A bag with many small messages."""
+    messages = RosbagsMessages()
+    rng = np.random.default_rng(0)
+    names = [f'joint_{i}' for i in range(37)]
+    with BagWriter(path) as bag:
+        for i in range(max(10, count)):
+            stamp = 10**18 + i * 1_000_000
+            state = messages.create(
+                'sensor_msgs/msg/JointState',
+                header=header_message(messages, stamp, 'camera'),
+                name=names,
+                position=rng.normal(size=37),
+            )
+            bag.write('joint_states', stamp, state)
+    return path
+
+
+# Memory
+
+
+def memory(folder: Path, size: int) -> dict[str, Any]:
+    """Resident memory while a large bag is written, and while it is read."""
+    forget_peak()
+    before = resident_memory()
+    path = pictures(folder / 'large', size)
+    writing = peak_memory() - before
+    stored = sum(file.stat().st_size for file in path.iterdir())
+    track: list[list[float]] = []
+    forget_peak()
+    before = resident_memory()
+    start = time.perf_counter()
+    with BagReader(path) as bag:
+        count = bag.message_count()
+        marks = {round(share * (count - 1)) for share in np.linspace(0.05, 1.0, 20)}
+        for i, stored_message in enumerate(bag.messages()):
+            assert len(stored_message.message.data) == PICTURE_BYTES
+            if i in marks:
+                track.append([i / (count - 1), (resident_memory() - before) / 1e6])
+    growth = 1e6 * (max(used for _, used in track) - track[0][1])
+    return {
+        'gb': stored / 1e9,
+        'seconds': time.perf_counter() - start,
+        'writing_mb': writing / 1e6,
+        'reading_mb': (peak_memory() - before) / 1e6,
+        'resident_mb': track,
+        'growth_mb': growth / 1e6,
+        'wanted': f'at most {MOST_GROWTH / 1e6:g} MB more from a twentieth of it to the end',
+        'met': growth <= MOST_GROWTH,
+    }
+
+
+# Replay
+
+
+def replayed(folder: Path) -> list[dict[str, Any]]:
+    """What replay adds to the time of the estimate, with and without smoother and BME."""
+    source = find_clips(None)[0][-1]
+    background = ['--background', str(source / 'background.png')]
+    person = ['--subject', str(source / 'subject.yaml'), *background]
+    ways = {
+        'filter': [*person, '--no-smoother'],
+        'filter and smoother': person,
+        'filter, smoother and BME': [*person, '--bme'],
+    }
+    # Kernels are compiled.
+    _run(source, folder / 'first', ways['filter, smoother and BME'])
+    found = []
+    for number, (what, options) in enumerate(ways.items()):
+        with clock() as estimates:
+            start = time.perf_counter()
+            _run(source, folder / str(number), options)
+            seconds = time.perf_counter() - start
+        added = seconds - estimates[0]
+        with BagReader(source) as bag:
+            images = bag.find_topic(['sensor_msgs/msg/CompressedImage']).message_count
+        found.append(
+            {
+                'what': what,
+                'clip': source.name,
+                'images': images,
+                'estimate_ms': 1e3 * estimates[0] / images,
+                'added_ms': 1e3 * added / images,
+                'share': added / estimates[0],
+                'wanted': f'at most {100 * MOST_ADDED:g} %',
+                'met': added <= MOST_ADDED * estimates[0],
+            }
+        )
+    return found
+
+
+def _run(source: Path, target: Path, options: list[str]) -> None:
+    if code := replay.main([str(source), '-o', str(target), '--quiet', *options]):
+        raise ValueError(f'replay of {source} ended with {code}')
+
+
+@contextmanager
+def clock() -> Iterator[list[float]]:
+    """Sums up the seconds in estimators, which may call each other."""
+    total = [0.0]
+    within = [False]
+
+    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*args: Any, **kwargs: Any) -> Any:
+            if within[0]:
+                return function(*args, **kwargs)
+            within[0] = True
+            start = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                total[0] += time.perf_counter() - start
+                within[0] = False
+
+        return run
+
+    usual = [(owner, name, getattr(owner, name)) for owner, name in ESTIMATORS]
+    try:
+        for owner, name, function in usual:
+            setattr(owner, name, timed(function))
+        yield total
+    finally:
+        for owner, name, function in usual:
+            setattr(owner, name, function)
+
+
+# What is printed
+
+
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+    """Tables for people."""
+    parts = []
+    if 'reading' in result:
+        rows = [
+            ['reading', 'messages', 'this package', 'rosbags', 'ratio', f'at least {LEAST_RATE}']
+        ]
+        rows += [
+            [
+                f'{case["what"]}, {case["how"]}',
+                str(case['messages']),
+                f'{case["ours_mb_per_s"]:.0f} MB/s',
+                f'{case["rosbags_mb_per_s"]:.0f} MB/s',
+                f'{case["ratio"]:.2f}',
+                _verdict(case),
+            ]
+            for case in result['reading']
+        ]
+        parts.append(table(rows, markdown=markdown))
+    if 'memory' in result:
+        case = result['memory']
+        rows = [
+            ['memory', 'size', 'growth on the way', 'most, reading', 'most, writing', ''],
+            [
+                'one large bag',
+                f'{case["gb"]:.2f} GB',
+                f'{case["growth_mb"]:.1f} MB',
+                f'{case["reading_mb"]:.0f} MB',
+                f'{case["writing_mb"]:.0f} MB',
+                _verdict(case),
+            ],
+        ]
+        parts.append(table(rows, markdown=markdown))
+    if 'replay' in result:
+        rows = [['replay, per image', 'images', 'estimate', 'added', 'share', 'at most 10 %']]
+        rows += [
+            [
+                f'{case["clip"]}, {case["what"]}',
+                str(case['images']),
+                f'{case["estimate_ms"]:.0f} ms',
+                f'{case["added_ms"]:.1f} ms',
+                f'{100 * case["share"]:.1f} %',
+                _verdict(case),
+            ]
+            for case in result['replay']
+        ]
+        parts.append(table(rows, markdown=markdown))
+    return '\n\n'.join(parts)
+
+
+def _verdict(case: dict[str, Any]) -> str:
+    return 'met' if case['met'] else 'missed'
