@@ -47,6 +47,7 @@ FOREIGN = {
     'pip',
     'colcon',
     'ros2',
+    'rviz2',
     'git',
     'install/hmt_ros/lib/hmt_ros/filter_node',
 }

@@ -90,8 +90,8 @@ class FilterParameters:
         overlay_modes: heaviest modes that are drawn on the image; 0: no overlay.
         overlay_quality: of the JPEG pictures of the overlay.
         publish_tf: whether the segments of the heaviest mode are published on /tf.
-        frame_prefix: stands before the names of the segments on /tf, so that several persons
-            differ.
+        frame_prefix: stands before the names of the segments on /tf and in human_description, so
+            that several persons differ.
         autostart: whether the node configures and activates itself; otherwise it waits for its
             lifecycle services.
         tracker: settings of the tracker.
