@@ -48,6 +48,8 @@ FOREIGN = {
     'colcon',
     'ros2',
     'rviz2',
+    'sed',
+    'export',
     'git',
     'install/hmt_ros/lib/hmt_ros/filter_node',
 }
