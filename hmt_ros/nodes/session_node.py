@@ -125,7 +125,12 @@ class SessionNode(LifecycleNode):
         self._events = MiddlewareEvents(self.get_logger().warn)
         self._latencies: deque[float] = deque(maxlen=1000)
         self._rates = Rates(self.COUNTED_NAME, self.DONE)
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RELIABLE)
+        self._diagnostics = self.create_publisher(
+            DiagnosticArray,
+            '/diagnostics',
+            RELIABLE,
+            event_callbacks=self._events.of_publisher('/diagnostics'),
+        )
         # With use_sim_time and nobody who tells the time, diagnostics are needed most.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._diagnose_period, clock=steady)
@@ -228,7 +233,12 @@ class SessionNode(LifecycleNode):
                 LATCHED if published.latched else RELIABLE,
                 event_callbacks=self._events.of_publisher(self.resolve_topic_name(topic)),
             )
-        self._handled = self.create_lifecycle_publisher(DiagnosticStatus, '~/handled', RELIABLE)
+        self._handled = self.create_lifecycle_publisher(
+            DiagnosticStatus,
+            '~/handled',
+            RELIABLE,
+            event_callbacks=self._events.of_publisher(self.resolve_topic_name('~/handled')),
+        )
         # While a service waits for something, the others of its group would wait with it.
         group = ReentrantCallbackGroup()
         self._offered = [

@@ -3,6 +3,7 @@
 import signal
 import threading
 import time
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
@@ -53,9 +54,10 @@ def published(handled):
 def test_images_become_messages(running, small_camera):
     from hmt_msgs.msg import Body, PoseMixture
     from rclpy.qos import DurabilityPolicy, QoSProfile
+    from std_msgs.msg import String
     from tf2_msgs.msg import TFMessage
 
-    mixtures, transforms, bodies = [], [], []
+    mixtures, transforms, bodies, descriptions = [], [], [], []
     running.listen(PoseMixture, 'pose_mixture', mixtures)
     running.listen(TFMessage, '/tf', transforms)
     running.spin_until(lambda: running.node.count_subscribers('pose_mixture') == 1)
@@ -74,8 +76,14 @@ def test_images_become_messages(running, small_camera):
     # The body waits for those who come late.
     late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     running.listen(Body, 'body', bodies, late)
-    running.spin_until(lambda: len(bodies) == 1)
+    running.listen(String, 'human_description', descriptions, late)
+    running.spin_until(lambda: len(bodies) == len(descriptions) == 1)
     assert bodies[0].name == 'human37'
+    # The URDF has its place in the namespace of the person, and never that of the robot.
+    robot = ET.fromstring(descriptions[0].data)
+    links = {link.attrib['name'] for link in robot.findall('link')}
+    assert links - {'lens'} == {t.child_frame_id for t in transforms[1].transforms}
+    assert running.other.count_publishers('/robot_description') == 0
 
 
 def test_parameters_are_those_of_the_file(running):
