@@ -31,6 +31,9 @@ setup(
             (f'share/{PACKAGE}', ['package.xml']),
             (f'share/{PACKAGE}/config', files(f'{PACKAGE}/config', '*.yaml')),
             (f'share/{PACKAGE}/launch', files('launch', '*.launch.*')),
+            (f'share/{PACKAGE}/rviz', files('rviz', '*.rviz')),
+            (f'share/{PACKAGE}/foxglove', files('foxglove', '*.json')),
+            (f'share/{PACKAGE}/security', files('security', '*.xml')),
         )
         if sources
     ],

@@ -78,3 +78,16 @@ def message_of_body(messages: MessageFactory, body: Body, stamp_ns: int, frame_i
         stamp_ns=stamp_ns,
         frame_id=frame_id,
     )
+
+
+def description_message(
+    messages: MessageFactory, body: Body, frame_id: str, link_prefix: str = ''
+) -> Any:
+    """std_msgs/String with the URDF of a body, as viewers want it.
+
+    Its links are the frames of the transforms: the root is `frame_id`, all others have the prefix.
+    """
+    return messages.create(
+        'std_msgs/msg/String',
+        data=body_urdf(body.name, segments_of(body.skeleton), frame_id, link_prefix=link_prefix),
+    )

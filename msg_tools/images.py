@@ -24,6 +24,9 @@ MAX_PIXELS = 2**26
 
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 
+# A progressive JPEG has a dozen; each costs the decoder a pass over the whole picture.
+MAX_JPEG_SCANS = 100
+
 # What compression can do at its best: JPEG spends one bit on each block of 8x8 pixels, deflate one
 # byte on 1032, which in PNG may be 8 pixels each.
 _JPEG_PIXELS_PER_BYTE = 512
@@ -124,11 +127,25 @@ def _decode_raw(message: Any) -> Picture:
 
 
 def _decode_compressed(message: Any) -> Picture:
-    data = _bytes_of(message.data)
-    content = data.tobytes()
     form = str(message.format)
     if 'compressedDepth' in form:
         raise ImageError(f'compressed image has format {form!r}: depth, wanted a picture')
+    return decode_picture(_bytes_of(message.data).tobytes(), f'format {form!r}')
+
+
+def decode_picture(content: bytes, form: str = 'unknown format') -> Picture:
+    """The picture of a PNG or JPEG file, BGR (H, W, 3).
+
+    The size that the file tells is looked at before anything is decoded.
+
+    Args:
+        content: of the file.
+        form: what it is said to be, for messages.
+
+    Raises:
+        ImageError: another format, a damaged file, more pixels than `MAX_PIXELS`, more pixels than
+            so many bytes can hold.
+    """
     if content.startswith(b'\xff\xd8\xff'):
         width, height = _jpeg_size(content)
         densest = _JPEG_PIXELS_PER_BYTE
@@ -137,7 +154,7 @@ def _decode_compressed(message: Any) -> Picture:
         densest = _PNG_PIXELS_PER_BYTE
     else:
         raise ImageError(
-            f'compressed image of format {form!r} starts with {content[:4]!r}, wanted jpeg or png'
+            f'compressed image of {form} starts with {content[:4]!r}, wanted jpeg or png'
         )
     _check_size(width, height)
     if width * height > densest * len(content):
@@ -146,11 +163,11 @@ def _decode_compressed(message: Any) -> Picture:
         )
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        image = cv2.imdecode(data, flags)
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     except cv2.error as error:
         raise ImageError(f'compressed image can not be decoded: {error.err}') from error
     if image is None or image.shape != (height, width, 3):
-        raise ImageError(f'compressed image of {len(content)} bytes and format {form!r} is damaged')
+        raise ImageError(f'compressed image of {len(content)} bytes and {form} is damaged')
     return np.array(image, dtype=np.uint8, order='C')
 
 
@@ -204,9 +221,13 @@ def _jpeg_size(content: bytes) -> tuple[int, int]:
             height, width = struct.unpack('>HH', content[at + 5 : at + 9])
             size = width, height
         if marker == 0xDA:
-            if size is not None and content.find(b'\xff\xd9', at) >= 0:
-                return size
-            break
+            if size is None or content.find(b'\xff\xd9', at) < 0:
+                break
+            # Within a scan a byte ff is never followed by the number of a marker like this.
+            scans = content.count(b'\xff\xda', at)
+            if scans > MAX_JPEG_SCANS:
+                raise ImageError(f'jpeg has {scans} scans, the limit is {MAX_JPEG_SCANS}')
+            return size
         at += 2 + int.from_bytes(content[at + 2 : at + 4], 'big')
     raise ImageError(f'jpeg of {len(content)} bytes breaks off or is damaged')
 

@@ -15,6 +15,9 @@ from msg_tools.message_factory import MessageFactory
 
 Array = NDArray[np.float64]
 
+# Of one person; detectors tell up to a few hundred.
+MAX_KEYPOINTS = 10_000
+
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
@@ -90,6 +93,10 @@ def keypoints_of(
             which one half is missing, a covariance that is not positive definite, a confidence
             beyond 0 to 1.
     """
+    if len(message.names) > MAX_KEYPOINTS:
+        raise MessageError(
+            f'keypoints has {len(message.names)} names, the limit is {MAX_KEYPOINTS}'
+        )
     names = names_of(message.names, 'keypoints')
     n = len(names)
     if n == 0:

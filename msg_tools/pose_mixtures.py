@@ -25,6 +25,9 @@ from msg_tools.message_factory import MessageFactory
 
 Array = NDArray[np.float64]
 
+# As many as any node publishes; a message of more costs whoever reads it time without end.
+MAX_COMPONENTS = 1024
+
 
 class MixtureKind(IntEnum):
     """What a mixture is the density of; the constants of PoseMixture.msg."""
@@ -145,6 +148,10 @@ def pose_mixture_of(
     check_names(joints, joint_names, 'mixture: joint_names')
     if not message.components:
         raise MessageError('mixture has no components')
+    if len(message.components) > MAX_COMPONENTS:
+        raise MessageError(
+            f'mixture has {len(message.components)} components, the limit is {MAX_COMPONENTS}'
+        )
     d = len(names)
     means, covariances, positions = [], [], []
     for k, component in enumerate(message.components):

@@ -6,7 +6,8 @@ Seen from its parent a segment is
 
     Trans(offset + translations) * mount * Rot(axis_1, q_1) * ... * Rot(axis_n, q_n)
 
-as in `hmt_ros.body.skeleton`. Links have no inertia: the URDF is for looking at.
+as in `hmt_ros.body.skeleton`. Links have no inertia: the URDF is for looking at. `link_frames`
+tells where all links are, also those within a chain: viewers find fault with a link without frame.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_ros.body.kinematics import Frames
 from hmt_ros.body.skeleton import Skeleton
 from msg_tools.message_error import MessageError
 
@@ -103,7 +105,11 @@ def segments_of(skeleton: Skeleton) -> list[Segment]:
 
 
 def body_urdf(
-    name: str, segments: Sequence[Segment], root_link: str, rod_radius: float = 0.025
+    name: str,
+    segments: Sequence[Segment],
+    root_link: str,
+    rod_radius: float = 0.025,
+    link_prefix: str = '',
 ) -> str:
     """The URDF; the same text for the same body.
 
@@ -112,6 +118,7 @@ def body_urdf(
         segments: of the body, parents before their children.
         root_link: what the segments without parent hang on: the frame of the camera.
         rod_radius: of the rods that show a segment, m.
+        link_prefix: stands before the names of all links but the root.
 
     Raises:
         MessageError: a parent that does not stand before its child, a translation after a rotation,
@@ -125,8 +132,10 @@ def body_urdf(
             raise MessageError(
                 f'urdf: segment {segment.name} has parent {segment.parent}, wanted one before it'
             )
-        parent = root_link if segment.parent == -1 else segments[segment.parent].name
-        _add_segment(robot, joints, segment, parent, rod_radius)
+        parent = root_link
+        if segment.parent != -1:
+            parent = f'{link_prefix}{segments[segment.parent].name}'
+        _add_segment(robot, joints, segment, parent, rod_radius, link_prefix)
     robot.extend(joints)
     for kind in ('link', 'joint'):
         seen: set[str] = set()
@@ -144,6 +153,7 @@ def _add_segment(
     segment: Segment,
     parent: str,
     rod_radius: float,
+    link_prefix: str,
 ) -> None:
     offset = np.asarray(segment.offset, dtype=np.float64)
     mount = np.asarray(segment.mount, dtype=np.float64)
@@ -165,7 +175,7 @@ def _add_segment(
     for index, step in enumerate(steps):
         turns = step is None or step.kind == 'revolute'
         last = index == len(steps) - 1
-        link = segment.name if last else f'{segment.name}.{step.name if step else "mount"}'
+        link = f'{link_prefix}{segment.name if last else _within(segment.name, step)}'
         joints.append(
             _joint(
                 step, segment.name, parent, link, waiting_offset, waiting_mount if turns else None
@@ -179,6 +189,72 @@ def _add_segment(
             for point in np.reshape(np.asarray(segment.points, dtype=np.float64), (-1, 3)):
                 _add_rod(element, point, rod_radius)
         parent = link
+
+
+def _within(segment: str, step: Freedom | None) -> str:
+    """Name of a link between a segment and its parent."""
+    return f'{segment}.{step.name if step else "mount"}'
+
+
+def link_frames(
+    skeleton: Skeleton, frames: Frames, pose: ArrayLike, index: int = 0
+) -> tuple[list[str], Array, Array]:
+    """Where the links of `body_urdf` are, all but the root, which is the camera.
+
+    Args:
+        skeleton: of the body.
+        frames: of its segments.
+        pose: (d,) that they belong to.
+        index: of the pose among those of the frames.
+
+    Returns:
+        Names of the links (L), as `body_urdf` gives them without a prefix; rotations (L, 3, 3) and
+        origins (L, 3), m, in the frame of the camera.
+    """
+    q = np.asarray(pose, dtype=np.float64)
+    turned = frames.rotations()[index]
+    origins = np.ascontiguousarray(frames.origins[:, :, index])
+    # What takes a rotation back: a turn by -q about its axis, which it does not move itself.
+    back = _rotations(frames.axes[:, :, index], -q)
+    names: list[str] = []
+    rotations: list[Array] = []
+    places: list[Array] = []
+    for segment, name in enumerate(skeleton.segment_names):
+        own = skeleton.segment_dofs[segment]
+        chain = [(name, turned[segment], origins[segment])]
+        # From the segment towards its parent; the links of its translations do not turn.
+        rotation, place = turned[segment], origins[segment]
+        parent = skeleton.parents[segment]
+        unturned = np.eye(3) if parent == -1 else turned[parent]
+        turns = any(skeleton.dof_is_rotation[i] for i in own)
+        for position in reversed(range(len(own))):
+            dof = own[position]
+            if position == len(own) - 1 and turns:
+                # The last rotation ends in the segment itself.
+                rotation = back[dof] @ rotation
+                continue
+            link = f'{name}.{skeleton.dof_names[dof]}'
+            if skeleton.dof_is_rotation[dof]:
+                chain.append((link, rotation, place))
+                rotation = back[dof] @ rotation
+            else:
+                chain.append((link, unturned, place))
+                place = place - q[dof] * frames.axes[dof, :, index]
+        for link, r, t in reversed(chain):
+            names.append(link)
+            rotations.append(r)
+            places.append(t)
+    return names, np.array(rotations), np.array(places)
+
+
+def _rotations(axes: Array, angles: Array) -> Array:
+    """Rotations (N, 3, 3) about unit vectors (N, 3) by angles (N,), rad; Rodrigues' formula."""
+    x, y, z = axes.T
+    zero = np.zeros(len(axes))
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    sine, versine = np.sin(angles)[:, None, None], (1 - np.cos(angles))[:, None, None]
+    result: Array = np.eye(3) + sine * cross + versine * (cross @ cross)
+    return result
 
 
 def _joint(

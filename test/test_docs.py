@@ -47,6 +47,9 @@ FOREIGN = {
     'pip',
     'colcon',
     'ros2',
+    'rviz2',
+    'sed',
+    'export',
     'git',
     'install/hmt_ros/lib/hmt_ros/filter_node',
 }

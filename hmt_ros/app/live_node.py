@@ -58,6 +58,7 @@ class Player:
             from rclpy.executors import SingleThreadedExecutor
             from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
             from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
+            from std_msgs.msg import String
             from tf2_msgs.msg import TFMessage
             from visualization_msgs.msg import MarkerArray
         except ImportError as error:
@@ -66,7 +67,7 @@ class Player:
             ) from error
         kinds = (
             Body, CameraInfo, CompressedImage, DiagnosticStatus, Image, JointState, Keypoints2D,
-            MarkerArray, PoseMixture, TFMessage, TrajectoryMixture,
+            MarkerArray, PoseMixture, String, TFMessage, TrajectoryMixture,
         )  # fmt: skip
         self.classes: dict[str, Any] = {
             f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}': kind for kind in kinds
@@ -256,6 +257,8 @@ class LiveNode:
 
     def _start(self, parameters: Any, sensors: tuple[str, ...]) -> subprocess.Popen[bytes]:
         values = {name: yaml_scalar(value) for name, value in values_of(parameters).items()}
+        # The last line that it says is to be the one that matters.
+        values['status_interval'] = '0'
         for topic in sensors:
             values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
         lines = [f'    {name}: {text}' for name, text in values.items()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmt_ros.body import Body, load_body
+from hmt_ros.body import Body, load_body, named_body
 from msg_tools import BagMessage
 from msg_tools.pose_mixtures import PoseMixture
 
@@ -29,12 +29,11 @@ class RecordedBodies:
     def learn(self, stored: BagMessage) -> None:
         """Takes a message about a body; a model that is not known leaves the body unknown."""
         message = stored.message
-        name = str(message.name) if self._model is None else self._model
         lengths = dict(
             zip(map(str, message.segment_names), map(float, message.segment_lengths), strict=False)
         )
         try:
-            body = load_body(name)
+            body = self._body(str(message.name))
         except FileNotFoundError:
             if self._model is not None:
                 raise
@@ -43,6 +42,10 @@ class RecordedBodies:
             self._known[_namespace(stored.topic)] = body.with_segment_lengths(lengths)
         except KeyError as error:
             raise ValueError(f'topic {stored.topic}: {error.args[0]}') from error
+
+    def _body(self, name: str) -> Body:
+        """The body that was chosen, or that ships under a name; names in bags lead to no files."""
+        return named_body(name) if self._model is None else load_body(self._model)
 
     def of(self, topic: str, dof_names: tuple[str, ...]) -> Body | None:
         """The body whose poses a topic carries, None: not known."""
@@ -58,7 +61,7 @@ class RecordedBodies:
             if body is not None and _is_there(body, content):
                 return body
         try:
-            body = load_body(self._model or content.body_model).with_joints_at(
+            body = self._body(content.body_model).with_joints_at(
                 content.mixture.means, content.joint_names, content.joint_positions
             )
         except (FileNotFoundError, ValueError):

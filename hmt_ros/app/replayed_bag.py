@@ -9,7 +9,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
 from tqdm import tqdm
 
 from hmt_ros.app.played_track import (
@@ -22,6 +21,7 @@ from hmt_ros.app.played_track import (
     PlayedTrack,
 )
 from hmt_ros.app.recorded_input import GROUND_TRUTH, RecordedInput, recorded_input
+from hmt_ros.body.plain_yaml import load_plain_yaml
 from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
 from hmt_ros.nodes.bme_parameters import BmeParameters
 from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
@@ -192,8 +192,8 @@ def _given_values(options: argparse.Namespace, node: str) -> dict[str, Any]:
         if of != node:
             continue
         try:
-            values[name] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
+            values[name] = load_plain_yaml(value)
+        except ValueError as error:
             raise ValueError(f'--set {text}: {error_line(error)}') from error
         if values[name] is None:
             values[name] = value

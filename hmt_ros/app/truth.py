@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.inference.array_file import read_archive
 from msg_tools import BagReader
 from msg_tools.headers import time_ns
 from msg_tools.pose_mixtures import MixtureKind
@@ -79,14 +79,14 @@ def read_truth(path: Path) -> Truth:
 
 def _from_arrays(path: Path) -> Truth:
     try:
-        with np.load(path, allow_pickle=False) as content:
-            missing = [name for name in FIELDS if name not in content.files]
-            if missing:
-                raise ValueError(f'it has no {missing}; it has {sorted(content.files)}')
-            stamps, names, joints = (np.array(content[name]) for name in FIELDS)
+        content = read_archive(path)
+        missing = [name for name in FIELDS if name not in content]
+        if missing:
+            raise ValueError(f'it has no {missing}; it has {sorted(content)}')
+        stamps, names, joints = (content[name] for name in FIELDS)
     except OSError as error:
         raise ValueError(f'{path} can not be read ({error.strerror or error})') from error
-    except (ValueError, zipfile.BadZipFile, EOFError) as error:
+    except ValueError as error:
         raise ValueError(f'{path} is no truth file: {error}') from error
     if stamps.ndim != 1 or not np.issubdtype(stamps.dtype, np.integer):
         raise ValueError(f'{path}: stamps must be whole nanoseconds (T,), saw {stamps.dtype}')

@@ -10,7 +10,7 @@ from hmt_ros.body.interpretation_tree import enumerate_flips
 from hmt_ros.body.model_file import model_names, read_body
 from hmt_ros.body.motion_file import SUFFIXES, read_skeleton
 
-__all__ = ['Body', 'Camera', 'enumerate_flips', 'load_body', 'model_names']
+__all__ = ['Body', 'Camera', 'enumerate_flips', 'load_body', 'model_names', 'named_body']
 
 
 def load_body(source: str | Path) -> Body:
@@ -25,3 +25,15 @@ def load_body(source: str | Path) -> Body:
     if Path(source).suffix.lower() in SUFFIXES:
         return read_skeleton(source)
     return read_body(source)
+
+
+def named_body(name: str) -> Body:
+    """The body that ships under a name; for names in messages, which must not lead to files.
+
+    Raises:
+        FileNotFoundError: none ships under this name.
+    """
+    known = model_names()
+    if name not in known:
+        raise FileNotFoundError(f'no body {name!r}: wanted one of {known}')
+    return read_body(name)

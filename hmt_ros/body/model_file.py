@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body, PartShape
+from hmt_ros.body.plain_yaml import load_plain_yaml
 from hmt_ros.body.skeleton import Skeleton
 
 Array = NDArray[np.float64]
@@ -46,7 +46,7 @@ def read_body(source: str | Path) -> Body:
             f'{source}: not a body model ({type(fault).__name__}: {fault}); '
             'compare with human37.yaml'
         ) from fault
-    except (ValueError, yaml.YAMLError) as fault:
+    except ValueError as fault:
         text = ' '.join(str(fault).split())
         raise ValueError(
             f'{source}: not a body model ({text}); compare with human37.yaml'
@@ -65,9 +65,9 @@ def _read(source: str | Path) -> dict[str, Any]:
                 f'file (.bvh, .asf, .amc)'
             )
         if path.stat().st_size > LARGEST_FILE:
-            raise ValueError(f'the file has {path.stat().st_size} bytes')
+            raise ValueError(f'the file has {path.stat().st_size} bytes, wanted {LARGEST_FILE}')
         text = path.read_text('utf-8')
-    content = yaml.safe_load(text)
+    content = load_plain_yaml(text)
     if not isinstance(content, dict):
         raise ValueError(f'wanted a mapping, saw {type(content).__name__}')
     if 'extends' in content:

@@ -8,13 +8,14 @@ arrays under a prefix: `nested` and `part`.
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hmt_ros.inference.array_file import read_archive
 
 FORMAT = 'hmt_ros model'
 VERSION = 1
@@ -113,9 +114,8 @@ def read_arrays(path: str | Path, kind: str | None = None) -> Arrays:
     if not path.is_file():
         raise FileNotFoundError(f'{path}: no such model file; train one with `train`')
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as fault:
+        arrays = read_archive(path)
+    except (OSError, ValueError) as fault:
         text = ' '.join(str(fault).split())
         raise ValueError(f'{path}: not a model file of hmt_ros ({text})') from fault
     check_header(arrays, kind, str(path))

@@ -43,6 +43,8 @@ class BmeParameters:
             of a new sequence; otherwise such images are skipped.
         image_transport: 'raw' (topic image) or 'compressed' (topic image/compressed).
         queue_size: images that wait at most; when the node is late the oldest are dropped.
+        status_interval: a line on the console says every so many seconds what the node does, while
+            messages come, s; 0: never.
         autostart: whether the node configures and activates itself; otherwise it waits for its
             lifecycle services.
         background: settings of the background subtraction.
@@ -59,6 +61,7 @@ class BmeParameters:
     reset_on_time_jump: bool = parameter_field(False, AT_ONCE)
     image_transport: str = parameter_field('raw', NEXT_CONFIGURE)
     queue_size: int = parameter_field(5, AT_ONCE, (1, 1000))
+    status_interval: int = parameter_field(1, AT_ONCE, (0, 3600))
     autostart: bool = parameter_field(True, AT_LAUNCH)
     background: BackgroundSettings = field(
         default_factory=BackgroundSettings,

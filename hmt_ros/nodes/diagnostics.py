@@ -19,12 +19,13 @@ class Rates:
         done: what one calls those that were used.
 
     Attributes:
-        dropped, faults: of the period.
+        dropped, faults, lost: of the period.
     """
 
     def __init__(self, name: str, done: str) -> None:
         self.dropped = 0
         self.faults = 0
+        self.lost = 0
         self._name, self._done = name, done
         self._received = self._used = 0.0
         self._latencies: list[float] = []
@@ -35,7 +36,7 @@ class Rates:
         """Ends a period.
 
         Args:
-            counts: 'received', 'dropped', 'faults' and those used, of all time.
+            counts: 'received', 'dropped', 'faults', 'lost' and those used, of all time.
             latencies: of the period, s.
         """
         now = time.monotonic()
@@ -45,6 +46,7 @@ class Rates:
         self._received = change['received'] / duration
         self._used = change[self._done] / duration
         self.dropped, self.faults = change['dropped'], change['faults']
+        self.lost = change['lost']
         self._latencies, self._counts, self._began = latencies, counts, now
 
     def values(self) -> list[tuple[str, str]]:
@@ -56,6 +58,18 @@ class Rates:
             ('latency, mean, ms', f'{1e3 * sum(known) / len(known):.1f}'),
             ('latency, largest, ms', f'{1e3 * max(known):.1f}'),
         ]
+
+    def line(self) -> str:
+        """For the console."""
+        latency = ''
+        if self._latencies:
+            mean = 1e3 * sum(self._latencies) / len(self._latencies)
+            latency = f', latency {mean:.0f} ms'
+        dropped = f', {self.dropped} dropped' if self.dropped else ''
+        return (
+            f'{self._received:.1f} {self._name} a second, {self._used:.1f} {self._done}'
+            f'{latency}{dropped}'
+        )
 
 
 def handled_message(handled: Handled) -> DiagnosticStatus:

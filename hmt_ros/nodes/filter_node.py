@@ -12,6 +12,7 @@ from hmt_msgs.msg import Body, Keypoints2D, PoseMixture
 from hmt_msgs.srv import Reset
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CompressedImage, JointState
+from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
@@ -45,6 +46,7 @@ class FilterNode(SessionNode):
     CLASSES = {  # noqa: RUF012
         'hmt_msgs/msg/Body': Body,
         'hmt_msgs/msg/PoseMixture': PoseMixture,
+        'std_msgs/msg/String': String,
         'sensor_msgs/msg/JointState': JointState,
         'sensor_msgs/msg/CompressedImage': CompressedImage,
         'visualization_msgs/msg/MarkerArray': MarkerArray,

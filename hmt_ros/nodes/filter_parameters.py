@@ -92,8 +92,10 @@ class FilterParameters:
         overlay_modes: heaviest modes that are drawn on the image; 0: no overlay.
         overlay_quality: of the JPEG pictures of the overlay.
         publish_tf: whether the segments of the heaviest mode are published on /tf.
-        frame_prefix: stands before the names of the segments on /tf, so that several persons
-            differ.
+        frame_prefix: stands before the names of the segments on /tf and in human_description, so
+            that several persons differ.
+        status_interval: a line on the console says every so many seconds what the node does, while
+            messages come, s; 0: never.
         autostart: whether the node configures and activates itself; otherwise it waits for its
             lifecycle services.
         tracker: settings of the tracker.
@@ -116,6 +118,7 @@ class FilterParameters:
     overlay_quality: int = parameter_field(85, AT_ONCE, (1, 100))
     publish_tf: bool = parameter_field(True, AT_ONCE)
     frame_prefix: str = parameter_field('', AT_ONCE)
+    status_interval: int = parameter_field(1, AT_ONCE, (0, 3600))
     autostart: bool = parameter_field(True, AT_LAUNCH)
     tracker: TrackerSettings = field(
         default_factory=TrackerSettings,

@@ -108,6 +108,7 @@ class FilterSession(Session):
         self._input = CameraInput(self._log, 'the track')
         self._tracker: Tracker | None = None
         self._shown_body: Body | None = None
+        self._shown_frames: tuple[str, str] | None = None
         self._keypoints: StampedInputs[Keypoints] = StampedInputs()
         self._predictions: StampedInputs[PosePrediction] = StampedInputs()
         self._weights = np.empty(0)
@@ -294,17 +295,19 @@ class FilterSession(Session):
         likelihood: GaussianMixture,
     ) -> None:
         p = self.parameters
+        shown = self._shown_body
+        starts = shown is None or tracker.body.skeleton is not shown.skeleton
+        frame = self._input.frame_of(waiting)
         track = TrackedImage(
             image=waiting.image,
             stamp_ns=waiting.stamp_ns,
-            frame_id=self._input.frame_of(waiting),
+            frame_id=frame,
             body=tracker.body,
             camera=tracker.camera,
             posterior=posterior,
             likelihood=likelihood,
             log_likelihoods=tracker.modes.log_likelihoods,
-            starts=self._shown_body is None
-            or tracker.body.skeleton is not self._shown_body.skeleton,
+            starts=starts,
         )
         presentation = Presentation(
             tracker.settings.max_hypotheses,
@@ -312,6 +315,7 @@ class FilterSession(Session):
             p.overlay_quality,
             p.publish_tf,
             p.frame_prefix,
+            describe=starts or self._shown_frames != (frame, p.frame_prefix),
         )
 
         track_messages(
@@ -321,7 +325,7 @@ class FilterSession(Session):
             self._wanted,
             lambda topic, message: self._publish(topic, waiting.stamp_ns, message),
         )
-        self._shown_body = tracker.body
+        self._shown_body, self._shown_frames = tracker.body, (frame, p.frame_prefix)
         self._weights = posterior.weights
         self._log.counts['tracked'] += 1
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from hmt_ros.body.plain_yaml import load_plain_yaml
 from hmt_ros.nodes.declared_parameters import (
     EFFECTS,
     DeclaredParameter,
@@ -94,11 +95,16 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
     path = Path(path)
     try:
         if path.stat().st_size > _LARGEST_FILE:
-            raise ParameterError(f'{path}: {path.stat().st_size} bytes, wanted a parameter file')
-        document = yaml.safe_load(path.read_text('utf-8'))
+            raise ParameterError(
+                f'{path}: {path.stat().st_size} bytes, wanted a parameter file of at most '
+                f'{_LARGEST_FILE}'
+            )
+        document = load_plain_yaml(path.read_text('utf-8'))
     except OSError as error:
         raise ParameterError(f'{path}: can not be read ({error.strerror})') from error
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+    except ParameterError:
+        raise
+    except ValueError as error:
         raise ParameterError(f'{path}: not YAML ({error_line(error)})') from error
     if document is None:
         return {}

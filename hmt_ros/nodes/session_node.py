@@ -21,7 +21,7 @@ import traceback
 from abc import abstractmethod
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -33,7 +33,7 @@ from rcl_interfaces.msg import (
 )
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import InvalidHandle, ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -50,6 +50,7 @@ from hmt_ros.nodes.declared_parameters import (
 from hmt_ros.nodes.diagnostics import Rates, handled_message
 from hmt_ros.nodes.handled import Handled, Output
 from hmt_ros.nodes.input_queue import InputQueue, Waiting
+from hmt_ros.nodes.middleware_events import MiddlewareEvents
 from hmt_ros.nodes.published_topic import SUBSCRIBERS, PublishedTopic
 from hmt_ros.nodes.session import Session
 from hmt_ros.nodes.subscribed_topic import LATCHED, RELIABLE, SubscribedTopic
@@ -60,8 +61,17 @@ from msg_tools.error_line import error_line
 SMALL_QUEUE = 100
 
 _RESTART = 'restart'
+# An active node that is sent nothing for so long says so, s.
+_SILENCE = 3.0
 # What a last estimate may take at the end, s; kernels that are being compiled are not waited for.
 _LAST_ESTIMATE = 5.0
+
+
+class _TooLarge(NamedTuple):
+    """Stands for a message that is not kept."""
+
+    size: int
+    limit: int
 
 
 class SessionNode(LifecycleNode):
@@ -108,9 +118,19 @@ class SessionNode(LifecycleNode):
         self._inputs: list[Any] = []
         self._types: dict[str, str] = {}
         self._failure = ''
+        self._inner_faults = 0
+        self._inner_fault = ''
+        self._last_arrival: float | None = None
+        self._ticks, self._told_at = 0, 0
+        self._events = MiddlewareEvents(self.get_logger().warn)
         self._latencies: deque[float] = deque(maxlen=1000)
         self._rates = Rates(self.COUNTED_NAME, self.DONE)
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RELIABLE)
+        self._diagnostics = self.create_publisher(
+            DiagnosticArray,
+            '/diagnostics',
+            RELIABLE,
+            event_callbacks=self._events.of_publisher('/diagnostics'),
+        )
         # With use_sim_time and nobody who tells the time, diagnostics are needed most.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._diagnose_period, clock=steady)
@@ -146,13 +166,22 @@ class SessionNode(LifecycleNode):
     def _judgement(self, state: Any) -> tuple[bytes, str]:
         """Level and message of the diagnostics of an active node."""
         rates = self._rates
+        deaf = self._deaf_topic()
+        if deaf:
+            return DiagnosticStatus.WARN, deaf
         if rates.dropped:
             late = f'late: {rates.dropped} {self.COUNTED_NAME} dropped in a second'
             return DiagnosticStatus.WARN, late
         if rates.faults:
             return DiagnosticStatus.WARN, state.last_fault
+        if rates.lost:
+            return DiagnosticStatus.WARN, f'{rates.lost} messages lost on their way in a second'
         if state.wants:
             return DiagnosticStatus.WARN, f'waits for {state.wants}'
+        if self._last_arrival is not None:
+            silence = time.monotonic() - self._last_arrival
+            if silence > _SILENCE:
+                return DiagnosticStatus.WARN, f'no {self.COUNTED_NAME} for {silence:.0f} s'
         return DiagnosticStatus.OK, f'{state.status}, {self._summary(state)}'
 
     def _check_changed(self, settings: Any, changed: Mapping[str, Any]) -> None:
@@ -199,9 +228,17 @@ class SessionNode(LifecycleNode):
         self._failure = ''
         for topic, published in self.TOPICS.items():
             self._outputs[topic] = self.create_lifecycle_publisher(
-                self.CLASSES[published.msgtype], topic, LATCHED if published.latched else RELIABLE
+                self.CLASSES[published.msgtype],
+                topic,
+                LATCHED if published.latched else RELIABLE,
+                event_callbacks=self._events.of_publisher(self.resolve_topic_name(topic)),
             )
-        self._handled = self.create_lifecycle_publisher(DiagnosticStatus, '~/handled', RELIABLE)
+        self._handled = self.create_lifecycle_publisher(
+            DiagnosticStatus,
+            '~/handled',
+            RELIABLE,
+            event_callbacks=self._events.of_publisher(self.resolve_topic_name('~/handled')),
+        )
         # While a service waits for something, the others of its group would wait with it.
         group = ReentrantCallbackGroup()
         self._offered = [
@@ -258,8 +295,13 @@ class SessionNode(LifecycleNode):
         assert queue is not None
 
         def receive(data: bytes) -> None:
-            queue.put(wanted.source, data, time.monotonic())
+            now = time.monotonic()
+            if wanted.source == self.COUNTED:
+                self._last_arrival = now
+            content = data if len(data) <= wanted.largest else _TooLarge(len(data), wanted.largest)
+            queue.put(wanted.source, content, now)
 
+        events = self._events.of_subscription(self.resolve_topic_name(wanted.topic))
         self._inputs.append(
             self.create_subscription(
                 wanted.kind,
@@ -267,6 +309,7 @@ class SessionNode(LifecycleNode):
                 receive,
                 wanted.qos,
                 raw=True,
+                event_callbacks=events,
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
         )
@@ -275,6 +318,21 @@ class SessionNode(LifecycleNode):
         for subscription in self._inputs:
             self.destroy_subscription(subscription)
         self._inputs.clear()
+        self._events.forget()
+        self._last_arrival = None
+
+    def _deaf_topic(self) -> str:
+        """Of a topic that only publishers that do not fit publish, which and why; '': none."""
+        try:
+            for subscription in list(self._inputs):
+                topic = subscription.topic_name
+                policy = self._events.refused_policy(topic)
+                if policy and not subscription.get_publisher_count():
+                    return f'{topic}: publishers offer another {policy} than is asked for'
+        except InvalidHandle:
+            # The other thread is closing them.
+            pass
+        return ''
 
     def _close(self) -> None:
         self._unsubscribe()
@@ -340,6 +398,8 @@ class SessionNode(LifecycleNode):
                 self._handle(session, waiting)
             except Exception as error:  # noqa: BLE001
                 # A fault of ours. What comes next may not suffer from it.
+                self._inner_faults += 1
+                self._inner_fault = f'{type(error).__name__}: {error_line(error)}'
                 self.get_logger().error(''.join(traceback.format_exception(error)))
                 session.restart(session.start)
             after = session.state
@@ -353,6 +413,10 @@ class SessionNode(LifecycleNode):
             session.restart(waiting.content)
             return
         try:
+            if isinstance(waiting.content, _TooLarge):
+                raise ValueError(
+                    f'it has {waiting.content.size} bytes, the limit is {waiting.content.limit}'
+                )
             message = deserialise(waiting.content, self._types[waiting.source])
         except Exception as error:  # noqa: BLE001
             # Bytes from outside meet generated code here, which does not say what it may raise.
@@ -383,22 +447,37 @@ class SessionNode(LifecycleNode):
             state = self._session.state
             counts = Counter(self._counts(state))
             counts['faults'] = state.faults.total()
+        counts['lost'] = self._events.lost
         latencies = [self._latencies.popleft() for _ in range(len(self._latencies))]
         self._rates.next_period(counts, latencies)
         self._diagnose()
+        self._tell_status(counts)
+
+    def _tell_status(self, counts: Counter[str]) -> None:
+        """One line a period, or a few periods, while there is something new to tell."""
+        self._ticks += 1
+        interval = self._settings.status_interval
+        if not interval or self._ticks < interval or counts['received'] == self._told_at:
+            return
+        self._ticks, self._told_at = 0, counts['received']
+        if self._session is not None:
+            _, text = self._judgement(self._session.state)
+            self.get_logger().info(f'{text}; {self._rates.line()}')
+
+    def _present_judgement(self, label: str, state: Any) -> tuple[bytes, str]:
+        if self._failure:
+            return DiagnosticStatus.ERROR, self._failure
+        if state is None or label != 'active':
+            return DiagnosticStatus.OK, label
+        return self._judgement(state)
 
     def _diagnose(self) -> None:
         label = self._state_machine.current_state[1]
         state = self._session.state if self._session is not None else None
         name = f'{self.get_fully_qualified_name().strip("/")}: {self._subject}'
-        status = DiagnosticStatus(name=name)
+        level, text = self._present_judgement(label, state)
+        status = DiagnosticStatus(name=name, level=level, message=text)
         values = [('lifecycle', label)]
-        if self._failure:
-            status.level, status.message = DiagnosticStatus.ERROR, self._failure
-        elif state is None or label != 'active':
-            status.level, status.message = DiagnosticStatus.OK, label
-        else:
-            status.level, status.message = self._judgement(state)
         if state is not None:
             counts = self._counts(state)
             values += [
@@ -410,6 +489,9 @@ class SessionNode(LifecycleNode):
                 *self._state_values(state),
                 *((f'faults: {kind}', str(count)) for kind, count in sorted(state.faults.items())),
                 ('last fault', state.last_fault),
+                ('errors of the node itself', str(self._inner_faults)),
+                ('last error of the node itself', self._inner_fault),
+                *self._events.values(),
                 *self._rates.values(),
                 *(
                     (f'{SUBSCRIBERS}{topic}', str(publisher.get_subscription_count()))

@@ -92,6 +92,8 @@ class SmootherParameters:
             as large.
         queue_size: mixtures that wait at most, for the body or when the node is late; the oldest
             are dropped.
+        status_interval: a line on the console says every so many seconds what the node does, while
+            messages come, s; 0: never.
         autostart: whether the node configures and activates itself; otherwise it waits for its
             lifecycle services.
         dynamics: settings of the motion model.
@@ -111,6 +113,7 @@ class SmootherParameters:
     longest_interval: float = parameter_field(0.25, AT_ONCE, (0.0, 3600.0))
     publish_covariances: bool = parameter_field(False, AT_ONCE)
     queue_size: int = parameter_field(50, AT_ONCE, (1, 1000))
+    status_interval: int = parameter_field(1, AT_ONCE, (0, 3600))
     autostart: bool = parameter_field(True, AT_LAUNCH)
     dynamics: SmootherDynamics = field(
         default_factory=SmootherDynamics,

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hmt_ros.body import Body, load_body
+from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes.handled import Handled, Output
 from hmt_ros.nodes.session import Session, entropy, everything
@@ -190,8 +190,10 @@ class SmootherSession(Session):
             self.kept = KeptMixtures(new, ())
 
     def _body_of(self, message: Any) -> Body:
-        name = self.parameters.body_model or str(message.name)
-        body = known_body(name)
+        chosen = self.parameters.body_model
+        name = chosen or str(message.name)
+        # A message must not have files read: what it names ships with the package.
+        body = known_body(name, load_body if chosen else named_body)
         lengths = dict(
             zip(map(str, message.segment_names), map(float, message.segment_lengths), strict=False)
         )
@@ -387,14 +389,14 @@ class SmootherSession(Session):
         )
 
 
-def known_body(name: str) -> Body:
-    """The body of a name or a file.
+def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
+    """The body of a name, or of a file where `load` takes one.
 
     Raises:
         ValueError: there is none.
     """
     try:
-        return load_body(name)
+        return load(name)
     except OSError as error:
         text = error_line(error)
         raise ValueError(f'{text}; body_model names it, or a file with it') from error

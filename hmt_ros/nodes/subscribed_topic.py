@@ -8,6 +8,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profi
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
+from msg_tools.images import MAX_PIXELS
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
@@ -15,6 +16,11 @@ LATCHED = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
+
+
+# Bytes of a message: what is larger is no mixture of a person, or more pixels than are taken.
+LARGEST_MESSAGE = 2**24
+LARGEST_IMAGE = 8 * MAX_PIXELS + 2**16
 
 
 class SubscribedTopic(NamedTuple):
@@ -26,6 +32,7 @@ class SubscribedTopic(NamedTuple):
         kind: generated class.
         msgtype: for example 'sensor_msgs/msg/Image'.
         qos: of the subscription.
+        largest: bytes of a message that is taken.
     """
 
     source: str
@@ -33,6 +40,7 @@ class SubscribedTopic(NamedTuple):
     kind: type
     msgtype: str
     qos: QoSProfile
+    largest: int = LARGEST_MESSAGE
 
 
 def camera_info_topic() -> SubscribedTopic:
@@ -46,6 +54,12 @@ def image_topic(image_transport: str) -> SubscribedTopic:
     if image_transport == 'compressed':
         kind = 'sensor_msgs/msg/CompressedImage'
         return SubscribedTopic(
-            IMAGE, 'image/compressed', CompressedImage, kind, qos_profile_sensor_data
+            IMAGE,
+            'image/compressed',
+            CompressedImage,
+            kind,
+            qos_profile_sensor_data,
+            LARGEST_IMAGE,
         )
-    return SubscribedTopic(IMAGE, 'image', Image, 'sensor_msgs/msg/Image', qos_profile_sensor_data)
+    kind = 'sensor_msgs/msg/Image'
+    return SubscribedTopic(IMAGE, 'image', Image, kind, qos_profile_sensor_data, LARGEST_IMAGE)

@@ -19,12 +19,13 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes.overlay import draw_modes
 from hmt_ros.nodes.published_topic import PublishedTopic
 from msg_tools import MessageFactory
-from msg_tools.bodies import message_of_body
+from msg_tools.bodies import description_message, message_of_body
 from msg_tools.images import compressed_image_message
 from msg_tools.joint_states import heaviest_joint_state
 from msg_tools.markers import skeleton_markers
 from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 from msg_tools.transforms import transforms_message
+from msg_tools.urdf import link_frames
 
 Array = NDArray[np.float64]
 
@@ -32,6 +33,8 @@ Array = NDArray[np.float64]
 # In the order in which they are published.
 TOPICS = {
     'body': PublishedTopic('hmt_msgs/msg/Body', latched=True),
+    # Never robot_description: without a namespace that would be the robot's own.
+    'human_description': PublishedTopic('std_msgs/msg/String', latched=True),
     'pose_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
     'likelihood_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
     'joint_states': PublishedTopic('sensor_msgs/msg/JointState'),
@@ -74,7 +77,8 @@ class Presentation:
         overlay_modes: heaviest modes that are drawn on the image; 0: no overlay.
         overlay_quality: of the JPEG, 1 to 100.
         publish_tf: whether there are transforms.
-        frame_prefix: of the names of the frames of the segments.
+        frame_prefix: of the names of the frames of the links.
+        describe: whether the URDF is due: a new body, or other names of its frames.
     """
 
     max_hypotheses: int
@@ -82,6 +86,7 @@ class Presentation:
     overlay_quality: int
     publish_tf: bool
     frame_prefix: str
+    describe: bool
 
 
 def track_messages(
@@ -119,6 +124,9 @@ def track_messages(
     )
     if track.starts:
         publish('body', message_of_body(messages, track.body, stamp, frame))
+    if presentation.describe:
+        prefix = presentation.frame_prefix
+        publish('human_description', description_message(messages, track.body, frame, prefix))
     if wanted('pose_mixture'):
         publish('pose_mixture', pose_mixture_message(messages, posterior))
     if wanted('likelihood_mixture'):
@@ -126,7 +134,7 @@ def track_messages(
     if wanted('joint_states'):
         publish('joint_states', heaviest_joint_state(messages, posterior))
     if presentation.publish_tf and wanted('/tf'):
-        publish('/tf', _segment_transforms(messages, track, frames, presentation.frame_prefix))
+        publish('/tf', _link_transforms(messages, track, frames, presentation.frame_prefix))
     if wanted('markers'):
         names = track.body.joint_names
         publish(
@@ -177,17 +185,19 @@ def _content(
     )
 
 
-def _segment_transforms(
+def _link_transforms(
     messages: MessageFactory, track: TrackedImage, frames: Frames, prefix: str
 ) -> Any:
-    """Every segment of the heaviest mode, seen from the camera."""
-    names = track.body.skeleton.segment_names
+    """Every link of the URDF in the heaviest mode, seen from the camera."""
     heaviest = int(np.argmax(track.posterior.weights))
+    names, rotations, origins = link_frames(
+        track.body.skeleton, frames, track.posterior.means[heaviest], heaviest
+    )
     return transforms_message(
         messages,
         [track.frame_id] * len(names),
         [f'{prefix}{name}' for name in names],
-        frames.rotations()[heaviest],
-        frames.origins[:, :, heaviest],
+        rotations,
+        origins,
         track.stamp_ns,
     )

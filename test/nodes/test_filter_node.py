@@ -3,6 +3,7 @@
 import signal
 import threading
 import time
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ from test.nodes.conftest import PATIENCE, values_of
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parents[2]
+# Published when a track starts, whether anybody listens or not.
+STARTS = ['body', 'human_description']
 CONFIG = ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml'
 
 
@@ -51,9 +54,10 @@ def published(handled):
 def test_images_become_messages(running, small_camera):
     from hmt_msgs.msg import Body, PoseMixture
     from rclpy.qos import DurabilityPolicy, QoSProfile
+    from std_msgs.msg import String
     from tf2_msgs.msg import TFMessage
 
-    mixtures, transforms, bodies = [], [], []
+    mixtures, transforms, bodies, descriptions = [], [], [], []
     running.listen(PoseMixture, 'pose_mixture', mixtures)
     running.listen(TFMessage, '/tf', transforms)
     running.spin_until(lambda: running.node.count_subscribers('pose_mixture') == 1)
@@ -63,7 +67,7 @@ def test_images_become_messages(running, small_camera):
     assert first.name == 'image'
     assert (first.values[0].key, first.values[0].value) == ('stamp', str(small_camera.stamp(0)))
     # What nobody listens to is not made.
-    assert published(first) == ['body', 'pose_mixture', '/tf']
+    assert published(first) == [*STARTS, 'pose_mixture', '/tf']
     assert published(running.send('image', small_camera.image(1))) == ['pose_mixture', '/tf']
     running.spin_until(lambda: len(mixtures) == 2 and len(transforms) == 2)
     assert [len(m.components) for m in mixtures] == [2, 2]
@@ -72,8 +76,14 @@ def test_images_become_messages(running, small_camera):
     # The body waits for those who come late.
     late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     running.listen(Body, 'body', bodies, late)
-    running.spin_until(lambda: len(bodies) == 1)
+    running.listen(String, 'human_description', descriptions, late)
+    running.spin_until(lambda: len(bodies) == len(descriptions) == 1)
     assert bodies[0].name == 'human37'
+    # The URDF has its place in the namespace of the person, and never that of the robot.
+    robot = ET.fromstring(descriptions[0].data)
+    links = {link.attrib['name'] for link in robot.findall('link')}
+    assert links - {'lens'} == {t.child_frame_id for t in transforms[1].transforms}
+    assert running.other.count_publishers('/robot_description') == 0
 
 
 def test_parameters_are_those_of_the_file(running):
@@ -231,7 +241,7 @@ def test_node_without_its_subject_lives(world, subject_file, small_camera):
     assert one.change_state('activate')
     one.connect()
     one.send('camera_info', small_camera.info())
-    assert published(one.send('image', small_camera.image(0))) == ['body']
+    assert published(one.send('image', small_camera.image(0))) == STARTS
 
 
 def test_reset(running, small_camera, stub_tracker, subject_file, body):
@@ -242,7 +252,7 @@ def test_reset(running, small_camera, stub_tracker, subject_file, body):
     running.send('image', small_camera.image(0))
     answer = running.call(Reset, 'reset')
     assert (answer.success, answer.message) == (True, 'the next image starts a new track')
-    assert published(running.send('image', small_camera.image(1))) == ['body']
+    assert published(running.send('image', small_camera.image(1))) == STARTS
     assert len(stub_tracker.made) == 2
     mixture = PoseMixture(
         body_model='human37',

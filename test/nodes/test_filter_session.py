@@ -1,5 +1,6 @@
 """The rules of the session, with a tracker that costs nothing."""
 
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
 from test.nodes.conftest import Likelihoods
 
 MIXTURES = ['pose_mixture', 'likelihood_mixture']
+STARTS = ['body', 'human_description']
 ONE_IMAGE = [*MIXTURES, 'joint_states', '/tf', 'markers', 'overlay/compressed']
 
 
@@ -40,9 +42,9 @@ def test_images_become_messages_in_their_order(session, outputs, small_camera):
     assert one.take(CAMERA_INFO, small_camera.info()).published == ()
     first = one.take(IMAGE, small_camera.image(0))
     second = one.take(IMAGE, small_camera.image(1))
-    assert [output.topic for output in outputs] == ['body', *ONE_IMAGE, *ONE_IMAGE]
+    assert [output.topic for output in outputs] == [*STARTS, *ONE_IMAGE, *ONE_IMAGE]
     assert first.published == tuple(
-        (topic, small_camera.stamp(0)) for topic in ['body', *ONE_IMAGE]
+        (topic, small_camera.stamp(0)) for topic in [*STARTS, *ONE_IMAGE]
     )
     assert second.published == tuple((topic, small_camera.stamp(1)) for topic in ONE_IMAGE)
     assert (first.source, first.stamp_ns) == (IMAGE, small_camera.stamp(0))
@@ -74,7 +76,7 @@ def test_what_nobody_wants_is_not_made(session, outputs, small_camera):
     one = session(wanted=lambda topic: topic == 'markers')
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
-    assert [output.topic for output in outputs] == ['body', 'markers']
+    assert [output.topic for output in outputs] == [*STARTS, 'markers']
     assert one.state.images['tracked'] == 1
 
 
@@ -578,7 +580,29 @@ def test_switches_of_the_outputs(session, small_camera, outputs):
     one = session(overlay_modes=0, publish_tf=False)
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
-    assert [o.topic for o in outputs] == ['body', *MIXTURES, 'joint_states', 'markers']
+    assert [o.topic for o in outputs] == [*STARTS, *MIXTURES, 'joint_states', 'markers']
+
+
+def test_urdf_comes_again_with_other_frames(session, small_camera, outputs):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.take(IMAGE, small_camera.image(1))
+    one.parameters = replace(one.parameters, frame_prefix='anna/')
+    one.take(IMAGE, small_camera.image(2))
+    one.take(IMAGE, small_camera.image(3, frame_id='other'))
+    texts = [
+        deserialise(o.data, 'std_msgs/msg/String').data
+        for o in outputs
+        if o.topic == 'human_description'
+    ]
+    links = [ET.fromstring(text).findall('link')[:2] for text in texts]
+    assert [[link.attrib['name'] for link in pair] for pair in links] == [
+        ['lens', 'pelvis.root_tx'],
+        ['lens', 'anna/pelvis.root_tx'],
+        ['other', 'anna/pelvis.root_tx'],
+    ]
+    assert [o.topic for o in outputs].count('body') == 1
 
 
 def test_dropped_images_are_counted(session, small_camera):
@@ -589,5 +613,5 @@ def test_dropped_images_are_counted(session, small_camera):
 
 
 def test_topics_are_those_of_the_architecture():
-    assert set(TOPICS) == {'body', *ONE_IMAGE}
-    assert [topic for topic, published in TOPICS.items() if published.latched] == ['body']
+    assert set(TOPICS) == {*STARTS, *ONE_IMAGE}
+    assert [topic for topic, published in TOPICS.items() if published.latched] == STARTS

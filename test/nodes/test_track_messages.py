@@ -1,8 +1,12 @@
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from hmt_ros.body import Camera
+from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes.overlay import draw_modes
@@ -48,7 +52,7 @@ def draw(body, poses, weights, count, image):
     return draw_modes(image, CAMERA, joints, body.skeleton.bones, weights, count)
 
 
-SHOWN = Presentation(8, 3, 90, True, 'anna/')
+SHOWN = Presentation(8, 3, 90, True, 'anna/', True)
 
 
 def made(track, presentation=SHOWN):
@@ -86,17 +90,99 @@ def test_joint_states_are_those_of_the_heaviest(track, body):
 
 def test_transforms_lead_from_the_camera_to_the_segments(track, body):
     frames = forward(body.skeleton, track.posterior.means[:1])
-    transforms = made(track)['/tf'].transforms
-    assert [t.child_frame_id for t in transforms] == [
-        f'anna/{name}' for name in body.skeleton.segment_names
-    ]
-    for index, transform in enumerate(transforms):
+    transforms = {t.child_frame_id: t for t in made(track)['/tf'].transforms}
+    for index, name in enumerate(body.skeleton.segment_names):
+        transform = transforms[f'anna/{name}']
         assert transform.header.frame_id == 'lens'
         t, q = transform.transform.translation, transform.transform.rotation
         assert np.array_equal([t.x, t.y, t.z], frames.origins[index, :, 0])
         x, y, z, w = q.x, q.y, q.z, q.w
         third = [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)]
         assert np.allclose(third, frames.rotations()[0, index, :, 2], atol=1e-12)
+
+
+def joints_of(urdf):
+    """Root of a URDF, and (name, parent, child, type, origin, axis) of its joints, in order."""
+    robot = ET.fromstring(urdf)
+    found = []
+    for joint in robot.findall('joint'):
+        origin = np.eye(4)
+        element = joint.find('origin')
+        angles = [float(x) for x in element.attrib['rpy'].split()]
+        origin[:3, :3] = Rotation.from_euler('xyz', angles).as_matrix()
+        origin[:3, 3] = [float(x) for x in element.attrib['xyz'].split()]
+        axis = joint.find('axis')
+        direction = None if axis is None else [float(x) for x in axis.attrib['xyz'].split()]
+        parent, child = (joint.find(end).attrib['link'] for end in ('parent', 'child'))
+        found.append((joint.attrib['name'], parent, child, joint.attrib['type'], origin, direction))
+    links = {link.attrib['name'] for link in robot.findall('link')}
+    (root,) = links - {child for _, _, child, *_ in found}
+    return root, found
+
+
+def forward_kinematics(urdf, state):
+    """Frames (4, 4) of the links of a URDF, by name, seen from its root."""
+    values = dict(zip(state.name, state.position, strict=True))
+    root, joints = joints_of(urdf)
+    frames = {root: np.eye(4)}
+    for name, parent, child, kind, origin, axis in joints:
+        motion = np.eye(4)
+        if kind == 'revolute':
+            motion[:3, :3] = Rotation.from_rotvec(np.multiply(axis, values.pop(name))).as_matrix()
+        elif kind == 'prismatic':
+            motion[:3, 3] = np.multiply(axis, values.pop(name))
+        else:
+            assert kind == 'fixed'
+        frames[child] = frames[parent] @ origin @ motion
+    assert not values
+    return root, frames
+
+
+@pytest.mark.parametrize('name', ['human32', 'human34', 'human37'])
+def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
+    """A viewer that moves the URDF by joint states, and one that takes transforms, see the same."""
+    rng = np.random.default_rng(7)
+    plain = load_body(name)
+    body = plain.with_segment_lengths(
+        {key: value * rng.uniform(0.8, 1.2) for key, value in plain.segment_lengths.items()}
+    )
+    poses = np.clip(rng.normal(0, 0.7, (2, body.dimension)), body.lower, body.upper)
+    poses[:, :3] = rng.uniform([-1, -1, 2], [1, 1, 6], (2, 3))
+    covariances = np.tile(1e-2 * np.eye(body.dimension), (2, 1, 1))
+    mixture = GaussianMixture(np.array([0.4, 0.6]), poses, covariances)
+    found = made(
+        TrackedImage(
+            **{
+                **track.__dict__,
+                'body': body,
+                'posterior': mixture,
+                'likelihood': mixture,
+                'log_likelihoods': np.zeros(2),
+            }
+        )
+    )
+    urdf = found['human_description'].data
+    root, frames = forward_kinematics(urdf, found['joint_states'])
+    assert root == 'lens'
+    transforms = {t.child_frame_id: t.transform for t in found['/tf'].transforms}
+    # No link without a frame and no frame without a link.
+    assert transforms.keys() == frames.keys() - {root}
+    for link, transform in transforms.items():
+        t, q = transform.translation, transform.rotation
+        turn = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+        np.testing.assert_allclose([t.x, t.y, t.z], frames[link][:3, 3], atol=1e-9)
+        np.testing.assert_allclose(turn, frames[link][:3, :3], atol=1e-9)
+    skeleton = body.skeleton
+    heaviest = found['pose_mixture'].components[0]
+    for index, point in enumerate(heaviest.joint_positions):
+        segment = skeleton.segment_names[skeleton.joint_segments[index]]
+        place = frames[f'anna/{segment}'] @ [*skeleton.joint_offsets[index], 1.0]
+        np.testing.assert_allclose([point.x, point.y, point.z], place[:3], atol=1e-9)
+        assert np.allclose(place[:3], body.joint_positions(poses[1:])[0, index], atol=1e-9)
+    # The URDF in the body is the same, with names of its own.
+    plain_root, plain_frames = forward_kinematics(found['body'].urdf, found['joint_states'])
+    assert plain_root == 'lens'
+    assert {f'anna/{link}' for link in plain_frames if link != 'lens'} == transforms.keys()
 
 
 def test_markers_speak_about_all_ranks(track):
@@ -112,6 +198,9 @@ def test_body_comes_with_its_first_image_only(track):
     assert next(iter(made(track))) == 'body'
     again = TrackedImage(**{**track.__dict__, 'starts': False})
     assert 'body' not in made(again)
+    unchanged = made(again, replace(SHOWN, describe=False))
+    assert 'human_description' in made(again)
+    assert 'human_description' not in unchanged
     assert made(track)['body'].header.frame_id == 'lens'
 
 

@@ -1,0 +1,45 @@
+"""YAML that people write by hand: data alone, without aliases, not deep.
+
+Tags of Python are unknown to the loader. Aliases, which ROS does not read in its parameter files
+either, could make a short file stand for more data than any memory holds.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+_DEEPEST = 50
+
+
+class _PlainLoader(yaml.SafeLoader):
+    _depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError(f'line {self._line()}: an alias (*), wanted plain values')
+        if self._depth == _DEEPEST:
+            raise yaml.YAMLError(f'line {self._line()}: nested deeper than {_DEEPEST} levels')
+        self._depth += 1
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self._depth -= 1
+
+    def _line(self) -> int:
+        event: yaml.Event = self.peek_event()  # type: ignore[no-untyped-call]
+        mark = event.start_mark
+        return 0 if mark is None else int(mark.line) + 1
+
+
+def load_plain_yaml(text: str) -> Any:
+    """The document that a text holds.
+
+    Raises:
+        ValueError: not YAML, or YAML that is not plain; one line.
+    """
+    try:
+        return yaml.load(text, Loader=_PlainLoader)
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+        raise ValueError(' '.join(str(error).split())) from error

@@ -1,0 +1,89 @@
+"""Archives of plain arrays (.npz) from outside: data alone, and no more of it than is agreed.
+
+Nothing is unpickled. An archive is compressed and could unfold to any size, and the head of an
+array could claim one: both are looked at before memory is spent.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as array_format
+from numpy.typing import NDArray
+
+# Bytes of all arrays of an archive together.
+LARGEST_ARCHIVE = 2**31
+_MOST_ARRAYS = 10_000
+# What damaged archives lead to, besides OSError and ValueError.
+_FAULTS = (
+    zipfile.BadZipFile,
+    zipfile.LargeZipFile,
+    zlib.error,
+    KeyError,
+    EOFError,
+    AttributeError,
+    NotImplementedError,
+    RuntimeError,
+    MemoryError,
+    SyntaxError,
+    TypeError,
+    OverflowError,
+)
+
+
+def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, NDArray[Any]]:
+    """The arrays of an archive by name.
+
+    Args:
+        path: of the file.
+        largest: bytes that they may have together.
+
+    Raises:
+        OSError: a file that can not be read.
+        ValueError: no archive, a damaged one, one with objects in it, or one that is too large; one
+            line, without the path.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            _check_sizes(archive, largest)
+        with np.load(path, allow_pickle=False) as content:
+            return {name: content[name] for name in content.files}
+    except _FAULTS as fault:
+        raise ValueError(' '.join(str(fault).split()) or type(fault).__name__) from fault
+
+
+def _check_sizes(archive: zipfile.ZipFile, largest: int) -> None:
+    members = archive.infolist()
+    total = sum(member.file_size for member in members)
+    if total > largest or len(members) > _MOST_ARRAYS:
+        raise ValueError(
+            f'its {len(members)} arrays have {total} bytes, wanted at most {_MOST_ARRAYS} arrays '
+            f'and {largest} bytes'
+        )
+    for name, claimed, there in _claims(archive, members):
+        if claimed > there:
+            raise ValueError(f'the array {name} claims {claimed} bytes, but has {there}')
+
+
+def _claims(
+    archive: zipfile.ZipFile, members: list[zipfile.ZipInfo]
+) -> Iterator[tuple[str, int, int]]:
+    """Name, claimed size and size of each array, bytes."""
+    for member in members:
+        with archive.open(member) as file:
+            version = array_format.read_magic(file)
+            if version == (1, 0):
+                shape, _, dtype = array_format.read_array_header_1_0(file)
+            elif version == (2, 0):
+                shape, _, dtype = array_format.read_array_header_2_0(file)
+            else:
+                raise ValueError(f'the array {member.filename} has the version {version}')
+            if dtype.hasobject:
+                raise ValueError(f'the array {member.filename} holds Python objects')
+            yield member.filename, math.prod(shape) * dtype.itemsize, member.file_size

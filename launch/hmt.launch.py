@@ -1,0 +1,209 @@
+"""Starts the nodes for one person, all in a namespace of that person's own (REP 155).
+
+    ros2 launch hmt_ros hmt.launch.py image:=/camera/image_raw
+    ros2 launch hmt_ros hmt.launch.py body_id:=anna image:=/left/image image_transport:=compressed
+    ros2 launch hmt_ros hmt.launch.py bag:=my_recording rviz:=true
+    ros2 launch hmt_ros hmt.launch.py --show-args
+
+Parameters come, the later before the earlier, from the files in config/, from the arguments here,
+and from the file that params_file names.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+PACKAGE = 'hmt_ros'
+NODES = ('filter_node', 'smoother_node', 'bme_node')
+# Where nothing says what the frame of the images is the nodes take the first; views want z up.
+OPTICAL, UPRIGHT = 'camera_optical_frame', 'camera_upright'
+# x forward, y left, z up, seen from a frame with x right, y down, z forward.
+TURN = {'qx': 0.5, 'qy': -0.5, 'qz': 0.5, 'qw': 0.5}
+TRUTH = {'true': True, 'false': False}
+
+# Name, default, and what it is.
+ARGUMENTS = (
+    (
+        'body_id',
+        'p1',
+        'who is tracked: topics lie in /humans/bodies/<body_id>/, frames are body_<body_id>/...; '
+        'letters, digits and underscores, a letter first',
+    ),
+    ('namespace', '', 'topics lie here instead of /humans/bodies/<body_id>'),
+    ('nodes', 'filter_node smoother_node bme_node', 'which nodes are started, with blanks between'),
+    ('image', '/camera/image_raw', 'topic of the images, without /compressed'),
+    ('camera_info', '', 'topic of the calibration; empty: camera_info beside the images'),
+    ('image_transport', 'raw', "'raw', or 'compressed' for images on <image>/compressed"),
+    ('keypoints', '', 'topic of joints that a 2D detector has found; empty: none'),
+    ('subject_file', '', 'file with the joints in one image; empty: a prediction starts the track'),
+    ('background_file', '', 'picture of the empty scene; empty: learned from the first images'),
+    ('model_file', '', 'model that train has written; empty: the one that comes with the package'),
+    ('params_file', '', 'parameter file, for one node or several, that goes before all else'),
+    ('bag', '', 'bag that is played, once the nodes are there; empty: none'),
+    ('use_sim_time', '', "'true' or 'false'; empty: true while a bag is played"),
+    ('autostart', 'true', "'false': the nodes wait for their lifecycle services"),
+    (
+        'camera_frame',
+        '',
+        f'optical frame of the images; given, or with rviz: a frame {UPRIGHT} that looks the same '
+        'way with z up is published, for views',
+    ),
+    ('rviz', 'false', "'true': RViz is started too"),
+    ('log_level', 'info', 'of the nodes: debug, info, warn, error or fatal'),
+)
+
+
+def generate_launch_description() -> LaunchDescription:
+    """What `ros2 launch` asks for."""
+    return LaunchDescription(
+        [
+            *(
+                DeclareLaunchArgument(name, default_value=default, description=what)
+                for name, default, what in ARGUMENTS
+            ),
+            OpaqueFunction(function=_actions),
+        ]
+    )
+
+
+def _actions(context: Any) -> list[Any]:
+    """The processes, now that the arguments are known."""
+    given = {name: LaunchConfiguration(name).perform(context) for name, _, _ in ARGUMENTS}
+    return actions_of(given, Path(get_package_share_directory(PACKAGE)))
+
+
+def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
+    """The processes for arguments.
+
+    Args:
+        given: all arguments, by name.
+        share: folder in which config/ and rviz/ are.
+
+    Raises:
+        ValueError: an argument that can not be used.
+    """
+    namespace = _namespace(given)
+    names = given['nodes'].replace(',', ' ').split()
+    unknown = [name for name in names if name not in NODES]
+    if unknown or not names:
+        raise ValueError(f'nodes: wanted some of {" ".join(NODES)}, saw {given["nodes"]!r}')
+    transport = given['image_transport']
+    if transport not in ('raw', 'compressed'):
+        raise ValueError(f"image_transport: wanted 'raw' or 'compressed', saw {transport!r}")
+    bag = given['bag']
+    sim_time = _truth(given, 'use_sim_time') if given['use_sim_time'] else bool(bag)
+    image = given['image'].removesuffix('/compressed')
+    info = given['camera_info'] or f'{image.rpartition("/")[0]}/camera_info'
+    remappings = [('image', image), ('image/compressed', f'{image}/compressed')]
+    remappings.append(('camera_info', info))
+    if given['keypoints']:
+        remappings.append(('keypoints', given['keypoints']))
+
+    common = {'use_sim_time': sim_time, 'autostart': _truth(given, 'autostart')}
+    camera = {**common, 'image_transport': transport, **_named(given, 'background_file')}
+    values: dict[str, dict[str, Any]] = {
+        'filter_node': {
+            **camera,
+            **_named(given, 'subject_file'),
+            'use_predictions': 'bme_node' in names,
+            'use_keypoints': bool(given['keypoints']),
+            'frame_prefix': f'{_frame(namespace)}/',
+        },
+        'smoother_node': common,
+        'bme_node': {**camera, **_named(given, 'model_file')},
+    }
+    own = [given['params_file']] if given['params_file'] else []
+    actions: list[Any] = [
+        Node(
+            package=PACKAGE,
+            executable=name,
+            name=name,
+            namespace=namespace,
+            parameters=[str(share / 'config' / f'{name}.yaml'), values[name], *own],
+            remappings=[] if name == 'smoother_node' else remappings,
+            ros_arguments=['--log-level', f'{_logger(namespace, name)}:={given["log_level"]}'],
+            output='both',
+        )
+        for name in names
+    ]
+    rviz = _truth(given, 'rviz')
+    if rviz or given['camera_frame']:
+        frames = {'frame-id': given['camera_frame'] or OPTICAL, 'child-frame-id': UPRIGHT}
+        options = [str(x) for key, value in {**frames, **TURN}.items() for x in (f'--{key}', value)]
+        actions.append(
+            Node(
+                package='tf2_ros',
+                executable='static_transform_publisher',
+                name=UPRIGHT,
+                namespace=namespace,
+                arguments=options,
+                output='log',
+            )
+        )
+    if rviz:
+        # Its topics are relative: the namespace says whose they are.
+        actions.append(
+            Node(
+                package='rviz2',
+                executable='rviz2',
+                name='rviz2',
+                namespace=namespace,
+                arguments=['-d', str(share / 'rviz' / 'hmt.rviz')],
+                parameters=[{'use_sim_time': sim_time}],
+                output='log',
+            )
+        )
+    if bag:
+        # Who subscribes late must not miss the first images: the bag waits for the nodes.
+        command = ['ros2', 'bag', 'play', bag, '--clock', '--delay', '5']
+        actions.append(ExecuteProcess(cmd=command, output='both'))
+    return actions
+
+
+def _namespace(given: Mapping[str, str]) -> str:
+    """Namespace of the person, absolute."""
+    body_id = given['body_id']
+    if not re.fullmatch(r'[A-Za-z][A-Za-z0-9_]*', body_id):
+        raise ValueError(
+            f'body_id: wanted letters, digits and underscores, a letter first, saw {body_id!r}'
+        )
+    namespace = given['namespace'] or f'/humans/bodies/{body_id}'
+    # The URDF of a person must not come near that of a robot.
+    if not re.fullmatch(r'(/[A-Za-z_][A-Za-z0-9_]*)+', namespace):
+        raise ValueError(
+            f'namespace: wanted a name such as /humans/bodies/anna, saw {given["namespace"]!r}'
+        )
+    return namespace
+
+
+def _named(given: Mapping[str, str], name: str) -> dict[str, Any]:
+    """The file that an argument names, as a parameter; none where it is empty."""
+    # Told that it is text, or a file named 12 would be a number.
+    return {name: ParameterValue(given[name], value_type=str)} if given[name] else {}
+
+
+def _frame(namespace: str) -> str:
+    """What the frames of a person begin with, by the last part of its namespace."""
+    return f'body_{namespace.rpartition("/")[2]}'
+
+
+def _logger(namespace: str, name: str) -> str:
+    """Name of a node's logger."""
+    return f'{namespace}/{name}'.strip('/').replace('/', '.')
+
+
+def _truth(given: Mapping[str, str], name: str) -> bool:
+    text = given[name].lower()
+    if text not in TRUTH:
+        raise ValueError(f"{name}: wanted 'true' or 'false', saw {given[name]!r}")
+    return TRUTH[text]

@@ -1,0 +1,248 @@
+"""What a node tells of itself: rates, silence, errors, events of the middleware, a status line."""
+
+import re
+import time
+from types import SimpleNamespace
+
+import pytest
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def running(stub_tracker, subject_file, world_of):
+    from sensor_msgs.msg import CameraInfo, Image
+
+    from hmt_ros.nodes.filter_node import FilterNode
+
+    inputs = {'image': Image, 'camera_info': CameraInfo}
+    return world_of(FilterNode, 'filter_node', inputs, subject_file=str(subject_file)).start()
+
+
+@pytest.fixture
+def smoother(world_of):
+    """A smoother to which nobody publishes mixtures."""
+    from hmt_msgs.msg import Body
+
+    from hmt_ros.nodes.smoother_node import SmootherNode
+
+    return world_of(SmootherNode, 'smoother_node', {'body': Body}).start()
+
+
+def best_effort():
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+    return QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def transient_local():
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+
+    return QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def test_publisher_that_does_not_fit_is_one_warning_with_topic_and_policy(smoother, likelihoods):
+    from hmt_msgs.msg import PoseMixture
+
+    smoother.send('body', likelihoods.body_message())
+    wrong = [
+        smoother.other.create_publisher(PoseMixture, 'likelihood_mixture', best_effort())
+        for _ in range(2)
+    ]
+    key = 'publishers of /likelihood_mixture with another reliability'
+    smoother.spin_until(lambda: smoother.diagnosis()[2].get(key) == '2', 'both events')
+    # The other node complains as well, in lines behind.
+    assert [text.splitlines()[0] for text in smoother.warnings()] == [
+        '/likelihood_mixture: a publisher offers another reliability than is asked for, none of '
+        'its messages will arrive; see "ros2 topic info --verbose /likelihood_mixture" (more of '
+        'the kind are counted in /diagnostics)'
+    ]
+    level, message, _ = smoother.diagnosis()
+    assert level == 1
+    assert message == '/likelihood_mixture: publishers offer another reliability than is asked for'
+    # One that fits is all that is needed.
+    good = smoother.other.create_publisher(PoseMixture, 'likelihood_mixture', 10)
+    smoother.spin_until(
+        lambda: smoother.diagnosis()[1] == 'waits for likelihood_mixture', 'the publisher'
+    )
+    for publisher in (good, *wrong):
+        smoother.other.destroy_publisher(publisher)
+
+
+def test_subscription_that_does_not_fit_is_one_warning(smoother):
+    from hmt_msgs.msg import PoseMixture
+
+    smoother.listen(PoseMixture, 'smoothed_pose_mixture', [], transient_local())
+    key = 'subscriptions to /smoothed_pose_mixture with another durability'
+    smoother.spin_until(lambda: smoother.diagnosis()[2].get(key) == '1', 'the event')
+    (text,) = smoother.warnings()
+    assert text.splitlines()[0].endswith('counted in /diagnostics)')
+    assert text.startswith('/smoothed_pose_mixture: a subscription asks for another durability')
+
+
+def test_lost_messages_are_told_once_and_counted():
+    from hmt_ros.nodes.middleware_events import MiddlewareEvents
+
+    texts = []
+    events = MiddlewareEvents(texts.append)
+    callbacks = events.of_subscription('/a/image')
+    for count in (2, 3):
+        callbacks.message_lost(SimpleNamespace(total_count_change=count))
+    events.of_subscription('/a/other').message_lost(SimpleNamespace(total_count_change=1))
+    assert events.lost == 6
+    assert [text.partition(' (more')[0] for text in texts] == [
+        '/a/image: 2 messages were lost on their way',
+        '/a/other: 1 messages were lost on their way',
+    ]
+    assert events.values() == [
+        ('messages lost', '6'),
+        ('messages lost of /a/image', '5'),
+        ('messages lost of /a/other', '1'),
+    ]
+
+
+def test_other_types_and_unknown_policies_are_told():
+    from hmt_ros.nodes.middleware_events import MiddlewareEvents
+
+    texts = []
+    events = MiddlewareEvents(texts.append)
+    event = SimpleNamespace(total_count_change=1, last_policy_kind=12345)
+    events.of_subscription('/a').incompatible_type(event)
+    events.of_publisher('/b').incompatible_type(event)
+    events.of_publisher('/b').incompatible_qos(event)
+    events.of_subscription('/a').incompatible_qos(event)
+    assert [text.partition(',')[0] for text in texts] == [
+        '/a: a publisher has another type',
+        '/b: a subscription has another type',
+        '/b: a subscription asks for another policy 12345 than is offered',
+        '/a: a publisher offers another policy 12345 than is asked for',
+    ]
+    assert events.refused_policy('/a') == 'policy 12345'
+    events.forget()
+    assert events.refused_policy('/a') == ''
+
+
+def test_lost_messages_are_in_the_diagnostics(running, small_camera):
+    running.send('camera_info', small_camera.info())
+    running.send('image', small_camera.image(0))
+    (callbacks,) = (
+        handler.callback
+        for handler in running.node._inputs[-1].event_handlers
+        if handler.event_type.name.endswith('MESSAGE_LOST')
+    )
+    callbacks(SimpleNamespace(total_count_change=4))
+    running.spin_until(
+        lambda: any(
+            status.message == '4 messages lost on their way in a second'
+            for array in running.diagnostics
+            for status in array.status
+        ),
+        'a warning in the diagnostics',
+    )
+    assert running.diagnosis()[2]['messages lost of /image'] == '4'
+    assert running.warnings()[0].startswith('/image: 4 messages were lost on their way')
+
+
+def test_silence_is_told(running, small_camera):
+    running.send('camera_info', small_camera.info())
+    running.send('image', small_camera.image(0))
+    running.node._last_arrival = time.monotonic() - 20
+    running.spin_until(
+        lambda: re.fullmatch(r'no images for 2\d s', running.diagnosis()[1]), 'a warning'
+    )
+    assert running.diagnosis()[0] == 1
+    running.send('image', small_camera.image(1))
+    running.spin_until(lambda: running.diagnosis()[:2] == (0, 'tracking, 2 modes'), 'an end')
+
+
+def test_errors_of_the_node_itself_are_in_the_diagnostics(running, small_camera, stub_tracker):
+    running.send('camera_info', small_camera.info())
+    running.send('image', small_camera.image(0))
+    assert running.diagnosis()[2]['errors of the node itself'] == '0'
+    stub_tracker.fault = TypeError('a fault of ours')
+    running.publishers['image'].publish(running.of_ros(small_camera.image(1)))
+    running.spin_until(
+        lambda: running.diagnosis()[2]['errors of the node itself'] == '1', 'the error'
+    )
+    values = running.diagnosis()[2]
+    assert values['last error of the node itself'] == 'TypeError: a fault of ours'
+
+
+def status_lines(world):
+    """Lines that the node has logged as information, since it became active."""
+    world.logged += world.stderr.readouterr().err
+    lines = re.findall(r'^\[INFO\] \[[0-9.]+\] \[filter_node\]: (.*)$', world.logged, re.MULTILINE)
+    return lines[1:]
+
+
+def test_status_line(running, small_camera):
+    """One a period of diagnostics, which is a second, and only when something has come."""
+    running.node._timer.cancel()
+    period = running.node._diagnose_period
+    period()
+    assert status_lines(running) == []
+    running.send('camera_info', small_camera.info())
+    running.send('image', small_camera.image(0))
+    for _ in range(3):
+        period()
+    (line,) = status_lines(running)
+    number = r'\d+\.\d'
+    assert re.fullmatch(
+        rf'tracking, 2 modes; {number} images a second, {number} tracked, latency \d+ ms', line
+    )
+    assert running.set(status_interval=3) == (True, '')
+    for index in range(1, 7):
+        running.send('image', small_camera.image(index))
+        period()
+    assert len(status_lines(running)) == 3
+    assert running.set(status_interval=0) == (True, '')
+    running.send('image', small_camera.image(7))
+    period()
+    assert len(status_lines(running)) == 3
+
+
+def test_what_diagnostics_tell(running, small_camera):
+    """All that the architecture names, for every node by the same keys."""
+    running.send('camera_info', small_camera.info())
+    running.send('image', small_camera.image(0))
+    values = running.diagnosis()[2]
+    assert {
+        'lifecycle',
+        'status',
+        'images received',
+        'images tracked',
+        'images skipped',
+        'images dropped',
+        'images received a second',
+        'images tracked a second',
+        'latency, mean, ms',
+        'latency, largest, ms',
+        'modes',
+        'entropy of the weights, nats',
+        'last fault',
+        'last error of the node itself',
+        'messages lost',
+    } <= values.keys()
+
+
+def test_messages_beyond_the_limit_are_not_even_read(running, small_camera, monkeypatch):
+    running.send('camera_info', small_camera.info())
+    count = len(running.handled)
+    wanted = list(running.node._wanted_inputs())
+    assert {one.source: one.largest for one in wanted} == {
+        'camera_info': 2**24,
+        'keypoints': 2**24,
+        'pose_prediction': 2**24,
+        'image': 8 * 2**26 + 2**16,
+    }
+    small = [one._replace(largest=5000) for one in wanted]
+    monkeypatch.setattr(running.node, '_wanted_inputs', lambda: small)
+    assert running.change_state('deactivate')
+    assert running.change_state('activate')
+    running.connect()
+    running.publishers['image'].publish(running.of_ros(small_camera.image(0)))
+    running.spin_until(lambda: len(running.handled) > count, 'an answer')
+    assert re.fullmatch(
+        r'message of image can not be read: it has 9\d{3} bytes, the limit is 5000',
+        running.handled[-1].message,
+    )

@@ -1,0 +1,581 @@
+"""The launch file, the views, and what the nodes do when they are started as it says.
+
+`launch` and `launch_ros` are not among the wheels. Where they are not installed stand-ins that keep
+what they are given take their place; what is given is then started as launch_ros would.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import runpy
+import subprocess
+import sys
+import time
+import types
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
+from hmt_ros.nodes.bme_parameters import BmeParameters
+from hmt_ros.nodes.declared_parameters import values_of, with_values
+from hmt_ros.nodes.filter_parameters import FilterParameters
+from hmt_ros.nodes.parameter_file import read_parameter_file, yaml_scalar
+from hmt_ros.nodes.smoother_parameters import SmootherParameters
+
+ROOT = Path(__file__).resolve().parents[1]
+FILE = ROOT / 'launch' / 'hmt.launch.py'
+NAMESPACE = '/humans/bodies/p1'
+PATIENCE = 60.0  # s
+# Services and topics that rclpy gives every lifecycle node.
+OF_ALL_NODES = (
+    r'/(get_type_description|describe_parameters|get_parameter_types|get_parameters|'
+    r'list_parameters|set_parameters|set_parameters_atomically|change_state|get_state|'
+    r'get_available_states|get_available_transitions|get_transition_graph|transition_event)$'
+)
+TOPICS = {**track_messages.TOPICS, **smoothed_messages.TOPICS, **bme_session.TOPICS}
+SETTINGS = {
+    'filter_node': FilterParameters(),
+    'smoother_node': SmootherParameters(),
+    'bme_node': BmeParameters(),
+}
+
+
+class Kept:
+    """Any action or substitution: keeps its arguments."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self.arguments, self.options = arguments, options
+
+
+class Configuration(Kept):
+    def perform(self, context: Any) -> str:
+        return str(context[self.arguments[0]])
+
+
+STAND_INS = {
+    'launch': {'LaunchDescription': Kept},
+    'launch.actions': {
+        'DeclareLaunchArgument': Kept,
+        'ExecuteProcess': type('ExecuteProcess', (Kept,), {}),
+        'OpaqueFunction': Kept,
+    },
+    'launch.substitutions': {'LaunchConfiguration': Configuration},
+    'launch_ros': {},
+    'launch_ros.actions': {'Node': type('Node', (Kept,), {})},
+    'launch_ros.parameter_descriptions': {'ParameterValue': Kept},
+    'ament_index_python': {},
+    'ament_index_python.packages': {
+        'get_package_share_directory': lambda package: str(ROOT / package)
+    },
+}
+
+
+@pytest.fixture(scope='module')
+def description():
+    """Everything in the launch file, with stand-ins."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, content in STAND_INS.items():
+            module = types.ModuleType(name)
+            module.__dict__.update(content)
+            patch.setitem(sys.modules, name, module)
+        yield runpy.run_path(str(FILE))
+
+
+@pytest.fixture
+def actions(description):
+    """Makes the options of all actions, by their executable."""
+
+    def make(**given):
+        entities = description['generate_launch_description']().arguments[0]
+        *declared, function = entities
+        context = {one.arguments[0]: one.options['default_value'] for one in declared}
+        assert given.keys() <= context.keys()
+        made = function.options['function']({**context, **given})
+        return {one.options.get('executable', 'bag'): one.options for one in made}
+
+    return make
+
+
+def parameters(options: dict[str, Any]) -> dict[str, Any]:
+    """What a node is given beside its file in config/, without the type of its texts."""
+    file, values, *_ = options['parameters']
+    assert file == str(ROOT / 'hmt_ros' / 'config' / f'{options["name"]}.yaml')
+    plain = {}
+    for name, value in values.items():
+        if isinstance(value, Kept):
+            assert value.options == {'value_type': str}
+            (value,) = value.arguments
+        plain[name] = value
+    return plain
+
+
+def test_three_nodes_in_the_namespace_of_a_person(actions):
+    made = actions()
+    assert list(made) == ['filter_node', 'smoother_node', 'bme_node']
+    for name, options in made.items():
+        assert options['package'] == 'hmt_ros'
+        assert options['name'] == name
+        assert options['namespace'] == '/humans/bodies/p1'
+        assert Path(options['parameters'][0]).is_file()
+        # Every name is a parameter of the node and every value one it can have.
+        own = parameters(options)
+        sim_time = own.pop('use_sim_time')
+        assert sim_time is False
+        with_values(SETTINGS[name], own)
+    assert parameters(made['filter_node']) == {
+        'use_sim_time': False,
+        'autostart': True,
+        'image_transport': 'raw',
+        'use_predictions': True,
+        'use_keypoints': False,
+        'frame_prefix': 'body_p1/',
+    }
+    wanted = {
+        ('image', '/camera/image_raw'),
+        ('image/compressed', '/camera/image_raw/compressed'),
+        ('camera_info', '/camera/camera_info'),
+    }
+    assert set(made['filter_node']['remappings']) == wanted
+    assert set(made['bme_node']['remappings']) == wanted
+    assert made['smoother_node']['remappings'] == []
+
+
+def test_arguments(actions, tmp_path):
+    made = actions(
+        body_id='anna',
+        nodes='bme_node,filter_node',
+        image='/left/rect/compressed',
+        image_transport='compressed',
+        keypoints='/pose2d',
+        subject_file='12',
+        background_file='wall.png',
+        model_file='m.npz',
+        params_file='own.yaml',
+        bag='walk',
+        autostart='False',
+        log_level='debug',
+    )
+    assert list(made) == ['bme_node', 'filter_node', 'bag']
+    tracks, predicts = made['filter_node'], made['bme_node']
+    assert tracks['namespace'] == '/humans/bodies/anna'
+    assert parameters(tracks) == {
+        'use_sim_time': True,
+        'autostart': False,
+        'image_transport': 'compressed',
+        'background_file': 'wall.png',
+        'subject_file': '12',
+        'use_predictions': True,
+        'use_keypoints': True,
+        'frame_prefix': 'body_anna/',
+    }
+    assert parameters(predicts)['model_file'] == 'm.npz'
+    assert dict(tracks['remappings']) == {
+        'image': '/left/rect',
+        'image/compressed': '/left/rect/compressed',
+        'camera_info': '/left/camera_info',
+        'keypoints': '/pose2d',
+    }
+    # What the user's own file says goes before all else.
+    assert tracks['parameters'][-1] == 'own.yaml'
+    assert tracks['ros_arguments'] == ['--log-level', 'humans.bodies.anna.filter_node:=debug']
+    assert made['bag']['cmd'][:4] == ['ros2', 'bag', 'play', 'walk']
+    assert not parameters(actions(nodes='filter_node')['filter_node'])['use_predictions']
+    other = actions(namespace='/lab/bob', use_sim_time='true')['smoother_node']
+    assert other['namespace'] == '/lab/bob'
+    assert parameters(other)['use_sim_time'] is True
+
+
+@pytest.mark.parametrize(
+    ('given', 'message'),
+    [
+        ({'body_id': '1'}, "a letter first, saw '1'"),
+        ({'body_id': 'a/b'}, "saw 'a/b'"),
+        ({'namespace': '/'}, "wanted a name such as /humans/bodies/anna, saw '/'"),
+        ({'namespace': 'lab'}, "saw 'lab'"),
+        (
+            {'nodes': 'filter_node smother'},
+            "nodes: wanted some of filter_node .*, saw 'filter_node",
+        ),
+        ({'nodes': ''}, 'nodes: wanted some of'),
+        ({'image_transport': 'theora'}, "image_transport: wanted 'raw' or 'compressed'"),
+        ({'rviz': 'yes'}, "rviz: wanted 'true' or 'false', saw 'yes'"),
+    ],
+)
+def test_wrong_arguments_are_told_in_one_line(actions, given, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        actions(**given)
+    assert '\n' not in str(caught.value)
+
+
+def test_views_are_upright(actions):
+    made = actions(rviz='true', camera_frame='lens', body_id='anna')
+    rviz = made['rviz2']
+    assert rviz['namespace'] == '/humans/bodies/anna'
+    # The package's share folder is hmt_ros/ here, with config/ alone.
+    assert rviz['arguments'] == ['-d', str(ROOT / 'hmt_ros' / 'rviz' / 'hmt.rviz')]
+    words = made['static_transform_publisher']['arguments']
+    options = dict(zip(words[::2], words[1::2], strict=True))
+    assert options['--frame-id'] == 'lens'
+    view = yaml.safe_load((ROOT / 'rviz' / 'hmt.rviz').read_text('utf-8'))
+    fixed = view['Visualization Manager']['Global Options']['Fixed Frame']
+    assert options['--child-frame-id'] == fixed
+    turn = Rotation.from_quat([float(options[f'--q{axis}']) for axis in 'xyzw']).as_matrix()
+    # Forward, left and up of the upright frame are depth, minus right and minus down.
+    np.testing.assert_allclose(turn, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
+    assert list(actions(nodes='bme_node')) == ['bme_node']
+
+
+def test_everything_is_installed(monkeypatch):
+    import setuptools
+
+    given: dict[str, Any] = {}
+    monkeypatch.setattr(setuptools, 'setup', lambda **arguments: given.update(arguments))
+    monkeypatch.chdir(ROOT)
+    runpy.run_path('setup.py', run_name='__main__')
+    installed = {f'{target}/{Path(x).name}' for target, files in given['data_files'] for x in files}
+    assert {
+        'share/hmt_ros/launch/hmt.launch.py',
+        'share/hmt_ros/rviz/hmt.rviz',
+        'share/hmt_ros/foxglove/hmt.json',
+        *(f'share/hmt_ros/config/{name}.yaml' for name in SETTINGS),
+    } <= installed
+
+
+def test_rviz_shows_topics_of_the_nodes_relative_to_a_namespace():
+    text = (ROOT / 'rviz' / 'hmt.rviz').read_text('utf-8')
+    displays = yaml.safe_load(text)['Visualization Manager']['Displays']
+    shown = {
+        (one.get('Topic') or one['Description Topic'])['Value']: one
+        for one in displays
+        if 'Topic' in one or 'Description Topic' in one
+    }
+    kinds = {
+        'MarkerArray': 'visualization_msgs/msg/MarkerArray',
+        'RobotModel': 'std_msgs/msg/String',
+        'Image': 'sensor_msgs/msg/CompressedImage',
+    }
+    for topic, one in shown.items():
+        assert not topic.startswith('/')
+        assert TOPICS[topic].msgtype == kinds[one['Class'].rpartition('/')[2]]
+        policy = (one.get('Topic') or one['Description Topic'])['Durability Policy']
+        assert policy == ('Transient Local' if TOPICS[topic].latched else 'Volatile')
+    assert shown.keys() == {
+        'markers',
+        'trajectory_markers',
+        'human_description',
+        'overlay/compressed',
+    }
+    assert any(one['Class'].endswith('/TF') for one in displays)
+    assert 'robot_description' not in text
+
+
+def panels(layout: Any) -> set[str]:
+    """Panels that the tree of a layout names."""
+    if isinstance(layout, str):
+        return {layout}
+    assert layout['direction'] in ('row', 'column')
+    return panels(layout['first']) | panels(layout['second'])
+
+
+def test_layout_shows_topics_of_the_nodes():
+    text = (ROOT / 'foxglove' / 'hmt.json').read_text('utf-8')
+    layout = json.loads(text)
+    assert panels(layout['layout']) == layout['configById'].keys()
+    named = set(re.findall(r'"/humans/bodies/p1/([a-z_/]+)', text))
+    assert named <= TOPICS.keys()
+    assert {'markers', 'human_description', 'overlay/compressed', 'pose_mixture'} <= named
+    assert '/robot_description' not in text
+    selected = layout['configById']['DiagnosticStatusPanel!filter']['selectedName']
+    assert selected == 'humans/bodies/p1/filter_node: track'
+
+
+def test_page_lists_the_arguments(description):
+    page = (ROOT / 'docs' / 'views.md').read_text('utf-8')
+    table = page.partition('| argument |')[2].partition('\n\n')[0]
+    cells = [line.split('|')[1] for line in table.splitlines()[2:]]
+    listed = [name for cell in cells for name in re.findall('`([a-z_]+)`', cell)]
+    assert sorted(listed) == sorted(name for name, _, _ in description['ARGUMENTS'])
+    pages = [*(ROOT / 'docs').glob('*.md'), ROOT / 'README.md']
+    commands = re.findall(
+        r'^ros2 launch hmt_ros hmt.launch.py((?:.|\\\n)*)$',
+        '\n'.join(path.read_text('utf-8') for path in pages),
+        re.MULTILINE,
+    )
+    given = re.findall(r'([a-z_]+):=', ' '.join(commands))
+    assert len(given) > 10
+    assert set(given) <= set(listed)
+
+
+def test_a_configuration_file_alone_changes_nothing(actions):
+    for name, options in actions().items():
+        assert read_parameter_file(options['parameters'][0], name) == values_of(SETTINGS[name])
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec('launch_ros') is None,
+    reason='launch and launch_ros are not installed (they come with ROS 2, not as wheels)',
+)
+def test_the_real_launch_package_understands_the_file():
+    from launch import LaunchContext, LaunchDescription
+
+    made = runpy.run_path(str(FILE))['generate_launch_description']()
+    assert isinstance(made, LaunchDescription)
+    context = LaunchContext()
+    *declared, function = made.entities
+    for one in declared:
+        one.execute(context)
+    assert [type(one).__name__ for one in function.execute(context)] == ['Node'] * 3
+
+
+# The nodes, started with what the launch file gives launch_ros.
+
+
+def command(options: dict[str, Any], folder: Path) -> list[str]:
+    """Arguments of a node as launch_ros makes them."""
+    name, namespace = options['name'], options['namespace']
+    words = ['--ros-args', '-r', f'__node:={name}', '-r', f'__ns:={namespace}']
+    config, _, *own = options['parameters']
+    text = '\n'.join(
+        [
+            f'{namespace}/{name}:',
+            '  ros__parameters:',
+            *(f'    {key}: {yaml_scalar(value)}' for key, value in parameters(options).items()),
+        ]
+    )
+    path = folder / f'{name}.yaml'
+    path.write_text(text + '\n', 'utf-8')
+    for file in (config, str(path), *own):
+        words += ['--params-file', file]
+    for source, target in options['remappings']:
+        words += ['-r', f'{source}:={target}']
+    return [sys.executable, '-m', f'hmt_ros.nodes.{name}', *words, *options['ros_arguments']]
+
+
+class Running:
+    """Nodes in processes of their own, and a node that looks at them.
+
+    Args:
+        node: that looks.
+        context: of it.
+        processes: by the name of their node.
+        folder: with what they have said.
+    """
+
+    def __init__(self, node, context, processes, folder):
+        from rclpy.executors import SingleThreadedExecutor
+
+        self.node, self.processes, self.folder = node, processes, folder
+        self.executor = SingleThreadedExecutor(context=context)
+        self.executor.add_node(node)
+
+    def spin_until(self, done, what):
+        end = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < end, f'waited in vain for {what}: {self.said()}'
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def said(self):
+        return [path.read_text('utf-8') for path in sorted(self.folder.glob('*.output'))]
+
+    def call(self, kind, name, service, **fields):
+        client = self.node.create_client(kind, f'{NAMESPACE}/{name}/{service}')
+        self.spin_until(client.service_is_ready, f'{service} of {name}')
+        future = client.call_async(kind.Request(**fields))
+        self.spin_until(future.done, f'an answer of {service} of {name}')
+        self.node.destroy_client(client)
+        return future.result()
+
+    def wait_until_active(self, name):
+        from lifecycle_msgs.srv import GetState
+
+        self.spin_until(
+            lambda: self.call(GetState, name, 'get_state').current_state.label == 'active', name
+        )
+
+    def graph(self, name):
+        """Types by name of what a node publishes, subscribes to and replies to."""
+        node = self.node
+        return {
+            'publish': self._types(node.get_publisher_names_and_types_by_node, name),
+            'subscribe': self._types(node.get_subscriber_names_and_types_by_node, name),
+            'reply': self._types(node.get_service_names_and_types_by_node, name),
+        }
+
+    @staticmethod
+    def _types(ask, name):
+        return {topic: kind for topic, (kind,) in ask(name, NAMESPACE)}
+
+    @staticmethod
+    def resolved(name, topic):
+        """The full name that the launch file gives a topic or service of a node."""
+        camera = {'image': '/image_raw', 'image/compressed': '/image_raw/compressed'}
+        if topic in (*camera, 'camera_info'):
+            return f'/camera{camera.get(topic, "/camera_info")}'
+        if topic.startswith('~'):
+            return f'{NAMESPACE}/{name}{topic[1:]}'
+        return topic if topic.startswith('/') else f'{NAMESPACE}/{topic}'
+
+
+def policy():
+    """Names that the SROS 2 policy allows, resolved as sros2 does, by node and by what is done."""
+    root = ET.parse(ROOT / 'security' / 'sros2_policy.xml').getroot()
+    assert (root.tag, root.attrib) == ('policy', {'version': '0.2.0'})
+    result = {}
+    for enclave in root.findall('./enclaves/enclave'):
+        (profile,) = enclave.findall('./profiles/profile')
+        name = profile.attrib['node']
+        assert profile.attrib['ns'] == NAMESPACE
+        assert enclave.attrib['path'] == f'{NAMESPACE}/{name}'
+        result[name] = {}
+        for group in profile:
+            ((verb, value),) = group.attrib.items()
+            assert value == 'ALLOW'
+            assert (group.tag, verb) in (
+                ('topics', 'publish'),
+                ('topics', 'subscribe'),
+                ('services', 'reply'),
+            )
+            assert {element.tag for element in group} == {group.tag.removesuffix('s')}
+            result[name][verb] = {
+                text
+                if text.startswith('/')
+                else f'{NAMESPACE}/{name}{text[1:]}'
+                if text.startswith('~')
+                else f'{NAMESPACE}/{text}'
+                for text in (str(element.text) for element in group)
+            }
+    return result
+
+
+def opened(pid):
+    """How many sockets of a process others may connect to or send to, by kind."""
+    process = Path('/proc') / str(pid)
+    links = [str(link.readlink()) for link in (process / 'fd').iterdir()]
+    inodes = {link[8:-1] for link in links if link.startswith('socket:[')}
+    counts = {}
+    for kind in ('tcp', 'tcp6', 'udp', 'udp6', 'raw', 'raw6', 'unix'):
+        rows = [line.split() for line in (process / 'net' / kind).read_text().splitlines()[1:]]
+        if kind == 'unix':
+            # Those with the flag of a socket that accepts connections.
+            rows = [row for row in rows if row[6] in inodes and int(row[3], 16) & 0x10000]
+        else:
+            # Of TCP those in the state LISTEN.
+            rows = [row for row in rows if row[9] in inodes]
+            rows = [row for row in rows if not kind.startswith('tcp') or row[3] == '0A']
+        counts[kind] = len(rows)
+    return counts
+
+
+@pytest.fixture(scope='module')
+def started(description, tmp_path_factory):
+    """The three nodes with the default arguments, running, and somebody who looks at them."""
+    import rclpy
+
+    folder = tmp_path_factory.mktemp('launched')
+    own = folder / 'own.yaml'
+    own.write_text('/**/filter_node:\n  ros__parameters:\n    max_hypotheses: 5\n', 'utf-8')
+    entities = description['generate_launch_description']().arguments[0]
+    context = {one.arguments[0]: one.options['default_value'] for one in entities[:-1]}
+    context['params_file'] = str(own)
+    made = entities[-1].options['function'](context)
+    processes = []
+    for one in made:
+        output = (folder / f'{one.options["name"]}.output').open('wb')
+        words = command(one.options, folder)
+        processes.append(subprocess.Popen(words, cwd=ROOT, stdout=output, stderr=output))
+        output.close()
+    ros = rclpy.Context()
+    rclpy.init(context=ros)
+    node = rclpy.create_node('looker', context=ros)
+    try:
+        yield Running(node, ros, dict(zip(SETTINGS, processes, strict=True)), folder)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=ros)
+        for process in processes:
+            process.terminate()
+        codes = [process.wait(PATIENCE) for process in processes]
+    assert codes == [0, 0, 0]
+
+
+@pytest.mark.ros
+def test_nodes_are_active_with_the_parameters_of_the_launch_file(started):
+    from rcl_interfaces.srv import GetParameters
+
+    for name in SETTINGS:
+        started.wait_until_active(name)
+    names = ['max_hypotheses', 'frame_prefix', 'use_predictions', 'image_transport']
+    answer = started.call(GetParameters, 'filter_node', 'get_parameters', names=names)
+    values = answer.values
+    assert values[0].integer_value == 5
+    assert values[1].string_value == 'body_p1/'
+    assert values[2].bool_value is True
+    assert values[3].string_value == 'raw'
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('name', SETTINGS)
+def test_policy_allows_what_the_nodes_do_and_nothing_else(started, name):
+    started.wait_until_active(name)
+    allowed = policy()[name]
+    found = started.graph(name)
+    assert found.keys() == allowed.keys()
+    # Time is subscribed to when it is simulated, and images in one form or the other.
+    optional = {'/clock', '/camera/image_raw/compressed'}
+    assert allowed['subscribe'] - optional == set(found['subscribe'])
+    assert allowed['publish'] == set(found['publish'])
+    assert allowed['reply'] == set(found['reply'])
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('name', SETTINGS)
+def test_page_names_what_the_nodes_have(started, name):
+    """docs/nodes.md: subscribed, published, services, each with its type."""
+    started.wait_until_active(name)
+    found = started.graph(name)
+    page = (ROOT / 'docs' / 'nodes.md').read_text('utf-8')
+    section = page.partition(f'\n## {name}\n')[2].partition('\n## ')[0]
+    for heading, key, elsewhere in (
+        ('### Subscribed topics', 'subscribe', ()),
+        ('### Published topics', 'publish', ('/rosout', '/parameter_events')),
+        ('### Services', 'reply', ()),
+    ):
+        text = re.split(r'\n#+ ', section.partition(f'\n{heading}\n')[2], maxsplit=1)[0]
+        rows = re.findall(r'^\| `([^`]+)` \| ([\w/]+) \|', text, re.MULTILINE)
+        listed = {started.resolved(name, topic): kind for topic, kind in rows}
+        has = {
+            topic: re.sub('/(msg|srv)/', '/', kind)
+            for topic, kind in found[key].items()
+            if topic not in elsewhere and not re.search(OF_ALL_NODES, topic)
+        }
+        if key == 'subscribe':
+            compressed = '/camera/image_raw/compressed'
+            assert listed.pop(compressed, None) in (None, 'sensor_msgs/CompressedImage')
+        assert listed == has
+
+
+@pytest.mark.ros
+def test_nodes_listen_to_nothing_but_dds(started):
+    """No TCP port, no socket file; as many UDP ports as DDS opens for any node."""
+    program = 'import rclpy, sys; rclpy.init(); n = rclpy.create_node("plain"); print(flush=True)'
+    plain = subprocess.Popen(
+        [sys.executable, '-c', f'{program}; sys.stdin.read()'],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    plain.stdout.readline()
+    wanted = opened(plain.pid)
+    plain.communicate(timeout=PATIENCE)
+    assert wanted['udp'] > 0
+    assert {kind for kind, count in wanted.items() if count} <= {'udp', 'udp6'}
+    for name, process in started.processes.items():
+        started.wait_until_active(name)
+        assert opened(process.pid) == wanted

@@ -1,0 +1,118 @@
+"""What comes from outside is data: not executed, not unpickled, not unbounded."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from hmt_ros.body import model_file, rig
+from hmt_ros.inference import array_file
+from hmt_ros.nodes import parameter_file, picture_file
+from hmt_ros.tracking import subject
+from msg_tools import images, keypoints, pose_mixtures
+
+ROOT = Path(__file__).resolve().parents[1]
+FILES = sorted(
+    path for folder in ('hmt_ros', 'msg_tools', 'launch') for path in (ROOT / folder).rglob('*.py')
+)
+# Modules that execute what they read, or open connections.
+FORBIDDEN_MODULES = {
+    'pickle', 'cPickle', 'dill', 'cloudpickle', 'joblib', 'shelve', 'marshal', 'code', 'codeop',
+    'http', 'urllib.request', 'requests', 'ftplib', 'smtplib', 'telnetlib', 'xmlrpc',
+    'socket', 'socketserver', 'ssl', 'torch',
+}  # fmt: skip
+# Where a module that others may not use is used for something that opens nothing.
+ALLOWED = {
+    # Reserves the number of a ROS domain for a replay; nobody is listened to.
+    ('hmt_ros/app/live_node.py', 'socket'),
+}
+FORBIDDEN_CALLS = {
+    'eval', 'exec', 'compile', '__import__', 'os.system', 'os.popen', 'yaml.load_all',
+    'yaml.unsafe_load', 'yaml.full_load', 'np.loadtxt', 'np.genfromtxt', 'np.fromfile',
+}  # fmt: skip
+
+
+def faults(text: str, name: str) -> list[str]:
+    """What a source does that it must not do."""
+    found = []
+    for node in ast.walk(ast.parse(text)):
+        modules = []
+        if isinstance(node, ast.Import):
+            modules = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            modules = [str(node.module), *(f'{node.module}.{alias.name}' for alias in node.names)]
+        for module in modules:
+            known = {module, module.partition('.')[0]}
+            if known & FORBIDDEN_MODULES and (name, module) not in ALLOWED:
+                found.append(f'imports {module}')
+        if isinstance(node, ast.Call):
+            found += faults_of_call(node)
+    return found
+
+
+def faults_of_call(call: ast.Call) -> list[str]:
+    function = ast.unparse(call.func)
+    words = {word.arg: ast.unparse(word.value) for word in call.keywords}
+    found = [function] if function in FORBIDDEN_CALLS else []
+    if words.get('shell', 'False') != 'False':
+        found.append(f'{function} through a shell')
+    if function in ('np.load', 'numpy.load') and words.get('allow_pickle') != 'False':
+        found.append(f'{function} without allow_pickle=False')
+    if function == 'yaml.load' and words.get('Loader') != '_PlainLoader':
+        found.append(f'{function} with another loader')
+    return found
+
+
+@pytest.mark.parametrize('path', FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_nothing_that_is_read_is_executed(path: Path) -> None:
+    assert faults(path.read_text('utf-8'), str(path.relative_to(ROOT))) == []
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'import pickle',
+        'from urllib.request import urlopen',
+        'from urllib import request',
+        'import socket',
+        'eval("1")',
+        'np.load("a")',
+        'np.load("a", allow_pickle=True)',
+        'yaml.load("a", Loader=yaml.Loader)',
+        'subprocess.run("a", shell=True)',
+    ],
+)
+def test_the_rules_find_what_they_forbid(text: str) -> None:
+    assert len(faults(text, 'hmt_ros/app/replay.py')) > 0
+
+
+def test_limits_are_those_of_the_page() -> None:
+    page = (ROOT / 'docs' / 'security.md').read_text('utf-8')
+    table = page.partition('## Limits')[2].partition('\n## ')[0]
+    stated = {int(text.replace(' ', '')) for text in re.findall(r'\*\*([\d ]+)\*\*', table)}
+    limits = {
+        images.MAX_PIXELS,
+        images.MAX_JPEG_SCANS,
+        picture_file._LARGEST_FILE,
+        pose_mixtures.MAX_COMPONENTS,
+        keypoints.MAX_KEYPOINTS,
+        model_file.LARGEST_FILE,
+        subject.LARGEST_FILE,
+        parameter_file._LARGEST_FILE,
+        rig.LARGEST_FILE,
+        rig.LARGEST_MOTION,
+        array_file.LARGEST_ARCHIVE,
+    }
+    assert limits <= stated
+
+
+@pytest.mark.ros
+def test_limits_of_messages_are_those_of_the_page() -> None:
+    from hmt_ros.nodes import subscribed_topic
+
+    page = (ROOT / 'docs' / 'security.md').read_text('utf-8')
+    stated = {int(text.replace(' ', '')) for text in re.findall(r'\*\*([\d ]+)\*\*', page)}
+    assert {subscribed_topic.LARGEST_MESSAGE, subscribed_topic.LARGEST_IMAGE} <= stated
