@@ -202,7 +202,8 @@ def _with_truth(mixtures: RecordedMixtures, truth: Truth) -> list[str]:
         if topic.ends:  # without a body there are no joints
             stamps[topic.topic] = {stamp for window in topic.windows for stamp in window.stamps_ns}
     known = [name for name, own in stamps.items() if not own.isdisjoint(truth.joints)]
-    return known or [part.topic for part in (*mixtures.layers, *mixtures.trajectories)]
+    layers = [layer.topic for layer in mixtures.layers]
+    return known or [*layers, *(one.topic for one in mixtures.trajectories)]
 
 
 def _shown(mixtures: RecordedMixtures, most: int) -> list[int]:
