@@ -89,7 +89,7 @@ def description():
             module = types.ModuleType(name)
             module.__dict__.update(content)
             patch.setitem(sys.modules, name, module)
-        yield runpy.run_path(str(FILE))
+        return runpy.run_path(str(FILE))
 
 
 @pytest.fixture
