@@ -12,7 +12,7 @@ from hmt_ros.body import model_file, rig
 from hmt_ros.inference import array_file
 from hmt_ros.nodes import parameter_file, picture_file
 from hmt_ros.tracking import subject
-from msg_tools import images, keypoints, pose_mixtures
+from msg_tools import bag_metadata, decompression, images, keypoints, pose_mixtures
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted(
@@ -107,6 +107,13 @@ def test_limits_are_those_of_the_page() -> None:
         array_file.LARGEST_ARCHIVE,
     }
     assert limits <= stated
+
+
+def test_limits_of_bags_are_those_of_the_page() -> None:
+    page = (ROOT / 'docs' / 'security.md').read_text('utf-8')
+    (row,) = (line for line in page.splitlines() if line.startswith('| bag |'))
+    stated = [int(text.replace(' ', '')) for text in re.findall(r'\*\*([\d ]+)\*\*', row)]
+    assert stated == [decompression.MAX_BYTES, bag_metadata.MAX_BYTES]
 
 
 @pytest.mark.ros

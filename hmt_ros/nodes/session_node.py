@@ -461,7 +461,8 @@ class SessionNode(LifecycleNode):
             return
         self._ticks, self._told_at = 0, counts['received']
         if self._session is not None:
-            _, text = self._judgement(self._session.state)
+            label = self._state_machine.current_state[1]
+            _, text = self._present_judgement(label, self._session.state)
             self.get_logger().info(f'{text}; {self._rates.line()}')
 
     def _present_judgement(self, label: str, state: Any) -> tuple[bytes, str]:

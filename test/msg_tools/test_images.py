@@ -17,6 +17,7 @@ from msg_tools.images import (
     ImageError,
     compressed_image_message,
     decode_image,
+    decode_picture,
     encode_jpeg,
     image_message,
 )
@@ -320,6 +321,26 @@ def test_defects_of_compressed_images() -> None:
 
 
 # Encoding
+
+
+def test_jpeg_with_scans_without_end_is_refused_undecoded() -> None:
+    done, file = cv2.imencode('.jpg', scene(), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])
+    assert done
+    plain = file.tobytes()
+    assert plain.count(b'\xff\xda') > 3
+    wanted = cv2.imdecode(file, cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(decode_image(compressed(plain)), wanted)
+    last = plain[plain.rfind(b'\xff\xda') : -2]
+    bomb = plain[:-2] + last * 500 + plain[-2:]
+    with pytest.raises(ImageError, match=r'jpeg has 5\d\d scans, the limit is 100'):
+        decode_image(compressed(bomb))
+
+
+def test_pictures_of_files() -> None:
+    png = encoded('.png', scene())
+    np.testing.assert_array_equal(decode_picture(png), scene())
+    with pytest.raises(ImageError, match=r"unknown format starts with b'BM"):
+        decode_picture(encoded('.bmp', scene()))
 
 
 def test_encoding_is_repeatable_and_near(messages: RosbagsMessages) -> None:

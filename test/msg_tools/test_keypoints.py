@@ -53,6 +53,7 @@ def test_covariance_of_a_joint_that_was_not_seen_does_not_matter(messages: Rosba
         ({'names': [], 'u': [], 'v': []}, r'keypoints has no names'),
         ({'names': ['neck', 'neck', 'head']}, r"keypoints has the name 'neck' twice"),
         ({'names': ['neck', 'left_elbow', 'tail']}, r"keypoint 'tail' is not a joint of the body"),
+        ({'names': ['x'] * 10_001}, r'keypoints has 10001 names, the limit is 10000'),
         ({'u': [1.0, 2.0]}, r'keypoints: u has 2 values, wanted 3'),
         ({'v': [1.0] * 4}, r'keypoints: v has 4 values, wanted 3'),
         ({'covariance': [1.0] * 11}, r'keypoints: covariance has 11 values, wanted 12'),

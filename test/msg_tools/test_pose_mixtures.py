@@ -154,3 +154,12 @@ def test_content_that_no_message_may_have(
 ) -> None:
     with pytest.raises(MessageError, match=error):
         replace(pose_mixture, **changes)
+
+
+def test_more_components_than_anybody_publishes(
+    pose_mixture: PoseMixture, messages: RosbagsMessages
+) -> None:
+    message = pose_mixture_message(messages, pose_mixture)
+    message.components = [message.components[0]] * 1025
+    with pytest.raises(MessageError, match='mixture has 1025 components, the limit is 1024'):
+        pose_mixture_of(message)

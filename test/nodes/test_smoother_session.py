@@ -370,3 +370,18 @@ def test_a_span_is_smoothed_on_demand(running, likelihoods):
 def test_parameters_that_can_not_be(values, message):
     with pytest.raises(ValueError, match=message):
         with_values(SmootherParameters(), values)
+
+
+def test_body_in_a_message_leads_to_no_file(session, likelihoods, tmp_path):
+    """Files are read where a parameter names them, not where somebody on the network does."""
+    path = tmp_path / 'own.yaml'
+    path.write_text('extends: human37\n')
+    message = likelihoods.body_message()
+    message.name = str(path)
+    one = session()
+    (fault,) = one.take(BODY, message).faults
+    assert 'own.yaml' in fault
+    assert 'wanted one of' in fault
+    assert one.state.status == 'no body'
+    trusting = session(body_model=str(path))
+    assert trusting.take(BODY, message).faults == ()
