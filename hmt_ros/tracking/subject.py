@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.plain_yaml import load_plain_yaml
 from hmt_ros.image.observation import Keypoints
 
 Array = NDArray[np.float64]
@@ -63,8 +63,8 @@ def read_subject(path: str | Path, body: Body) -> Subject:
     except UnicodeDecodeError as fault:
         raise SubjectError(f'{path}: not YAML ({fault})') from fault
     try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as fault:
+        content = load_plain_yaml(text)
+    except ValueError as fault:
         raise SubjectError(f'{path}: not YAML ({" ".join(str(fault).split())})') from fault
     try:
         return parse_subject(content, body)
