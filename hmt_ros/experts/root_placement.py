@@ -39,7 +39,7 @@ OUTLINE_SIGMA, CLOTHES = 1.5, 0.02
 # Relative deviation of the depth, and of the place across in units of depth, before the box counts.
 DEPTH_SPREAD, ACROSS_SPREAD = 0.7, 1.0
 STEPS = 10
-DONE = 3e-4  # relative to the depth
+DONE = 1e-3  # relative to the depth
 TURNED = 0.05  # share of the depth: a step that turns the line of sight this far, as an angle
 LONGEST_STEP = 0.4  # shares of the depth
 
