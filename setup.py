@@ -53,7 +53,7 @@ setup(
     ],
     # OpenCV has several distributions of one module (apt, opencv-python, -headless): naming one
     # here would install it a second time next to another.
-    extras_require={'test': ['pytest', 'hypothesis']},
+    extras_require={'test': ['pytest', 'hypothesis'], 'dask': ['distributed']},
     zip_safe=False,
     entry_points={
         'console_scripts': [

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import csv
+import gc
 import json
 import os
 import shutil
+import tempfile
+import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -591,6 +594,36 @@ def test_collected_bags_read_wholly_or_say_why_not(
                 assert len(found) == int(row['messages']), row['file']
         seen += 1
     assert seen >= 35
+
+
+def test_collected_files_cost_little_and_leave_nothing(
+    shared: Path, read: Callable[[Path], Any]
+) -> None:
+    """All 416 files of the conformance suite, all other recordings: memory, files, folders."""
+    paths = [
+        path
+        for path in sorted((shared / 'mcap').rglob('*'))
+        if path.suffix in ('.mcap', '.db3', '.bag', '.zstd')
+    ]
+    assert sum('conformance' in path.parts for path in paths) == 416
+    read(paths[0])
+    opened = len(list(Path('/proc/self/fd').iterdir()))
+    before = set(Path(tempfile.gettempdir()).glob('bag_reader.*'))
+    for path in paths:
+        gc.collect()
+        tracemalloc.start()
+        begun = time.monotonic()
+        found, error = read(path)
+        assert time.monotonic() - begun < 60, path
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        kept = sum(len(data) for _, _, data in found)
+        assert error is None or '\n' not in error
+        # What is kept here, and twice a chunk: packed and not.
+        assert peak < 2.5 * kept + 16e6, (path, peak, kept)
+        del found
+    assert len(list(Path('/proc/self/fd').iterdir())) == opened
+    assert set(Path(tempfile.gettempdir()).glob('bag_reader.*')) <= before
 
 
 def test_collected_bags_in_detail(shared: Path, read: Callable[[Path], Any]) -> None:
