@@ -104,8 +104,9 @@ def replay_bag(options: argparse.Namespace, tell: Tell) -> Replayed:
             with WriteBehind() as behind:
                 write = partial(behind.call, out.write_serialised)
                 with way(parameters, write) as track:
-                    copy = partial(behind.call, out.write)
-                    count = _play(options, bag, recorded, parameters.filter, track, copy, tell)
+                    count = _play(
+                        options, bag, recorded, parameters.filter, track, out, behind, tell
+                    )
             if not count.tracked:
                 raise ValueError(f'{source}: {_why_nothing(count, subject)}')
     return Replayed(target, count.images, count.tracked)
@@ -231,7 +232,8 @@ def _play(
     recorded: RecordedInput,
     parameters: FilterParameters,
     track: PlayedTrack,
-    copy: Callable[[str, int, Any], None],
+    out: BagWriter,
+    behind: WriteBehind,
     tell: Tell,
 ) -> _Count:
     """Gives the nodes what is in the bag; copies what is to be copied."""
@@ -252,6 +254,7 @@ def _play(
     ):
 
         def judge(handled: Handled) -> None:
+            behind.check()
             count.tracked += sum(topic == 'pose_mixture' for topic, _ in handled.published)
             if handled.faults:
                 count.last_fault = handled.faults[-1]
@@ -264,7 +267,7 @@ def _play(
 
         for source, stored, given in _readable(ahead, options.keep_going, tell):
             if source in copied:
-                copy(stored.topic, stored.log_time_ns, stored.message)
+                behind.call(out.write, stored.topic, stored.log_time_ns, stored.message)
             if source == GROUND_TRUTH:
                 continue
             judge(track.take(source, given))

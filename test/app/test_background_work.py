@@ -65,6 +65,9 @@ def test_an_error_ends_the_calls():
         with WriteBehind() as behind:
             for i in range(count):
                 behind.call(write, i)
+            if count > 51:
+                behind.check()
+                raise AssertionError('an error is told within 32 calls')
 
     for count in (51, 1000):
         found.clear()
