@@ -74,9 +74,9 @@ def names_of(values: Sequence[str], what: str) -> tuple[str, ...]:
         MessageError: a name that is there twice.
     """
     names = tuple(str(value) for value in values)
-    for name in names:
-        if names.count(name) > 1:
-            raise MessageError(f'{what} has the name {name!r} twice')
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise MessageError(f'{what} has the name {twice!r} twice')
     return names
 
 

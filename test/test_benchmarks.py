@@ -2,13 +2,14 @@
 
 import json
 import multiprocessing
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import flips, kernels, kjs, tracking, votes
+from benchmarks import bags, flips, kernels, kjs, tracking, votes
 from benchmarks.__main__ import main
 from benchmarks.clips import find_clips, read_clip, rounded, table
 from benchmarks.command import run_stages
@@ -66,6 +67,46 @@ def test_the_tree_that_is_timed_has_1024_leaves(body):
     assert set(whole['us_per_leaf']) == set(whole['us_per_leaf_at_yardstick'])
     assert 50 < whole['peak_mb'] < 600
     assert 'most probable first' in flips.as_text(result)
+
+
+def test_both_read_the_same_bags_and_memory_is_followed(tmp_path):
+    found = bags.reading(tmp_path, 0.002, rounds=1)
+    assert [case['messages'] for case in found] == [10, 10, 100, 100]
+    for case in found:
+        assert case['ratio'] == pytest.approx(
+            case['ours_mb_per_s'] / case['rosbags_mb_per_s'], rel=1e-9
+        )
+    assert bags._our_bytes(tmp_path / 'states') == bags._their_bytes(tmp_path / 'states')
+    assert bags._our_messages(tmp_path / 'states') == bags._their_messages(tmp_path / 'states')
+    remembered = bags.memory(tmp_path, 20_000_000)
+    assert 0.019 < remembered['gb'] < 0.021
+    assert [share for share, _ in remembered['resident_mb']][-1] == 1.0
+    assert remembered['growth_mb'] < 32
+    text = bags.as_text({'reading': found, 'memory': remembered}, markdown=True)
+    assert 'images of 100 kB, as bytes' in text
+    assert '0.02 GB' in text
+
+
+def test_time_in_estimators_is_counted_once(monkeypatch):
+    class Inner:
+        def step(self):
+            time.sleep(0.02)
+
+    class Outer:
+        def step(self):
+            Inner().step()
+
+    before = Outer.step
+    monkeypatch.setattr(bags, 'ESTIMATORS', ((Outer, 'step'), (Inner, 'step')))
+    with bags.clock() as total:
+        start = time.perf_counter()
+        Outer().step()
+        spent = time.perf_counter() - start
+    assert 0.02 <= total[0] <= spent
+    assert Outer.step is before
+    case = {'what': 'filter', 'clip': 'walk', 'images': 2, 'estimate_ms': 100.0, 'added_ms': 9.0}
+    text = bags.as_text({'replay': [{**case, 'share': 0.09, 'met': True}]})
+    assert '9.0 %' in text
 
 
 def test_jumps_are_minima_and_cheap(monkeypatch):

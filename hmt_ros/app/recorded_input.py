@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 
 from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
@@ -38,7 +38,7 @@ class RecordedInput:
         """Value of the parameter image_transport."""
         return 'compressed' if self.image.msgtype == COMPRESSED else 'raw'
 
-    def messages(self, bag: BagReader) -> Iterator[tuple[str, BagMessage]]:
+    def messages(self, bag: BagReader) -> Generator[tuple[str, BagMessage], None, None]:
         """(source, message) by log time; the source is one of the filter's or `GROUND_TRUTH`.
 
         Raises:

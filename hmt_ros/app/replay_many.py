@@ -111,7 +111,7 @@ def replay_many(options: argparse.Namespace, tell: Tell) -> int:
         return 130
     if not options.quiet:
         print(
-            f'{options.output}: {counts[DONE]} bags replayed, {counts[BEFORE]} done before, '
+            f'{options.output}: {counts[DONE]} replayed, {counts[BEFORE]} done before, '
             f'{counts[FAILED]} failed'
         )
     return 1 if counts[FAILED] else 0

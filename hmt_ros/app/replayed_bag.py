@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from hmt_ros.app.played_track import (
     OfflineTrack,
     PlayedTrack,
 )
-from hmt_ros.app.recorded_input import GROUND_TRUTH, RecordedInput, recorded_input
+from hmt_ros.app.read_ahead import ReadAhead
+from hmt_ros.app.recorded_input import COMPRESSED, GROUND_TRUTH, RecordedInput, recorded_input
+from hmt_ros.app.write_behind import WriteBehind
 from hmt_ros.body.plain_yaml import load_plain_yaml
 from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
 from hmt_ros.nodes.bme_parameters import BmeParameters
@@ -36,6 +39,7 @@ from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
 from msg_tools.error_line import error_line
 from msg_tools.headers import header_message, time_ns
+from msg_tools.images import ImageError, decode_image, image_message
 
 # What the bag and the command say, whatever a parameter file says.
 _DECIDED_HERE = ('image_transport', 'autostart')
@@ -96,8 +100,13 @@ def replay_bag(options: argparse.Namespace, tell: Tell) -> Replayed:
             for topic, published in topics.items():
                 out.add_topic(topic, published.msgtype, latched=published.latched)
             way = LiveTrack if options.live else OfflineTrack
-            with way(parameters, out.write_serialised) as track:
-                count = _play(options, bag, recorded, parameters.filter, track, out, tell)
+            # Bytes are compressed and images decoded while the next image is tracked.
+            with WriteBehind() as behind:
+                write = partial(behind.call, out.write_serialised)
+                with way(parameters, write) as track:
+                    count = _play(
+                        options, bag, recorded, parameters.filter, track, out, behind, tell
+                    )
             if not count.tracked:
                 raise ValueError(f'{source}: {_why_nothing(count, subject)}')
     return Replayed(target, count.images, count.tracked)
@@ -224,6 +233,7 @@ def _play(
     parameters: FilterParameters,
     track: PlayedTrack,
     out: BagWriter,
+    behind: WriteBehind,
     tell: Tell,
 ) -> _Count:
     """Gives the nodes what is in the bag; copies what is to be copied."""
@@ -232,11 +242,19 @@ def _play(
         recorded = replace(recorded, keypoints=None)
     copied = {GROUND_TRUTH, IMAGE, CAMERA_INFO} if options.with_images else {GROUND_TRUTH}
     hidden = options.quiet or not sys.stderr.isatty()
-    with tqdm(
-        total=recorded.image.message_count, unit='image', desc=str(options.output), disable=hidden
-    ) as bar:
+    messages = recorded.messages(bag)
+    with (
+        ReadAhead(partial(_read, messages, not options.live), messages.close) as ahead,
+        tqdm(
+            total=recorded.image.message_count,
+            unit='image',
+            desc=str(options.output),
+            disable=hidden,
+        ) as bar,
+    ):
 
         def judge(handled: Handled) -> None:
+            behind.check()
             count.tracked += sum(topic == 'pose_mixture' for topic, _ in handled.published)
             if handled.faults:
                 count.last_fault = handled.faults[-1]
@@ -247,12 +265,12 @@ def _play(
             for text in handled.warnings:
                 tell(f'{bag.path}: {text}')
 
-        for source, stored in _readable(recorded.messages(bag), options.keep_going, tell):
+        for source, stored, given in _readable(ahead, options.keep_going, tell):
             if source in copied:
-                out.write(stored.topic, stored.log_time_ns, stored.message)
+                behind.call(out.write, stored.topic, stored.log_time_ns, stored.message)
             if source == GROUND_TRUTH:
                 continue
-            judge(track.take(source, stored.message))
+            judge(track.take(source, given))
             if source == IMAGE:
                 count.images += 1
                 count.last_stamp = time_ns(stored.message.header.stamp)
@@ -264,9 +282,30 @@ def _play(
     return count
 
 
+def _read(messages: Iterator[tuple[str, BagMessage]], decode: bool) -> tuple[str, BagMessage, Any]:
+    """The next message, and what is to be given to the nodes: an image that is decoded already.
+
+    Raises:
+        BagError: its bytes are none; the one behind it can be read all the same.
+        StopIteration: there is none.
+    """
+    source, stored = next(messages)
+    given = stored.message
+    if decode and source == IMAGE and stored.msgtype == COMPRESSED:
+        try:
+            picture = decode_image(given)
+        except ImageError:
+            # Whoever takes it says what is wrong with it.
+            return source, stored, given
+        given = image_message(
+            RosbagsMessages(), picture, time_ns(given.header.stamp), str(given.header.frame_id)
+        )
+    return source, stored, given
+
+
 def _readable(
-    messages: Iterator[tuple[str, BagMessage]], keep_going: bool, tell: Tell
-) -> Iterator[tuple[str, BagMessage]]:
+    messages: Iterator[tuple[str, BagMessage, Any]], keep_going: bool, tell: Tell
+) -> Iterator[tuple[str, BagMessage, Any]]:
     """The messages, without those whose bytes are none, up to where the bag is damaged.
 
     Raises:
@@ -274,9 +313,7 @@ def _readable(
     """
     while True:
         try:
-            source, stored = next(messages)
-            # Read here, where it is known that a fault is one of the bag.
-            assert stored.message is not None
+            found = next(messages)
         except StopIteration:
             return
         except BagError as error:
@@ -284,7 +321,7 @@ def _readable(
                 raise
             tell(str(error))
             continue
-        yield source, stored
+        yield found
 
 
 def _nobody(stamp_ns: int) -> Any:

@@ -1,5 +1,7 @@
 """replay, offline."""
 
+import resource
+import signal
 import sys
 from pathlib import Path
 
@@ -362,4 +364,20 @@ def test_interruption_leaves_nothing(short, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(StandingStill, 'step', interrupted)
     assert main([str(short), '-o', str(tmp_path / 'out'), *SUBJECT]) == 130
     assert capsys.readouterr().err == 'replay: interrupted, nothing is written\n'
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('options', [[], ['--keep-going']])
+def test_full_disk(still, short, tmp_path, capsys, options):
+    """It is no fault of an image that could be passed over."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
+    try:
+        assert main([str(short), '-o', str(tmp_path / 'out'), *SUBJECT, *options]) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f'replay: {tmp_path / "out"} can not be written: File too large'
     assert list(tmp_path.iterdir()) == []

@@ -69,7 +69,7 @@ def test_bags_that_are_done_are_skipped(archive, tracked, monkeypatch, capsys):
     assert capsys.readouterr().out.splitlines() == [
         'a: done before',
         'day/b: done before',
-        f'{tracked}: 0 bags replayed, 2 done before, 0 failed',
+        f'{tracked}: 0 replayed, 2 done before, 0 failed',
     ]
     assert {path: path.stat().st_mtime_ns for path in tracked.rglob('*')} == before
     # With other parameters they are not, and are not replaced unasked.
@@ -127,7 +127,7 @@ def test_one_that_fails_does_not_keep_the_others(archive, tracked, tmp_path, cap
     streams = capsys.readouterr()
     assert streams.out.splitlines() == [
         'a: 2 of 2 images tracked',
-        f'{tmp_path / "out"}: 1 bags replayed, 0 done before, 2 failed',
+        f'{tmp_path / "out"}: 1 replayed, 0 done before, 2 failed',
     ]
     broken, nowhere = streams.err.splitlines()
     assert broken.startswith('replay: broken: ')
@@ -178,7 +178,7 @@ def test_through_dask_the_bags_are_the_same(archive, tracked, tmp_path, capfd):
     assert main([*command, '--scheduler', 'local']) == 1
     streams = capfd.readouterr()
     assert sorted(streams.out.splitlines()) == [
-        f'{out}: 2 bags replayed, 0 done before, 1 failed',
+        f'{out}: 2 replayed, 0 done before, 1 failed',
         'a: 2 of 2 images tracked',
         'day/b: 2 of 2 images tracked',
     ]
