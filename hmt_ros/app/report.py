@@ -202,7 +202,8 @@ def _with_truth(mixtures: RecordedMixtures, truth: Truth) -> list[str]:
         if topic.ends:  # without a body there are no joints
             stamps[topic.topic] = {stamp for window in topic.windows for stamp in window.stamps_ns}
     known = [name for name, own in stamps.items() if not own.isdisjoint(truth.joints)]
-    return known or [part.topic for part in (*mixtures.layers, *mixtures.trajectories)]
+    windows = [topic.topic for topic in mixtures.trajectories]
+    return known or [layer.topic for layer in mixtures.layers] + windows
 
 
 def _shown(mixtures: RecordedMixtures, most: int) -> list[int]:
