@@ -63,7 +63,7 @@ class Chart {
     context.fillText(labels[0], (left + right) / 2, bottom + 19);
     context.save();
     context.beginPath();
-    context.rect(left, top - 2, right - left, bottom - top + 4);
+    context.rect(left - 4, top - 4, right - left + 8, bottom - top + 8);
     context.clip();
     draw(context, u, v);
     context.restore();
@@ -189,8 +189,8 @@ function errorsChart(layer) {
       if (report.lost_mm < y[1]) {
         context.fillStyle = colour('muted');
         context.textAlign = 'right';
-        context.textBaseline = 'bottom';
-        context.fillText('lost', u(timeRange()[1]) - 2, v(report.lost_mm) - 1);
+        context.textBaseline = 'top';
+        context.fillText('lost', u(timeRange()[1]) - 2, v(report.lost_mm) + 2);
       }
       ERRORS.forEach(({ series, dash }, i) => {
         curve(context, u, v, TIMES, curves[i], { colour: colour(series), dash });

@@ -1,6 +1,8 @@
 // What is drawn of the person: skeletons in space, which turn, and skeletons on the image.
 
 const FAINTEST = 0.12;
+// How far away one looks from, in radii of what is in sight.
+const DISTANCE = 5;
 const DASHES = { likelihood: [5, 3], prediction: [2, 3] };
 
 /** What is shown: indices of layers, truth, trajectories; of one layer a single mode, or all. */
@@ -50,55 +52,70 @@ class Space {
     this.listen();
   }
 
-  /** Where the person is on the whole, and how much room all heaviest modes take. */
+  /** Where the person is on the whole, and how much room all modes take, there and about the pelvis. */
   measure() {
     const low = [Infinity, Infinity, Infinity];
     const high = [-Infinity, -Infinity, -Infinity];
     const floor = [];
-    this.roots = TIMES.map(() => null);
+    let own = 0;
     const figure = layers[0] || truth;
-    TIMES.forEach((_, t) => {
+    this.roots = TIMES.map((_, t) => {
       const offset = this.heaviest(figure, t);
-      if (offset < 0) return;
-      const joints = figure.joints.length;
-      const at = (joint, axis) => figure.positions[(offset * joints + joint) * 3 + axis];
-      this.roots[t] = [0, 1, 2].map((axis) => at(figure.root, axis));
+      return offset < 0 ? null : this.joint(figure, offset, figure.root);
+    });
+    const include = (point) => point.forEach((x, axis) => {
+      low[axis] = Math.min(low[axis], x);
+      high[axis] = Math.max(high[axis], x);
+    });
+    TIMES.forEach((_, t) => {
+      if (!this.roots[t]) return;
       let lowest = Infinity;
-      for (let joint = 0; joint < joints; joint += 1) {
-        for (let axis = 0; axis < 3; axis += 1) {
-          low[axis] = Math.min(low[axis], at(joint, axis));
-          high[axis] = Math.max(high[axis], at(joint, axis));
+      const modes = figure === truth ? 1 : figure.weights[t].length;
+      for (let rank = 0; rank < modes; rank += 1) {
+        for (let joint = 0; joint < figure.joints.length; joint += 1) {
+          const point = this.joint(figure, this.heaviest(figure, t) + rank, joint);
+          include(point);
+          const [dx, dy, dz] = point.map((x, axis) => x - this.roots[t][axis]);
+          own = Math.max(own, Math.abs(dy), Math.hypot(dx, dz));
+          if (rank === 0) lowest = Math.min(lowest, point[1]);
         }
-        lowest = Math.min(lowest, at(joint, 1));
       }
       floor.push(lowest);
     });
     if (!floor.length) {
       const ways = trajectories.flatMap((topic) => topic.windows.map((w) => w.ways).filter(Boolean));
-      ways.forEach((way) => way.forEach((x, i) => {
-        low[i % 3] = Math.min(low[i % 3], x);
-        high[i % 3] = Math.max(high[i % 3], x);
-      }));
+      ways.forEach((way) => { for (let i = 0; i < way.length; i += 3) include([...way.slice(i, i + 3)]); });
       if (!ways.length) { low.fill(-1); high.fill(1); }
       floor.push(low[1]);
     }
     floor.sort((a, b) => a - b);
     this.floor = floor[Math.floor(floor.length * 0.1)];
     this.centre = low.map((x, axis) => 0.5 * (x + high[axis]));
-    this.radius = Math.max(0.5 * Math.hypot(...low.map((x, axis) => high[axis] - x)), 0.5);
+    const half = low.map((x, axis) => 0.5 * (high[axis] - x));
+    this.room = Math.max(half[1], Math.hypot(half[0], half[2]), 0.3);
+    this.ownRoom = Math.max(own, 0.3);
     const roots = this.roots.filter(Boolean);
-    const range = [0, 2].map((axis) => {
+    this.follow = [0, 2].some((axis) => {
       const values = roots.map((root) => root[axis]);
-      return values.length ? Math.max(...values) - Math.min(...values) : 0;
+      return values.length > 0 && Math.max(...values) - Math.min(...values) > 1.5;
     });
-    this.follow = Math.max(...range) > 1.5;
-    if (this.follow) this.radius = Math.max(Math.min(this.radius, 1.3), 0.5);
+  }
+
+  /** A joint of a mode. */
+  joint(figure, offset, joint) {
+    const i = (offset * figure.joints.length + joint) * 3;
+    return [...figure.positions.slice(i, i + 3)];
   }
 
   heaviest(figure, t) {
     if (!figure) return -1;
     if (figure === truth) return truth.starts[t];
     return figure.weights[t].length ? figure.starts[t] : -1;
+  }
+
+  /** Half of what is in sight at zoom 1, m. */
+  get radius() {
+    return 1.12 * (this.follow && this.lastRoot() ? this.ownRoom : this.room);
   }
 
   reset() {
@@ -158,8 +175,8 @@ class Space {
     const yaw = (this.yaw * Math.PI) / 180;
     const pitch = (this.pitch * Math.PI) / 180;
     const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
-    const distance = 3.2 * this.radius;
-    const scale = (0.6 * Math.min(width, height) * this.zoom * distance) / this.radius;
+    const distance = DISTANCE * this.radius;
+    const scale = (0.5 * Math.min(width, height) * this.zoom * distance) / this.radius;
     const root = this.follow ? this.lastRoot() : null;
     const centre = root || this.centre;
     return (x, y, z) => {
@@ -209,7 +226,7 @@ class Space {
     segments.forEach(({ from, to, mode, side }) => {
       context.globalAlpha = mode.strength;
       context.setLineDash(mode.dash);
-      context.lineWidth = mode.width * (this.radius * 3.2) / (0.5 * (from[2] + to[2]));
+      context.lineWidth = (mode.width * DISTANCE * this.radius) / (0.5 * (from[2] + to[2]));
       context.strokeStyle = colour(mode.ink || `${mode.style}-${side}`);
       context.beginPath();
       context.moveTo(from[0], from[1]);
