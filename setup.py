@@ -20,7 +20,7 @@ setup(
     maintainer_email='hmt-ros@example.com',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*', 'msg_tools', 'msg_tools.*']),
     package_data={
-        PACKAGE: ['config/*.yaml', 'body/models/*.yaml', 'experts/models/*.npz'],
+        PACKAGE: ['config/*.yaml', 'config/*.xml', 'body/models/*.yaml', 'experts/models/*.npz'],
         # The message definitions are read by whoever works on bags without ROS.
         'msg_tools': ['hmt_msgs/msg/*.msg', 'hmt_msgs/srv/*.srv'],
     },
@@ -29,7 +29,7 @@ setup(
         for target, sources in (
             ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
             (f'share/{PACKAGE}', ['package.xml']),
-            (f'share/{PACKAGE}/config', files(f'{PACKAGE}/config', '*.yaml')),
+            (f'share/{PACKAGE}/config', files(f'{PACKAGE}/config', '*.*ml')),
             (f'share/{PACKAGE}/launch', files('launch', '*.launch.*')),
         )
         if sources

@@ -41,6 +41,7 @@ NODES = {
 }
 # Programs that are not part of this repository.
 FOREIGN = {
+    'export',
     'sudo',
     'source',
     'rosdep',

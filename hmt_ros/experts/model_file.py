@@ -8,7 +8,12 @@ arrays under a prefix: `nested` and `part`.
 from __future__ import annotations
 
 import json
+import math
+import os
+import secrets
+import struct
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,10 +24,27 @@ from numpy.typing import NDArray
 FORMAT = 'hmt_ros model'
 VERSION = 1
 
+# What an archive may unpack to, bytes; a model is some MB.
+LARGEST = 2**31
+
 Arrays = dict[str, NDArray[Any]]
 
 # What wrong arrays lead to, wherever they are looked at.
 FAULTS = (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError)
+
+# What wrong bytes lead to where an archive is read.
+_DAMAGE = (
+    OSError,
+    ValueError,
+    KeyError,
+    EOFError,
+    AttributeError,
+    NotImplementedError,
+    RuntimeError,
+    struct.error,
+    zlib.error,
+    zipfile.BadZipFile,
+)
 
 # What every archive holds besides the arrays of its kind.
 _HEADER = ('format', 'version', 'kind', 'parameters')
@@ -84,7 +106,7 @@ def damaged(where: str, fault: Exception) -> ValueError:
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
-    """Writes an archive; the same arrays give the same bytes.
+    """Writes an archive, whole or not at all; the same arrays give the same bytes.
 
     Args:
         path: of the file; '.npz' is appended where it is missing.
@@ -97,8 +119,16 @@ def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
     if path.suffix != '.npz':
         path = path.with_name(path.name + '.npz')
     content: dict[str, Any] = dict(arrays)
-    with path.open('wb') as file:
-        np.savez_compressed(file, **content)
+    partial = path.with_name(f'.{path.name}.{secrets.token_hex(4)}.partial')
+    try:
+        with partial.open('xb') as file:
+            np.savez_compressed(file, **content)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
     return path
 
 
@@ -113,13 +143,44 @@ def read_arrays(path: str | Path, kind: str | None = None) -> Arrays:
     if not path.is_file():
         raise FileNotFoundError(f'{path}: no such model file; train one with `train`')
     try:
+        _check_members(path)
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as fault:
+    except _DAMAGE as fault:
         text = ' '.join(str(fault).split())
         raise ValueError(f'{path}: not a model file of hmt_ros ({text})') from fault
     check_header(arrays, kind, str(path))
+    for name, values in arrays.items():
+        if values.dtype.kind == 'f' and not np.isfinite(values).all():
+            raise ValueError(
+                f'{path}: a damaged model file ({name} has values that are not finite); '
+                'train it again'
+            )
     return arrays
+
+
+def _check_members(path: Path) -> None:
+    """Raises ValueError where an archive unpacks to more than a model, or not to what it says."""
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        size = sum(member.file_size for member in members)
+        if size > LARGEST:
+            raise ValueError(f'it unpacks to {size} bytes, the limit is {LARGEST}')
+        for member in members:
+            with archive.open(member) as file:
+                version = np.lib.format.read_magic(file)
+                read = (
+                    np.lib.format.read_array_header_1_0
+                    if version == (1, 0)
+                    else np.lib.format.read_array_header_2_0
+                )
+                shape, _, dtype = read(file)
+                # numpy makes room for what the header says before it reads.
+                if (
+                    math.prod(shape) * dtype.itemsize > member.file_size
+                    or min(shape, default=0) < 0
+                ):
+                    raise ValueError(f'{member.filename} has no room for the shape {shape}')
 
 
 def nested(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
