@@ -1,6 +1,7 @@
 # make demo   tracks the person of a bag in bags/      make lint   ruff and mypy
 # make test   all tests                                make bench  the benchmarks
-# make setup  the workspace alone                      make clean  back to the state of a clone
+# make setup  the workspace alone                      make soak   nodes under load and fault
+# make clean  back to the state of a clone
 #
 # Each works as the first command after a clone: what it needs is installed into .venv and built
 # once. See CONTRIBUTING.md.
@@ -8,7 +9,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -e -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench clean lock
+.PHONY: help setup demo test lint bench soak clean lock
 
 # Small matrices: a second BLAS thread costs more than it brings.
 export OMP_NUM_THREADS := 1
@@ -18,6 +19,7 @@ WORKSPACE := tools/workspace.sh
 PYTHON_IN_VENV := .venv/bin/python
 SOURCED := source tools/environment.bash &&
 TEST_PROCESSES ?= 2
+SOAK_MINUTES ?= 10
 DEMO_BAG ?= $(patsubst %/metadata.yaml,%,$(firstword $(wildcard bags/*/metadata.yaml)))
 
 help:
@@ -44,6 +46,10 @@ lint:
 bench:
 	@$(WORKSPACE) ros test build
 	@$(SOURCED) python -m benchmarks $(ARGS)
+
+soak:
+	@$(WORKSPACE) ros test build
+	@$(SOURCED) python -m benchmarks soak --minutes $(SOAK_MINUTES) $(ARGS)
 
 clean:
 	rm -rf .venv build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info

@@ -20,7 +20,13 @@ setup(
     maintainer_email='hmt-ros@example.com',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*', 'msg_tools', 'msg_tools.*']),
     package_data={
-        PACKAGE: ['config/*.yaml', 'body/models/*.yaml', 'experts/models/*.npz', 'app/page/*'],
+        PACKAGE: [
+            'config/*.yaml',
+            'config/*.xml',
+            'body/models/*.yaml',
+            'experts/models/*.npz',
+            'app/page/*',
+        ],
         # The message definitions are read by whoever works on bags without ROS.
         'msg_tools': ['hmt_msgs/msg/*.msg', 'hmt_msgs/srv/*.srv'],
     },
@@ -29,7 +35,7 @@ setup(
         for target, sources in (
             ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
             (f'share/{PACKAGE}', ['package.xml']),
-            (f'share/{PACKAGE}/config', files(f'{PACKAGE}/config', '*.yaml')),
+            (f'share/{PACKAGE}/config', files(f'{PACKAGE}/config', '*.*ml')),
             (f'share/{PACKAGE}/launch', files('launch', '*.launch.*')),
             (f'share/{PACKAGE}/rviz', files('rviz', '*.rviz')),
             (f'share/{PACKAGE}/foxglove', files('foxglove', '*.json')),

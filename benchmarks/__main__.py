@@ -20,6 +20,7 @@ USAGE = """usage: python -m benchmarks [NAME [options]]
   kjs        kinematic jumps against random sampling at finding minima
   kernels    the compiled likelihood against vectorised numpy
   nodes      images at the rate of a camera, through DDS
+  soak       nodes and files under load and fault
   smoothing  exactness, speed and peers of the smoother
   votes      which chain to flip or to search, by the vote that chooses it
 
@@ -30,7 +31,18 @@ Without a name all of them run. Every benchmark takes --json and --help.
 def main(argv: list[str]) -> int:
     """Runs one benchmark, or all; the exit code is that of the first that fails."""
     # Only now: they import numpy.
-    from benchmarks import bags, experts, flips, kernels, kjs, nodes, smoothing, tracking, votes
+    from benchmarks import (
+        bags,
+        experts,
+        flips,
+        kernels,
+        kjs,
+        nodes,
+        smoothing,
+        soak,
+        tracking,
+        votes,
+    )
 
     benchmarks = {
         'bags': bags.main,
@@ -40,6 +52,7 @@ def main(argv: list[str]) -> int:
         'kjs': kjs.main,
         'nodes': nodes.main,
         'smoothing': smoothing.main,
+        'soak': soak.main,
         'tracking': tracking.main,
         'votes': votes.main,
     }

@@ -57,21 +57,21 @@ def on_machine(machine: dict[str, Any]) -> str:
     return f'{machine["processor"]}, {machine["cores"]} cores; {versions}.'
 
 
-def peak_memory() -> float:
-    """Largest resident memory of this process since it began, or since `forget_peak`, bytes.
+def peak_memory(process: int | str = 'self') -> float:
+    """Largest resident memory of a process since it began, or since `forget_peak`, bytes.
 
     Not `ru_maxrss`: a process inherits that of the one that started it.
     """
-    lines = Path('/proc/self/status').read_text('utf-8').splitlines()
+    lines = Path(f'/proc/{process}/status').read_text('utf-8').splitlines()
     return 1024.0 * float(next(line.split()[1] for line in lines if line.startswith('VmHWM:')))
 
 
-def forget_peak() -> None:
+def forget_peak(process: int | str = 'self') -> None:
     """From now on `peak_memory` tells of what follows."""
-    Path('/proc/self/clear_refs').write_text('5', 'utf-8')
+    Path(f'/proc/{process}/clear_refs').write_text('5', 'utf-8')
 
 
-def resident_memory() -> float:
-    """Resident memory of this process now, bytes."""
-    pages = int(Path('/proc/self/statm').read_text('utf-8').split()[1])
+def resident_memory(process: int | str = 'self') -> float:
+    """Resident memory of a process now, bytes."""
+    pages = int(Path(f'/proc/{process}/statm').read_text('utf-8').split()[1])
     return float(pages * resource.getpagesize())

@@ -5,6 +5,8 @@
     python docs/generate.py flips          times in flips.md
     python docs/generate.py kjs            minima that samples find in sampling.md (minutes)
     python docs/generate.py kernels        times in likelihood.md
+    python docs/generate.py nodes          rates and latency of nodes in nodes.md (minutes)
+    python docs/generate.py soak           the table of robustness.md (ten minutes)
     python docs/generate.py smoothing      exactness and speed in smoothing.md (minutes)
     python docs/generate.py bags           rates and memory in bags.md (minutes)
     python docs/generate.py experts        experts.md (a quarter of an hour)
@@ -31,6 +33,8 @@ PAGES = {
     'smoother_node': 'nodes.md',
     'bme_node': 'nodes.md',
     'bags': 'bags.md',
+    'nodes': 'nodes.md',
+    'soak': 'robustness.md',
     'flips': 'flips.md',
     'kernels': 'likelihood.md',
     'kjs': 'sampling.md',
@@ -68,12 +72,25 @@ def with_part(page: str, name: str, content: str) -> str:
 
 def part(name: str) -> str:
     """The content of a part."""
-    if PAGES[name] == 'nodes.md':
+    if name.endswith('_node'):
         return parameter_table(name)
-    from benchmarks import bags, experts, flips, kernels, kjs, smoothing, tracking, votes
+    from benchmarks import (
+        bags,
+        experts,
+        flips,
+        kernels,
+        kjs,
+        nodes,
+        smoothing,
+        soak,
+        tracking,
+        votes,
+    )
 
     pages = {
         'bags': bags,
+        'nodes': nodes,
+        'soak': soak,
         'flips': flips,
         'kernels': kernels,
         'kjs': kjs,

@@ -19,6 +19,11 @@ from msg_tools.message_factory import MessageFactory
 # Number of coefficients that stand for no distortion.
 _COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 
+# A calibration beyond these is damage: focal lengths and the principal point in sizes of the
+# picture, and coefficients of the distortion.
+_FARTHEST = 1000.0
+_LARGEST_COEFFICIENT = 1e6
+
 
 class CameraInfoError(ValueError):
     """A camera info that gives no camera, in one line: what was seen and what was wanted."""
@@ -51,6 +56,7 @@ def camera_from_info(message: Any, image_size: tuple[int, int] | None = None) ->
         )
     model, coefficients = _distortion(str(message.distortion_model), d)
     x, y, width, height = _region(message)
+    _check_plausible(k, coefficients, max(width, height))
     binning_x, binning_y = max(int(message.binning_x), 1), max(int(message.binning_y), 1)
     width, height = width // binning_x, height // binning_y
     if width < 1 or height < 1:
@@ -74,6 +80,25 @@ def camera_from_info(message: Any, image_size: tuple[int, int] | None = None) ->
         )
     except ValueError as error:
         raise CameraInfoError(f'camera info: {error}') from error
+
+
+def _check_plausible(k: list[float], coefficients: tuple[float, ...], size: int) -> None:
+    """Raises CameraInfoError for numbers that no camera has, and that overflow when squared."""
+    low, high = size / _FARTHEST, size * _FARTHEST
+    if not (low < k[0] < high and low < k[4] < high):
+        raise CameraInfoError(
+            f'camera info: focal lengths are {k[0]:g} and {k[4]:g}, wanted {low:g} to {high:g} '
+            f'for {size} pixels'
+        )
+    if max(abs(k[2]), abs(k[5])) > high:
+        raise CameraInfoError(
+            f'camera info: principal point is ({k[2]:g}, {k[5]:g}), wanted at most {high:g}'
+        )
+    if any(abs(value) > _LARGEST_COEFFICIENT for value in coefficients):
+        raise CameraInfoError(
+            f'camera info: D has a coefficient of {max(coefficients, key=abs):g}, wanted at most '
+            f'{_LARGEST_COEFFICIENT:g}'
+        )
 
 
 def _distortion(model: str, coefficients: list[float]) -> tuple[str, tuple[float, ...]]:

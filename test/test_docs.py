@@ -41,6 +41,7 @@ NODES = {
 }
 # Programs that are not part of this repository.
 FOREIGN = {
+    'export',
     'sudo',
     'source',
     'rosdep',
@@ -49,7 +50,6 @@ FOREIGN = {
     'ros2',
     'rviz2',
     'sed',
-    'export',
     'git',
     'install/hmt_ros/lib/hmt_ros/filter_node',
 }

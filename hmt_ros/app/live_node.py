@@ -109,6 +109,9 @@ class LiveNode:
         inputs: topic and type by source, of what is published for it.
         topics: that it publishes.
         sensors: topics that it would take from sensors, which may lose data; a replay may not.
+        latched: inputs of which a subscriber that comes late wants the last message.
+        namespace: of the node and of all its topics, '/humans/bodies/7' for example.
+        module: that runs it; empty: the one in `hmt_ros.nodes` with its name.
         write: takes topic, stamp and bytes of all that the node publishes, in its order.
 
     Raises:
@@ -125,30 +128,46 @@ class LiveNode:
         inputs: Mapping[str, tuple[str, str]],
         topics: Mapping[str, PublishedTopic],
         sensors: tuple[str, ...] = (),
+        latched: tuple[str, ...] = (),
+        namespace: str = '',
+        module: str = '',
         write: Callable[[str, int, bytes], None],
     ) -> None:
         self.name = name
+        self.full_name = f'{namespace}/{name}'.strip('/')
+        self._namespace, self._module = namespace, module or f'hmt_ros.nodes.{name}'
         self._player, self._topics, self._write = player, topics, write
         self._arrived: dict[str, deque[bytes]] = {topic: deque() for topic in topics}
         self._answers: deque[bytes] = deque()
         self._process: subprocess.Popen[bytes] | None = None
-        self._open_topics(inputs)
+        self._open_topics(inputs, latched)
         opened.callback(self.stop)
         self._process = self._start(parameters, sensors)
 
     def publish(self, source: str, message: Any) -> None:
         """Hands a message over."""
-        self._publishers[source].publish(serialise(message))
+        self.publish_bytes(source, serialise(message))
 
-    def answer(self, source: str) -> Handled:
+    def publish_bytes(self, source: str, data: bytes) -> None:
+        """Hands over what may be a message."""
+        self._publishers[source].publish(data)
+
+    @property
+    def has_answered(self) -> bool:
+        """Whether `answer` would not wait for an answer."""
+        return bool(self._answers)
+
+    def answer(self, source: str, seconds: float = MESSAGE_SECONDS) -> Handled:
         """Waits for what became of the next message, and writes what it led to.
+
+        Args:
+            source: of the message.
+            seconds: that it may take.
 
         Raises:
             LiveNodeError: the node has ended, or does not answer.
         """
-        handled = self._handled(
-            self._next(self._answers, MESSAGE_SECONDS, f'an answer to a {source}')
-        )
+        handled = self._handled(self._next(self._answers, seconds, f'an answer to a {source}'))
         for topic, stamp in handled.published:
             data = self._next(self._arrived[topic], START_SECONDS, f'{topic} of {stamp} ns')
             # On its way a message may get bytes behind its end, up to a multiple of four.
@@ -164,13 +183,34 @@ class LiveNode:
         from lifecycle_msgs.msg import Transition
         from lifecycle_msgs.srv import ChangeState
 
-        client = self._player.node.create_client(ChangeState, f'{self.name}/change_state')
-        self._wait(client.service_is_ready, START_SECONDS, 'its services')
         transition = Transition(id=Transition.TRANSITION_DEACTIVATE)
-        future = client.call_async(ChangeState.Request(transition=transition))
-        self._wait(future.done, MESSAGE_SECONDS, 'its end')
-        if not future.result().success:
+        if not self.call(ChangeState, 'change_state', transition=transition).success:
             raise LiveNodeError(f'the {self.title} can not be deactivated: {self._last_words()}')
+
+    def call(self, kind: Any, service: str, **fields: Any) -> Any:
+        """The answer of one of its services, 'change_state' for example.
+
+        Raises:
+            LiveNodeError: none comes.
+        """
+        client = self._player.node.create_client(kind, f'/{self.full_name}/{service}')
+        try:
+            self._wait(client.service_is_ready, START_SECONDS, f'its service {service}')
+            future = client.call_async(kind.Request(**fields))
+            self._wait(future.done, MESSAGE_SECONDS, f'an answer of {service}')
+            return future.result()
+        finally:
+            self._player.node.destroy_client(client)
+
+    @property
+    def process(self) -> subprocess.Popen[bytes]:
+        """In which it runs."""
+        assert self._process is not None
+        return self._process
+
+    def output(self) -> str:
+        """All that it has written to its console."""
+        return self._output.read_text('utf-8', 'replace')
 
     @property
     def title(self) -> str:
@@ -223,7 +263,7 @@ class LiveNode:
         """
 
         def connected() -> bool:
-            values = self._player.diagnostics.get(self.name, {})
+            values = self._player.diagnostics.get(self.full_name, {})
             return all(int(values.get(f'{SUBSCRIBERS}{x}', '0')) >= count for x in topics)
 
         self._wait(
@@ -262,13 +302,15 @@ class LiveNode:
         for topic in sensors:
             values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
         lines = [f'    {name}: {text}' for name, text in values.items()]
-        file = self._player.folder / f'{self.name}.yaml'
+        file = self._player.folder / f'{self._file_name}.yaml'
         file.write_text('\n'.join(['/**:', '  ros__parameters:', *lines, '']), encoding='utf-8')
         sources = str(Path(hmt_ros.__file__).resolve().parents[1])
-        command = [sys.executable, '-m', f'hmt_ros.nodes.{self.name}']
+        command = [sys.executable, '-m', self._module, '--ros-args', '--params-file', str(file)]
+        if self._namespace:
+            command += ['-r', f'__ns:={self._namespace}']
         with self._output.open('wb') as output:
             return subprocess.Popen(
-                [*command, '--ros-args', '--params-file', str(file)],
+                command,
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -279,6 +321,8 @@ class LiveNode:
                         [sources, *filter(None, [os.environ.get('PYTHONPATH')])]
                     ),
                     'ROS_LOG_DIR': str(self._player.folder),
+                    # As `hmt_ros.nodes.session_node.OWNER`: a killed replay leaves no nodes.
+                    'HMT_ROS_OWNER': str(os.getpid()),
                 },
                 # The interrupt key is for this process; it stops the node itself.
                 start_new_session=True,
@@ -286,33 +330,44 @@ class LiveNode:
 
     @property
     def _output(self) -> Path:
-        return self._player.folder / f'{self.name}.output'
+        return self._player.folder / f'{self._file_name}.output'
 
-    def _open_topics(self, inputs: Mapping[str, tuple[str, str]]) -> None:
+    @property
+    def _file_name(self) -> str:
+        return self.full_name.replace('/', '.')
+
+    def _topic(self, name: str) -> str:
+        return name if name.startswith('/') else f'{self._namespace}/{name}'
+
+    def _open_topics(self, inputs: Mapping[str, tuple[str, str]], latched: tuple[str, ...]) -> None:
         from lifecycle_msgs.srv import GetState
 
         player, node = self._player, self._player.node
         self._publishers = {
-            source: node.create_publisher(player.classes[msgtype], topic, player.reliable)
+            source: node.create_publisher(
+                player.classes[msgtype],
+                self._topic(topic),
+                player.latched if source in latched else player.reliable,
+            )
             for source, (topic, msgtype) in inputs.items()
         }
         for topic, published in self._topics.items():
             node.create_subscription(
                 player.classes[published.msgtype],
-                topic,
+                self._topic(topic),
                 _into(self._arrived[topic]),
                 player.latched if published.latched else player.reliable,
                 raw=True,
             )
         node.create_subscription(
             player.classes['diagnostic_msgs/msg/DiagnosticStatus'],
-            f'{self.name}/handled',
+            f'/{self.full_name}/handled',
             _into(self._answers),
             player.reliable,
             raw=True,
         )
         # The last of all: discovery tells the node of the topics above before it tells of this.
-        self._state = node.create_client(GetState, f'{self.name}/get_state')
+        self._state = node.create_client(GetState, f'/{self.full_name}/get_state')
         self._state_request = GetState.Request()
 
     def _next(self, queue: deque[bytes], seconds: float, what: str) -> bytes:
@@ -337,8 +392,7 @@ class LiveNode:
 
     def _last_words(self) -> str:
         """The last line that the node has written."""
-        text = self._output.read_text('utf-8', 'replace')
-        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        lines = [line.strip() for line in self.output().splitlines() if line.strip()]
         return lines[-1] if lines else 'it has said nothing'
 
     def _handled(self, data: bytes) -> Handled:

@@ -18,6 +18,8 @@ DISTORTION_MODELS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,), 'equid
 
 # Points nearer than this in front of the camera plane are not projected sensibly, m.
 NEAR = 0.01
+# Tangent beyond which no ray is looked for when distortion is undone.
+STEEPEST = 1e3
 
 
 @dataclass(frozen=True)
@@ -135,12 +137,14 @@ class Camera:
                 error = value - target
                 det = inner[0][0] * inner[1][1] - inner[0][1] * inner[1][0]
                 det = np.where(np.abs(det) > 1e-9, det, 1.0)
-                ab = ab - np.stack(
+                step = np.stack(
                     [
                         (inner[1][1] * error[0] - inner[0][1] * error[1]) / det,
                         (inner[0][0] * error[1] - inner[1][0] * error[0]) / det,
                     ]
                 )
+                # Where the model has no such ray, iterations must not run away.
+                ab = np.clip(ab - step, -STEEPEST, STEEPEST)
         rays = np.stack([ab[0], ab[1], np.ones_like(ab[0])], axis=-1)
         result: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         return result

@@ -8,6 +8,8 @@ arrays under a prefix: `nested` and `part`.
 from __future__ import annotations
 
 import json
+import os
+import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -85,7 +87,7 @@ def damaged(where: str, fault: Exception) -> ValueError:
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
-    """Writes an archive; the same arrays give the same bytes.
+    """Writes an archive, whole or not at all; the same arrays give the same bytes.
 
     Args:
         path: of the file; '.npz' is appended where it is missing.
@@ -98,8 +100,16 @@ def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
     if path.suffix != '.npz':
         path = path.with_name(path.name + '.npz')
     content: dict[str, Any] = dict(arrays)
-    with path.open('wb') as file:
-        np.savez_compressed(file, **content)
+    partial = path.with_name(f'.{path.name}.{secrets.token_hex(4)}.partial')
+    try:
+        with partial.open('xb') as file:
+            np.savez_compressed(file, **content)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
     return path
 
 
@@ -119,6 +129,12 @@ def read_arrays(path: str | Path, kind: str | None = None) -> Arrays:
         text = ' '.join(str(fault).split())
         raise ValueError(f'{path}: not a model file of hmt_ros ({text})') from fault
     check_header(arrays, kind, str(path))
+    for name, values in arrays.items():
+        if values.dtype.kind == 'f' and not np.isfinite(values).all():
+            raise ValueError(
+                f'{path}: a damaged model file ({name} has values that are not finite); '
+                'train it again'
+            )
     return arrays
 
 

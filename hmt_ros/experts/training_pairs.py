@@ -39,10 +39,17 @@ class Standardisation:
 
     Attributes:
         centre, scale: (p,) each; scales are positive.
+
+    Raises:
+        ValueError: a scale that is not.
     """
 
     centre: Array
     scale: Array
+
+    def __post_init__(self) -> None:
+        if not (self.scale > 0).all():
+            raise ValueError(f'scales must be positive, saw {np.min(self.scale)}')
 
     @classmethod
     def of(cls, values: Array, weights: Array, scaling: str = 'each') -> Standardisation:

@@ -7,6 +7,7 @@ array could claim one: both are looked at before memory is spent.
 from __future__ import annotations
 
 import math
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ _FAULTS = (
     zipfile.BadZipFile,
     zipfile.LargeZipFile,
     zlib.error,
+    struct.error,
     KeyError,
     EOFError,
     AttributeError,

@@ -60,6 +60,9 @@ from msg_tools.error_line import error_line
 # Small messages that wait while an estimate is made.
 SMALL_QUEUE = 100
 
+# Names, in the environment, the process without which a node ends.
+OWNER = 'HMT_ROS_OWNER'
+
 _RESTART = 'restart'
 # An active node that is sent nothing for so long says so, s.
 _SILENCE = 3.0
@@ -521,9 +524,10 @@ def run(name: str, make: Callable[[], SessionNode], args: list[str] | None = Non
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     node.start()
-    while not stopped.is_set():
-        # A signal does not wake who waits for messages.
-        executor.spin_once(timeout_sec=0.2)
+    # Whoever started a node for a while, and was killed, can not end it any more.
+    owner = os.environ.get(OWNER)
+    while not stopped.is_set() and owner in (None, str(os.getppid())):
+        _spin_once(executor, node)
     if not node.stop(_LAST_ESTIMATE):
         sys.stderr.flush()
         os._exit(0)
@@ -531,6 +535,16 @@ def run(name: str, make: Callable[[], SessionNode], args: list[str] | None = Non
     node.destroy_node()
     rclpy.try_shutdown()
     return 0
+
+
+def _spin_once(executor: SingleThreadedExecutor, node: SessionNode) -> None:
+    try:
+        # A signal does not wake who waits for messages.
+        executor.spin_once(timeout_sec=0.2)
+    except Exception as error:  # noqa: BLE001
+        # rclpy itself raises where /clock goes below zero, for example: the node lives.
+        text = f'{type(error).__name__}: {error_line(error)}'
+        node.get_logger().error(f'a callback failed: {text}', throttle_duration_sec=1.0)
 
 
 def _descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:

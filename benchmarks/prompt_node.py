@@ -1,0 +1,51 @@
+"""bme_node with an estimate that costs nothing: what is left is what ROS adds to an image.
+
+    python -m benchmarks.prompt_node --ros-args --params-file FILE
+
+Everything else is the real node: subscription, queue, the thread that estimates, decoding of the
+image, and the message of a mixture of the usual size.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from hmt_ros.body import Camera
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.nodes.bme_node import NAME, BmeNode
+from hmt_ros.nodes.bme_session import BmeSession
+from hmt_ros.nodes.camera_input import WaitingImage
+from hmt_ros.nodes.handled import Output
+from hmt_ros.nodes.session_node import run
+
+
+class PromptSession(BmeSession):
+    """Says the same of every image."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        body, count = self._predictor.body, self.parameters.max_hypotheses
+        means = np.tile(body.prior_mean, (count, 1))
+        means[:, 2] = 4.0
+        covariances = np.tile(1e-2 * np.eye(body.dimension), (count, 1, 1))
+        self._said = GaussianMixture(np.full(count, 1.0 / count), means, covariances)
+
+    def _mixture_of(self, waiting: WaitingImage, camera: Camera) -> GaussianMixture:
+        return self._said
+
+
+class PromptNode(BmeNode):
+    """The node."""
+
+    def _new_session(
+        self, publish: Callable[[Output], None], wanted: Callable[[str], bool]
+    ) -> BmeSession:
+        return PromptSession(self._settings, publish, wanted)
+
+
+if __name__ == '__main__':
+    sys.exit(run(NAME, PromptNode))

@@ -1,0 +1,191 @@
+"""The soak of files: random and damaged YAML, model files and pictures into what reads them."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from benchmarks.machine import forget_peak, peak_memory, resident_memory
+from benchmarks.mutations import damaged
+from benchmarks.soak_messages import place, warnings_as_errors
+from benchmarks.soak_outcome import Amount, Outcome
+from benchmarks.soak_scenes import CLIP, ROOT
+from hmt_ros.body import load_body
+from hmt_ros.experts.shipped_models import load_predictor
+from hmt_ros.nodes.declared_parameters import with_values
+from hmt_ros.nodes.filter_parameters import FilterParameters
+from hmt_ros.nodes.parameter_file import read_parameter_file
+from hmt_ros.nodes.picture_file import read_picture
+from hmt_ros.tracking import read_subject
+
+# What breaks a value of a file of text.
+_WORDS = (
+    '', 'null', '.nan', '-.inf', '1e999', '-1', '0', '[]', '{}', "''", '!!python/name:os.system',
+    '&a [*a]', '999999999999999999999', 'yes', '[[1, 2], 3]', '{a: b}', '2024-01-01', '\t', ': ',
+    '%', '"', '- - -', '\ud7ff', '\x00',
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A kind of file.
+
+    Attributes:
+        name: of it.
+        suffix: of its name.
+        valid: a good one.
+        damage: makes bad ones of it.
+        read: what a node or a command does with it.
+    """
+
+    name: str
+    suffix: str
+    valid: bytes
+    damage: Callable[[bytes, np.random.Generator], bytes]
+    read: Callable[[Path], Any]
+
+
+def files(amount: Amount) -> Iterator[Outcome]:
+    """Every kind of file that is read, damaged: it is used, or refused with one line."""
+    kinds = _kinds()
+    with TemporaryDirectory(prefix='hmt_ros.') as folder:
+        for kind in kinds:
+            with warnings_as_errors():
+                outcome = _read_damaged(kind, Path(folder), amount.part(1.0 / len(kinds)))
+            yield outcome
+
+
+def _kinds() -> list[_Kind]:
+    body = load_body('human37')
+    config = (ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml').read_bytes()
+    subject = (CLIP / 'subject.yaml').read_bytes()
+    models = ROOT / 'hmt_ros' / 'experts' / 'models'
+    human = (ROOT / 'hmt_ros' / 'body' / 'models' / 'human37.yaml').read_bytes()
+
+    def parameters(path: Path) -> Any:
+        return with_values(FilterParameters(), read_parameter_file(path, 'filter_node'))
+
+    def posed(path: Path) -> Any:
+        found = load_body(str(path))
+        return found.joint_positions(found.prior_mean[None])
+
+    model = (models / 'procedural.npz').read_bytes()
+    return [
+        _Kind('parameter files', '.yaml', config, _damaged_text, parameters),
+        _Kind('subject files', '.yaml', subject, _damaged_text, lambda x: read_subject(x, body)),
+        _Kind('bodies', '.yaml', human, _damaged_text, posed),
+        _Kind('model files, bytes', '.npz', model, damaged, load_predictor),
+        _Kind('model files, arrays', '.npz', model, _damaged_arrays, load_predictor),
+        _Kind(
+            'pictures', '.png', (CLIP / 'background.png').read_bytes(), damaged,
+            lambda x: read_picture(str(x)),
+        ),
+    ]  # fmt: skip
+
+
+def _read_damaged(kind: _Kind, folder: Path, amount: Amount) -> Outcome:
+    outcome = Outcome(kind.name, 'damaged, and read')
+    rng = np.random.default_rng(0)
+    path = folder / f'file{kind.suffix}'
+    path.write_bytes(kind.valid)
+    kind.read(path)
+    forget_peak()
+    before = resident_memory()
+    for _ in amount.counted():
+        path.write_bytes(kind.damage(kind.valid, rng))
+        outcome.times += 1
+        try:
+            kind.read(path)
+        except (ValueError, OSError) as error:
+            outcome.refused += 1
+            if '\n' in str(error):
+                outcome.fault(f'more than one line: {place(error)}')
+        except Exception as error:  # noqa: BLE001
+            outcome.fault(place(error))
+    outcome.growth_mb = (peak_memory() - before) / 1e6
+    path.write_bytes(kind.valid)
+    kind.read(path)
+    return outcome
+
+
+def _damaged_text(data: bytes, rng: np.random.Generator) -> bytes:
+    """Damaged bytes, or lines that were changed, lost, doubled or exchanged."""
+    if rng.random() < 0.3:
+        return damaged(data, rng)
+    lines = data.decode().split('\n')
+    content = [i for i, line in enumerate(lines) if line.strip() and line.lstrip()[0] != '#']
+    for _ in range(int(rng.integers(1, 4))):
+        at, other = (int(rng.choice(content)) for _ in range(2))
+        word = _WORDS[int(rng.integers(0, len(_WORDS)))]
+        kind = int(rng.integers(0, 6))
+        if kind <= 1:
+            lines[at] = f'{lines[at].partition(":")[0]}: {word}'
+        elif kind == 2:
+            lines[at] = ''
+        elif kind == 3:
+            lines[at] = f'{lines[at]}\n{lines[at]}'
+        elif kind == 4:
+            lines[at], lines[other] = lines[other], lines[at]
+        else:
+            lines[at] = f'{lines[at]} {word}'
+    return '\n'.join(lines).encode('utf-8', 'replace')
+
+
+def _damaged_arrays(data: bytes, rng: np.random.Generator) -> bytes:
+    """A whole archive with arrays that are missing, of another shape or type, or other numbers."""
+    with np.load(io.BytesIO(data)) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    names = sorted(arrays)
+    for _ in range(int(rng.integers(1, 4))):
+        name = names[int(rng.integers(0, len(names)))]
+        if name not in arrays:
+            continue
+        arrays[name] = _damaged_array(arrays[name], rng)
+        if rng.random() < 0.1:
+            del arrays[name]
+    target = io.BytesIO()
+    np.savez(target, **arrays)
+    if rng.random() < 0.1:
+        return _with_member(target.getvalue(), names, rng)
+    return target.getvalue()
+
+
+def _damaged_array(values: Any, rng: np.random.Generator) -> Any:
+    kind = int(rng.integers(0, 8))
+    if kind == 0:
+        return values.reshape(-1)
+    if kind == 1:
+        return values[..., None]
+    if kind == 2:
+        return np.zeros(0, values.dtype)
+    if kind == 3:
+        return values.astype('U') if values.dtype.kind != 'U' else np.array(7)
+    if values.dtype.kind == 'f' and values.size:
+        wrong = np.array(values)
+        wrong.flat[int(rng.integers(0, wrong.size))] = (np.nan, np.inf, -6e4, 0.0)[kind - 4]
+        return wrong
+    if values.dtype.kind in 'iu' and values.size:
+        wrong = np.array(values)
+        wrong.flat[int(rng.integers(0, wrong.size))] = (-1, 0, 2**30, 1)[kind - 4]
+        return wrong
+    if values.dtype.kind == 'U':
+        return np.array(damaged(str(values).encode(), rng).decode('utf-8', 'replace'))
+    return values[:1] if values.ndim else values
+
+
+def _with_member(data: bytes, names: list[str], rng: np.random.Generator) -> bytes:
+    """An archive with a member whose header lies about what follows."""
+    target = io.BytesIO(data)
+    with zipfile.ZipFile(target, 'a') as archive:
+        shape = (2**40,) if rng.random() < 0.5 else (-1, 3)
+        header = repr({'descr': '<f8', 'fortran_order': False, 'shape': shape}).encode() + b'\n'
+        content = b'\x93NUMPY\x01\x00' + len(header).to_bytes(2, 'little') + header + b'abc'
+        archive.writestr(f'{names[0]}x.npy', content)
+    return target.getvalue()

@@ -1,0 +1,233 @@
+"""The soak without DDS: random and damaged messages into the sessions behind the nodes."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis.strategies import booleans
+
+from benchmarks.machine import forget_peak, peak_memory, resident_memory
+from benchmarks.mutations import damaged, messages_of
+from benchmarks.soak_outcome import Amount, Outcome
+from benchmarks.soak_scenes import Scene, scenes, stamped
+from hmt_ros.body import load_body
+from hmt_ros.nodes.filter_session import PREDICTION, FilterSession
+from hmt_ros.nodes.session import Session
+from hmt_ros.nodes.smoother_session import SmootherSession
+from hmt_ros.nodes.track_start import prepare_start
+from msg_tools.cdr import deserialise, serialise
+from msg_tools.error_line import error_line
+
+# Share of the messages that hypothesis makes up by their type, which takes longer than damage.
+_MADE_UP = 0.05
+# So many damaged messages, then a valid one, which has to be used.
+_BETWEEN = 200
+# A session is replaced after so many: damage may have put it where little more can happen.
+_LIFE = 500
+
+
+def messages(amount: Amount) -> Iterator[Outcome]:
+    """Messages through every subscriber and service of every node."""
+    count = len(scenes())
+    for scene in scenes().values():
+        with warnings_as_errors():
+            outcome = _through(scene, amount.part(1.0 / count))
+        yield outcome
+
+
+@contextmanager
+def warnings_as_errors() -> Iterator[None]:
+    """What our code warns of is a fault; what libraries say of damaged pictures is nobody's."""
+    with warnings.catch_warnings(), Path(os.devnull).open('w') as nothing:
+        warnings.simplefilter('error', RuntimeWarning)
+        sys.stderr.flush()
+        kept = os.dup(2)
+        os.dup2(nothing.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+
+
+def _through(scene: Scene, amount: Amount) -> Outcome:
+    outcome = Outcome(scene.node, 'random and damaged messages, in process')
+    fed = _Fed(scene, outcome)
+    fed.check()
+    forget_peak()
+    before = resident_memory()
+    _damage(fed, amount.part(1.0 - _MADE_UP))
+    _make_up(fed, amount.part(_MADE_UP))
+    outcome.growth_mb = (peak_memory() - before) / 1e6
+    return outcome
+
+
+class _Fed:
+    """A session, and what it is given.
+
+    Args:
+        scene: of the node.
+        outcome: what is told of it.
+    """
+
+    def __init__(self, scene: Scene, outcome: Outcome) -> None:
+        self.scene, self.outcome = scene, outcome
+        self._published: list[Any] = []
+        self._lives = 0
+        self._begin()
+
+    @property
+    def asked(self) -> str:
+        """The source whose type its service takes."""
+        return PREDICTION if PREDICTION in self.valid else self.scene.counted
+
+    def take(self, source: str, data: bytes) -> None:
+        """Gives it bytes as its node would."""
+        self.outcome.times += 1
+        if self.outcome.times % _LIFE == 0:
+            self._begin()
+        try:
+            message = deserialise(data, self.valid[source].__msgtype__)
+        except Exception as error:  # noqa: BLE001
+            # As in the node: generated code does not say what it may raise.
+            self.outcome.refused += 1
+            self.session.refuse(source, error_line(error))
+            return
+        try:
+            handled = self.session.take(source, message)
+        except Exception as error:  # noqa: BLE001
+            self.outcome.fault(f'{source}: {place(error)}')
+            self._begin()
+            return
+        self.outcome.refused += bool(handled.faults)
+        self._compare(handled.published)
+
+    def ask(self, data: bytes) -> None:
+        """Gives bytes to its service."""
+        self.outcome.times += 1
+        try:
+            message = deserialise(data, self.valid[self.asked].__msgtype__)
+        except Exception:  # noqa: BLE001
+            self.outcome.refused += 1
+            return
+        try:
+            ask(self.session, message)
+        except (ValueError, ArithmeticError):
+            self.outcome.refused += 1
+        except Exception as error:  # noqa: BLE001
+            self.outcome.fault(f'service: {place(error)}')
+
+    def check(self) -> None:
+        """Damage is over: a valid message has to be used, of a fresh stream at the latest."""
+        for attempt in range(2):
+            if attempt:
+                # What came before may have left a track that fits nothing, or a stamp of the
+                # future.
+                self._begin()
+            for source, message in self.scene.prelude:
+                self.session.take(source, message)
+            self._next += 1
+            handled = self.session.take(self.scene.counted, self.scene.message(self._next))
+            self._published.clear()
+            if not handled.faults:
+                return
+        self.outcome.fault(f'a valid message is refused: {handled.faults[0]}')
+
+    def _begin(self) -> None:
+        changes = self.scene.variants[self._lives % len(self.scene.variants)]
+        self._lives += 1
+        self._next = 0
+        self.valid = self.scene.valid(changes.get('image_transport', ''))
+        parameters = replace(self.scene.parameters, **changes)
+        self.session: Session = self.scene.session(parameters, self._published.append)
+
+    def _compare(self, told: tuple[tuple[str, int], ...]) -> None:
+        """What is said to be published is, and can be read."""
+        made = tuple((output.topic, output.stamp_ns) for output in self._published)
+        if told != made:
+            self.outcome.lost += len(set(told) - set(made)) or 1
+        for output in self._published:
+            deserialise(output.data, self.scene.topics[output.topic].msgtype)
+        self._published.clear()
+
+
+def ask(session: Any, message: Any) -> None:
+    """What the service of a node does with a message.
+
+    Raises:
+        ValueError, ArithmeticError: a clean refusal.
+    """
+    if isinstance(session, FilterSession):
+        prepare_start(session.parameters, message, session.state.body)
+    elif isinstance(session, SmootherSession):
+        stamp = message.header.stamp
+        session.smooth_span(stamp.sec, stamp.nanosec)
+    else:
+        session.predict_once(message)
+
+
+def _damage(fed: _Fed, amount: Amount) -> None:
+    rng = np.random.default_rng(0)
+    for number in amount.counted():
+        if number % _BETWEEN == 0:
+            fed.check()
+        sources = [*fed.valid, '']
+        chosen = sources[int(rng.integers(0, len(sources)))]
+        if chosen:
+            fed.take(chosen, damaged(serialise(fed.valid[chosen]), rng))
+        else:
+            fed.ask(damaged(serialise(fed.valid[fed.asked]), rng))
+    fed.check()
+
+
+def _make_up(fed: _Fed, amount: Amount) -> None:
+    words = _words()
+    sources = dict(fed.valid)
+    for source, valid in sources.items():
+        msgtype = valid.__msgtype__
+        part = amount.part(1.0 / len(sources))
+
+        @seed(0)
+        @settings(
+            max_examples=part.times,
+            database=None,
+            deadline=None,
+            phases=[Phase.generate],
+            suppress_health_check=list(HealthCheck),
+        )
+        @given(messages_of(msgtype, words), booleans())
+        def give(message: Any, in_time: bool) -> None:
+            if in_time:
+                message = stamped(message, fed.scene.stamp(fed.outcome.times))
+            if fed.valid[source].__msgtype__ == msgtype:  # noqa: B023
+                fed.take(source, serialise(message))  # noqa: B023
+
+        give()
+        fed.check()
+
+
+def _words() -> tuple[str, ...]:
+    body = load_body('human37')
+    return (
+        *body.dof_names, *body.joint_names[:6], body.name, 'plumb_bob', 'equidistant', 'bgr8',
+        'mono8', 'rgba16', 'nv12', 'jpeg', 'png',
+    )  # fmt: skip
+
+
+def place(error: BaseException) -> str:
+    """What was raised, and where in our code."""
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [x for x in frames if any(name in x.filename for name in ('/hmt_ros/', '/msg_tools/'))]
+    at = ours[-1] if ours else frames[-1]
+    where = f'{at.name} of {at.filename.rpartition("/")[2]}'
+    return f'{type(error).__name__} in {where}, {error_line(error)[:100]}'

@@ -1,0 +1,80 @@
+"""What a case of the soak reports, and how long it may take."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+# What a case may need of memory beyond what the process had before, MB.
+MOST_GROWTH = 150.0
+# Faults that are told of a case; the others are counted.
+_TOLD = 5
+
+
+@dataclass
+class Outcome:
+    """What came of one case.
+
+    Attributes:
+        of: what it was done to: a node, or a kind of file.
+        done: what was done.
+        times: how often.
+        refused: how often the answer was a clean error.
+        lost: what had been acknowledged and is not there.
+        growth_mb: of the peak of resident memory; None: not measured.
+        faults: what went wrong otherwise; empty: alive, or a clean error, every time.
+    """
+
+    of: str
+    done: str
+    times: int = 0
+    refused: int = 0
+    lost: int = 0
+    growth_mb: float | None = None
+    faults: list[str] = field(default_factory=list)
+
+    def fault(self, text: str) -> None:
+        """Tells of something that must not be; the same thing once."""
+        if text not in self.faults:
+            self.faults.append(text)
+
+    @property
+    def met(self) -> bool:
+        """Whether nothing was lost and nothing went wrong."""
+        return not self.lost and not self.faults and (self.growth_mb or 0.0) <= MOST_GROWTH
+
+    def told(self) -> str:
+        """'met', or what was not."""
+        texts = [f'{self.lost} lost'] if self.lost else []
+        if (self.growth_mb or 0.0) > MOST_GROWTH:
+            texts.append(f'wanted at most {MOST_GROWTH:g} MB')
+        texts += self.faults[:_TOLD]
+        if len(self.faults) > _TOLD:
+            texts.append(f'{len(self.faults) - _TOLD} other faults')
+        return '; '.join(texts) or 'met'
+
+
+@dataclass(frozen=True)
+class Amount:
+    """How much of a case is to be done.
+
+    Attributes:
+        times: how often, if time allows.
+        seconds: that it may take.
+    """
+
+    times: int
+    seconds: float
+
+    def counted(self) -> Iterator[int]:
+        """Numbers from 0, until it is enough."""
+        end = time.monotonic() + self.seconds
+        for number in range(self.times):
+            yield number
+            if time.monotonic() > end:
+                return
+
+    def part(self, share: float) -> Amount:
+        """A share of it."""
+        return Amount(max(1, round(share * self.times)), share * self.seconds)

@@ -1,0 +1,234 @@
+"""What each node is given in the soak: parameters, topics, and valid messages without end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hmt_ros.body import load_body
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
+from hmt_ros.nodes.bme_parameters import BmeParameters
+from hmt_ros.nodes.bme_session import BmeSession
+from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.nodes.filter_parameters import FilterParameters
+from hmt_ros.nodes.filter_session import KEYPOINTS, PREDICTION, FilterSession
+from hmt_ros.nodes.published_topic import PublishedTopic
+from hmt_ros.nodes.session import Session
+from hmt_ros.nodes.smoother_parameters import SmootherParameters
+from hmt_ros.nodes.smoother_session import BODY, MIXTURE, SmootherSession
+from hmt_ros.tracking import TrackerSettings
+from msg_tools import BagReader, RosbagsMessages
+from msg_tools.bodies import message_of_body
+from msg_tools.headers import header_message, time_ns
+from msg_tools.images import decode_image, image_message
+from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+
+ROOT = Path(__file__).resolve().parents[1]
+CLIP = ROOT / 'bags' / 'reach'
+STEP_NS = 100_000_000
+_SMALL = TrackerSettings(max_hypotheses=2, candidates=4, combinations=16)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A node and what it is fed with.
+
+    Attributes:
+        node: its name.
+        parameters: of the node.
+        session: what stands behind its topics.
+        inputs: topic and type by source.
+        sensors: topics on which data may be lost unless a player asks for better.
+        topics: that it publishes.
+        prelude: source and message of what has to come first.
+        counted: the source that gives the tempo.
+        pictures: messages of that source.
+        others: a valid message of each other source.
+        start_ns: stamp of the first.
+        variants: other parameters, with which more of what comes is looked at.
+    """
+
+    node: str
+    parameters: Any
+    session: Callable[..., Session]
+    inputs: Mapping[str, tuple[str, str]]
+    sensors: tuple[str, ...]
+    topics: Mapping[str, PublishedTopic]
+    prelude: tuple[tuple[str, Any], ...]
+    counted: str
+    pictures: tuple[Any, ...]
+    others: Mapping[str, Any]
+    start_ns: int
+    variants: tuple[Mapping[str, Any], ...]
+
+    def message(self, index: int) -> Any:
+        """A message of the counted source; stamps grow with the index."""
+        return stamped(self._picture(index), self.stamp(index))
+
+    def stamp(self, index: int) -> int:
+        """Of a message, ns."""
+        return self.start_ns + index * STEP_NS
+
+    def valid(self, image_transport: str = '') -> dict[str, Any]:
+        """A valid message of each source; images of the transport that is named."""
+        message = self.message(0)
+        if image_transport == 'raw':
+            picture, header = decode_image(message), message.header
+            message = image_message(
+                RosbagsMessages(), picture, time_ns(header.stamp), str(header.frame_id)
+            )
+        return {**self.others, self.counted: message}
+
+    def _picture(self, index: int) -> Any:
+        count = len(self.pictures)
+        at = index % max(2 * count - 2, 1)
+        return self.pictures[at if at < count else 2 * count - 2 - at]
+
+
+def stamped(message: Any, stamp_ns: int) -> Any:
+    """The same message with another stamp."""
+    header = header_message(RosbagsMessages(), stamp_ns, str(message.header.frame_id))
+    return replace(message, header=header)
+
+
+@cache
+def scenes() -> dict[str, Scene]:
+    """One of each node."""
+    return {scene.node: scene for scene in (_filter(), _smoother(), _bme())}
+
+
+@cache
+def _clip() -> tuple[Any, tuple[Any, ...]]:
+    with BagReader(CLIP) as bag:
+        info = next(bag.messages([bag.find_topic(['sensor_msgs/msg/CameraInfo']).name])).message
+        topic = bag.find_topic(['sensor_msgs/msg/CompressedImage']).name
+        return info, tuple(stored.message for stored in bag.messages([topic]))
+
+
+_CAMERA = {
+    CAMERA_INFO: ('camera_info', 'sensor_msgs/msg/CameraInfo'),
+    IMAGE: ('image/compressed', 'sensor_msgs/msg/CompressedImage'),
+}
+_CAMERA_TOPICS = ('/image/compressed', '/camera_info')
+
+
+def _filter() -> Scene:
+    info, images = _clip()
+    start = time_ns(images[0].header.stamp)
+    return Scene(
+        'filter_node',
+        FilterParameters(
+            subject_file=str(CLIP / 'subject.yaml'),
+            background_file=str(CLIP / 'background.png'),
+            image_transport='compressed',
+            tracker=_SMALL,
+        ),
+        FilterSession,
+        {
+            **_CAMERA,
+            KEYPOINTS: ('keypoints', 'hmt_msgs/msg/Keypoints2D'),
+            PREDICTION: ('pose_prediction', 'hmt_msgs/msg/PoseMixture'),
+        },
+        (*_CAMERA_TOPICS, '/keypoints'),
+        track_messages.TOPICS,
+        ((CAMERA_INFO, info),),
+        IMAGE,
+        images,
+        {
+            CAMERA_INFO: info,
+            KEYPOINTS: _keypoints(start),
+            PREDICTION: _mixture(0, MixtureKind.PREDICTION),
+        },
+        start,
+        (
+            {},
+            {'subject_file': '', 'image_transport': 'raw', 'reset_on_time_jump': True},
+            {'subject_file': '', 'use_keypoints': True, 'reset_on_time_jump': True},
+            {'subject_file': '', 'background_file': '', 'reset_on_time_jump': True},
+            {'subject_file': '', 'use_predictions': True, 'prediction_timeout': 0.0},
+        ),
+    )
+
+
+def _bme() -> Scene:
+    info, images = _clip()
+    return Scene(
+        'bme_node',
+        BmeParameters(background_file=str(CLIP / 'background.png'), image_transport='compressed'),
+        BmeSession,
+        _CAMERA,
+        _CAMERA_TOPICS,
+        bme_session.TOPICS,
+        ((CAMERA_INFO, info),),
+        IMAGE,
+        images,
+        {CAMERA_INFO: info},
+        time_ns(images[0].header.stamp),
+        (
+            {},
+            {'image_transport': 'raw', 'reset_on_time_jump': True},
+            {'propagate': True, 'reset_on_time_jump': True},
+            {'background_file': '', 'background_images': 2},
+        ),
+    )
+
+
+def _smoother() -> Scene:
+    body = message_of_body(RosbagsMessages(), load_body('human37'), 10**18, 'lens')
+    return Scene(
+        'smoother_node',
+        SmootherParameters(max_trajectories=4, window_length=8, queue_size=5),
+        SmootherSession,
+        {
+            BODY: ('body', 'hmt_msgs/msg/Body'),
+            MIXTURE: ('likelihood_mixture', 'hmt_msgs/msg/PoseMixture'),
+        },
+        (),
+        smoothed_messages.TOPICS,
+        ((BODY, body),),
+        MIXTURE,
+        tuple(_mixture(index, MixtureKind.LIKELIHOOD) for index in range(10)),
+        {BODY: body},
+        10**18,
+        ({}, {'reset_on_time_jump': True}, {'body_model': 'human37', 'fixed_lag': 0}),
+    )
+
+
+def _mixture(index: int, kind: MixtureKind) -> Any:
+    """Two modes of somebody who raises a forearm."""
+    body = load_body('human37')
+    means = np.tile(body.prior_mean, (2, 1))
+    means[:, 2] = 4.0
+    elbow = body.dof_names.index('left_elbow')
+    means[:, elbow] = (0.5 + 0.05 * index, 1.3 + 0.05 * index)
+    covariances = np.tile(1e-3 * np.eye(body.dimension), (2, 1, 1))
+    mixture = GaussianMixture(np.array([0.6, 0.4]), means, covariances)
+    content = PoseMixture(
+        mixture=mixture,
+        body_model=body.name,
+        dof_names=body.dof_names,
+        joint_names=body.joint_names,
+        joint_positions=body.joint_positions(means),
+        kind=kind,
+        stamp_ns=10**18,
+        frame_id='lens',
+    )
+    return pose_mixture_message(RosbagsMessages(), content)
+
+
+def _keypoints(stamp_ns: int) -> Any:
+    messages = RosbagsMessages()
+    names = ('left_hip', 'right_hip', 'left_shoulder', 'right_shoulder', 'head')
+    return messages.create(
+        'hmt_msgs/msg/Keypoints2D',
+        header=header_message(messages, stamp_ns, 'lens'),
+        names=list(names),
+        u=np.linspace(200.0, 240.0, len(names)),
+        v=np.linspace(100.0, 200.0, len(names)),
+    )
