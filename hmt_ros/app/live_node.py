@@ -157,17 +157,18 @@ class LiveNode:
         """Whether `answer` would not wait for an answer."""
         return bool(self._answers)
 
-    def answer(self, source: str, seconds: float = MESSAGE_SECONDS) -> Handled:
+    def answer(self, source: str, seconds: float | None = None) -> Handled:
         """Waits for what became of the next message, and writes what it led to.
 
         Args:
             source: of the message.
-            seconds: that it may take.
+            seconds: that it may take; None: `MESSAGE_SECONDS`.
 
         Raises:
             LiveNodeError: the node has ended, or does not answer.
         """
-        handled = self._handled(self._next(self._answers, seconds, f'an answer to a {source}'))
+        patience = MESSAGE_SECONDS if seconds is None else seconds
+        handled = self._handled(self._next(self._answers, patience, f'an answer to a {source}'))
         for topic, stamp in handled.published:
             data = self._next(self._arrived[topic], START_SECONDS, f'{topic} of {stamp} ns')
             # On its way a message may get bytes behind its end, up to a multiple of four.
