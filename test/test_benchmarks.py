@@ -299,7 +299,7 @@ def test_command_line(capsys, tmp_path):
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
         "benchmarks: no 'flops', wanted one of bags, experts, flips, kernels, kjs, nodes, "
-        'smoothing, tracking, votes'
+        'smoothing, soak, tracking, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
