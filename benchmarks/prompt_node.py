@@ -20,7 +20,7 @@ from hmt_ros.nodes.bme_node import NAME, BmeNode
 from hmt_ros.nodes.bme_session import BmeSession
 from hmt_ros.nodes.camera_input import WaitingImage
 from hmt_ros.nodes.handled import Output
-from hmt_ros.nodes.session_node import run
+from hmt_ros.nodes.run_node import run
 
 
 class PromptSession(BmeSession):

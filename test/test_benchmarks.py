@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import bags, flips, kernels, kjs, tracking, votes
+from benchmarks import bags, flips, kernels, kjs, nodes, tracking, votes
 from benchmarks.__main__ import main
 from benchmarks.clips import find_clips, read_clip, rounded, table
 from benchmarks.command import run_stages
@@ -329,3 +329,14 @@ def test_peak_memory_is_that_of_the_process_alone():
     assert peak_memory() == pytest.approx(largest, rel=0.01)
     forget_peak()
     assert peak_memory() < largest - 3e8
+
+
+def test_nodes_that_lose_images_are_told():
+    found = {
+        'rate_hz': 30.0, 'answered_hz': 20.0, 'images': 90, 'results': 60, 'wanted': 'all',
+        'met': False, 'latency_ms': {'median': 4.0, '99 %': 9.0, 'largest': None},
+    }  # fmt: skip
+    text = nodes.as_text({'added, raw': found, '4': 'skipped: no ROS'})
+    assert '60  4.0 ms  9.0 ms           missed, wanted all' in ' '.join(text.split('\n'))
+    assert 'skipped: no ROS' in text
+    assert nodes._prompt('raw').images[0].data.size == 640 * 480 * 3

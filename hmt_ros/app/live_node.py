@@ -322,7 +322,7 @@ class LiveNode:
                         [sources, *filter(None, [os.environ.get('PYTHONPATH')])]
                     ),
                     'ROS_LOG_DIR': str(self._player.folder),
-                    # As `hmt_ros.nodes.session_node.OWNER`: a killed replay leaves no nodes.
+                    # As `hmt_ros.nodes.run_node.OWNER`: a killed replay leaves no nodes.
                     'HMT_ROS_OWNER': str(os.getpid()),
                 },
                 # The interrupt key is for this process; it stops the node itself.

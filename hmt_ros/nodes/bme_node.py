@@ -15,7 +15,8 @@ from hmt_ros.nodes.bme_parameters import BmeParameters
 from hmt_ros.nodes.bme_session import TOPICS, BmeSession, BmeState
 from hmt_ros.nodes.camera_input import IMAGE
 from hmt_ros.nodes.handled import Output
-from hmt_ros.nodes.session_node import SessionNode, run
+from hmt_ros.nodes.run_node import run
+from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import SubscribedTopic, camera_info_topic, image_topic
 from msg_tools.cdr import serialise
 from msg_tools.error_line import error_line

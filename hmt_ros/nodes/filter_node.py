@@ -25,7 +25,8 @@ from hmt_ros.nodes.filter_session import (
     SessionState,
 )
 from hmt_ros.nodes.handled import Output
-from hmt_ros.nodes.session_node import SessionNode, run
+from hmt_ros.nodes.run_node import run
+from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
     RELIABLE,
     SubscribedTopic,
@@ -80,8 +81,8 @@ class FilterNode(SessionNode):
             prepare_start(settings)
 
     def _on_reset(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
-        session, queue = self._session, self._queue
-        if session is None or queue is None:
+        session, thread = self._session, self._thread
+        if session is None or thread is None:
             response.success, response.message = False, 'the node is not active'
             return response
         try:
@@ -89,7 +90,7 @@ class FilterNode(SessionNode):
         except ValueError as error:
             response.success, response.message = False, str(error)
             return response
-        self._restart_with(start)
+        thread.restart(start)
         response.success = True
         if start.initial is None and self._settings.use_predictions:
             response.message = 'the next pose_prediction starts a new track'

@@ -72,12 +72,17 @@ class InputQueue:
             dropped, self._dropped = self._dropped, 0
             return Waiting(source, content, arrival, dropped)
 
-    def close(self) -> None:
-        """Drops what waits and ends every `get`."""
+    def close(self) -> list[Waiting]:
+        """Ends every `get`; returns what waited."""
         with self._changed:
             self._closed = True
+            left = [Waiting(*waiting, dropped=0) for waiting in self._waiting]
+            if left:
+                left[0] = left[0]._replace(dropped=self._dropped)
             self._waiting.clear()
+            self._sizes.clear()
             self._changed.notify_all()
+            return left
 
     def __len__(self) -> int:
         with self._changed:

@@ -70,7 +70,9 @@ class Session(ABC):
 
     def count_dropped(self, messages: int) -> None:
         """Counts messages that were dropped before they came here, because the node was late."""
-        self._log.count_dropped(messages)
+        if messages:
+            self._log.count_dropped(messages)
+            self.state = self._present_state()
 
     def _publish(self, topic: str, stamp: int, message: Any) -> None:
         self._log.published(topic, stamp)

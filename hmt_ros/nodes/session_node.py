@@ -12,69 +12,34 @@ player that waits for it feeds the node in lock step.
 
 from __future__ import annotations
 
-import os
-import signal
-import sys
-import threading
 import time
-import traceback
 from abc import abstractmethod
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidHandle, ParameterException
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.signals import SignalHandlerOptions
 
-from hmt_ros.nodes.declared_parameters import (
-    AT_LAUNCH,
-    EFFECTS,
-    DeclaredParameter,
-    declared_parameters,
-    with_values,
-)
+from hmt_ros.nodes.declared_parameters import declared_parameters, with_values
 from hmt_ros.nodes.diagnostics import Rates, handled_message
+from hmt_ros.nodes.estimating_thread import EstimatingThread, InnerFaults
 from hmt_ros.nodes.handled import Handled, Output
-from hmt_ros.nodes.input_queue import InputQueue, Waiting
 from hmt_ros.nodes.middleware_events import MiddlewareEvents
+from hmt_ros.nodes.parameter_descriptor import parameter_descriptor
 from hmt_ros.nodes.published_topic import SUBSCRIBERS, PublishedTopic
 from hmt_ros.nodes.session import Session
-from hmt_ros.nodes.subscribed_topic import LATCHED, RELIABLE, SubscribedTopic
-from msg_tools.cdr import deserialise
+from hmt_ros.nodes.subscribed_topic import ANSWERS, LATCHED, RELIABLE, SubscribedTopic
 from msg_tools.error_line import error_line
 
-# Small messages that wait while an estimate is made.
-SMALL_QUEUE = 100
-
-# Names, in the environment, the process without which a node ends.
-OWNER = 'HMT_ROS_OWNER'
-
-_RESTART = 'restart'
 # An active node that is sent nothing for so long says so, s.
 _SILENCE = 3.0
-# What a last estimate may take at the end, s; kernels that are being compiled are not waited for.
-_LAST_ESTIMATE = 5.0
-
-
-class _TooLarge(NamedTuple):
-    """Stands for a message that is not kept."""
-
-    size: int
-    limit: int
 
 
 class SessionNode(LifecycleNode):
@@ -106,27 +71,25 @@ class SessionNode(LifecycleNode):
         super().__init__(name, **options)
         self._defaults, self._subject = defaults, subject
         declared = declared_parameters(defaults)
-        self.declare_parameters('', [(p.name, p.default, _descriptor(p)) for p in declared])
+        self.declare_parameters(
+            '', [(p.name, p.default, parameter_descriptor(p)) for p in declared]
+        )
         names = [parameter.name for parameter in declared]
         self._values = {name: self.get_parameter(name).value for name in names}
         self._settings = with_values(defaults, self._values)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._refuse_impossible_transitions()
         self._session: Any = None
-        self._queue: InputQueue | None = None
-        self._worker: threading.Thread | None = None
+        self._thread: EstimatingThread | None = None
         self._outputs: dict[str, Any] = {}
         self._handled: Any = None
         self._offered: list[Any] = []
         self._inputs: list[Any] = []
-        self._types: dict[str, str] = {}
         self._failure = ''
-        self._inner_faults = 0
-        self._inner_fault = ''
+        self._inner_faults = InnerFaults()
         self._last_arrival: float | None = None
         self._ticks, self._told_at = 0, 0
         self._events = MiddlewareEvents(self.get_logger().warn)
-        self._latencies: deque[float] = deque(maxlen=1000)
         self._rates = Rates(self.COUNTED_NAME, self.DONE)
         self._diagnostics = self.create_publisher(
             DiagnosticArray,
@@ -208,13 +171,9 @@ class SessionNode(LifecycleNode):
         Returns:
             Whether it has ended within `timeout` s.
         """
-        if self._queue is not None:
-            self._queue.close()
-        if self._worker is not None:
-            self._worker.join(timeout)
-            if self._worker.is_alive():
-                return False
-        self._queue, self._worker = None, None
+        if self._thread is not None and not self._thread.stop(timeout):
+            return False
+        self._thread = None
         return True
 
     # Lifecycle.
@@ -239,7 +198,7 @@ class SessionNode(LifecycleNode):
         self._handled = self.create_lifecycle_publisher(
             DiagnosticStatus,
             '~/handled',
-            RELIABLE,
+            ANSWERS,
             event_callbacks=self._events.of_publisher(self.resolve_topic_name('~/handled')),
         )
         # While a service waits for something, the others of its group would wait with it.
@@ -253,16 +212,19 @@ class SessionNode(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Listens."""
         assert self._session is not None
-        inputs = list(self._wanted_inputs())
-        limits = {one.source: SMALL_QUEUE for one in inputs}
-        limits[self.COUNTED] = self._settings.queue_size
-        self._queue = InputQueue(limits, counted=self.COUNTED)
+        session, inputs = self._session, list(self._wanted_inputs())
         result = super().on_activate(state)
-        self._types = {one.source: one.msgtype for one in inputs}
-        self._worker = threading.Thread(
-            target=self._work, args=(self._session, self._queue), name='estimate', daemon=True
+        self._thread = EstimatingThread(
+            session,
+            inputs,
+            self.COUNTED,
+            self._settings.queue_size,
+            done=lambda: self._counts(session.state)[self.DONE],
+            tell=self._tell,
+            tell_change=self._diagnose,
+            inner_faults=self._inner_faults,
+            log_error=self.get_logger().error,
         )
-        self._worker.start()
         for one in inputs:
             self._subscribe(one)
         topic = self._inputs[-1].topic_name
@@ -294,15 +256,14 @@ class SessionNode(LifecycleNode):
         return super().on_error(state)
 
     def _subscribe(self, wanted: SubscribedTopic) -> None:
-        queue = self._queue
-        assert queue is not None
+        thread = self._thread
+        assert thread is not None
 
         def receive(data: bytes) -> None:
             now = time.monotonic()
             if wanted.source == self.COUNTED:
                 self._last_arrival = now
-            content = data if len(data) <= wanted.largest else _TooLarge(len(data), wanted.largest)
-            queue.put(wanted.source, content, now)
+            thread.put(wanted.source, data, now)
 
         events = self._events.of_subscription(self.resolve_topic_name(wanted.topic))
         self._inputs.append(
@@ -381,54 +342,11 @@ class SessionNode(LifecycleNode):
         self._settings = settings
         if self._session is not None:
             self._session.parameters = settings
-        if self._queue is not None:
-            self._queue.limit(self.COUNTED, settings.queue_size)
+        if self._thread is not None:
+            self._thread.limit(settings.queue_size)
         return SetParametersResult(successful=True)
 
-    def _restart_with(self, start: Any) -> bool:
-        """Has the session start anew once what has come before is handled; whether it will."""
-        if self._session is None or self._queue is None:
-            return False
-        self._queue.put(_RESTART, start, time.monotonic())
-        return True
-
-    # The thread that estimates.
-
-    def _work(self, session: Any, queue: InputQueue) -> None:
-        while (waiting := queue.get()) is not None:
-            before = session.state
-            try:
-                self._handle(session, waiting)
-            except Exception as error:  # noqa: BLE001
-                # A fault of ours. What comes next may not suffer from it.
-                self._inner_faults += 1
-                self._inner_fault = f'{type(error).__name__}: {error_line(error)}'
-                self.get_logger().error(''.join(traceback.format_exception(error)))
-                session.restart(session.start)
-            after = session.state
-            if (after.status, after.faults.keys()) != (before.status, before.faults.keys()):
-                self._diagnose()
-
-    def _handle(self, session: Any, waiting: Waiting) -> None:
-        session.count_dropped(waiting.dropped)
-        done = self._counts(session.state)[self.DONE]
-        if waiting.source == _RESTART:
-            session.restart(waiting.content)
-            return
-        try:
-            if isinstance(waiting.content, _TooLarge):
-                raise ValueError(
-                    f'it has {waiting.content.size} bytes, the limit is {waiting.content.limit}'
-                )
-            message = deserialise(waiting.content, self._types[waiting.source])
-        except Exception as error:  # noqa: BLE001
-            # Bytes from outside meet generated code here, which does not say what it may raise.
-            handled = session.refuse(waiting.source, error_line(error))
-        else:
-            handled = session.take(waiting.source, message)
-        if self._counts(session.state)[self.DONE] > done:
-            self._latencies.append(time.monotonic() - waiting.arrival)
-        self._tell(handled)
+    # What the thread that estimates calls.
 
     def _tell(self, handled: Handled) -> None:
         for text in handled.warnings:
@@ -451,7 +369,7 @@ class SessionNode(LifecycleNode):
             counts = Counter(self._counts(state))
             counts['faults'] = state.faults.total()
         counts['lost'] = self._events.lost
-        latencies = [self._latencies.popleft() for _ in range(len(self._latencies))]
+        latencies = [] if self._thread is None else self._thread.take_latencies()
         self._rates.next_period(counts, latencies)
         self._diagnose()
         self._tell_status(counts)
@@ -493,8 +411,8 @@ class SessionNode(LifecycleNode):
                 *self._state_values(state),
                 *((f'faults: {kind}', str(count)) for kind, count in sorted(state.faults.items())),
                 ('last fault', state.last_fault),
-                ('errors of the node itself', str(self._inner_faults)),
-                ('last error of the node itself', self._inner_fault),
+                ('errors of the node itself', str(self._inner_faults.count)),
+                ('last error of the node itself', self._inner_faults.last),
                 *self._events.values(),
                 *self._rates.values(),
                 *(
@@ -506,58 +424,3 @@ class SessionNode(LifecycleNode):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
-
-
-def run(name: str, make: Callable[[], SessionNode], args: list[str] | None = None) -> int:
-    """Runs a node until it is told to stop; 0, or 1 where it could not start."""
-    # The handlers of rclpy end the context under whatever is going on; ours let it come to its end.
-    stopped = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopped.set())
-    try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        node = make()
-    except (ParameterException, ValueError, RuntimeError) as error:
-        sys.stderr.write(f'{name}: {error_line(error)}\n')
-        rclpy.try_shutdown()
-        return 1
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    node.start()
-    # Whoever started a node for a while, and was killed, can not end it any more.
-    owner = os.environ.get(OWNER)
-    while not stopped.is_set() and owner in (None, str(os.getppid())):
-        _spin_once(executor, node)
-    if not node.stop(_LAST_ESTIMATE):
-        sys.stderr.flush()
-        os._exit(0)
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.try_shutdown()
-    return 0
-
-
-def _spin_once(executor: SingleThreadedExecutor, node: SessionNode) -> None:
-    try:
-        # A signal does not wake who waits for messages.
-        executor.spin_once(timeout_sec=0.2)
-    except Exception as error:  # noqa: BLE001
-        # rclpy itself raises where /clock goes below zero, for example: the node lives.
-        text = f'{type(error).__name__}: {error_line(error)}'
-        node.get_logger().error(f'a callback failed: {text}', throttle_duration_sec=1.0)
-
-
-def _descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(
-        description=f'{parameter.description} {EFFECTS[parameter.effect]}',
-        read_only=parameter.effect == AT_LAUNCH,
-    )
-    if parameter.limits is not None:
-        low, high = parameter.limits
-        if isinstance(parameter.default, int):
-            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
-        else:
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=float(low), to_value=float(high))
-            ]
-    return descriptor

@@ -20,7 +20,8 @@ from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
 from hmt_ros.nodes.handled import Output
-from hmt_ros.nodes.session_node import SessionNode, run
+from hmt_ros.nodes.run_node import run
+from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.smoothed_messages import TOPICS
 from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.nodes.smoother_session import (

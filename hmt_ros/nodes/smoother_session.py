@@ -43,7 +43,7 @@ from msg_tools import MessageError
 from msg_tools.error_line import error_line
 from msg_tools.headers import SECOND_NS, time_ns
 from msg_tools.message_error import check_names
-from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_of
 from msg_tools.trajectory_mixtures import trajectory_mixture_message
 
 BODY, MIXTURE = 'body', 'likelihood_mixture'
@@ -127,6 +127,7 @@ class SmootherSession(Session):
             known_body(parameters.body_model)
         super().__init__(parameters, publish, wanted)
         self._of: SmoothedBody | None = None
+        self._model: tuple[str, Body] | None = None  # as it was read last, by its name
         self._window: SlidingWindow | None = None
         self._waiting: deque[Any] = deque()
         self._newest: int | None = None
@@ -192,8 +193,10 @@ class SmootherSession(Session):
     def _body_of(self, message: Any) -> Body:
         chosen = self.parameters.body_model
         name = chosen or str(message.name)
-        # A message must not have files read: what it names ships with the package.
-        body = known_body(name, load_body if chosen else named_body)
+        if self._model is None or self._model[0] != name:
+            # A message must not have files read: what it names ships with the package.
+            self._model = name, known_body(name, load_body if chosen else named_body)
+        body = self._model[1]
         lengths = dict(
             zip(map(str, message.segment_names), map(float, message.segment_lengths), strict=False)
         )
@@ -207,14 +210,15 @@ class SmootherSession(Session):
     def _smooth_what_is_ready(self) -> None:
         received, self._waiting = self._waiting, deque()
         for message in received:
-            if self._of is None or not _is_of(message, self._of.body):
+            content = None if self._of is None else _content(message, self._of.body)
+            if self._of is None or not (content is None or _is_of(content, self._of.body)):
                 self._waiting.append(message)
                 continue
             # The body of those before will not come any more.
             for older in self._waiting:
                 self._drop(older)
             self._waiting.clear()
-            self._take_mixture(message, self._of)
+            self._take_mixture(message, content, self._of)
 
     def _drop(self, message: Any) -> None:
         self._log.counts['dropped'] += 1
@@ -222,9 +226,9 @@ class SmootherSession(Session):
         what = 'no body has come' if self._of is None else 'no body that its joints are of has come'
         self._log.fault('no body', f'mixture of {stamp} ns is dropped: {what}')
 
-    def _take_mixture(self, message: Any, of: SmoothedBody) -> None:
+    def _take_mixture(self, message: Any, content: PoseMixture | None, of: SmoothedBody) -> None:
         stamp = time_ns(message.header.stamp)
-        mixture = self._readable(message, stamp, of)
+        mixture = self._readable(message, content, stamp, of)
         if mixture is None or not self._in_time(stamp):
             return
         p = self.parameters
@@ -264,13 +268,16 @@ class SmootherSession(Session):
         for pose in update.final:
             self._publish_final(pose, of)
 
-    def _readable(self, message: Any, stamp: int, of: SmoothedBody) -> GaussianMixture | None:
+    def _readable(
+        self, message: Any, content: PoseMixture | None, stamp: int, of: SmoothedBody
+    ) -> GaussianMixture | None:
         """The mixture of a message, None where it can not be used."""
         name = str(message.body_model)
         try:
             if not self.parameters.body_model and name and name != of.body.name:
                 raise MessageError(f'mixture is of the body {name}, wanted one of {of.body.name}')
-            content = pose_mixture_of(message, of.body.dof_names)
+            if content is None:
+                content = pose_mixture_of(message, of.body.dof_names)
         except ValueError as error:
             text = str(error)
             kind = next((words for words in _FAULTS if words in text), 'mixture')
@@ -402,12 +409,16 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
         raise ValueError(f'{text}; body_model names it, or a file with it') from error
 
 
-def _is_of(message: Any, body: Body) -> bool:
-    """Whether the joints of a mixture are where the body has them; what can not be read may be."""
+def _content(message: Any, body: Body) -> PoseMixture | None:
+    """The content of a mixture with the joints of a body; None: there are none, or faults."""
     try:
-        content = pose_mixture_of(message, body.dof_names, body.joint_names)
+        return pose_mixture_of(message, body.dof_names, body.joint_names)
     except ValueError:
-        return True
+        return None
+
+
+def _is_of(content: PoseMixture, body: Body) -> bool:
+    """Whether the joints of a mixture are where the body has them."""
     computed = body.joint_positions(content.mixture.means[:1])
     return bool(np.abs(computed - content.joint_positions[:1]).max() < _SAME_PLACE)
 

@@ -11,6 +11,8 @@ from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
 from msg_tools.images import MAX_PIXELS
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+# Of `~/handled`: whoever counts on an answer to each message must not miss those to a burst.
+ANSWERS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,

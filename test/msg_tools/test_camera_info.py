@@ -109,6 +109,9 @@ def test_size_of_the_picture() -> None:
         ({'roi': {'x_offset': 600, 'width': 100, 'height': 100}}, r'roi of 100x100 at \(600, 0\)'),
         ({'roi': {'x_offset': 10}}, r'roi of 0x0 at \(10, 0\) does not lie in the 640x480'),
         ({'binning_x': 1000}, r'binning of 1000 and 1 leaves 0x480 pixels'),
+        ({'k': [1e-3, 0, 320, 0, 590.0, 240, 0, 0, 1]}, 'focal lengths are 0.001 and 590, wanted'),
+        ({'k': [600.0, 0, 1e300, 0, 590.0, 240, 0, 0, 1]}, 'principal point'),
+        ({'d': [1e9, 0, 0, 0, 0]}, 'coefficient of 1e'),
     ],
 )
 def test_what_gives_no_camera(changes: dict[str, Any], error: str) -> None:

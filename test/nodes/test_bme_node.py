@@ -75,7 +75,7 @@ def test_parameters_are_those_of_the_file(running):
     )
     assert running.set(max_hypotheses=1, queue_size=3) == (True, '')
     assert running.node._session.parameters.max_hypotheses == 1
-    assert running.node._queue._limits['image'] == 3
+    assert running.node._thread.queue._limits['image'] == 3
 
 
 def test_one_warning_for_each_kind_and_the_node_lives(running, somebody):

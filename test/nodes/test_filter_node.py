@@ -121,7 +121,7 @@ def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
     assert running.set(max_hypotheses=20, candidates=24, queue_size=2) == (True, '')
     assert running.node._settings.tracker.max_hypotheses == 20
     assert running.node._session.parameters is running.node._settings
-    assert running.node._queue._limits['image'] == 2
+    assert running.node._thread.queue._limits['image'] == 2
 
 
 def test_one_warning_for_each_kind_and_the_node_lives(running, small_camera):
@@ -173,7 +173,7 @@ def test_bytes_that_are_no_message(running, small_camera):
     running.send('camera_info', small_camera.info())
     data = serialise(small_camera.image(0))
     count = len(running.handled)
-    running.node._queue.put('image', data[:60], time.monotonic())
+    running.node._thread.queue.put('image', data[:60], time.monotonic())
     running.spin_until(lambda: len(running.handled) > count)
     assert faults(running.handled[-1])[0].startswith('message of image can not be read: ')
     assert faults(running.send('image', small_camera.image(1))) == []
@@ -244,6 +244,38 @@ def test_node_without_its_subject_lives(world, subject_file, small_camera):
     assert published(one.send('image', small_camera.image(0))) == STARTS
 
 
+def test_reset_counts_though_the_node_is_deactivated(
+    world, small_camera, stub_tracker, monkeypatch
+):
+    from hmt_msgs.srv import Reset
+
+    begun, go = threading.Event(), threading.Event()
+    step = stub_tracker.step
+
+    def slow(self, *arguments):
+        begun.set()
+        assert go.wait(PATIENCE)
+        return step(self, *arguments)
+
+    monkeypatch.setattr(stub_tracker, 'step', slow)
+    one = world().start()
+    one.send('camera_info', small_camera.info())
+    one.publishers['image'].publish(serialise(small_camera.image(0)))
+    one.spin_until(begun.is_set, 'the estimate of the first image')
+    session, before = one.node._session, one.node._session.start
+    answers = [one.call(Reset, 'reset') for _ in range(3)]
+    assert all(answer.success for answer in answers)
+    # Several wait as one, the last.
+    assert len(one.node._thread.queue) == 1
+    one.publishers['image'].publish(serialise(small_camera.image(1)))
+    one.spin_until(lambda: len(one.node._thread.queue) == 2)
+    threading.Timer(0.3, go.set).start()
+    assert one.change_state('deactivate')
+    assert session.start is not before
+    assert session.state.status == 'waiting'
+    assert session.state.images == {'received': 2, 'tracked': 1, 'dropped': 1}
+
+
 def test_reset(running, small_camera, stub_tracker, subject_file, body):
     from hmt_msgs.msg import PoseComponent, PoseMixture
     from hmt_msgs.srv import Reset
@@ -299,7 +331,7 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
     one = world(queue_size=2).start()
     one.send('camera_info', small_camera.info())
     try:
-        queue = one.node._queue
+        queue = one.node._thread.queue
         for index in range(12):
             one.publishers['image'].publish(serialise(small_camera.image(index)))
             one.spin_until(begun.is_set, 'the estimate of the first image')

@@ -46,3 +46,12 @@ def test_closing_ends_who_waits():
     queue.put('image', 1, 0.0)
     assert len(queue) == 0
     assert queue.get() is None
+
+
+def test_closing_returns_what_waited():
+    queue = InputQueue({'image': 1}, counted='image')
+    queue.put('restart', 'a', 1.0)
+    queue.put('image', 'b', 2.0)
+    queue.put('image', 'c', 3.0)
+    assert queue.close() == [Waiting('restart', 'a', 1.0, 1), Waiting('image', 'c', 3.0, 0)]
+    assert queue.close() == []

@@ -37,6 +37,15 @@ def test_a_disk_that_gets_full():
 
 
 @pytest.mark.ros
+def test_a_node_does_not_outlive_its_owner(monkeypatch, executable):
+    # Process 1 has not started it.
+    monkeypatch.setenv('HMT_ROS_OWNER', '1')
+    node = executable('smoother_node', '-p', 'autostart:=false')
+    node.process.communicate(timeout=60.0)
+    assert node.process.returncode == 0
+
+
+@pytest.mark.ros
 @pytest.mark.parametrize(
     ('node', 'chosen'), [('smoother_node', slice(0, 6)), ('bme_node', slice(5, None))]
 )

@@ -99,7 +99,7 @@ def test_parameters_are_those_of_the_file(running):
     )
     assert running.set(queue_size=3, max_hypotheses=2) == (True, '')
     assert running.node._session.parameters.max_hypotheses == 2
-    assert running.node._queue._limits['likelihood_mixture'] == 3
+    assert running.node._thread.queue._limits['likelihood_mixture'] == 3
 
 
 def test_one_warning_for_each_kind_and_the_node_lives(running, likelihoods):
@@ -209,7 +209,7 @@ def test_lifecycle(world, likelihoods):
 
 def test_queue_holds_what_was_published(running, likelihoods):
     """Mixtures that come while one is smoothed wait."""
-    queue = running.node._queue
+    queue = running.node._thread.queue
     data = serialise(likelihoods.message(0))
     count = len(running.handled)
     queue.put('likelihood_mixture', data[:60], 0.0)

@@ -1,0 +1,62 @@
+"""Runs a node in a process of its own, until it is told to stop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+
+import rclpy
+from rclpy.exceptions import ParameterException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+
+from hmt_ros.nodes.session_node import SessionNode
+from msg_tools.error_line import error_line
+
+# Names, in the environment, the process without which a node ends.
+OWNER = 'HMT_ROS_OWNER'
+
+# What a last estimate may take at the end, s; kernels that are being compiled are not waited for.
+_LAST_ESTIMATE = 5.0
+
+
+def run(name: str, make: Callable[[], SessionNode], args: list[str] | None = None) -> int:
+    """Runs a node until it is told to stop; 0, or 1 where it could not start."""
+    # The handlers of rclpy end the context under whatever is going on; ours let it come to its end.
+    stopped = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopped.set())
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        node = make()
+    except (ParameterException, ValueError, RuntimeError) as error:
+        sys.stderr.write(f'{name}: {error_line(error)}\n')
+        rclpy.try_shutdown()
+        return 1
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    node.start()
+    # Whoever started a node for a while, and was killed, can not end it any more.
+    owner = os.environ.get(OWNER)
+    while not stopped.is_set() and owner in (None, str(os.getppid())):
+        _spin_once(executor, node)
+    if not node.stop(_LAST_ESTIMATE):
+        sys.stderr.flush()
+        os._exit(0)
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown()
+    return 0
+
+
+def _spin_once(executor: SingleThreadedExecutor, node: SessionNode) -> None:
+    try:
+        # A signal does not wake who waits for messages.
+        executor.spin_once(timeout_sec=0.2)
+    except Exception as error:  # noqa: BLE001
+        # rclpy itself raises where /clock goes below zero, for example: the node lives.
+        text = f'{type(error).__name__}: {error_line(error)}'
+        node.get_logger().error(f'a callback failed: {text}', throttle_duration_sec=1.0)
