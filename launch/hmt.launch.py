@@ -11,6 +11,7 @@ and from the file that params_file names.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,6 +31,8 @@ OPTICAL, UPRIGHT = 'camera_optical_frame', 'camera_upright'
 # x forward, y left, z up, seen from a frame with x right, y down, z forward.
 TURN = {'qx': 0.5, 'qy': -0.5, 'qz': 0.5, 'qw': 0.5}
 TRUTH = {'true': True, 'false': False}
+# What names a file with the settings of Fast DDS.
+PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 
 # Name, default, and what it is.
 ARGUMENTS = (
@@ -123,6 +126,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
         'bme_node': {**camera, **_named(given, 'model_file')},
     }
     own = [given['params_file']] if given['params_file'] else []
+    env = _room_for_images(share) if transport == 'raw' else {}
     actions: list[Any] = [
         Node(
             package=PACKAGE,
@@ -133,6 +137,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
             remappings=[] if name == 'smoother_node' else remappings,
             ros_arguments=['--log-level', f'{_logger(namespace, name)}:={given["log_level"]}'],
             output='both',
+            additional_env=env,
         )
         for name in names
     ]
@@ -166,8 +171,15 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
     if bag:
         # Who subscribes late must not miss the first images: the bag waits for the nodes.
         command = ['ros2', 'bag', 'play', bag, '--clock', '--delay', '5']
-        actions.append(ExecuteProcess(cmd=command, output='both'))
+        actions.append(ExecuteProcess(cmd=command, output='both', additional_env=env))
     return actions
+
+
+def _room_for_images(share: Path) -> dict[str, str]:
+    """Environment in which raw images are not lost on their way; empty: it has settings already."""
+    if any(name in os.environ for name in PROFILES):
+        return {}
+    return {PROFILES[0]: str(share / 'config' / 'fastdds.xml')}
 
 
 def _namespace(given: Mapping[str, str]) -> str:

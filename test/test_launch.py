@@ -151,6 +151,21 @@ def test_three_nodes_in_the_namespace_of_a_person(actions):
     assert made['smoother_node']['remappings'] == []
 
 
+def test_room_for_raw_images(actions, monkeypatch):
+    for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'):
+        monkeypatch.delenv(name, raising=False)
+    room = {'FASTRTPS_DEFAULT_PROFILES_FILE': str(ROOT / 'hmt_ros' / 'config' / 'fastdds.xml')}
+    assert Path(*room.values()).is_file()
+    assert {
+        name: one['additional_env'] for name, one in actions(bag='walk').items()
+    } == dict.fromkeys(('filter_node', 'smoother_node', 'bme_node', 'bag'), room)
+    compressed = actions(image_transport='compressed').values()
+    assert [one['additional_env'] for one in compressed] == [{}, {}, {}]
+    # Whoever has settings of their own keeps them.
+    monkeypatch.setenv('FASTDDS_DEFAULT_PROFILES_FILE', 'mine.xml')
+    assert actions()['filter_node']['additional_env'] == {}
+
+
 def test_arguments(actions, tmp_path):
     made = actions(
         body_id='anna',
