@@ -122,9 +122,13 @@ class BackgroundModel:
 
 def _pieces_of_one_person(mask: Image, settings: BackgroundSettings) -> Mask:
     """The largest piece of a mask and the pieces that are large enough and near enough to it."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    if count == 1:
-        return np.zeros(mask.shape, dtype=bool)
+    result = np.zeros(mask.shape, dtype=bool)
+    x, y, width, height = cv2.boundingRect(mask)
+    if width == 0:
+        return result
+    # Most of an image is empty.
+    inside = slice(y, y + height), slice(x, x + width)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask[inside], connectivity=8)
     area = stats[1:, cv2.CC_STAT_AREA]
     main = 1 + int(np.argmax(area))
     keep = np.zeros(count, dtype=bool)
@@ -139,5 +143,5 @@ def _pieces_of_one_person(mask: Image, settings: BackgroundSettings) -> Mask:
     large = stats[:, cv2.CC_STAT_AREA] >= settings.smallest_part * area.max()
     keep |= near & large
     keep[0] = False
-    result: Mask = keep[labels]
+    result[inside] = keep[labels]
     return result
