@@ -17,7 +17,7 @@ import hmt_ros
 from benchmarks.clips import find_clips, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.machine import on_machine
-from benchmarks.soak_publisher import with_stamp
+from benchmarks.publisher import with_stamp
 from hmt_ros.app.live_node import LiveNode, LiveNodeError, Player, changed_environment
 from hmt_ros.nodes import bme_session, track_messages
 from hmt_ros.nodes.bme_parameters import BmeParameters

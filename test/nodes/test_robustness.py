@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks import soak, soak_disk, soak_files, soak_messages, soak_nodes
 from benchmarks.mutations import damaged, messages_of
-from benchmarks.soak_outcome import MOST_GROWTH, Amount, Outcome
-from benchmarks.soak_scenes import scenes
+from benchmarks.soak import cases, disk, files, messages, nodes
+from benchmarks.soak.outcome import MOST_GROWTH, Amount, Outcome
+from benchmarks.soak.scenes import scenes
 from hmt_ros.experts.model_file import read_arrays, write_arrays
 from msg_tools.cdr import deserialise, serialise
 
@@ -22,17 +22,17 @@ def assert_met(outcomes, count):
 
 
 def test_random_and_damaged_messages():
-    found = assert_met(soak_messages.messages(Amount(450, 30.0)), 3)
+    found = assert_met(messages.messages(Amount(450, 30.0)), 3)
     assert all(0 < outcome.refused < outcome.times for outcome in found)
 
 
 def test_damaged_files():
-    found = assert_met(soak_files.files(Amount(60, 15.0)), 6)
+    found = assert_met(files.files(Amount(60, 15.0)), 6)
     assert all(0 < outcome.refused <= outcome.times for outcome in found)
 
 
 def test_a_disk_that_gets_full():
-    found = assert_met(soak_disk.disk(Amount(10, 10.0)), 3)
+    found = assert_met(disk.disk(Amount(10, 10.0)), 3)
     assert all(outcome.refused > 0 for outcome in found)
 
 
@@ -50,9 +50,9 @@ def test_a_node_does_not_outlive_its_owner(monkeypatch, executable):
     ('node', 'chosen'), [('smoother_node', slice(0, 6)), ('bme_node', slice(5, None))]
 )
 def test_nodes(node, chosen, monkeypatch):
-    monkeypatch.setattr(soak_nodes, '_CASES', soak_nodes._CASES[chosen])
-    monkeypatch.setattr(soak_nodes, 'scenes', lambda: {node: scenes()[node]})
-    assert_met(soak_nodes.nodes(Amount(6, 20.0)), len(soak_nodes._CASES))
+    monkeypatch.setattr(nodes, 'CASES', nodes.CASES[chosen])
+    monkeypatch.setattr(nodes, 'scenes', lambda: {node: scenes()[node]})
+    assert_met(nodes.nodes(Amount(6, 20.0)), len(nodes.CASES))
 
 
 def test_damage_is_damage_and_repeats():
@@ -80,25 +80,25 @@ def test_what_is_not_met_is_told(monkeypatch, capsys):
         yield Outcome('something', 'broken', amount.times, 1, lost=2, growth_mb=MOST_GROWTH + 1.0)
         yield Outcome('something', 'kept', amount.times)
 
-    monkeypatch.setattr(soak, 'CASES', {'one': (case, 7, 3, 1.0)})
-    assert soak.main(['--quick', '--json', '--only', 'one']) == 1
+    monkeypatch.setattr(cases, 'CASES', {'one': (case, 7, 3, 1.0)})
+    assert cases.main(['--quick', '--json', '--only', 'one']) == 1
     broken, kept = json.loads(capsys.readouterr().out)['one']
     assert (broken['times'], broken['lost'], broken['met']) == (3, 2, False)
     assert kept['met']
-    assert soak.main(['--only', 'one']) == 1
+    assert cases.main(['--only', 'one']) == 1
     assert '2 lost; wanted at most 150 MB' in capsys.readouterr().out
 
 
 def test_arrays_that_lie_about_their_size_are_refused(tmp_path):
-    path = write_arrays(tmp_path / 'model', read_arrays(soak_disk._MODEL))
+    path = write_arrays(tmp_path / 'model', read_arrays(disk._MODEL))
     lying = tmp_path / 'lying.npz'
-    lying.write_bytes(soak_files._with_member(path.read_bytes(), ['x'], np.random.default_rng(0)))
+    lying.write_bytes(files._with_member(path.read_bytes(), ['x'], np.random.default_rng(0)))
     with pytest.raises(ValueError, match='not a model file'):
         read_arrays(lying)
 
 
 def test_models_with_numbers_that_are_none_are_refused(tmp_path):
-    arrays = read_arrays(soak_disk._MODEL)
+    arrays = read_arrays(disk._MODEL)
     name = next(name for name, values in arrays.items() if values.dtype.kind == 'f')
     arrays[name] = np.full_like(arrays[name], np.nan)
     with pytest.raises(ValueError, match=f'{name} has values that are not finite'):

@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import sys
-import traceback
-import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +12,9 @@ from hypothesis.strategies import booleans
 
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.mutations import damaged, messages_of
-from benchmarks.soak_outcome import Amount, Outcome
-from benchmarks.soak_scenes import Scene, scenes, stamped
+from benchmarks.soak.faults import place, warnings_as_errors
+from benchmarks.soak.outcome import Amount, Outcome
+from benchmarks.soak.scenes import Scene, scenes, stamped
 from hmt_ros.body import load_body
 from hmt_ros.nodes.filter_session import PREDICTION, FilterSession
 from hmt_ros.nodes.session import Session
@@ -43,21 +38,6 @@ def messages(amount: Amount) -> Iterator[Outcome]:
         with warnings_as_errors():
             outcome = _through(scene, amount.part(1.0 / count))
         yield outcome
-
-
-@contextmanager
-def warnings_as_errors() -> Iterator[None]:
-    """What our code warns of is a fault; what libraries say of damaged pictures is nobody's."""
-    with warnings.catch_warnings(), Path(os.devnull).open('w') as nothing:
-        warnings.simplefilter('error', RuntimeWarning)
-        sys.stderr.flush()
-        kept = os.dup(2)
-        os.dup2(nothing.fileno(), 2)
-        try:
-            yield
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
 
 
 def _through(scene: Scene, amount: Amount) -> Outcome:
@@ -222,12 +202,3 @@ def _words() -> tuple[str, ...]:
         *body.dof_names, *body.joint_names[:6], body.name, 'plumb_bob', 'equidistant', 'bgr8',
         'mono8', 'rgba16', 'nv12', 'jpeg', 'png',
     )  # fmt: skip
-
-
-def place(error: BaseException) -> str:
-    """What was raised, and where in our code."""
-    frames = traceback.extract_tb(error.__traceback__)
-    ours = [x for x in frames if any(name in x.filename for name in ('/hmt_ros/', '/msg_tools/'))]
-    at = ours[-1] if ours else frames[-1]
-    where = f'{at.name} of {at.filename.rpartition("/")[2]}'
-    return f'{type(error).__name__} in {where}, {error_line(error)[:100]}'

@@ -1,6 +1,6 @@
 """A publisher in a process of its own, to be killed: messages of a file, again and again.
 
-python -m benchmarks.soak_publisher FILE TOPIC TYPE FIRST_STAMP_NS RATE
+python -m benchmarks.publisher FILE TOPIC TYPE FIRST_STAMP_NS RATE
 """
 
 from __future__ import annotations

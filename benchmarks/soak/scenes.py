@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.publisher import STEP_NS
 from hmt_ros.body import load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
@@ -29,9 +30,8 @@ from msg_tools.headers import header_message, time_ns
 from msg_tools.images import decode_image, image_message
 from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 CLIP = ROOT / 'bags' / 'reach'
-STEP_NS = 100_000_000
 _SMALL = TrackerSettings(max_hypotheses=2, candidates=4, combinations=16)
 
 

@@ -1,0 +1,193 @@
+"""A node in a process of its own that the soak feeds, asks and listens to over DDS."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from typing import Any
+
+from benchmarks.soak.scenes import Scene
+from hmt_ros.app.live_node import LiveNode, LiveNodeError, Player
+from hmt_ros.nodes.handled import Handled
+from hmt_ros.nodes.smoother_session import BODY
+
+# How long one message may take, s.
+PATIENCE = 60.0
+# How long a valid message is waited for that may have been sent too early, s.
+SHORT = 2.0
+# Messages before memory is compared: kernels are compiled, buffers have grown.
+_WARM = 8
+
+
+class Silent(Exception):
+    """Nothing was heard in time."""
+
+
+class Watched:
+    """A node that runs, what it publishes, and what it says.
+
+    Args:
+        scene: of the node.
+        changes: of its parameters.
+    """
+
+    def __init__(self, scene: Scene, **changes: Any) -> None:
+        self.scene, self._changes = scene, changes
+        self._opened = ExitStack()
+        self.restart()
+
+    def restart(self) -> None:
+        """Starts it, in a domain of its own; ends the one that ran before."""
+        self._opened.close()
+        self.index = 0
+        scene = self.scene
+        with ExitStack() as opened:
+            self.player = Player(opened)
+            self.node = LiveNode(
+                self.player,
+                opened,
+                scene.node,
+                replace(scene.parameters, reset_on_time_jump=True, **self._changes),
+                inputs=scene.inputs,
+                topics=scene.topics,
+                sensors=scene.sensors,
+                latched=(BODY,),
+                write=_ignored,
+            )
+            self.node.wait_until_active()
+            self.node.wait_for_subscribers(tuple(scene.topics), 1)
+            self._opened = opened.pop_all()
+
+    def __enter__(self) -> Watched:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._opened.close()
+
+    def warm_up(self) -> None:
+        """Until all is loaded; after that memory is compared."""
+        for source, message in self.scene.prelude:
+            self.send(source, message)
+        for _ in range(_WARM):
+            self.next()
+
+    def send(self, source: str, message: Any) -> Handled:
+        """A message in lock step; what became of it."""
+        self.node.publish(source, message)
+        return self.node.answer(source, PATIENCE)
+
+    def next(self) -> Handled:
+        """The next valid message in lock step."""
+        self.index += 1
+        return self.send(self.scene.counted, self.scene.message(self.index - 1))
+
+    def anew(self) -> None:
+        """Valid messages from the first on, until one is used: a session has begun."""
+        self.index = 0
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end:
+            for source, message in self.scene.prelude:
+                self.node.publish(source, message)
+            self.node.publish(self.scene.counted, self.scene.message(self.index))
+            self.index += 1
+            with suppress(Silent):
+                while True:
+                    handled = self.answer(SHORT)
+                    if handled.source == self.scene.counted and not handled.faults:
+                        self.settle()
+                        return
+        raise LiveNodeError(f'the {self.node.title} uses no message any more')
+
+    def answer(self, seconds: float) -> Handled:
+        """What became of a message.
+
+        Raises:
+            Silent: nothing is heard.
+        """
+        end = time.monotonic() + seconds
+        while not self.node.has_answered:
+            if time.monotonic() > end:
+                raise Silent
+            self.check_alive()
+            self.player.executor.spin_once(timeout_sec=0.02)
+        return self.node.answer('message', PATIENCE)
+
+    def settle(self, seconds: float = 0.5) -> list[Handled]:
+        """What it tells of messages, until it is silent for a while."""
+        found = []
+        with suppress(Silent):
+            while True:
+                found.append(self.answer(seconds))
+        return found
+
+    def check_alive(self) -> None:
+        """Raises LiveNodeError where the process has ended."""
+        code = self.node.process.poll()
+        if code is not None:
+            words = self.node.output().strip().splitlines()[-1:]
+            raise LiveNodeError(f'{self.scene.node} ended with code {code}: {" ".join(words)}')
+
+    def change(self, transition: int) -> bool:
+        """Whether a transition has been made."""
+        from lifecycle_msgs.msg import Transition
+        from lifecycle_msgs.srv import ChangeState
+
+        asked = Transition(id=transition)
+        return bool(self.node.call(ChangeState, 'change_state', transition=asked).success)
+
+    def state(self) -> int:
+        """Number of the state of its lifecycle."""
+        from lifecycle_msgs.srv import GetState
+
+        return int(self.node.call(GetState, 'get_state').current_state.id)
+
+    def set(self, **values: Any) -> tuple[bool, str]:
+        """Sets parameters all at once; whether that was done, and why not."""
+        from rcl_interfaces.srv import SetParametersAtomically
+        from rclpy.parameter import Parameter
+
+        given = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        found = self.node.call(
+            SetParametersAtomically, 'set_parameters_atomically', parameters=given
+        ).result
+        return bool(found.successful), str(found.reason)
+
+    def get(self, names: list[str]) -> list[Any]:
+        """Values of parameters."""
+        from rcl_interfaces.srv import GetParameters
+        from rclpy.parameter import parameter_value_to_python
+
+        found = self.node.call(GetParameters, 'get_parameters', names=names).values
+        return [parameter_value_to_python(value) for value in found]
+
+    def values(self) -> dict[str, str]:
+        """The values of its next diagnostics."""
+        diagnostics = self.player.diagnostics
+        diagnostics.pop(self.node.full_name, None)
+        end = time.monotonic() + PATIENCE
+        while self.node.full_name not in diagnostics:
+            if time.monotonic() > end:
+                raise LiveNodeError(f'{self.scene.node} tells no diagnostics')
+            self.check_alive()
+            self.player.executor.spin_once(timeout_sec=0.1)
+        return diagnostics[self.node.full_name]
+
+    def traces(self) -> list[str]:
+        """What it has said that no user should see."""
+        lines = self.node.output().splitlines()
+        return [
+            f'said {line.strip()[:120]}'
+            for line in lines
+            if 'Error' in line.partition(':')[0].split('.')[-1] and not line.startswith('[')
+        ] or [f'said {line[:120]}' for line in lines if 'Traceback' in line or 'Warning:' in line]
+
+    def spin(self, seconds: float) -> None:
+        """Listens for a while."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            self.player.executor.spin_once(timeout_sec=left)
+
+
+def _ignored(topic: str, stamp: int, data: bytes) -> None:
+    """That it has come is enough."""
