@@ -1,1 +1,29 @@
-"""Measurements, each next to a yardstick of the same run: `python -m benchmarks --help`."""
+"""What is measured: `python -m benchmarks NAME`; docs/generate.py writes it into the pages."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from types import ModuleType
+
+# Benchmark, which is the module of that name: what it measures.
+BENCHMARKS = {
+    'bags': 'reading, memory, and what replay adds to the estimate',
+    'experts': 'conditional densities: a toy, motions of people apart, clips, speed',
+    'flips': 'time per leaf of the interpretation trees',
+    'kernels': 'the compiled likelihood against vectorised numpy',
+    'kjs': 'kinematic jumps against random sampling at finding minima',
+    'nodes': 'images at the rate of a camera, through DDS',
+    'smoothing': 'exactness, speed and peers of the smoother',
+    'soak': 'nodes and files under load and fault',
+    'tracking': 'accuracy, calibration and speed of the tracker on clips with known truth',
+    'votes': 'which chain to flip or to search, by the vote that chooses it',
+}
+
+
+def benchmark(name: str) -> ModuleType:
+    """The module of a benchmark: `main` runs it, `measure` measures, `as_text` tells of that."""
+    # Before numpy is imported: with small matrices a second BLAS thread costs more than it brings.
+    for library in ('OMP', 'OPENBLAS', 'MKL'):
+        os.environ.setdefault(f'{library}_NUM_THREADS', '1')
+    return importlib.import_module(f'benchmarks.{name}')

@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Reader
 
 from benchmarks.clips import find_clips, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
-from benchmarks.machine import forget_peak, on_machine, peak_memory, resident_memory
+from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from hmt_ros.app import replay
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.image.background import BackgroundModel
@@ -54,12 +54,6 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     result = measure(quick=options.quick, only=options.only)
     return show(result, as_text, as_json=options.json)
-
-
-def page() -> str:
-    """The part of the documentation that this benchmark writes."""
-    result = measure()
-    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
 
 
 def measure(*, quick: bool = False, only: tuple[str, ...] = STAGES) -> dict[str, Any]:

@@ -25,7 +25,11 @@ def benchmark_parser(name: str, text: str | None, *, quick: str) -> argparse.Arg
         text: what it measures.
         quick: what --quick does.
     """
-    parser = argparse.ArgumentParser(prog=f'python -m benchmarks {name}', description=text)
+    parser = argparse.ArgumentParser(
+        prog=f'python -m benchmarks {name}',
+        description=text,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     parser.add_argument('--quick', action='store_true', help=quick)
     return parser

@@ -11,7 +11,7 @@ from benchmarks import experts_clips, experts_motion, experts_start, experts_toy
 from benchmarks.clips import table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.experts_motion import BEST_OF, COLUMNS, Learned, SeenMotion
-from benchmarks.machine import best_time, on_machine
+from benchmarks.machine import best_time
 from hmt_ros.body import Camera, load_body
 from hmt_ros.experts.training_set import procedural_sequence
 from hmt_ros.image.renderer import render_silhouettes
@@ -33,12 +33,6 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     result = measure(quick=options.quick, only=options.only, propagated=options.propagate)
     return show(result, as_text, as_json=options.json)
-
-
-def page() -> str:
-    """The part of the documentation that this benchmark writes."""
-    result = measure()
-    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
 
 
 def measure(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 import subprocess
 import sys
 from functools import partial
@@ -14,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.clips import rounded, table
-from benchmarks.machine import best_time, description, dgemm_rate, on_machine
+from benchmarks.clips import table
+from benchmarks.command import benchmark_parser, show
+from benchmarks.machine import best_time, description, dgemm_rate
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.flip_products import full_body_flips
 from hmt_ros.body.interpretation_tree import enumerate_flips, flip_counts
@@ -29,22 +28,10 @@ YARDSTICK_RATE = 58e9
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = argparse.ArgumentParser(prog='python -m benchmarks flips', description=__doc__)
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument('--quick', action='store_true', help='measure less long')
+    parser = benchmark_parser('flips', __doc__, quick='measure less long')
     options = parser.parse_args(argv)
     result = measure(0.1 if options.quick else 1.0)
-    if options.json:
-        print(json.dumps(rounded(result), indent=1))
-        return 0
-    print(as_text(result))
-    return 0
-
-
-def page() -> str:
-    """The part of the documentation that this benchmark writes."""
-    result = measure()
-    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
+    return show(result, as_text, as_json=options.json)
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:

@@ -20,7 +20,7 @@ from benchmarks import (
 from benchmarks.arm_waving import waving
 from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
-from benchmarks.machine import best_time, description, on_machine
+from benchmarks.machine import best_time, description
 from benchmarks.smoothing_relations import CLOSE, layers_of
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.interpretation_tree import enumerate_flips
@@ -50,12 +50,6 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     result = measure(0.1 if options.quick else 1.0)
     return show(result, as_text, as_json=options.json)
-
-
-def page() -> str:
-    """The part of the documentation that this benchmark writes."""
-    result = measure()
-    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.clips import rounded, table
-from benchmarks.machine import description, dgemm_rate, on_machine
+from benchmarks.clips import table
+from benchmarks.command import benchmark_parser, show
+from benchmarks.machine import description, dgemm_rate
 from hmt_ros.body import Body, Camera, enumerate_flips, load_body
 from hmt_ros.body.distinct_poses import distinct_poses
 from hmt_ros.body.flip_products import full_body_flips
@@ -35,6 +34,7 @@ SIGMA = 1.0  # px, of an image joint
 PRIOR_WEIGHT = 0.01
 OUT_OF_PLANE = np.radians(10.0)
 DRAWN = 20_000  # poses from which the one of the table is chosen
+SAMPLES, QUICK_SAMPLES = 2000, 100  # of each random row
 FRONTAL = 20  # poses that are taken as they are drawn
 APART = 0.01  # m: minima of which no joint differs by as much are one
 ALIKE = 10.0  # nats above the start, within which a minimum explains the image as well
@@ -104,24 +104,17 @@ class Samples:
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    parser = argparse.ArgumentParser(prog='python -m benchmarks kjs', description=__doc__)
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument('--samples', type=int, default=2000, help='random samples a row')
+    parser = benchmark_parser('kjs', __doc__, quick='few samples, and one pose as drawn')
+    parser.add_argument('--samples', type=int, default=SAMPLES, help='random samples a row')
     parser.add_argument('--frontal', type=int, default=FRONTAL, help='poses taken as drawn')
     parser.add_argument('--seed', type=int, default=0, help='of the random samples')
     options = parser.parse_args(argv)
-    result = measure(options.samples, options.frontal, options.seed)
-    print(json.dumps(rounded(result), indent=1) if options.json else as_text(result))
-    return 0
+    amount = (QUICK_SAMPLES, 1) if options.quick else (options.samples, options.frontal)
+    result = measure(*amount, options.seed)
+    return show(result, as_text, as_json=options.json)
 
 
-def page() -> str:
-    """The part of the documentation that this benchmark writes."""
-    result = measure()
-    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
-
-
-def measure(count: int = 2000, frontal: int = FRONTAL, seed: int = 0) -> dict[str, Any]:
+def measure(count: int = SAMPLES, frontal: int = FRONTAL, seed: int = 0) -> dict[str, Any]:
     """All rows of the table at one pose, and kinematic jumps at others."""
     body = load_body('human34')
     setting = setting_of(body, chosen_pose(body))

@@ -16,7 +16,6 @@ import numpy as np
 import hmt_ros
 from benchmarks.clips import find_clips, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
-from benchmarks.machine import on_machine
 from benchmarks.publisher import with_stamp
 from hmt_ros.app.live_node import LiveNode, LiveNodeError, Player, changed_environment
 from hmt_ros.nodes import bme_session, track_messages
@@ -88,12 +87,6 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     result = measure(2.0 if options.quick else SECONDS, options.model, tuple(options.only))
     return show(result, as_text, as_json=options.json)
-
-
-def page() -> str:
-    """The part of the documentation that this benchmark writes."""
-    result = measure()
-    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
 
 
 def measure(

@@ -20,7 +20,7 @@ from benchmarks.exact_smoothing import (
     modes,
     particle_marginals,
 )
-from benchmarks.machine import best_time, on_machine, peak_memory
+from benchmarks.machine import best_time, peak_memory
 from benchmarks.smoothing_clips import as_rows as rows_of_clips
 from benchmarks.smoothing_clips import clips
 from benchmarks.smoothing_peers import (
@@ -52,12 +52,6 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     result = measure(quick=options.quick, only=options.only)
     return show(result, as_text, as_json=options.json)
-
-
-def page() -> str:
-    """The part of the documentation that this benchmark writes."""
-    result = measure()
-    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
 
 
 def measure(*, quick: bool = False, only: Sequence[str] = PARTS) -> dict[str, Any]:

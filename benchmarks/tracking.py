@@ -7,12 +7,11 @@ image positions of the joints with noise of 3 px.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -22,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.clips import Clip, find_clips, read_clip, rounded, table
-from benchmarks.command import told
-from benchmarks.machine import description, forget_peak, on_machine, peak_memory, resident_memory
+from benchmarks.clips import Clip, find_clips, read_clip, table
+from benchmarks.command import benchmark_parser, show, told
+from benchmarks.machine import description, forget_peak, peak_memory, resident_memory
 from benchmarks.stages import StageClock
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
@@ -36,6 +35,8 @@ from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings, read_subj
 from hmt_ros.tracking.evaluation import EVALUATED_JOINTS, ORIGIN, Scores, joint_mixtures, score
 from hmt_ros.tracking.initialisation import start_from_keypoints
 
+PARTS = ('accuracy', 'speed')
+SEEDS = (0, 1, 2)
 TRACKER, SPHERICAL, KEYPOINTS = 'tracker', 'SS samples', '2D keypoints'
 KEYPOINT_SIGMA = 3.0  # px
 OF_KEYPOINTS = 3  # stream of random numbers of a seed
@@ -51,60 +52,60 @@ OPENCV = 'MOG2 + Canny + distance transform'
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark; 1: there is nothing to run it on."""
-    options = _parser().parse_args(argv)
-    try:
-        folders, source = find_clips(options.clips)
-        result = measure(options, folders, source)
-    except ValueError as error:
-        print(f'tracking: {error}', file=sys.stderr)
-        return 1
-    if options.json:
-        print(json.dumps(rounded(result), indent=1))
-    else:
-        print(as_text(result, markdown=options.markdown))
-    return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='python -m benchmarks tracking',
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
+    parser = benchmark_parser('tracking', __doc__, quick='20 images a clip, one seed')
     parser.add_argument('--markdown', action='store_true', help='tables for a Markdown page')
     parser.add_argument(
         '--clips', type=Path, metavar='DIR', help='their folder (the development clips, or bags/)'
     )
-    parser.add_argument('--only', nargs='+', default=[], metavar='NAME', help='some of the clips')
-    parser.add_argument('--seeds', type=int, nargs='+', default=[0, 1, 2], metavar='N')
-    parser.add_argument(
-        '--parts', nargs='+', choices=('accuracy', 'speed'), default=['accuracy', 'speed']
-    )
+    parser.add_argument('--only', nargs='+', default=(), metavar='NAME', help='some of the clips')
+    parser.add_argument('--seeds', type=int, nargs='+', default=SEEDS, metavar='N')
+    parser.add_argument('--parts', nargs='+', choices=PARTS, default=PARTS)
     parser.add_argument(
         '--frames', type=int, default=0, metavar='N',
         help='follow memory over so many images of a clip that is played back and forth',
     )  # fmt: skip
-    parser.add_argument('--quick', action='store_true', help='20 images a clip, one seed')
-    return parser
+    options = parser.parse_args(argv)
+    try:
+        result = measure(
+            options.clips, options.only, options.seeds, options.parts, options.frames,
+            quick=options.quick,
+        )  # fmt: skip
+    except ValueError as error:
+        print(f'tracking: {error}', file=sys.stderr)
+        return 1
+    return show(result, partial(as_text, markdown=options.markdown), as_json=options.json)
 
 
-def page() -> str:
-    """The part of the documentation that this benchmark writes."""
-    folders, source = find_clips(None)
-    result = measure(_parser().parse_args([]), folders, source)
-    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
+def measure(
+    clips: Path | None = None,
+    only: Sequence[str] = (),
+    seeds: Sequence[int] = SEEDS,
+    parts: Sequence[str] = PARTS,
+    frames: int = 0,
+    *,
+    quick: bool = False,
+) -> dict[str, Any]:
+    """Everything that was asked for.
 
+    Args:
+        clips: their folder; None: the development clips, or bags/.
+        only: names of some of them; empty: all.
+        seeds: of the tracker.
+        parts: some of `PARTS`.
+        frames: over so many images memory is followed.
+        quick: 20 images a clip, one seed.
 
-def measure(options: argparse.Namespace, folders: list[Path], source: str) -> dict[str, Any]:
-    """Everything that was asked for."""
-    limit, seeds = (20, options.seeds[:1]) if options.quick else (None, options.seeds)
-    if options.only:
-        folders = [folder for folder in folders if folder.name in options.only]
+    Raises:
+        ValueError: there is no such clip, or it can not be read.
+    """
+    folders, source = find_clips(clips)
+    limit, seeds = (20, seeds[:1]) if quick else (None, seeds)
+    if only:
+        folders = [folder for folder in folders if folder.name in only]
     if not folders:
-        raise ValueError(f'none of the clips {options.only} is there')
-    result: dict[str, Any] = {'machine': description(), 'clips': source, 'seeds': seeds}
-    if 'accuracy' in options.parts:
+        raise ValueError(f'none of the clips {list(only)} is there')
+    result: dict[str, Any] = {'machine': description(), 'clips': source, 'seeds': list(seeds)}
+    if 'accuracy' in parts:
         result['model_residual_mm'] = {
             folder.name: 1e3 * model_residual(read_clip(folder, limit), load_body('human37'))
             for folder in folders
@@ -116,10 +117,10 @@ def measure(options: argparse.Namespace, folders: list[Path], source: str) -> di
                 for folder in told('tracking', folders, lambda folder: folder.name)
                 for entry in _accuracies(folder, limit, seeds, bar)
             ]
-    if 'speed' in options.parts:
-        result['speed'] = speed(read_clip(folders[-1], 20 if options.quick else 60))
-    if options.frames > 0:
-        result['memory'] = memory(read_clip(folders[-1]), options.frames)
+    if 'speed' in parts:
+        result['speed'] = speed(read_clip(folders[-1], 20 if quick else 60))
+    if frames > 0:
+        result['memory'] = memory(read_clip(folders[-1]), frames)
     return result
 
 
@@ -127,7 +128,7 @@ def measure(options: argparse.Namespace, folders: list[Path], source: str) -> di
 
 
 def _accuracies(
-    folder: Path, limit: int | None, seeds: list[int], bar: Any
+    folder: Path, limit: int | None, seeds: Sequence[int], bar: Any
 ) -> Iterator[dict[str, Any]]:
     clip = read_clip(folder, limit)
     body = load_body('human37')

@@ -11,9 +11,8 @@ up to four.
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.clips import rounded, table
+from benchmarks.clips import table
+from benchmarks.command import benchmark_parser, show
 from benchmarks.flips import random_poses
-from benchmarks.machine import description, on_machine
+from benchmarks.machine import description
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.interpretation_tree import enumerate_flips
 from hmt_ros.body.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
@@ -41,6 +41,10 @@ from hmt_ros.tracking.proposals import covariance_scaled_samples
 
 Array = NDArray[np.float64]
 
+PARTS = ('minima', 'tracking')
+SEEDS, POSES, BUDGET = 6, 32, 12  # and samples a pose
+FILMS, IMAGES = 3, 16  # of each motion, of each film
+QUICK = {'seeds': 1, 'poses': 4, 'budget': 12, 'films': 1, 'images': 4}
 BODIES = ('human34', 'human37')
 CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg')
 OFF = TermSettings(0.0, 1.0, 1.0)
@@ -58,71 +62,53 @@ OF_POSES, OF_JUMPS, OF_CLICKS = 1, 2, 3
 
 def main(argv: list[str]) -> int:
     """Runs the benchmark."""
-    options = _parser().parse_args(argv)
-    result = measure(options)
-    if options.json:
-        print(json.dumps(rounded(result), indent=1))
-    else:
-        print(as_text(result))
-    return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog='python -m benchmarks votes',
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument('--seeds', type=int, default=6, metavar='N', help='of random poses')
-    parser.add_argument('--poses', type=int, default=32, metavar='N', help='a seed and body')
-    parser.add_argument('--budget', type=int, default=12, metavar='N', help='samples a pose')
-    parser.add_argument('--films', type=int, default=3, metavar='N', help='a motion; their seeds')
-    parser.add_argument('--images', type=int, default=16, metavar='N', help='a film, at 10 Hz')
+    parser = benchmark_parser('votes', __doc__, quick='one seed, few poses and images')
+    parser.add_argument('--seeds', type=int, default=SEEDS, metavar='N', help='of random poses')
+    parser.add_argument('--poses', type=int, default=POSES, metavar='N', help='a seed and body')
+    parser.add_argument('--budget', type=int, default=BUDGET, metavar='N', help='samples a pose')
     parser.add_argument(
-        '--parts', nargs='+', choices=('minima', 'tracking'), default=['minima', 'tracking']
+        '--films', type=int, default=FILMS, metavar='N', help='a motion; their seeds'
     )
-    parser.add_argument('--quick', action='store_true', help='one seed, few poses and images')
-    return parser
+    parser.add_argument('--images', type=int, default=IMAGES, metavar='N', help='a film, at 10 Hz')
+    parser.add_argument('--parts', nargs='+', choices=PARTS, default=PARTS)
+    options = parser.parse_args(argv)
+    amount = QUICK if options.quick else {name: getattr(options, name) for name in QUICK}
+    return show(measure(parts=options.parts, **amount), as_text, as_json=options.json)
 
 
-def page() -> str:
-    """The part of the documentation that this benchmark writes."""
-    result = measure(_parser().parse_args([]))
-    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
-
-
-def measure(options: argparse.Namespace) -> dict[str, Any]:
+def measure(
+    *,
+    seeds: int = SEEDS,
+    poses: int = POSES,
+    budget: int = BUDGET,
+    films: int = FILMS,
+    images: int = IMAGES,
+    parts: Sequence[str] = PARTS,
+) -> dict[str, Any]:
     """Everything that was asked for."""
-    if options.quick:
-        options.seeds, options.poses, options.budget = 1, 4, 12
-        options.films, options.images = 1, 4
-    seeds = range(options.seeds)
-    films = range(options.films)
-    result: dict[str, Any] = {'machine': description(), 'films': options.films}
-    result['seeds'] = options.seeds
+    result: dict[str, Any] = {'machine': description(), 'films': films, 'seeds': seeds}
     hidden = not sys.stderr.isatty()
-    if 'minima' in options.parts:
-        bar = tqdm(total=len(BODIES) * len(VOTES) * len(seeds), desc='minima', disable=hidden)
+    if 'minima' in parts:
+        bar = tqdm(total=len(BODIES) * len(VOTES) * seeds, desc='minima', disable=hidden)
         with bar:
             result['minima'] = {}
             for name in BODIES:
                 found: dict[str, Any] = {}
                 for vote in VOTES:
                     runs = []
-                    for seed in seeds:
-                        runs.append(new_minima(name, vote, seed, options.poses, options.budget))
+                    for seed in range(seeds):
+                        runs.append(new_minima(name, vote, seed, poses, budget))
                         bar.update()
                     found[vote] = _summary(runs)
                 result['minima'][name] = found
-    if 'tracking' in options.parts:
+    if 'tracking' in parts:
         runs_of: dict[str, dict[str, list[dict[str, float]]]] = {}
         votes = (*VOTES, ALL)
-        total = len(PROCEDURAL_MOTIONS) * len(films) * len(votes)
+        total = len(PROCEDURAL_MOTIONS) * films * len(votes)
         with tqdm(total=total, desc='tracking', disable=hidden) as bar:
             for motion in PROCEDURAL_MOTIONS:
-                for seed in films:
-                    film = filmed(motion, seed, options.images)
+                for seed in range(films):
+                    film = filmed(motion, seed, images)
                     for vote in votes:
                         one = tracked(film, vote, seed)
                         runs_of.setdefault(motion, {}).setdefault(vote, []).append(one)

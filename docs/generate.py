@@ -1,33 +1,22 @@
 """Writes the parts of the pages that are made by programs.
 
-    python docs/generate.py filter_node smoother_node bme_node
-                                           tables of parameters in nodes.md
-    python docs/generate.py flips          times in flips.md
-    python docs/generate.py kjs            minima that samples find in sampling.md (minutes)
-    python docs/generate.py kernels        times in likelihood.md
-    python docs/generate.py nodes          rates and latency of nodes in nodes.md (minutes)
-    python docs/generate.py soak           the table of robustness.md (ten minutes)
-    python docs/generate.py smoothing      exactness and speed in smoothing.md (minutes)
-    python docs/generate.py bags           rates and memory in bags.md (minutes)
-    python docs/generate.py experts        experts.md (a quarter of an hour)
-    python docs/generate.py tracking       accuracy and speed in tracking.md (minutes)
-    python docs/generate.py votes          votes for chains in tracking.md (minutes)
+    python docs/generate.py NAME [NAME ...]
 
-Such a part stands between `<!-- begin NAME -->` and `<!-- end -->`.
+A name of a node, as filter_node, is that of the table of its parameters; one of a benchmark is
+that of what it measures (minutes; soak ten, experts a quarter of an hour). Such a part stands
+between `<!-- begin NAME -->` and `<!-- end -->`.
 """
 
 from __future__ import annotations
 
 import math
-import os
 import sys
 from pathlib import Path
 
-for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
-    os.environ.setdefault(_name, '1')
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent))
 
+# Part: the page that it stands in.
 PAGES = {
     'filter_node': 'nodes.md',
     'smoother_node': 'nodes.md',
@@ -74,32 +63,13 @@ def part(name: str) -> str:
     """The content of a part."""
     if name.endswith('_node'):
         return parameter_table(name)
-    from benchmarks import (
-        bags,
-        experts,
-        flips,
-        kernels,
-        kjs,
-        nodes,
-        smoothing,
-        soak,
-        tracking,
-        votes,
-    )
+    from benchmarks import benchmark
 
-    pages = {
-        'bags': bags,
-        'nodes': nodes,
-        'soak': soak,
-        'flips': flips,
-        'kernels': kernels,
-        'kjs': kjs,
-        'smoothing': smoothing,
-        'experts': experts,
-        'tracking': tracking,
-        'votes': votes,
-    }
-    return pages[name].page()
+    measuring = benchmark(name)
+    from benchmarks.machine import on_machine
+
+    result = measuring.measure()
+    return f'{measuring.as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
 
 
 def parameter_table(node: str) -> str:

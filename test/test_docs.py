@@ -14,6 +14,7 @@ import cv2
 import pytest
 import yaml
 
+from benchmarks import BENCHMARKS
 from hmt_ros.app import COMMANDS
 from hmt_ros.body import load_body
 from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
@@ -111,7 +112,7 @@ def test_commands_are_understood(page):
         if words[:3] == ['python', '-m', 'hmt_ros']:
             parse(words[3:])
         elif words[:3] == ['python', '-m', 'benchmarks']:
-            assert (ROOT / 'benchmarks' / f'{words[3]}.py').is_file()
+            assert words[3] in BENCHMARKS
         elif words[0] == 'make':
             named = [word for word in words[1:] if '=' not in word]
             assert set(named) <= targets, words
@@ -164,6 +165,7 @@ def test_generated_parts_are_up_to_date():
     for node in NODES:
         fresh = generate['with_part'](page, node, generate['parameter_table'](node))
         assert page == fresh, f'run: python docs/generate.py {node}'
+    assert set(generate['PAGES']) == {*NODES, *BENCHMARKS}
     for name, page_name in generate['PAGES'].items():
         text = (ROOT / 'docs' / page_name).read_text('utf-8')
         part = text.partition(f'<!-- begin {name} -->\n')[2].partition('<!-- end -->')[0]

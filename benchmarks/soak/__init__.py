@@ -4,6 +4,6 @@
 `replay` do it; the cases of a running node stand in the modules that are called `node_...`.
 """
 
-from benchmarks.soak.cases import main, page
+from benchmarks.soak.cases import as_text, main, measure
 
-__all__ = ['main', 'page']
+__all__ = ['as_text', 'main', 'measure']

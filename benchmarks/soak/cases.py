@@ -11,7 +11,6 @@ from tqdm import tqdm
 
 from benchmarks.clips import table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
-from benchmarks.machine import on_machine
 from benchmarks.soak.disk import disk
 from benchmarks.soak.files import files
 from benchmarks.soak.messages import messages
@@ -43,12 +42,6 @@ def main(argv: list[str]) -> int:
     result = measure(options.minutes, quick=options.quick, only=tuple(options.only))
     show(result, as_text, as_json=options.json)
     return 0 if result_met(result) else 1
-
-
-def page() -> str:
-    """The part of the documentation that this programme writes."""
-    result = measure()
-    return f'{as_text(result, markdown=True)}\n\n{on_machine(result["machine"])}'
 
 
 def measure(
