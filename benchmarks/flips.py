@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import itertools
-import subprocess
-import sys
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +11,7 @@ from numpy.typing import NDArray
 
 from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
-from benchmarks.machine import best_time, description, dgemm_rate
+from benchmarks.machine import best_time, description, dgemm_rate, peak_memory_apart
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.flip_products import full_body_flips
 from hmt_ros.body.interpretation_tree import enumerate_flips, flip_counts
@@ -119,7 +116,7 @@ def whole_body(seconds: float, rate: float) -> dict[str, Any]:
         'us_per_leaf_at_yardstick': {
             name: 1e6 * spent / leaves * rate / YARDSTICK_RATE for name, spent in steps.items()
         },
-        'peak_mb': memory_of_enumeration(),
+        'peak_mb': peak_memory_apart(enumerate_most) / 1e6,
     }
 
 
@@ -130,25 +127,11 @@ def poses_with_most_leaves(body: Body) -> NDArray[np.float64]:
     return poses[np.argsort(-counts, kind='stable')[:MODES]]
 
 
-def memory_of_enumeration() -> float:
-    """Peak resident memory of a process of its own that does it, MB."""
-    # Not getrusage: a process that another starts inherits its peak from it.
-    code = (
-        'from benchmarks.flips import MOST_LEAVES, poses_with_most_leaves\n'
-        'from pathlib import Path\n'
-        'from hmt_ros.body import load_body\n'
-        'from hmt_ros.body.flip_products import full_body_flips\n'
-        "body = load_body('human37')\n"
-        'product = full_body_flips(body, poses_with_most_leaves(body))\n'
-        'assert len(product.most_probable(MOST_LEAVES).poses) == MOST_LEAVES\n'
-        "status = Path('/proc/self/status').read_text('utf-8').splitlines()\n"
-        "print(next(x.split()[1] for x in status if x.startswith('VmHWM')))\n"
-    )
-    root = Path(__file__).resolve().parents[1]
-    done = subprocess.run(
-        [sys.executable, '-c', code], cwd=root, check=True, capture_output=True, text=True
-    )
-    return 1024.0 * float(done.stdout) / 1e6
+def enumerate_most() -> None:
+    """The most probable leaves of whole bodies, once."""
+    body = load_body('human37')
+    product = full_body_flips(body, poses_with_most_leaves(body))
+    assert len(product.most_probable(MOST_LEAVES).poses) == MOST_LEAVES
 
 
 def random_poses(body: Body, count: int, seed: int) -> NDArray[np.float64]:

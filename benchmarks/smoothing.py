@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -20,7 +19,7 @@ from benchmarks.exact_smoothing import (
     modes,
     particle_marginals,
 )
-from benchmarks.machine import best_time, peak_memory
+from benchmarks.machine import best_time, peak_memory_apart
 from benchmarks.smoothing_clips import as_rows as rows_of_clips
 from benchmarks.smoothing_clips import clips
 from benchmarks.smoothing_peers import (
@@ -58,7 +57,7 @@ def measure(*, quick: bool = False, only: Sequence[str] = PARTS) -> dict[str, An
     """What was asked for; memory first, in a process of its own."""
     times = 12 if quick else TIMES
     parts: dict[str, Callable[[], Any]] = {
-        'memory': lambda: {'peak_mb': peak_memory_apart(times) / 1e6},
+        'memory': lambda: {'peak_mb': peak_memory_apart(smooth_one, times) / 1e6},
         'exactness': lambda: exactness(1 if quick else 4, WALKS[1:2] if quick else WALKS),
         'grid': lambda: grid(1 if quick else 3, 20 if quick else 40),
         'stages': lambda: stages(times, 0.0 if quick else 3.0),
@@ -68,12 +67,6 @@ def measure(*, quick: bool = False, only: Sequence[str] = PARTS) -> dict[str, An
         'clips': lambda: clips(quick),
     }
     return run_stages('smoothing', parts, only)
-
-
-def peak_memory_apart(times: int) -> float:
-    """`memory_of_a_run` in a process of its own, bytes."""
-    with multiprocessing.get_context('spawn').Pool(1) as pool:
-        return pool.apply(memory_of_a_run, (times,))
 
 
 def exactness(seeds: int, walks: tuple[float, ...] = WALKS) -> dict[str, Any]:
@@ -178,12 +171,11 @@ def stages(times: int, seconds: float) -> dict[str, Any]:
     }
 
 
-def memory_of_a_run(times: int) -> float:
-    """Largest resident memory of a process that smooths one sequence, bytes."""
+def smooth_one(times: int) -> None:
+    """Smooths one sequence."""
     sequence = waving(times)
     smoother = MixtureSmoother(sequence.dynamics, sequence.lower, sequence.upper)
     smoother.smooth(sequence.mixtures).marginal(0)
-    return peak_memory()
 
 
 def robust_problem(times: int, seed: int = 0) -> tuple[RobustSequence, Array, Array]:

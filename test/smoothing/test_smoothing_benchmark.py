@@ -73,7 +73,7 @@ def test_longer_windows_are_better_conditioned():
 
 
 def test_report(monkeypatch, capsys):
-    monkeypatch.setattr(smoothing, 'peak_memory_apart', lambda times: 1e8)
+    monkeypatch.setattr(smoothing, 'peak_memory_apart', lambda work, times: 1e8)
     monkeypatch.setattr(smoothing, 'clips', lambda quick: 'skipped: not here')
     assert smoothing.main(['--quick', '--json']) == 0
     result = json.loads(capsys.readouterr().out)
