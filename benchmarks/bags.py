@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from rosbags.rosbag2 import Reader
 from benchmarks.clips import find_clips, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
+from benchmarks.stages import StageClock, Stages
 from hmt_ros.app import replay
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.image.background import BackgroundModel
@@ -34,16 +34,17 @@ LARGE = 2_000_000_000  # bytes
 QUICK_LARGE = 200_000_000
 PICTURE_BYTES = 100_000
 # What estimates: all else that replay does is added by it.
-ESTIMATORS: tuple[tuple[Any, str], ...] = (
-    (Tracker, 'step'),
-    (smoother_session, 'merge_close_modes'),
-    (SlidingWindow, 'step'),
-    (SlidingWindow, 'finish'),
-    (TrajectoryMixture, 'marginal'),
-    (GaussianMixture, 'reduce'),
-    (BackgroundModel, 'learn'),
-    (BackgroundModel, 'silhouette'),
-    (PosePredictor, 'observe'),
+ESTIMATE = 'estimate'
+ESTIMATORS: Stages = (
+    (Tracker, 'step', ESTIMATE),
+    (smoother_session, 'merge_close_modes', ESTIMATE),
+    (SlidingWindow, 'step', ESTIMATE),
+    (SlidingWindow, 'finish', ESTIMATE),
+    (TrajectoryMixture, 'marginal', ESTIMATE),
+    (GaussianMixture, 'reduce', ESTIMATE),
+    (BackgroundModel, 'learn', ESTIMATE),
+    (BackgroundModel, 'silhouette', ESTIMATE),
+    (PosePredictor, 'observe', ESTIMATE),
 )
 
 
@@ -234,11 +235,13 @@ def replayed(folder: Path) -> list[dict[str, Any]]:
     _run(source, folder / 'first', ways['filter, smoother and BME'])
     found = []
     for number, (what, options) in enumerate(ways.items()):
-        with clock() as estimates:
+        clock = StageClock(ESTIMATORS)
+        with clock.running():
             start = time.perf_counter()
             _run(source, folder / str(number), options)
             seconds = time.perf_counter() - start
-        added = seconds - estimates[0]
+        estimate = clock.seconds[ESTIMATE]
+        added = seconds - estimate
         with BagReader(source) as bag:
             images = bag.find_topic(['sensor_msgs/msg/CompressedImage']).message_count
         found.append(
@@ -246,11 +249,11 @@ def replayed(folder: Path) -> list[dict[str, Any]]:
                 'what': what,
                 'clip': source.name,
                 'images': images,
-                'estimate_ms': 1e3 * estimates[0] / images,
+                'estimate_ms': 1e3 * estimate / images,
                 'added_ms': 1e3 * added / images,
-                'share': added / estimates[0],
+                'share': added / estimate,
                 'wanted': f'at most {100 * MOST_ADDED:g} %',
-                'met': added <= MOST_ADDED * estimates[0],
+                'met': added <= MOST_ADDED * estimate,
             }
         )
     return found
@@ -261,94 +264,54 @@ def _run(source: Path, target: Path, options: list[str]) -> None:
         raise ValueError(f'replay of {source} ended with {code}')
 
 
-@contextmanager
-def clock() -> Iterator[list[float]]:
-    """Sums up the seconds in estimators, which may call each other."""
-    total = [0.0]
-    within = [False]
-
-    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
-        def run(*args: Any, **kwargs: Any) -> Any:
-            if within[0]:
-                return function(*args, **kwargs)
-            within[0] = True
-            start = time.perf_counter()
-            try:
-                return function(*args, **kwargs)
-            finally:
-                total[0] += time.perf_counter() - start
-                within[0] = False
-
-        return run
-
-    usual = [(owner, name, getattr(owner, name)) for owner, name in ESTIMATORS]
-    try:
-        for owner, name, function in usual:
-            setattr(owner, name, timed(function))
-        yield total
-    finally:
-        for owner, name, function in usual:
-            setattr(owner, name, function)
-
-
 # What is printed
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """Tables for people."""
-    parts = []
-    if 'reading' in result:
-        rows = [
-            ['reading', 'messages', 'this package', 'rosbags', 'ratio', f'at least {LEAST_RATE}']
+    tables = {'reading': _reading_rows, 'memory': _memory_rows, 'replay': _replay_rows}
+    return '\n\n'.join(
+        table(rows(result[stage]), markdown=markdown)
+        for stage, rows in tables.items()
+        if stage in result
+    )
+
+
+def _reading_rows(cases: list[dict[str, Any]]) -> list[list[str]]:
+    head = ['reading', 'messages', 'this package', 'rosbags', 'ratio', f'at least {LEAST_RATE}']
+    return [head] + [
+        [
+            f'{case["what"]}, {case["how"]}', str(case['messages']),
+            f'{case["ours_mb_per_s"]:.0f} MB/s', f'{case["rosbags_mb_per_s"]:.0f} MB/s',
+            f'{case["ratio"]:.2f}', _verdict(case),
         ]
-        rows += [
-            [
-                f'{case["what"]}, {case["how"]}',
-                str(case['messages']),
-                f'{case["ours_mb_per_s"]:.0f} MB/s',
-                f'{case["rosbags_mb_per_s"]:.0f} MB/s',
-                f'{case["ratio"]:.2f}',
-                _verdict(case),
-            ]
-            for case in result['reading']
+        for case in cases
+    ]  # fmt: skip
+
+
+def _memory_rows(case: dict[str, Any]) -> list[list[str]]:
+    return [
+        [
+            'resident memory', 'size', 'growth on the way', 'most, reading', 'most, writing',
+            f'at most {MOST_GROWTH / 1e6:g} MB more',
+        ],
+        [
+            'one large bag', f'{case["gb"]:.2f} GB', f'{case["growth_mb"]:.1f} MB',
+            f'{case["reading_mb"]:.0f} MB', f'{case["writing_mb"]:.0f} MB', _verdict(case),
+        ],
+    ]  # fmt: skip
+
+
+def _replay_rows(cases: list[dict[str, Any]]) -> list[list[str]]:
+    most = f'at most {100 * MOST_ADDED:g} %'
+    return [['replay, per image', 'images', 'estimate', 'added', 'share', most]] + [
+        [
+            f'{case["clip"]}, {case["what"]}', str(case['images']),
+            f'{case["estimate_ms"]:.0f} ms', f'{case["added_ms"]:.1f} ms',
+            f'{100 * case["share"]:.1f} %', _verdict(case),
         ]
-        parts.append(table(rows, markdown=markdown))
-    if 'memory' in result:
-        case = result['memory']
-        rows = [
-            [
-                'resident memory',
-                'size',
-                'growth on the way',
-                'most, reading',
-                'most, writing',
-                'at most 32 MB more',
-            ],
-            [
-                'one large bag',
-                f'{case["gb"]:.2f} GB',
-                f'{case["growth_mb"]:.1f} MB',
-                f'{case["reading_mb"]:.0f} MB',
-                f'{case["writing_mb"]:.0f} MB',
-                _verdict(case),
-            ],
-        ]
-        parts.append(table(rows, markdown=markdown))
-    if 'replay' in result:
-        rows = [['replay, per image', 'images', 'estimate', 'added', 'share', 'at most 10 %']]
-        rows += [
-            [
-                f'{case["clip"]}, {case["what"]}',
-                str(case['images']),
-                f'{case["estimate_ms"]:.0f} ms',
-                f'{case["added_ms"]:.1f} ms',
-                f'{100 * case["share"]:.1f} %',
-                _verdict(case),
-            ]
-            for case in result['replay']
-        ]
-        parts.append(table(rows, markdown=markdown))
-    return '\n\n'.join(parts)
+        for case in cases
+    ]  # fmt: skip
 
 
 def _verdict(case: dict[str, Any]) -> str:

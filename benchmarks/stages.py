@@ -1,9 +1,9 @@
-"""Where the time of a tracking step goes: a clock around the parts of the tracker, from outside."""
+"""Where time goes: a clock around parts, from outside; and the parts of a tracking step."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -15,7 +15,8 @@ from hmt_ros.tracking.pose_energy import PoseEnergy
 from hmt_ros.tracking.tracker import Tracker
 
 # Part of the tracker -> name of the stage; time in a part that another part calls is its own.
-STAGES: tuple[tuple[Any, str, str], ...] = (
+Stages = Sequence[tuple[Any, str, str]]
+STAGES: Stages = (
     (BackgroundModel, 'silhouette', 'background'),
     (tracker_module, 'observe', 'observation'),
     (Tracker, '_begin', 'start of the track'),
@@ -35,9 +36,14 @@ PROPOSED = ('combinations', 'samples')
 
 
 class StageClock:
-    """Seconds per stage, summed up."""
+    """Seconds per stage, summed up.
 
-    def __init__(self) -> None:
+    Args:
+        stages: owner of a part, its name there, and the stage that it is.
+    """
+
+    def __init__(self, stages: Stages = STAGES) -> None:
+        self._stages = stages
         self.seconds: dict[str, float] = {}
         self._stack: list[str] = []
         self._since = 0.0
@@ -80,10 +86,10 @@ class StageClock:
 
     @contextmanager
     def running(self) -> Iterator[StageClock]:
-        """While it runs, the parts of all trackers are timed."""
-        usual = [(owner, name, getattr(owner, name)) for owner, name, _ in STAGES]
+        """While it runs, the parts are timed, whoever calls them."""
+        usual = [(owner, name, getattr(owner, name)) for owner, name, _ in self._stages]
         try:
-            for (owner, name, stage), (_, _, function) in zip(STAGES, usual, strict=True):
+            for (owner, name, stage), (_, _, function) in zip(self._stages, usual, strict=True):
                 setattr(owner, name, self._wrapped(function, stage))
             yield self
         finally:
