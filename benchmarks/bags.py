@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from rosbags.rosbag2 import Reader
 
-from benchmarks.clips import find_clips, table
+from benchmarks.clips import COMPRESSED, find_clips, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.stages import StageClock, Stages
@@ -243,7 +243,7 @@ def replayed(folder: Path) -> list[dict[str, Any]]:
         estimate = clock.seconds[ESTIMATE]
         added = seconds - estimate
         with BagReader(source) as bag:
-            images = bag.find_topic(['sensor_msgs/msg/CompressedImage']).message_count
+            images = bag.find_topic([COMPRESSED]).message_count
         found.append(
             {
                 'what': what,

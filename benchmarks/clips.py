@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from msg_tools.headers import time_ns
 from msg_tools.images import decode_image
 
 ROOT = Path(__file__).resolve().parents[1]
-IMAGES = ('sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/Image')
+COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+IMAGES = (COMPRESSED, 'sensor_msgs/msg/Image')
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +60,14 @@ class Clip:
     def back_and_forth(self, frames: int) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """So many images with increasing stamps: to the end, back to the start, and again."""
         step = self.stamps[1] - self.stamps[0]
-        at, direction = 0, 1
         for i in range(frames):
-            yield self.stamps[0] + i * step, self.images[at]
-            if not 0 <= at + direction < len(self.images):
-                direction = -direction
-            at += direction
+            yield self.stamps[0] + i * step, self.images[index_back_and_forth(i, len(self.images))]
+
+
+def index_back_and_forth(number: int, count: int) -> int:
+    """Index of what is shown as the number-th, of so many that are shown to the end and back."""
+    turn = max(2 * count - 2, 1)
+    return min(number % turn, turn - number % turn)
 
 
 def find_clips(folder: Path | None) -> tuple[list[Path], str]:
@@ -96,22 +100,29 @@ def _clips_in(folder: Path) -> list[Path]:
     return found
 
 
+def read_messages(
+    folder: Path, kinds: Sequence[str] = IMAGES, frames: int | None = None
+) -> tuple[Any, list[Any]]:
+    """Calibration and images of a clip as they are in its bag, or the first of them.
+
+    Raises:
+        ValueError: a bag that can not be read, or with no such topics.
+    """
+    with BagReader(folder) as bag:
+        topic = bag.find_topic(kinds).name
+        info = next(bag.messages([bag.find_topic(['sensor_msgs/msg/CameraInfo']).name])).message
+        return info, [stored.message for stored in islice(bag.messages([topic]), frames)]
+
+
 def read_clip(folder: Path, frames: int | None = None) -> Clip:
     """Reads a clip, or its first frames.
 
     Raises:
         ValueError: files that can not be read, or that do not fit each other.
     """
-    stamps: list[int] = []
-    images: list[NDArray[np.uint8]] = []
-    with BagReader(folder) as bag:
-        topic = bag.find_topic(IMAGES).name
-        info = next(bag.messages([bag.find_topic(['sensor_msgs/msg/CameraInfo']).name])).message
-        for stored in bag.messages([topic]):
-            if frames is not None and len(images) == frames:
-                break
-            stamps.append(time_ns(stored.message.header.stamp))
-            images.append(decode_image(stored.message))
+    info, messages = read_messages(folder, frames=frames)
+    stamps = [time_ns(message.header.stamp) for message in messages]
+    images = [decode_image(message) for message in messages]
     background = cv2.imread(str(folder / 'background.png'))
     if background is None:
         raise ValueError(f'{folder / "background.png"} is no image')

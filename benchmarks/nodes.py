@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 import hmt_ros
-from benchmarks.clips import find_clips, table
+from benchmarks.clips import COMPRESSED, find_clips, index_back_and_forth, read_messages, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.publisher import with_stamp
 from hmt_ros.app.live_node import LiveNode, LiveNodeError, Player, changed_environment
@@ -23,7 +23,7 @@ from hmt_ros.nodes.bme_parameters import BmeParameters
 from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
 from hmt_ros.nodes.filter_parameters import FilterParameters
 from hmt_ros.nodes.published_topic import PublishedTopic
-from msg_tools import BagReader, RosbagsMessages
+from msg_tools import RosbagsMessages
 from msg_tools.cdr import serialise
 from msg_tools.headers import time_ns
 from msg_tools.images import compressed_image_message, decode_image, image_message
@@ -241,9 +241,7 @@ class _Heard:
     def show(self, number: int, data: Sequence[bytes]) -> None:
         """Publishes an image."""
         stamp = self.feed.start_ns + number * self.feed.step_ns
-        turn = max(2 * len(data) - 2, 1)
-        at = min(number % turn, turn - number % turn)
-        content = with_stamp(data[at], stamp)
+        content = with_stamp(data[index_back_and_forth(number, len(data))], stamp)
         self.sent[stamp] = time.perf_counter()
         self.node.publish_bytes(IMAGE, content)
 
@@ -282,10 +280,7 @@ class _Heard:
 def _recorded() -> tuple[Path, Any, list[Any]]:
     """A clip: its folder, calibration and images."""
     folder = find_clips(None)[0][-1]
-    with BagReader(folder) as bag:
-        info = next(bag.messages([bag.find_topic(['sensor_msgs/msg/CameraInfo']).name])).message
-        topic = bag.find_topic(['sensor_msgs/msg/CompressedImage']).name
-        return folder, info, [stored.message for stored in bag.messages([topic])]
+    return folder, *read_messages(folder, [COMPRESSED])
 
 
 def _prompt(transport: str) -> Feed:

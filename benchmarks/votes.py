@@ -24,12 +24,13 @@ from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
 from benchmarks.flips import random_poses
 from benchmarks.machine import description
+from benchmarks.tracking import keypoints_only
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.interpretation_tree import enumerate_flips
 from hmt_ros.body.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
 from hmt_ros.body.viewpoint import Viewpoint
 from hmt_ros.image.background import BackgroundModel
-from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
+from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Keypoints, Observation
 from hmt_ros.image.renderer import render_frames
 from hmt_ros.image.scene import Scene
@@ -47,10 +48,7 @@ FILMS, IMAGES = 3, 16  # of each motion, of each film
 QUICK = {'seeds': 1, 'poses': 4, 'budget': 12, 'films': 1, 'images': 4}
 BODIES = ('human34', 'human37')
 CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg')
-OFF = TermSettings(0.0, 1.0, 1.0)
-ONLY_JOINTS = LikelihoodSettings(
-    containment=OFF, coverage=OFF, edges=OFF, intensity=OFF, motion=OFF
-)
+ONLY_JOINTS = keypoints_only(TrackerSettings()).likelihood
 SIGMA = 2.0  # px, of the joints
 SAME = 0.05  # m
 PLAUSIBLE = 4.6  # of energy above the best, ln 100: a hundredth of its probability

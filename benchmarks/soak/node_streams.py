@@ -10,9 +10,10 @@ from contextlib import suppress
 
 import numpy as np
 
+from benchmarks.clips import ROOT
 from benchmarks.publisher import STEP_NS, as_file
 from benchmarks.soak.outcome import Amount, Outcome
-from benchmarks.soak.scenes import ROOT, stamped
+from benchmarks.soak.scenes import stamped
 from benchmarks.soak.watched_node import PATIENCE, Silent, Watched
 from hmt_ros.app.live_node import LiveNodeError, environment
 from hmt_ros.nodes.handled import Handled

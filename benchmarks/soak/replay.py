@@ -12,8 +12,9 @@ from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from benchmarks.clips import ROOT
 from benchmarks.soak.outcome import Amount, Outcome
-from benchmarks.soak.scenes import CLIP, ROOT
+from benchmarks.soak.scenes import CLIP
 
 # How long a bag may take to begin, and nodes to end, s.
 _PATIENCE = 60.0

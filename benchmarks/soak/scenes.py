@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.clips import COMPRESSED, ROOT, index_back_and_forth, read_messages
 from benchmarks.publisher import STEP_NS
 from hmt_ros.body import load_body
 from hmt_ros.inference import GaussianMixture
@@ -24,13 +24,12 @@ from hmt_ros.nodes.session import Session
 from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.nodes.smoother_session import BODY, MIXTURE, SmootherSession
 from hmt_ros.tracking import TrackerSettings
-from msg_tools import BagReader, RosbagsMessages
+from msg_tools import RosbagsMessages
 from msg_tools.bodies import message_of_body
 from msg_tools.headers import header_message, time_ns
 from msg_tools.images import decode_image, image_message
 from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
-ROOT = Path(__file__).resolve().parents[2]
 CLIP = ROOT / 'bags' / 'reach'
 _SMALL = TrackerSettings(max_hypotheses=2, candidates=4, combinations=16)
 
@@ -69,7 +68,8 @@ class Scene:
 
     def message(self, index: int) -> Any:
         """A message of the counted source; stamps grow with the index."""
-        return stamped(self._picture(index), self.stamp(index))
+        picture = self.pictures[index_back_and_forth(index, len(self.pictures))]
+        return stamped(picture, self.stamp(index))
 
     def stamp(self, index: int) -> int:
         """Of a message, ns."""
@@ -84,11 +84,6 @@ class Scene:
                 RosbagsMessages(), picture, time_ns(header.stamp), str(header.frame_id)
             )
         return {**self.others, self.counted: message}
-
-    def _picture(self, index: int) -> Any:
-        count = len(self.pictures)
-        at = index % max(2 * count - 2, 1)
-        return self.pictures[at if at < count else 2 * count - 2 - at]
 
 
 def stamped(message: Any, stamp_ns: int) -> Any:
@@ -105,10 +100,8 @@ def scenes() -> dict[str, Scene]:
 
 @cache
 def _clip() -> tuple[Any, tuple[Any, ...]]:
-    with BagReader(CLIP) as bag:
-        info = next(bag.messages([bag.find_topic(['sensor_msgs/msg/CameraInfo']).name])).message
-        topic = bag.find_topic(['sensor_msgs/msg/CompressedImage']).name
-        return info, tuple(stored.message for stored in bag.messages([topic]))
+    info, images = read_messages(CLIP, [COMPRESSED])
+    return info, tuple(images)
 
 
 _CAMERA = {

@@ -29,11 +29,10 @@ class Watched:
 
     Args:
         scene: of the node.
-        changes: of its parameters.
     """
 
-    def __init__(self, scene: Scene, **changes: Any) -> None:
-        self.scene, self._changes = scene, changes
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
         self._opened = ExitStack()
         self.restart()
 
@@ -48,7 +47,7 @@ class Watched:
                 self.player,
                 opened,
                 scene.node,
-                replace(scene.parameters, reset_on_time_jump=True, **self._changes),
+                replace(scene.parameters, reset_on_time_jump=True),
                 inputs=scene.inputs,
                 topics=scene.topics,
                 sensors=scene.sensors,
