@@ -114,12 +114,9 @@ def _deepest(parts, pairs, columns, origins, rows, other_rows, result):  # type:
         a, b = rows[m], other_rows[m]
         for pair in range(len(pairs)):
             i, j = pairs[pair, 0], pairs[pair, 1]
-            gap = 0.0
-            for x in range(3):
-                gap += (centres[a, i, x] - centres[b, j, x]) ** 2
-            if gap > (parts.reaches[i] + parts.reaches[j]) ** 2:
+            if _far(parts, i, j, centres[a], centres[b], 0.0):
                 continue
-            found = _overlap(parts, i, j, columns[a], origins[a], columns[b], origins[b])
+            found = _overlap(parts, i, j, columns[a], centres[a], columns[b], centres[b])
             result[m] = max(result[m], found[9])
 
 
@@ -163,32 +160,26 @@ def _pairs(body: Body) -> tuple[Index, Index]:
     rest[~body.skeleton.dof_is_rotation] = 0.0
     columns, origins = forward(body.skeleton, rest[None]).by_pose()
     axes = _axes_of(body)
+    centres = np.empty((len(parts), 3))
+    _place_centres(axes, columns[0], origins[0], centres)
     apart = [
-        _overlap(axes, i, j, columns[0], origins[0], columns[0], origins[0])[9] < TOLERANCE
+        _overlap(axes, i, j, columns[0], centres, columns[0], centres)[9] < TOLERANCE
         for i, j in zip(first, second, strict=True)
     ]
     return first[apart], second[apart]
 
 
 @njit(cache=True, nogil=True)
-def _overlap(parts, i, j, columns, origins, others, starts):  # type: ignore[no-untyped-def]
+def _overlap(parts, i, j, columns, centres, others, middles):  # type: ignore[no-untyped-def]
     """Nearest points p and q of the axes of two parts, the direction between, and the overlap.
 
-    The first part is placed by columns and origins, the second by others and starts. The axes are
+    The first part is placed by columns and centres, the second by others and middles. The axes are
     middle + s axis, s in [-1, 1]; all ten numbers are scalars, as small arrays would cost more than
     the arithmetic.
     """
     a, b = parts.segments[i], parts.segments[j]
-    c0 = c1 = c2 = e0 = e1 = e2 = 0.0
-    for k in range(3):
-        c0 += columns[a, k, 0] * parts.centres[i, k]
-        c1 += columns[a, k, 1] * parts.centres[i, k]
-        c2 += columns[a, k, 2] * parts.centres[i, k]
-        e0 += others[b, k, 0] * parts.centres[j, k]
-        e1 += others[b, k, 1] * parts.centres[j, k]
-        e2 += others[b, k, 2] * parts.centres[j, k]
-    c0, c1, c2 = c0 + origins[a, 0], c1 + origins[a, 1], c2 + origins[a, 2]
-    e0, e1, e2 = e0 + starts[b, 0], e1 + starts[b, 1], e2 + starts[b, 2]
+    c0, c1, c2 = centres[i, 0], centres[i, 1], centres[i, 2]
+    e0, e1, e2 = middles[j, 0], middles[j, 1], middles[j, 2]
     h, g = parts.halves[i], parts.halves[j]
     u0, u1, u2 = columns[a, 2, 0] * h, columns[a, 2, 1] * h, columns[a, 2, 2] * h
     v0, v1, v2 = others[b, 2, 0] * g, others[b, 2, 1] * g, others[b, 2, 2] * g
@@ -229,19 +220,19 @@ def _place_centres(parts, columns, origins, centres):  # type: ignore[no-untyped
     for i in range(len(parts.segments)):
         s = parts.segments[i]
         for x in range(3):
-            total = origins[s, x]
+            total = 0.0
             for k in range(3):
                 total += columns[s, k, x] * parts.centres[i, k]
-            centres[i, x] = total
+            centres[i, x] = total + origins[s, x]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _far(parts, i, j, centres):  # type: ignore[no-untyped-def]
-    """Whether two parts are too far from each other to overlap by more than is tolerated."""
-    x = centres[i, 0] - centres[j, 0]
-    y = centres[i, 1] - centres[j, 1]
-    z = centres[i, 2] - centres[j, 2]
-    reach = parts.reaches[i] + parts.reaches[j] - TOLERANCE
+def _far(parts, i, j, centres, middles, allowed):  # type: ignore[no-untyped-def]
+    """Whether two parts are too far from each other to overlap by more than is allowed."""
+    x = centres[i, 0] - middles[j, 0]
+    y = centres[i, 1] - middles[j, 1]
+    z = centres[i, 2] - middles[j, 2]
+    reach = parts.reaches[i] + parts.reaches[j] - allowed
     return x * x + y * y + z * z > reach * reach
 
 
@@ -258,10 +249,10 @@ def _add_overlaps(  # type: ignore[no-untyped-def]
         _place_centres(parts, columns[n], origins[n], centres)
         for pair in range(len(first)):
             i, j = first[pair], second[pair]
-            if _far(parts, i, j, centres):
+            if _far(parts, i, j, centres, centres, TOLERANCE):
                 continue
             p0, p1, p2, q0, q1, q2, d0, d1, d2, depth = _overlap(
-                parts, i, j, columns[n], origins[n], columns[n], origins[n]
+                parts, i, j, columns[n], centres, columns[n], centres
             )
             overlap = (depth - TOLERANCE) / sigma
             if overlap <= 0.0:
