@@ -177,7 +177,7 @@ class FlipProduct:
     def _leaves(self, trunks: Index, picks: Index, log_priors: Array) -> Leaves:
         poses = np.take(self.trunks, trunks, axis=0)
         for c, chain in enumerate(self.chains):
-            dofs = np.array(_chain_dofs(self.body, chain), dtype=np.int64)
+            dofs = self.body.skeleton.chain_dofs[chain]
             _put_angles(poses, dofs, self.angles[c], trunks, picks[:, c])
         return Leaves(poses, log_priors, trunks)
 
@@ -255,11 +255,11 @@ def full_body_flips(
     angles, log_priors = [], []
     for chain in names:
         own, valid = _hung(body, given, trunks, parents, chain, slack)
-        dofs = _chain_dofs(body, chain)
+        dofs = body.skeleton.chain_dofs[chain]
         offset = (own - body.prior_mean[dofs]) / body.prior_sigma[dofs]
         angles.append(own)
         log_priors.append(np.where(valid, -0.5 * (offset * offset).sum(2), -np.inf))
-    limbs = [j for chain in names for j in _chain_dofs(body, chain)]
+    limbs = [j for chain in names for j in body.skeleton.chain_dofs[chain]]
     offset = (trunks - body.prior_mean) / body.prior_sigma
     offset[:, limbs] = 0.0
     trunk_log_priors = -0.5 * (offset * offset).sum(1)
@@ -277,17 +277,13 @@ def full_body_flips(
     )  # fmt: skip
 
 
-def _chain_dofs(body: Body, chain: str) -> list[int]:
-    return [j for s in body.chains[chain] for j in body.skeleton.segment_dofs[s]]
-
-
 def _torso_flips(body: Body, poses: Array, slack: float) -> tuple[Array, Index]:
     """Flipped torsos (T, d) that have the image of those of poses within a slack, and of which."""
     flips, parents = flip_torso(body, poses)
     if len(flips) == 0:
         return flips, parents
     which = body.skeleton.joint_index(JOINTS)
-    limbs = [j for chain in body.chains for j in _chain_dofs(body, chain)]
+    limbs = [j for chain in body.chains for j in body.skeleton.chain_dofs[chain]]
     free = [name for j, name in enumerate(body.dof_names) if j not in limbs]
     before = body.joint_positions(poses)[:, which]
     seen = before[parents]
@@ -320,7 +316,7 @@ def _hung(
 
     The first trunks are those of the poses; each has the given leaf first.
     """
-    dofs, count = _chain_dofs(body, chain), len(poses)
+    dofs, count = body.skeleton.chain_dofs[chain], len(poses)
     leaves, roots = enumerate_flips(body, None, poses, chain)
     seen, others = poses[parents[count:]], trunks[count:]
     hung, owners = rehang_chain(body, seen, others, chain, slack=slack)
@@ -343,10 +339,10 @@ def _reached(
     body: Body, poses: Array, trunks: Array, chain: str, slack: float
 ) -> tuple[Array, Index]:
     """Poses whose chain comes within the slack of its rays, where no leaf of its tree does."""
-    dofs = _chain_dofs(body, chain)
+    dofs = body.skeleton.chain_dofs[chain]
     skeleton = body.skeleton
-    own = np.isin(skeleton.joint_segments, skeleton.chains[chain])
-    names = tuple(name for name, ok in zip(skeleton.joint_names, own, strict=True) if ok)
+    own = skeleton.chain_joints[chain]
+    names = tuple(skeleton.joint_names[j] for j in own)
     seen = body.joint_positions(poses)[:, own]
     starts = trunks.copy()
     starts[:, dofs] = poses[:, dofs]
@@ -382,7 +378,7 @@ class _Pruning:
         poses, rows, count = [], [], 0
         for chain, angles in zip(self.chains, self.angles, strict=True):
             block = np.repeat(self.trunks[:, None], angles.shape[1], axis=1)
-            block[..., _chain_dofs(self.body, chain)] = angles
+            block[..., self.body.skeleton.chain_dofs[chain]] = angles
             poses.append(block.reshape(-1, self.body.dimension))
             rows.append(count + np.arange(len(poses[-1])).reshape(angles.shape[:2]))
             count += len(poses[-1])

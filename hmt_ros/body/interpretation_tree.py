@@ -247,7 +247,7 @@ def _chain(skeleton: Skeleton, name: str) -> _Chain:
                 f'{skeleton.dof_names[bend]} of {skeleton.name} has limits that no angle satisfies'
             )
     which = list(segments)
-    own = [j for s in segments for j in skeleton.segment_dofs[s]]
+    own = skeleton.chain_dofs[name]
     counts = [len(skeleton.segment_dofs[s]) for s in segments]
     return _Chain(
         np.array(which, dtype=np.int64),
@@ -256,7 +256,7 @@ def _chain(skeleton: Skeleton, name: str) -> _Chain:
         np.array([not np.array_equal(mount, np.eye(3)) for mount in skeleton.mounts[which]]),
         np.array(lengths),
         np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        np.array(own, dtype=np.int64),
+        own,
         skeleton.lower[own],
         skeleton.upper[own],
         np.array(sides),

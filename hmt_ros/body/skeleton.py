@@ -127,6 +127,22 @@ class Skeleton:
         )
 
     @cached_property
+    def chain_dofs(self) -> dict[str, Index]:
+        """Degrees of freedom of each chain, segment by segment."""
+        return {
+            chain: np.array([j for s in own for j in self.segment_dofs[s]], dtype=np.intp)
+            for chain, own in self.chains.items()
+        }
+
+    @cached_property
+    def chain_joints(self) -> dict[str, Index]:
+        """Joints that the segments of each chain carry."""
+        return {
+            chain: np.flatnonzero(np.isin(self.joint_segments, own))
+            for chain, own in self.chains.items()
+        }
+
+    @cached_property
     def moves(self) -> NDArray[np.bool_]:
         """(S, d): whether a degree of freedom moves a segment."""
         result = np.zeros((len(self.parents), self.dimension), dtype=bool)

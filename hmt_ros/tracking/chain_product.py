@@ -10,7 +10,6 @@ poses.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +17,6 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.distinct_poses import distinct_poses
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.skeleton import Skeleton
-from hmt_ros.tracking.proposals import chain_dofs
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -75,20 +72,14 @@ def distinct_alternatives(
     """
     skeleton = body.skeleton
     poses = np.repeat(pose[None], len(angles), axis=0)
-    poses[:, chain_dofs(body, chain)] = angles
-    moved = _chain_joints(skeleton, chain)
+    poses[:, body.skeleton.chain_dofs[chain]] = angles
+    moved = skeleton.chain_joints[chain]
     frames = forward(skeleton, poses)
     joints = frames.points(skeleton.joint_segments[moved], skeleton.joint_offsets[moved])
     kept, owner = distinct_poses(joints.transpose(2, 0, 1), apart, most)
     least = np.full((len(kept), len(penalties)), np.inf)
     np.minimum.at(least, owner[owner >= 0], penalties[:, owner >= 0].T)
     return Alternatives(chain, angles[kept], np.ascontiguousarray(least.T))
-
-
-@lru_cache(maxsize=256)
-def _chain_joints(skeleton: Skeleton, chain: str) -> Index:
-    """The joints that the segments of a chain carry."""
-    return np.flatnonzero(np.isin(skeleton.joint_segments, skeleton.chains[chain]))
 
 
 def best_combinations(
@@ -137,7 +128,7 @@ def best_combinations(
     poses = modes[parent]
     energies = np.full(len(best), base_energy)
     for c, (own, change) in enumerate(zip(alternatives, changes, strict=True)):
-        poses[:, chain_dofs(body, own.chain)] = own.angles[picks[:, c]]
+        poses[:, body.skeleton.chain_dofs[own.chain]] = own.angles[picks[:, c]]
         energies = energies + change[picks[:, c]]
     return Combinations(poses, parent, energies, total[best])
 

@@ -19,7 +19,6 @@ from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures
 from hmt_ros.inference.bounded_newton import minimise
-from hmt_ros.tracking.proposals import chain_dofs
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -70,7 +69,7 @@ class ChainSearch:
         for name, traced, occluders in (('_own', own, None), ('_rest', rest, rest)):
             likelihood = ImageLikelihood(self.body, self.camera, self.settings, traced, occluders)
             object.__setattr__(self, name, likelihood)
-        object.__setattr__(self, 'dofs', chain_dofs(self.body, self.chain))
+        object.__setattr__(self, 'dofs', self.body.skeleton.chain_dofs[self.chain])
 
     _own: ImageLikelihood = None  # type: ignore[assignment]
     _rest: ImageLikelihood = None  # type: ignore[assignment]

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.interpretation_tree import enumerate_flips
 from hmt_ros.tracking.candidates import relative_joints
-from hmt_ros.tracking.proposals import chain_dofs
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -62,7 +61,7 @@ def chain_votes(
     result = np.ones((len(covariances), len(chains)))
     if vote in ('trace', 'eigenvalue', 'minima'):
         for i, chain in enumerate(chains):
-            own = chain_dofs(body, chain)
+            own = body.skeleton.chain_dofs[chain]
             block = covariances[:, own[:, None], own]
             if vote == 'eigenvalue':
                 result[:, i] = np.linalg.eigvalsh(block)[:, -1]
@@ -89,8 +88,8 @@ def depth_variances(body: Body, poses: Array, covariances: Array, chain: str) ->
     A joint that moves along its ray is seen where it was: this is the covariance projected onto
     the displacements that leave the image as it is.
     """
-    own = chain_dofs(body, chain)
-    moved = np.isin(body.skeleton.joint_segments, body.skeleton.chains[chain])
+    own = body.skeleton.chain_dofs[chain]
+    moved = body.skeleton.chain_joints[chain]
     joints = body.joint_positions(poses)[:, moved]
     rays = joints / np.linalg.norm(joints, axis=2, keepdims=True)
     along = np.einsum('kjx,kjxd->kjd', rays, body.joint_jacobians(poses)[:, moved][..., own])

@@ -33,7 +33,6 @@ from hmt_ros.image.surface import (
     lens_of,
     trace_contour,
 )
-from hmt_ros.tracking.proposals import chain_dofs
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -67,7 +66,7 @@ class EdgeJumps:
     @cached_property
     def dofs(self) -> Index:
         """Degrees of freedom of the chain."""
-        return chain_dofs(self.body, self.chain)
+        return self.body.skeleton.chain_dofs[self.chain]
 
     @cached_property
     def _flesh(self) -> tuple[FleshTable, Lens, NDArray[np.bool_], Index]:

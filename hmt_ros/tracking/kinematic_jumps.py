@@ -29,7 +29,6 @@ from hmt_ros.tracking.chain_search import ChainSearch
 from hmt_ros.tracking.chain_votes import chain_votes
 from hmt_ros.tracking.edge_jumps import EdgeJumps
 from hmt_ros.tracking.limb_votes import LimbVotes, displaced, exchanged
-from hmt_ros.tracking.proposals import chain_dofs
 from hmt_ros.tracking.pruning import choose_hypotheses
 from hmt_ros.tracking.tracker_settings import TrackerSettings
 
@@ -323,7 +322,7 @@ class KinematicJumps:
         The modes' own, what was found, all flips, and what lies on other edges.
         """
         s = self.settings
-        own = chain_dofs(self.body, chain)
+        own = self.body.skeleton.chain_dofs[chain]
         jump = -np.log(s.jump_probability)
         angles, penalties = [modes[:, own]], [np.where(np.eye(len(modes)) > 0, 0.0, jump)]
         if found is not None:
@@ -363,7 +362,7 @@ class KinematicJumps:
         for flipped in flip_torso(self.body, pose[None])[0]:
             base, alternatives = flipped.copy(), []
             for chain in chains:
-                own = chain_dofs(self.body, chain)
+                own = self.body.skeleton.chain_dofs[chain]
                 hung, _ = rehang_chain(self.body, pose[None], flipped[None], chain)
                 angles = hung[:, own] if len(hung) else flipped[None, own]
                 base[own] = angles[0]
@@ -383,7 +382,7 @@ class KinematicJumps:
         """
         base, alternatives = pose.copy(), []
         for chain, sibling in (pair, pair[::-1]):
-            own = chain_dofs(self.body, chain)
+            own = self.body.skeleton.chain_dofs[chain]
             hung, _ = rehang_chain(self.body, pose[None], pose[None], chain, image_of=sibling)
             if len(hung) == 0:
                 return None
@@ -407,7 +406,7 @@ class KinematicJumps:
         poses = [pose[None]]
         for chain in alternatives:
             block = np.repeat(pose[None], len(chain.angles), axis=0)
-            block[:, chain_dofs(self.body, chain.chain)] = chain.angles
+            block[:, self.body.skeleton.chain_dofs[chain.chain]] = chain.angles
             poses.append(block)
         everything = np.concatenate(poses)
         value = self.evaluate(everything, observation, textures, np.full(len(everything), row))

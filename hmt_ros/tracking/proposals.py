@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 
 Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 PROPOSALS = ('kjs', 'css', 'ss')
 
@@ -45,12 +44,6 @@ def covariance_scaled_samples(
         means[:, None] + np.einsum('kij,knj->kni', factors, noise), body.lower, body.upper
     )
     return samples
-
-
-def chain_dofs(body: Body, chain: str) -> Index:
-    """Degrees of freedom of a chain."""
-    skeleton = body.skeleton
-    return np.array([j for s in skeleton.chains[chain] for j in skeleton.segment_dofs[s]])
 
 
 def _noise(shape: tuple[int, ...], scale: float, rng: np.random.Generator) -> Array:

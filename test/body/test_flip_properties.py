@@ -148,7 +148,7 @@ def test_ray_that_misses():
     pose[2] = 3.0
     rng = np.random.default_rng(0)
     missed = 0
-    arm = [j for s in BODY.chains['left_arm'] for j in BODY.skeleton.segment_dofs[s]]
+    arm = BODY.skeleton.chain_dofs['left_arm']
     for _ in range(200):
         pose[arm] = rng.uniform(BODY.lower[arm], BODY.upper[arm])
         places = BODY.joint_positions(pose[None])[0, BODY.skeleton.joint_index(ARM)]

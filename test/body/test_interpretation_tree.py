@@ -45,10 +45,6 @@ def limb_places(body, poses, chain):
     return body.joint_positions(poses)[:, which]
 
 
-def chain_dofs(body, chain):
-    return [j for s in body.chains[chain] for j in body.skeleton.segment_dofs[s]]
-
-
 def on_rays(points, seen):
     """Sines of the angles between points and the rays of others."""
     cross = np.linalg.norm(np.cross(points, seen), axis=-1)
@@ -116,7 +112,7 @@ def test_leaves_keep_image_and_lengths(body, random_poses, chain):
     assert np.abs(CAMERA.project(places) - CAMERA.project(before)).max() < 1e-6
     lengths, wanted = (np.linalg.norm(np.diff(x, axis=1), axis=2) for x in (places, before))
     assert np.abs(lengths - wanted).max() < 1e-9
-    others = np.setdiff1d(np.arange(body.dimension), chain_dofs(body, chain))
+    others = np.setdiff1d(np.arange(body.dimension), body.skeleton.chain_dofs[chain])
     assert np.array_equal(leaves[:, others], poses[parents][:, others])
 
 
@@ -179,7 +175,7 @@ def test_joints_behind_the_camera_are_pruned(small, random_poses):
 @pytest.mark.parametrize('chain', ['left_arm', 'right_arm', 'left_leg', 'right_leg'])
 def test_limits_leave_the_leaves_that_some_angles_within_them_reach(body, random_poses, chain):
     poses = random_poses(body, 60, 6)
-    own = chain_dofs(body, chain)
+    own = body.skeleton.chain_dofs[chain]
     lower, upper = body.lower[own], body.upper[own]
     leaves, parents = enumerate_flips(body, CAMERA, poses, chain)
     assert (leaves >= body.lower).all()
@@ -228,7 +224,7 @@ def test_chains_multiply(body, random_poses):
         before = limb_places(body, poses, chain)[parents]
         assert on_rays(limb_places(body, leaves, chain), before).max() < 1e-9
     # Every leaf of a chain is there, each with all of the others.
-    own = chain_dofs(body, 'left_arm')
+    own = body.skeleton.chain_dofs['left_arm']
     alone, roots = enumerate_flips(body, CAMERA, poses, 'left_arm')
     for p in range(8):
         found, times = np.unique(leaves[parents == p][:, own], axis=0, return_counts=True)
@@ -328,7 +324,7 @@ def moved_trunk(small, random_poses):
 def test_rehung_limbs_are_back_on_their_rays(small, moved_trunk, chain):
     poses, new = moved_trunk
     hung, parents = rehang_chain(without_limits(small), poses, new, chain, slack=1e-9)
-    own = chain_dofs(small, chain)
+    own = small.skeleton.chain_dofs[chain]
     others = np.setdiff1d(np.arange(small.dimension), own)
     assert np.array_equal(hung[:, others], new[parents][:, others])
     seen = limb_places(small, poses, chain)[parents]
@@ -347,7 +343,7 @@ def test_rehung_limbs_stay_within_limits(small, moved_trunk):
     poses, new = moved_trunk
     for chain in LIMBS:
         hung, _ = rehang_chain(small, poses, new, chain)
-        own = chain_dofs(small, chain)
+        own = small.skeleton.chain_dofs[chain]
         assert len(hung) > 10
         assert (hung[:, own] >= small.lower[own]).all()
         assert (hung[:, own] <= small.upper[own]).all()

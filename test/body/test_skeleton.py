@@ -86,3 +86,16 @@ def test_offsets_follow_the_lengths():
     np.testing.assert_allclose(longer.offsets[knee], [0, 0, -0.6])
     np.testing.assert_allclose(SKELETON.offsets[knee], [0, 0, -SKELETON.lengths[0]])
     assert replace(longer, name='tall').offsets[knee][2] == -0.6
+
+
+def test_chains_own_their_degrees_of_freedom_and_joints():
+    owned = SKELETON.chain_dofs
+    assert set(owned) == {'left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck'}
+    everything = np.concatenate(list(owned.values()))
+    assert len(everything) == len(np.unique(everything)) == 26
+    assert [SKELETON.dof_names[j] for j in owned['left_arm']] == [
+        'left_shoulder_x', 'left_shoulder_y', 'left_shoulder_z',
+        'left_elbow', 'left_wrist_x', 'left_wrist_y',
+    ]  # fmt: skip
+    joints = [SKELETON.joint_names[j] for j in SKELETON.chain_joints['left_arm']]
+    assert joints == ['left_shoulder', 'left_elbow', 'left_wrist', 'left_hand']

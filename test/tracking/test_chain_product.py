@@ -9,7 +9,6 @@ import pytest
 from scipy.special import logsumexp
 
 from hmt_ros.tracking.chain_product import Alternatives, best_combinations, distinct_alternatives
-from hmt_ros.tracking.proposals import chain_dofs
 
 CHAINS = ('left_arm', 'right_arm', 'left_leg')
 TEMPERATURE = 0.3
@@ -22,7 +21,7 @@ def group_of(body, modes, sizes, seed):
     alternatives = [
         Alternatives(
             chain,
-            rng.normal(size=(size, len(chain_dofs(body, chain)))),
+            rng.normal(size=(size, len(body.skeleton.chain_dofs[chain]))),
             rng.exponential(1.5, (modes, size)),
         )
         for chain, size in zip(CHAINS, sizes)
@@ -52,7 +51,7 @@ def found_picks(body, combinations, alternatives):
     """Which alternatives the poses carry."""
     columns = []
     for a in alternatives:
-        own = combinations.poses[:, chain_dofs(body, a.chain)]
+        own = combinations.poses[:, body.skeleton.chain_dofs[a.chain]]
         same = (own[:, None] == a.angles[None]).all(2)
         assert (same.sum(1) == 1).all()
         columns.append(same.argmax(1))
@@ -71,7 +70,7 @@ def test_all_combinations(human32, modes, sizes):
     assert np.allclose(found.energies, [w[3] for w in wanted], atol=1e-12)
     assert np.allclose(found.log_priors, [w[4] for w in wanted], atol=1e-12)
     # What belongs to no chain is the parent's.
-    own = np.concatenate([chain_dofs(human32, c) for c in CHAINS])
+    own = np.concatenate([human32.skeleton.chain_dofs[c] for c in CHAINS])
     others = np.setdiff1d(np.arange(human32.dimension), own)
     assert np.array_equal(found.poses[:, others], poses[found.parents][:, others])
 
@@ -107,7 +106,8 @@ def test_a_group_whose_chains_are_its_own_gives_its_modes(human32):
     poses = rng.normal(size=(3, human32.dimension))
     log_weights = np.log([0.2, 0.5, 0.3])
     alternatives = [
-        Alternatives(c, poses[:, chain_dofs(human32, c)], 1e3 * (1 - np.eye(3))) for c in CHAINS
+        Alternatives(c, poses[:, human32.skeleton.chain_dofs[c]], 1e3 * (1 - np.eye(3)))
+        for c in CHAINS
     ]
     found = best_combinations(
         human32, poses, log_weights, 1.0, alternatives, [np.zeros(3)] * 3, TEMPERATURE, 3
@@ -119,14 +119,14 @@ def test_a_group_whose_chains_are_its_own_gives_its_modes(human32):
 
 def joints_of(body, pose, chain, angles):
     poses = np.repeat(pose[None], len(angles), axis=0)
-    poses[:, chain_dofs(body, chain)] = angles
+    poses[:, body.skeleton.chain_dofs[chain]] = angles
     names = {'left_arm': ('left_elbow', 'left_wrist', 'left_hand')}[chain]
     return body.joint_positions(poses)[:, body.skeleton.joint_index(names)]
 
 
 def many_arms(body, count, seed):
     rng = np.random.default_rng(seed)
-    own = chain_dofs(body, 'left_arm')
+    own = body.skeleton.chain_dofs['left_arm']
     return rng.uniform(body.lower[own], body.upper[own], (count, len(own)))
 
 

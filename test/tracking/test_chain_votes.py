@@ -12,7 +12,6 @@ from hmt_ros.tracking.chain_votes import (
     depth_variances,
     shares_of_new_minima,
 )
-from hmt_ros.tracking.proposals import chain_dofs
 
 CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
 
@@ -36,7 +35,7 @@ def test_votes_by_trace_are_those_of_the_eigenvectors(human32, modes):
         values, vectors = np.linalg.eigh(covariances[k])
         shares = []
         for chain in CHAINS:
-            inside = vectors[chain_dofs(human32, chain)]
+            inside = vectors[human32.skeleton.chain_dofs[chain]]
             shares.append((values * (inside**2).sum(0)).sum())
         assert np.allclose(votes[k], np.array(shares) / np.sum(shares), rtol=1e-10)
 
@@ -48,7 +47,7 @@ def test_votes_by_the_largest_eigenvalue(human32, modes):
     for k in range(2):
         largest = []
         for chain in CHAINS:
-            own = chain_dofs(human32, chain)
+            own = human32.skeleton.chain_dofs[chain]
             block = covariances[k][own][:, own]
             x = np.ones(len(own))
             for _ in range(3000):
@@ -65,7 +64,7 @@ def test_uniform_votes(human32, modes):
 
 def test_an_uncertain_chain_gets_the_votes(human32):
     covariance = 1e-4 * np.eye(32)[None]
-    own = chain_dofs(human32, 'right_arm')
+    own = human32.skeleton.chain_dofs['right_arm']
     covariance[:, own, own] = 1e-2
     for vote, share in (('trace', 100 * 6 / (100 * 6 + 3 * 6 + 2)), ('eigenvalue', 100 / 104)):
         votes = chain_votes(human32, covariance, CHAINS, vote)
@@ -85,7 +84,7 @@ def test_votes_are_probabilities(human32, motion):
 def test_depth_variances_are_those_of_samples(human32, motion):
     """Of a chain that is moved by little, joint by joint along its ray."""
     rng = np.random.default_rng(0)
-    own = chain_dofs(human32, 'left_leg')
+    own = human32.skeleton.chain_dofs['left_leg']
     root = 1e-4 * rng.normal(size=(32, 32))
     covariance = root @ root.T
     poses = np.tile(motion[3], (20_000, 1))

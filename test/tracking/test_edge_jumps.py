@@ -24,7 +24,6 @@ from hmt_ros.tracking.candidates import Candidates
 from hmt_ros.tracking.edge_jumps import EdgeJumps
 from hmt_ros.tracking.kinematic_jumps import KinematicJumps
 from hmt_ros.tracking.limb_votes import NOISE, LimbVotes, displaced, exchanged
-from hmt_ros.tracking.proposals import chain_dofs
 
 LIMBS = ('left_leg', 'right_leg', 'left_arm', 'right_arm')
 
@@ -146,7 +145,7 @@ def test_exchanged_legs_are_proposed_as_they_are(human32, film):
     pose, observation = film.poses[1], film.seen[1]
     wrong = pose.copy()
     for chain, sibling in (('left_leg', 'right_leg'), ('right_leg', 'left_leg')):
-        own = chain_dofs(human32, chain)
+        own = human32.skeleton.chain_dofs[chain]
         hung, _ = rehang_chain(human32, pose[None], pose[None], chain, image_of=sibling)
         wrong[own] = hung[0, own]
     for voted in (False, True):

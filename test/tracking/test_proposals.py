@@ -1,4 +1,4 @@
-"""Samplers and votes against moments, quantiles and eigenvectors."""
+"""Samplers against moments, quantiles and eigenvectors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pytest
 from scipy import stats
 
 from hmt_ros.tracking.proposals import (
-    chain_dofs,
     covariance_scaled_samples,
     spherical_samples,
 )
@@ -106,17 +105,3 @@ def test_the_same_seed_gives_the_same_samples(free, modes, draw):
     first, again, other = (draw(free, *modes, 5, 2.0, np.random.default_rng(s)) for s in (6, 6, 7))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
-
-
-CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
-
-
-def test_chains_own_their_degrees_of_freedom(human32):
-    owned = {chain: chain_dofs(human32, chain) for chain in CHAINS}
-    everything = np.concatenate(list(owned.values()))
-    assert len(everything) == len(np.unique(everything)) == 26
-    names = {human32.dof_names[j] for j in owned['left_arm']}
-    assert names == {
-        'left_shoulder_x', 'left_shoulder_y', 'left_shoulder_z',
-        'left_elbow', 'left_wrist_x', 'left_wrist_y',
-    }  # fmt: skip
