@@ -5,9 +5,7 @@ interpretation tree, hung back onto its rays. A whole pose is a trunk with one l
 and its prior probability is a product over these: so the leaves of the body can be taken in order
 of probability, or sampled, from lists of a few dozen entries, without building their product.
 
-What is known to be wrong is pruned before any pose is built: leaves that run through the trunk or
-themselves, pairs of leaves of two chains that run through each other, and pairs that contradict
-what is known of which part is before which.
+What is known to be wrong is pruned before any pose is built (`body.flip_pruning`).
 """
 
 from __future__ import annotations
@@ -21,12 +19,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_ros.body.best_first import best_first
 from hmt_ros.body.body import Body
 from hmt_ros.body.distinct_poses import distinct_poses
+from hmt_ros.body.flip_pruning import DepthOrder, FlipPruning
 from hmt_ros.body.interpretation_tree import enumerate_flips, rehang_chain
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
-from hmt_ros.body.kinematics import Frames, forward
-from hmt_ros.body.self_intersection import deepest_overlaps
 from hmt_ros.body.torso_flips import JOINTS, flip_torso
 
 Array = NDArray[np.float64]
@@ -39,17 +37,6 @@ SAME_TRUNK = 0.03
 ITERATIONS = 20
 # Rejected samples that are drawn anew before it is given up.
 ROUNDS = 200
-
-
-class DepthOrder(NamedTuple):
-    """One part of the body is seen before another.
-
-    Attributes:
-        front, behind: joints at the two ends of a part; twice the same joint: the joint itself.
-    """
-
-    front: tuple[str, str]
-    behind: tuple[str, str]
 
 
 class Leaves(NamedTuple):
@@ -121,7 +108,7 @@ class FlipProduct:
         tables = np.ones((max(len(crossing), 1), len(self.trunks), widest, widest), dtype=np.bool_)
         for place, (_, _, table) in enumerate(crossing):
             tables[place, :, : table.shape[1], : table.shape[2]] = table
-        found = _best_first(
+        found = best_first(
             self.trunk_log_priors, *lists[0], *lists[1],
             np.array(halves[0], dtype=np.int64), np.array(halves[1], dtype=np.int64),
             np.array([c[:2] for c in crossing], dtype=np.int64).reshape(-1, 2), tables,
@@ -263,7 +250,7 @@ def full_body_flips(
     offset = (trunks - body.prior_mean) / body.prior_sigma
     offset[:, limbs] = 0.0
     trunk_log_priors = -0.5 * (offset * offset).sum(1)
-    pruning = _Pruning(body, names, given, trunks, parents, angles, log_priors)
+    pruning = FlipPruning(body, names, given, trunks, parents, angles, log_priors)
     allowed = pruning.allowed(most_overlap)
     for order in depth_orders:
         pruning.keep_order(order, trunk_log_priors, allowed)
@@ -355,215 +342,9 @@ def _reached(
     return solved[near], near
 
 
-@dataclass(frozen=True, eq=False)
-class _Pruning:
-    """Rules out leaves of chains and pairs of them; works on the lists in place.
-
-    Attributes:
-        body, chains, trunks, parents: as in `FlipProduct`.
-        given: (N, d) poses, which stay.
-        angles, log_priors: lists of the chains, of which pruned leaves become -inf.
-    """
-
-    body: Body
-    chains: tuple[str, ...]
-    given: Array
-    trunks: Array
-    parents: Index
-    angles: list[Array]
-    log_priors: list[Array]
-
-    def _frames(self) -> tuple[Frames, list[Index]]:
-        """Frames of every trunk with every leaf of every chain, and their rows (T, A)."""
-        poses, rows, count = [], [], 0
-        for chain, angles in zip(self.chains, self.angles, strict=True):
-            block = np.repeat(self.trunks[:, None], angles.shape[1], axis=1)
-            block[..., self.body.skeleton.chain_dofs[chain]] = angles
-            poses.append(block.reshape(-1, self.body.dimension))
-            rows.append(count + np.arange(len(poses[-1])).reshape(angles.shape[:2]))
-            count += len(poses[-1])
-        return forward(self.body.skeleton, np.concatenate([self.trunks[:0], *poses])), rows
-
-    def allowed(self, most_overlap: float) -> list[Mask]:
-        """Tables (T, A, A') of the pairs of leaves of two chains that do not intersect."""
-        pairs = list(combinations(range(len(self.chains)), 2))
-        shapes = [
-            (len(self.trunks), self.angles[i].shape[1], self.angles[j].shape[1]) for i, j in pairs
-        ]
-        tables: list[Mask] = [np.ones(shape, dtype=np.bool_) for shape in shapes]
-        if not (np.isfinite(most_overlap) and self.body.shapes):
-            return tables
-        frames, rows = self._frames()
-        placed = frames.by_pose()
-        own = [self.body.chains[chain] for chain in self.chains]
-        limbs = {s for segments in own for s in segments}
-        trunk = [s for s in range(len(self.body.skeleton.parents)) if s not in limbs]
-        for c, leaf_rows in enumerate(rows):
-            flat = leaf_rows.ravel()
-            depth = deepest_overlaps(self.body, *placed, flat, own[c], flat, [*trunk, *own[c]])
-            deep = depth.reshape(leaf_rows.shape) > most_overlap
-            deep[: len(self.given), 0] = False
-            self.log_priors[c][deep] = -np.inf
-        for (i, j), table in zip(pairs, tables, strict=True):
-            first = np.broadcast_to(rows[i][:, :, None], table.shape).ravel()
-            second = np.broadcast_to(rows[j][:, None, :], table.shape).ravel()
-            depth = deepest_overlaps(self.body, *placed, first, own[i], second, own[j])
-            table &= depth.reshape(table.shape) <= most_overlap
-            table[: len(self.given), 0, 0] = True
-        return tables
-
-    def keep_order(self, order: DepthOrder, trunk_log_priors: Array, allowed: list[Mask]) -> None:
-        """Rules out what contradicts an order in depth."""
-        frames, rows = self._frames()
-        joints = frames.joints()[:, 2]
-        crossings = np.array([_crossing(self.body, pose, order) for pose in self.given])
-        owners, depths = [], []
-        for part, at in zip(order, crossings[self.parents].T, strict=True):
-            owner = self._owner(part)
-            which = self.body.skeleton.joint_index(part)
-            if owner < 0:
-                places, share = self.body.joint_positions(self.trunks)[:, which, 2].T, at
-            else:
-                places, share = joints[which][:, rows[owner]], at[:, None]
-            # Along the image of a straight line the inverse of the depth is linear.
-            depths.append(1.0 / ((1.0 - share) / places[0] + share / places[1]))
-            owners.append(owner)
-        (i, j), (front, behind) = owners, depths
-        if i < 0 and j < 0:
-            trunk_log_priors[~(front < behind)] = -np.inf
-        elif i < 0 or j < 0 or i == j:
-            front, behind = (x[:, None] if x.ndim == 1 else x for x in (front, behind))
-            self.log_priors[max(i, j)][~(front < behind)] = -np.inf
-        else:
-            fits = front[:, :, None] < behind[:, None, :]
-            pairs = list(combinations(range(len(self.chains)), 2))
-            place = pairs.index((min(i, j), max(i, j)))
-            allowed[place] &= fits if i < j else fits.transpose(0, 2, 1)
-
-    def _owner(self, part: tuple[str, str]) -> int:
-        """The chain that carries a part, -1: the trunk."""
-        skeleton = self.body.skeleton
-        owners = set()
-        for joint in skeleton.joint_index(part):
-            segment = skeleton.joint_segments[joint]
-            if not np.any(skeleton.joint_offsets[joint]):
-                segment = skeleton.parents[segment]  # which has it at its end
-            owners |= {c for c, x in enumerate(self.chains) if segment in skeleton.chains[x]}
-        if len(owners) > 1:
-            raise ValueError(f'joints {part} of a depth order belong to different chains')
-        return int(owners.pop()) if owners else -1
-
-
-def _crossing(body: Body, pose: Array, order: DepthOrder) -> tuple[float, float]:
-    """Where in the image two parts cross, or come nearest, as shares of their lengths there."""
-    ends = []
-    for part in order:
-        joints = body.joint_positions(pose[None])[0, body.skeleton.joint_index(part)]
-        ends.append(joints[:, :2] / joints[:, 2:])
-    (a, b), (c, e) = ends
-    u, v, w = b - a, e - c, a - c
-    uu, uv, vv, uw, vw = u @ u, u @ v, v @ v, u @ w, v @ w
-    s = np.clip((uv * vw - vv * uw) / max(uu * vv - uv * uv, 1e-15), 0.0, 1.0)
-    t = np.clip((uv * s + vw) / max(vv, 1e-15), 0.0, 1.0)
-    s = np.clip((uv * t - uw) / max(uu, 1e-15), 0.0, 1.0)
-    return float(s), float(t)
-
-
-@njit(cache=True, nogil=True)
-def _best_first(  # type: ignore[no-untyped-def]
-    base, left, left_picks, left_bounds, right, right_picks, right_bounds, left_chains,
-    right_chains, crossing, tables, picks, trunks, log_priors,
-):  # fmt: skip
-    """Fills picks, trunks and log priors of the best pairs of a left and a right entry.
-
-    The heap holds at most one right entry for each left one: the next that it has not yet had.
-    Returns how many there are.
-    """
-    room = len(left) + len(base) + 1
-    keys = np.empty(room)
-    heap_trunk, heap_left = np.empty(room, np.int64), np.empty(room, np.int64)
-    heap_right = np.empty(room, np.int64)
-    size = 0
-    for t in range(len(base)):
-        i, j = left_bounds[t], right_bounds[t]
-        if i < left_bounds[t + 1] and j < right_bounds[t + 1]:
-            size = _push(
-                keys, heap_trunk, heap_left, heap_right, size, base[t] + left[i] + right[j], t, i, j
-            )
-    found = 0
-    while size > 0 and found < len(trunks):
-        key, t, i, j = keys[0], heap_trunk[0], heap_left[0], heap_right[0]
-        fresh = j == right_bounds[t]
-        if j + 1 < right_bounds[t + 1]:
-            _sift_down(
-                keys, heap_trunk, heap_left, heap_right, size, base[t] + left[i] + right[j + 1],
-                t, i, j + 1,
-            )  # fmt: skip
-        else:
-            size -= 1
-            if size > 0:
-                _sift_down(
-                    keys, heap_trunk, heap_left, heap_right, size, keys[size], heap_trunk[size],
-                    heap_left[size], heap_right[size],
-                )  # fmt: skip
-        if fresh and i + 1 < left_bounds[t + 1]:
-            size = _push(
-                keys, heap_trunk, heap_left, heap_right, size, base[t] + left[i + 1] + right[j], t,
-                i + 1, j,
-            )  # fmt: skip
-        for c in range(len(left_chains)):
-            picks[found, left_chains[c]] = left_picks[i, c]
-        for c in range(len(right_chains)):
-            picks[found, right_chains[c]] = right_picks[j, c]
-        fits = True
-        for pair in range(len(crossing)):
-            a, b = picks[found, crossing[pair, 0]], picks[found, crossing[pair, 1]]
-            if not tables[pair, t, a, b]:
-                fits = False
-                break
-        if fits:
-            trunks[found] = t
-            log_priors[found] = key
-            found += 1
-    return found
-
-
 @njit(cache=True, nogil=True)
 def _put_angles(poses, dofs, angles, trunks, picks):  # type: ignore[no-untyped-def]
     """Writes angles (T, A, D) of a chain, chosen by trunk and pick, into poses (N, d)."""
     for n in range(len(poses)):
         for k in range(len(dofs)):
             poses[n, dofs[k]] = angles[trunks[n], picks[n], k]
-
-
-@njit(cache=True, nogil=True, inline='always')
-def _push(keys, trunks, lefts, rights, size, key, t, i, j):  # type: ignore[no-untyped-def]
-    """Adds an entry to a heap with the largest key first; returns the new size."""
-    place = size
-    while place > 0:
-        parent = (place - 1) // 2
-        if keys[parent] >= key:
-            break
-        keys[place], trunks[place] = keys[parent], trunks[parent]
-        lefts[place], rights[place] = lefts[parent], rights[parent]
-        place = parent
-    keys[place], trunks[place], lefts[place], rights[place] = key, t, i, j
-    return size + 1
-
-
-@njit(cache=True, nogil=True, inline='always')
-def _sift_down(keys, trunks, lefts, rights, size, key, t, i, j):  # type: ignore[no-untyped-def]
-    """Replaces the first entry of a heap."""
-    place = 0
-    while True:
-        child = 2 * place + 1
-        if child >= size:
-            break
-        if child + 1 < size and keys[child + 1] > keys[child]:
-            child += 1
-        if keys[child] <= key:
-            break
-        keys[place], trunks[place] = keys[child], trunks[child]
-        lefts[place], rights[place] = lefts[child], rights[child]
-        place = child
-    keys[place], trunks[place], lefts[place], rights[place] = key, t, i, j

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
-from hmt_ros.body.flip_products import DepthOrder, full_body_flips
+from hmt_ros.body.flip_products import full_body_flips
+from hmt_ros.body.flip_pruning import DepthOrder
 from hmt_ros.body.interpretation_tree import enumerate_flips
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import deepest_overlaps
