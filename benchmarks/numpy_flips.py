@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.interpretation_tree import LIMIT_TOLERANCE, STRAIGHT, TOUCHING
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.body.tree_growth import LIMIT_TOLERANCE, STRAIGHT, TOUCHING
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
