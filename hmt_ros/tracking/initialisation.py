@@ -21,6 +21,7 @@ from hmt_ros.body.kinematics import forward, joint_length_jacobians, point_jacob
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
 from hmt_ros.image.observation import Keypoints, Observation, Outline
 from hmt_ros.inference.bounded_newton import Minimum, minimise
+from hmt_ros.tracking.candidates import some_minima
 from hmt_ros.tracking.subject import Subject
 
 Array = NDArray[np.float64]
@@ -256,8 +257,5 @@ def _distinct(solved: Minimum, body: Body, count: int) -> Minimum:
     """The best minima whose joints differ by more than 3 cm somewhere."""
     order = np.argsort(solved.value, kind='stable')
     order = order[np.isfinite(solved.value[order])]
-    k = order[distinct_poses(body.joint_positions(solved.x[order]), 0.03, count).kept]
-    return Minimum(
-        solved.x[k], solved.value[k], solved.gradient[k], solved.hessian[k], solved.free[k],
-        solved.status[k], solved.iterations[k],
-    )  # fmt: skip
+    distinct = distinct_poses(body.joint_positions(solved.x[order]), 0.03, count)
+    return some_minima(solved, order[distinct.kept])
