@@ -136,11 +136,11 @@ def minimise(
         status[stalled] = Status.STALLED
         active = active[~stalled[active]]
 
-    free = ~_resting(x, gradient, lower, upper)
+    free = ~resting(x, gradient, lower, upper)
     return Minimum(x, value, gradient, hessian, free, status, iterations)
 
 
-def _resting(x: Array, gradient: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
-    """Variables on a limit with a gradient that pushes them outwards."""
+def resting(x: Array, gradient: Array, lower: Array, upper: Array) -> NDArray[np.bool_]:
+    """Variables (N, d) on a limit with a gradient of the energy that pushes them outwards."""
     result: NDArray[np.bool_] = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
     return result

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures, capture_textures
-from hmt_ros.inference.bounded_newton import Minimum
+from hmt_ros.inference.bounded_newton import Minimum, resting
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.candidates import (
     Candidates,
@@ -27,7 +27,8 @@ from hmt_ros.tracking.flesh_fitting import FleshFit
 from hmt_ros.tracking.kinematic_jumps import KinematicJumps
 from hmt_ros.tracking.limb_votes import LimbVotes
 from hmt_ros.tracking.misfit import unexplained_keypoints, unexplained_outline
-from hmt_ros.tracking.mode_covariances import free_covariances, resting
+from hmt_ros.tracking.mode_covariances import free_covariances
+from hmt_ros.tracking.modes import Modes
 from hmt_ros.tracking.pose_energy import PoseEnergy
 from hmt_ros.tracking.proposals import covariance_scaled_samples, spherical_samples
 from hmt_ros.tracking.pruning import choose_hypotheses, inherited_log_weights
@@ -38,44 +39,6 @@ Index = NDArray[np.intp]
 
 # How far the usual energy follows that of the last image.
 USUAL_GAIN = 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class Modes:
-    """The mixture that is propagated: K modes, heaviest first.
-
-    Attributes:
-        poses, velocities: (K, d), velocities per second.
-        covariances: (K, d, d) of the posterior.
-        filtered: (K, d, d) covariances that are propagated, as if errors were independent from
-            image to image.
-        log_weights: (K,) normalised.
-        log_likelihoods: (K,) of the image at the poses.
-        textures: of the image at the poses, or None.
-    """
-
-    poses: Array
-    velocities: Array
-    covariances: Array
-    filtered: Array
-    log_weights: Array
-    log_likelihoods: Array
-    textures: Textures | None
-
-    def joined(self, other: Modes, log_shares: Array, count: int) -> Modes:
-        """The heaviest modes of both, for the log probabilities (2,) of the two."""
-        log_weights = np.concatenate(
-            [self.log_weights + log_shares[0], other.log_weights + log_shares[1]]
-        )
-        kept = np.argsort(-log_weights, kind='stable')[:count]
-        parts = {
-            name: np.concatenate([getattr(self, name), getattr(other, name)])[kept]
-            for name in ('poses', 'velocities', 'covariances', 'filtered', 'log_likelihoods')
-        }
-        log_weights = log_weights[kept]
-        return Modes(
-            log_weights=log_weights - np.logaddexp.reduce(log_weights), textures=None, **parts
-        )
 
 
 class MixtureFilter:
@@ -90,7 +53,6 @@ class MixtureFilter:
     Attributes:
         body: with the widths that have been estimated.
         misfit: share of the last observation that no mode explains.
-        lost: whether the last observations were explained too badly.
         log_evidence: by how much less energy than 0 the best mode had, summed over observations,
             tempered.
     """
@@ -100,7 +62,6 @@ class MixtureFilter:
         self.camera = camera
         self.settings = settings
         self.misfit = 0.0
-        self.lost = False
         self.log_evidence = 0.0
         self._seed = seed
         self._rng = np.random.default_rng(seed)
@@ -137,6 +98,11 @@ class MixtureFilter:
     def begun(self) -> bool:
         """Whether there are modes."""
         return self._modes is not None
+
+    @property
+    def lost(self) -> bool:
+        """Whether the last observations were explained too badly."""
+        return self._bad_images >= self.settings.lost_images
 
     def begin(
         self,
@@ -175,8 +141,8 @@ class MixtureFilter:
         """Modes from an observation and from poses (N, d) to search from; what became of each."""
         energy = self._energy.alone(observation)
         solved = self._energy.minimise(energy, poses, 3 * self.settings.iterations)
-        self._bad_images = 0
         self.keep_still(solved, np.zeros(len(poses)), observation)
+        self._bad_images = 0
         return solved
 
     def keep_still(self, solved: Minimum, log_weights: Array, observation: Observation) -> None:
@@ -266,7 +232,6 @@ class MixtureFilter:
             )  # fmt: skip
             self.misfit = max(self.misfit, of_keypoints)
         self._bad_images = self._bad_images + 1 if self.misfit > s.lost_misfit else 0
-        self.lost = self._bad_images >= s.lost_images
 
     def likelihood_mixture(self, m: Modes, observation: Observation) -> GaussianMixture:
         """The modes of the likelihood alone, without what was known from the images before.
@@ -276,7 +241,7 @@ class MixtureFilter:
         """
         body = self.body
         value, gradient, hessian = self._energy.likelihood.energy(m.poses, observation, None, None)
-        free = ~resting(m.poses, gradient, body)
+        free = ~resting(m.poses, gradient, body.lower, body.upper)
         covariances = free_covariances(hessian, free)
         step = -np.einsum('kij,kj->ki', covariances, np.where(free, gradient, 0.0))
         limit = 3.0 * np.sqrt(np.einsum('kii->ki', m.covariances))

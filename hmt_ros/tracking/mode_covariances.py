@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.body.body import Body
-
 Array = NDArray[np.float64]
 
 # Largest standard deviation of a mode: where an image shows nothing, rad or m.
@@ -29,10 +27,3 @@ def free_covariances(hessians: Array, free: NDArray[np.bool_]) -> Array:
     h[:, diagonal, diagonal] += WIDEST**-2.0
     result = np.linalg.inv(0.5 * (h + h.transpose(0, 2, 1)))
     return 0.5 * (result + result.transpose(0, 2, 1))
-
-
-def resting(poses: Array, gradient: Array, body: Body) -> NDArray[np.bool_]:
-    """Variables (K, d) of poses that a gradient of the energy pushes against their limits."""
-    at_lower = (poses <= body.lower) & (gradient > 0)
-    result: NDArray[np.bool_] = at_lower | ((poses >= body.upper) & (gradient < 0))
-    return result

@@ -25,7 +25,8 @@ from hmt_ros.tracking.initialisation import (
     poses_from_outline,
     start_from_keypoints,
 )
-from hmt_ros.tracking.mixture_filter import MixtureFilter, Modes
+from hmt_ros.tracking.mixture_filter import MixtureFilter
+from hmt_ros.tracking.modes import Modes
 from hmt_ros.tracking.pose_prediction import PosePrediction
 from hmt_ros.tracking.subject import Subject
 from hmt_ros.tracking.tracker_settings import TrackerSettings
@@ -71,7 +72,6 @@ class Tracker:
         self.model = body
         self.camera = camera
         self.background = background or BackgroundModel()
-        self.status = Status.WAITING
         self.evaluations = 0
         self._learning = background is None
         self._seed = seed
@@ -99,7 +99,6 @@ class Tracker:
             self._start = start
         self._filter, self._other_way = self._new_filter(self.body), None
         self._last_image, self._last_stamp = None, None
-        self.status = Status.WAITING
 
     def step(
         self,
@@ -154,8 +153,14 @@ class Tracker:
         self.evaluations = sum(one.evaluations for one in self._filters)
         if self._other_way is not None:
             self._decide_facing(self._other_way, observation, stamp)
-        self.status = Status.LOST if self._filter.lost else Status.TRACKING
         return self.posterior, self._filter.likelihood_mixture(self.modes, observation)
+
+    @property
+    def status(self) -> Status:
+        """What the tracker is doing."""
+        if not self._filter.begun:
+            return Status.WAITING
+        return Status.LOST if self._filter.lost else Status.TRACKING
 
     @property
     def body(self) -> Body:
