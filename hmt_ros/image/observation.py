@@ -104,6 +104,12 @@ class Observation:
         """Bounding box (left, top, right, bottom) of the silhouette, px."""
         return None if self.silhouette is None else _box(self.silhouette)
 
+    @property
+    def shows_shape(self) -> bool:
+        """Whether there is more to compare a pose with than keypoints."""
+        maps = (self.distance, self.edges, self.flow, self.intensity)
+        return any(m is not None for m in maps)
+
 
 def observe(
     image: Image,

@@ -247,9 +247,9 @@ class MixtureFilter:
         limit = 3.0 * np.sqrt(np.einsum('kii->ki', m.covariances))
         step = np.clip(step, -limit, limit)
         means = np.clip(m.poses + step, body.lower, body.upper)
-        if _shows_shape(observation):
+        if observation.shows_shape:
             frames = forward(body.skeleton, m.poses)
-            covariances = self._honest_covariances(m.poses, frames, free, observation)
+            covariances = self._honest_covariances(hessian, frames, free, observation)
         log_weights = -self.settings.temperature * value
         weights = np.exp(log_weights - log_weights.max())
         return GaussianMixture(weights / weights.sum(), means, covariances).sorted()
@@ -427,8 +427,9 @@ class MixtureFilter:
         image = self._energy.likelihood.image_energy(frames, observation, derivatives=False)
         filtered = free_covariances(solved.hessian[rows], solved.free[rows])
         covariances = filtered
-        if _shows_shape(observation):
-            covariances = self._honest_covariances(poses, frames, solved.free[rows], observation)
+        if observation.shows_shape:
+            _, _, hessian = self._energy.likelihood.energy(poses, observation)
+            covariances = self._honest_covariances(hessian, frames, solved.free[rows], observation)
         self._modes = Modes(
             poses, velocities[rows], covariances, filtered, weights[order], -image.value, textures
         )
@@ -441,22 +442,16 @@ class MixtureFilter:
         return capture_textures(self.body, self.camera, frames, observation.intensity)
 
     def _honest_covariances(
-        self, poses: Array, frames: Frames, free: NDArray[np.bool_], observation: Observation
+        self, hessian: Array, frames: Frames, free: NDArray[np.bool_], observation: Observation
     ) -> Array:
-        """Covariances that an image alone leaves, of which only a share is believed.
+        """Covariances that the Hessian of an image alone leaves, of which only a share is believed.
 
         Shapes, shadows and clothes differ from the model's in much the same way in image after
         image: such errors do not average out, over pixels or over time.
         """
-        _, _, hessian = self._energy.likelihood.energy(poses, observation)
         shape = self._energy.likelihood.image_energy(frames, replace(observation, keypoints=None))
         assert shape.hessian is not None
         return free_covariances(hessian - (1.0 - self.settings.image_trust) * shape.hessian, free)
-
-
-def _shows_shape(observation: Observation) -> bool:
-    maps = (observation.distance, observation.edges, observation.flow, observation.intensity)
-    return any(m is not None for m in maps)
 
 
 def _inverses(matrices: Array) -> Array:
