@@ -1,4 +1,4 @@
-"""A small body, a camera, a motion before it and its joints in the image."""
+"""A small body, a camera, a motion before it, its joints in the image, films, and modes."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.procedural_motion import procedural_motion
 from hmt_ros.body.viewpoint import Viewpoint
 from hmt_ros.image.observation import Keypoints
+from hmt_ros.image.renderer import render_frames
+from hmt_ros.image.scene import Scene
 
 KeypointsOf = Callable[..., Keypoints]
+Filmed = Callable[..., tuple[np.ndarray, list[np.ndarray], np.ndarray]]
 
 
 @pytest.fixture(scope='session')
@@ -43,3 +46,29 @@ def keypoints_of(camera) -> KeypointsOf:
         return Keypoints(body.joint_names, pixels + noise, covariances, np.ones(n))
 
     return see
+
+
+@pytest.fixture(scope='session')
+def filmed(human32) -> Filmed:
+    """Function (motion, seconds, camera, every) -> poses at 10 Hz, images and the empty scene."""
+
+    def film(motion: str, seconds: float, camera: Camera, every: int = 1):
+        view = Viewpoint(distance=3.2)
+        poses = procedural_motion(motion, human32, seconds, 10.0, 3, viewpoint=view)[::every]
+        scene = Scene(viewpoint=view, seed=2)
+        images = [frame.image for frame in render_frames(human32, poses, camera, scene)]
+        return poses, images, np.rint(scene.background(camera)).astype(np.uint8)
+
+    return film
+
+
+@pytest.fixture(scope='session')
+def modes(human32) -> tuple[np.ndarray, np.ndarray]:
+    """Means (2, d) in the middle of the limits and correlated covariances (2, d, d)."""
+    d = human32.dimension
+    rng = np.random.default_rng(0)
+    means = np.tile(0.5 * (human32.lower + human32.upper), (2, 1))
+    root = rng.normal(size=(2, d, d)) * np.array([0.02, 0.05])[:, None, None] / np.sqrt(d)
+    scales = np.exp(rng.normal(0, 0.5, (2, d)))
+    root = scales[:, :, None] * root
+    return means, root @ root.transpose(0, 2, 1) + 1e-6 * np.eye(d)

@@ -16,17 +16,6 @@ from hmt_ros.tracking.chain_votes import (
 CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
 
 
-@pytest.fixture(scope='module')
-def modes(human32):
-    """Means (2, d) in the middle of the limits and correlated covariances (2, d, d)."""
-    d = human32.dimension
-    rng = np.random.default_rng(0)
-    means = np.tile(0.5 * (human32.lower + human32.upper), (2, 1))
-    root = rng.normal(size=(2, d, d)) * np.array([0.02, 0.05])[:, None, None] / np.sqrt(d)
-    root = np.exp(rng.normal(0, 0.5, (2, d)))[:, :, None] * root
-    return means, root @ root.transpose(0, 2, 1) + 1e-6 * np.eye(d)
-
-
 def test_votes_by_trace_are_those_of_the_eigenvectors(human32, modes):
     """Sum over eigenvectors of eigenvalue times squared length inside the chain."""
     _, covariances = modes

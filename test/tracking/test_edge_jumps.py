@@ -11,13 +11,9 @@ import pytest
 from hmt_ros.body import Camera
 from hmt_ros.body.interpretation_tree import chain_points, place_chain, rehang_chain
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.procedural_motion import procedural_motion
-from hmt_ros.body.viewpoint import Viewpoint
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
-from hmt_ros.image.renderer import render_frames
-from hmt_ros.image.scene import Scene
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.candidates import Candidates
@@ -29,14 +25,11 @@ LIMBS = ('left_leg', 'right_leg', 'left_arm', 'right_arm')
 
 
 @pytest.fixture(scope='module')
-def film(human32):
+def film(filmed):
     """Camera, poses and observations of a person who walks by."""
     camera = Camera(660.0, 660.0, 319.5, 239.5, 640, 480)
-    view = Viewpoint(distance=3.2)
-    poses = procedural_motion('walk', human32, 0.6, 10.0, 3, viewpoint=view)[::2]
-    scene = Scene(viewpoint=view, seed=2)
-    background = BackgroundModel.from_image(np.rint(scene.background(camera)).astype(np.uint8))
-    images = [frame.image for frame in render_frames(human32, poses, camera, scene)]
+    poses, images, empty = filmed('walk', 0.6, camera, every=2)
+    background = BackgroundModel.from_image(empty)
     seen = [observe(image, background.silhouette(image)) for image in images]
     return SimpleNamespace(camera=camera, poses=poses, seen=seen)
 

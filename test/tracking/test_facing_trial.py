@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body.mirror import reverse_depth
-from hmt_ros.body.procedural_motion import procedural_motion
-from hmt_ros.body.viewpoint import Viewpoint
 from hmt_ros.image.background import BackgroundModel
-from hmt_ros.image.renderer import render_frames
-from hmt_ros.image.scene import Scene
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings
 from hmt_ros.tracking.facing_trial import faces_like, left_directions, log_shares
@@ -24,13 +20,9 @@ SMALL = TrackerSettings(
 
 
 @pytest.fixture(scope='module')
-def film(human32, camera):
+def film(filmed, camera):
     """Poses, images and the empty scene of a person who stands before the camera and reaches."""
-    view = Viewpoint(distance=3.2)
-    poses = procedural_motion('reach', human32, 0.8, 10.0, 3, viewpoint=view)
-    scene = Scene(viewpoint=view, seed=2)
-    images = [frame.image for frame in render_frames(human32, poses, camera, scene)]
-    return poses, images, np.rint(scene.background(camera)).astype(np.uint8)
+    return filmed('reach', 0.8, camera)
 
 
 @pytest.fixture(scope='module')

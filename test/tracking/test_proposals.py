@@ -25,18 +25,6 @@ def free(human32):
     return replace(human32, skeleton=replace(s, lower=-far, upper=far))
 
 
-@pytest.fixture(scope='module')
-def modes(human32):
-    """Means (2, d) in the middle of the limits and correlated covariances (2, d, d)."""
-    d = human32.dimension
-    rng = np.random.default_rng(0)
-    means = np.tile(0.5 * (human32.lower + human32.upper), (2, 1))
-    root = rng.normal(size=(2, d, d)) * np.array([0.02, 0.05])[:, None, None] / np.sqrt(d)
-    scales = np.exp(rng.normal(0, 0.5, (2, d)))
-    root = scales[:, :, None] * root
-    return means, root @ root.transpose(0, 2, 1) + 1e-6 * np.eye(d)
-
-
 @pytest.mark.parametrize('scale', [1.0, 4.0])
 def test_covariance_scaled_samples_have_the_covariance(free, modes, scale):
     means, covariances = modes

@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Body, load_body
-from hmt_ros.body.procedural_motion import procedural_motion
-from hmt_ros.body.viewpoint import Viewpoint
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
 from hmt_ros.image.observation import Keypoints, Observation
-from hmt_ros.image.renderer import render_frames
-from hmt_ros.image.scene import Scene
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.dynamics import DynamicsSettings
@@ -487,13 +483,9 @@ def test_settings_that_are_refused(values, said):
 
 
 @pytest.fixture(scope='module')
-def film(human32, camera):
+def film(filmed, camera):
     """Poses, images and the empty scene of a person who walks."""
-    view = Viewpoint(distance=3.2)
-    poses = procedural_motion('walk', human32, 0.6, 10.0, 3, viewpoint=view)
-    scene = Scene(viewpoint=view, seed=2)
-    images = [frame.image for frame in render_frames(human32, poses, camera, scene)]
-    return poses, images, np.rint(scene.background(camera)).astype(np.uint8)
+    return filmed('walk', 0.6, camera)
 
 
 def test_images_alone(film, human32, camera, keypoints_of):
