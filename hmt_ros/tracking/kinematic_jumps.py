@@ -9,7 +9,7 @@ that stand for all become candidates.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -41,6 +41,25 @@ TRUNK = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shou
 CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
 PAIRS = (('left_arm', 'right_arm'), ('left_leg', 'right_leg'))
 SIBLINGS = {a: b for pair in PAIRS for a, b in (pair, pair[::-1])}
+
+
+@dataclass(frozen=True, eq=False)
+class _Lead:
+    """The pose of a trunk, and the image in which its limbs are rated.
+
+    Attributes:
+        pose: (d,).
+        covariance: (d, d) of its prediction.
+        observation: of the image.
+        textures: of the last image.
+        row: of the textures, which the pose carries.
+    """
+
+    pose: Array
+    covariance: Array
+    observation: Observation
+    textures: Textures | None
+    row: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,67 +144,21 @@ class KinematicJumps:
         everything: list[tuple[Array, Index, Array, Array, Index]] = []
         first = int(np.argmin(base.value))
         for group in self._groups(base)[:MOST_GROUPS]:
-            lead = int(group[0])
-            pose, lead_row = base.x[lead], int(sources.texture_rows[lead])
-            found = self._search(
-                pose,
-                covariances[sources.parents[lead]],
-                observation,
-                textures,
-                lead_row,
-                base.x,
-                rng,
-            )
-            excess = self._excess(pose, observation, learn=lead == first and not again)
-            edges: dict[str, Array] = {}
-            if s.edge_jumps > 0 and again:
-                covariance = covariances[sources.parents[lead]]
-                edges = self._on_other_edges(
-                    pose, covariance, observation, textures, lead_row, excess
-                )
-            log_weights = sources.log_priors[group]
+            lead = _Lead(
+                base.x[group[0]], covariances[sources.parents[group[0]]], observation, textures,
+                int(sources.texture_rows[group[0]]),
+            )  # fmt: skip
+            found = self._search(lead, base.x, rng)
+            excess = self._excess(lead, learn=group[0] == first and not again)
+            edges = self._on_other_edges(lead, excess) if s.edge_jumps > 0 and again else {}
             alternatives = [
                 self._alternatives(base.x[group], chain, found.get(chain), edges.get(chain))
                 for chain in CHAINS
                 if chain in self.body.chains
             ]
-            changes, energy = self._rate(pose, alternatives, observation, textures, lead_row)
-            products = [
-                _Product(base.x[group], group, log_weights, alternatives, changes, energy, lead_row)
-            ]
-            weight = np.array([np.logaddexp.reduce(log_weights) + np.log(s.jump_probability)])
-            for pair in PAIRS:
-                if not set(pair) <= set(self.body.chains):
-                    continue
-                if not self._may_be_exchanged(pose, pair, excess):
-                    continue
-                swapped = self._swap(pose, pair)
-                if swapped is None:
-                    continue
-                row = lead_row
-                if textures is not None:
-                    row = len(textures.counts)
-                    textures = with_swapped_sides(
-                        textures, lead_row, *(self.body.skeleton.chains[chain] for chain in pair)
-                    )
-                rated, energy = self._rate(swapped[0], swapped[1], observation, textures, row)
-                choices, joined = [], []
-                for chain, change in zip(alternatives, changes, strict=True):
-                    if chain.chain in pair:
-                        i = pair.index(chain.chain)
-                        choices.append(swapped[1][i])
-                        joined.append(rated[i])
-                    else:
-                        choices.append(Alternatives(chain.chain, chain.angles, chain.penalties[:1]))
-                        joined.append(change)
-                products.append(
-                    _Product(swapped[0][None], group[:1], weight, choices, joined, energy, row)
-                )
-            for flipped, hung in self._torso_flips(pose, [a.chain for a in alternatives]):
-                changes, energy = self._rate(flipped, hung, observation, textures, lead_row)
-                products.append(
-                    _Product(flipped[None], group[:1], weight, hung, changes, energy, lead_row)
-                )
+            products, textures = self._products(
+                lead, base.x[group], group, sources.log_priors[group], alternatives, excess
+            )
             for product in products:
                 combined = best_combinations(
                     self.body, product.modes, product.log_weights, product.energy,
@@ -193,7 +166,7 @@ class KinematicJumps:
                 )  # fmt: skip
                 members = product.members[combined.parents]
                 rows = np.full(len(members), product.row)
-                if product.row == lead_row:
+                if product.row == lead.row:
                     rows = sources.texture_rows[members]
                 everything.append(
                     (combined.poses, members, combined.log_priors, combined.energies, rows)
@@ -234,43 +207,84 @@ class KinematicJumps:
             left = [i for i, ok in zip(left, near) if not ok]
         return groups
 
-    def _search(
+    def _products(
         self,
-        pose: Array,
-        covariance: Array,
-        observation: Observation,
-        textures: Textures | None,
-        row: int,
-        known: Array,
-        rng: np.random.Generator,
-    ) -> dict[str, Array]:
+        lead: _Lead,
+        modes: Array,
+        members: Index,
+        log_weights: Array,
+        alternatives: list[Alternatives],
+        excess: dict[str, float],
+    ) -> tuple[list[_Product], Textures | None]:
+        """The product of a group, those with limbs exchanged, and those with the torso flipped.
+
+        Args:
+            lead: first mode of the group.
+            modes, members, log_weights: (G, d), (G,), (G,) of the group.
+            alternatives: one entry a chain.
+            excess: votes for the limbs.
+
+        Returns:
+            The products, and the textures of which they have rows.
+        """
+        changes, energy = self._rate(lead, alternatives)
+        products = [_Product(modes, members, log_weights, alternatives, changes, energy, lead.row)]
+        weight = np.array(
+            [np.logaddexp.reduce(log_weights) + np.log(self.settings.jump_probability)]
+        )
+        for pair in PAIRS:
+            if not set(pair) <= set(self.body.chains):
+                continue
+            if not self._may_be_exchanged(lead, pair, excess):
+                continue
+            swapped = self._swap(lead, pair)
+            if swapped is None:
+                continue
+            other, hung = swapped
+            lead = replace(lead, textures=other.textures)
+            rated, energy = self._rate(other, hung)
+            choices, joined = [], []
+            for chain, change in zip(alternatives, changes, strict=True):
+                if chain.chain in pair:
+                    i = pair.index(chain.chain)
+                    choices.append(hung[i])
+                    joined.append(rated[i])
+                else:
+                    choices.append(Alternatives(chain.chain, chain.angles, chain.penalties[:1]))
+                    joined.append(change)
+            products.append(
+                _Product(other.pose[None], members[:1], weight, choices, joined, energy, other.row)
+            )
+        for flipped, hung in self._torso_flips(lead.pose, [a.chain for a in alternatives]):
+            rated, energy = self._rate(replace(lead, pose=flipped), hung)
+            products.append(
+                _Product(flipped[None], members[:1], weight, hung, rated, energy, lead.row)
+            )
+        return products, lead.textures
+
+    def _search(self, lead: _Lead, known: Array, rng: np.random.Generator) -> dict[str, Array]:
         """Configurations of some chains, chosen by vote, that fit the image."""
+        pose, observation = lead.pose, lead.observation
         shape = observation.distance is not None or observation.edges is not None
         names = list(self._searches) if shape else []
         count = min(self.settings.searched_chains, len(names))
         if count == 0:
             return {}
         votes = chain_votes(
-            self.body, covariance[None], names, self.settings.vote, pose[None], known
+            self.body, lead.covariance[None], names, self.settings.vote, pose[None], known
         )[0]
         chosen = rng.choice(len(names), size=count, replace=False, p=votes)
         result = {}
         for i in sorted(chosen):
             search = self._searches[names[i]]
-            result[names[i]] = search.find(pose, covariance, observation, textures, row, rng)
+            result[names[i]] = search.find(
+                pose, lead.covariance, observation, lead.textures, lead.row, rng
+            )
             own = self.settings.search
             self.count(own.samples + own.refined * own.iterations)
         return result
 
-    def _on_other_edges(
-        self,
-        pose: Array,
-        covariance: Array,
-        observation: Observation,
-        textures: Textures | None,
-        row: int,
-        excess: dict[str, float],
-    ) -> dict[str, Array]:
+    def _on_other_edges(self, lead: _Lead, excess: dict[str, float]) -> dict[str, Array]:
         """Configurations of limbs on other edges, where a limb costs much and is uncertain.
 
         Only those that by themselves take the surprise out of the image.
@@ -278,38 +292,41 @@ class KinematicJumps:
         s, result = self.settings, {}
         for chain, share in excess.items():
             jumps = self._edge_jumps[chain]
-            deviation, width = jumps.deviation(pose, covariance)
+            deviation, width = jumps.deviation(lead.pose, lead.covariance)
             if not self.votes.drawn(share * displaced(width, deviation)):
                 continue
-            found = jumps.find(pose, observation, s.edge_jumps)
-            poses = np.repeat(pose[None], len(found) + 1, axis=0)
+            found = jumps.find(lead.pose, lead.observation, s.edge_jumps)
+            poses = np.repeat(lead.pose[None], len(found) + 1, axis=0)
             poses[1:, jumps.dofs] = found
-            value = self.evaluate(poses, observation, textures, np.full(len(poses), row))
+            value = self._values(lead, poses)
             result[chain] = found[value[1:] < value[0] - s.surprise]
         return result
 
-    def _excess(self, pose: Array, observation: Observation, *, learn: bool) -> dict[str, float]:
+    def _excess(self, lead: _Lead, *, learn: bool) -> dict[str, float]:
         """By how much more than usual the contours of the limbs cost."""
         s = self.settings
-        if observation.edges is None or not (s.edge_jumps > 0 or s.voted_swaps):
+        if lead.observation.edges is None or not (s.edge_jumps > 0 or s.voted_swaps):
             return {}
-        residuals = {c: jumps.residual(pose, observation) for c, jumps in self._edge_jumps.items()}
+        residuals = {
+            chain: jumps.residual(lead.pose, lead.observation)
+            for chain, jumps in self._edge_jumps.items()
+        }
         excess = self.votes.excess(residuals)
         if learn:
             self.votes.learn(residuals)
         return excess
 
     def _may_be_exchanged(
-        self, pose: Array, pair: tuple[str, str], excess: dict[str, float]
+        self, lead: _Lead, pair: tuple[str, str], excess: dict[str, float]
     ) -> bool:
         """Whether the votes ask for two limbs to be exchanged."""
         if not self.settings.voted_swaps or not excess:
             return True
         pixels = [
-            self.camera.project(chain_points(self.body, pose[None], chain)[0, 1:3])
+            self.camera.project(chain_points(self.body, lead.pose[None], chain)[0, 1:3])
             for chain in pair
         ]
-        width = max(self._edge_jumps[chain].width(pose) for chain in pair)
+        width = max(self._edge_jumps[chain].width(lead.pose) for chain in pair)
         near = exchanged(np.linalg.norm(pixels[0] - pixels[1], axis=1), 2.0 * width)
         share = max(near, *(excess[chain] for chain in pair), self.settings.jump_probability)
         return self.votes.drawn(share)
@@ -374,12 +391,13 @@ class KinematicJumps:
             result.append((base, alternatives))
         return result
 
-    def _swap(self, pose: Array, pair: tuple[str, str]) -> tuple[Array, list[Alternatives]] | None:
+    def _swap(self, lead: _Lead, pair: tuple[str, str]) -> tuple[_Lead, list[Alternatives]] | None:
         """The pose with two limbs each on the other's image, in all ways; None if they reach not.
 
         Limbs that cross in the image are easily taken for each other, and one alone that changes
         sides leaves its own place empty.
         """
+        pose, textures, row = lead.pose, lead.textures, lead.row
         base, alternatives = pose.copy(), []
         for chain, sibling in (pair, pair[::-1]):
             own = self.body.skeleton.chain_dofs[chain]
@@ -392,23 +410,24 @@ class KinematicJumps:
                 apart=0.08, most=self.settings.alternatives,
             )  # fmt: skip
             alternatives.append(distinct)
-        return base, alternatives
+        if textures is not None:
+            row = len(textures.counts)
+            segments = (self.body.skeleton.chains[chain] for chain in pair)
+            textures = with_swapped_sides(textures, lead.row, *segments)
+        return replace(lead, pose=base, textures=textures, row=row), alternatives
 
-    def _rate(
-        self,
-        pose: Array,
-        alternatives: list[Alternatives],
-        observation: Observation,
-        textures: Textures | None,
-        row: int,
-    ) -> tuple[list[Array], float]:
+    def _rate(self, lead: _Lead, alternatives: list[Alternatives]) -> tuple[list[Array], float]:
         """Energy change that each alternative makes alone, and the energy of the pose itself."""
-        poses = [pose[None]]
+        poses = [lead.pose[None]]
         for chain in alternatives:
-            block = np.repeat(pose[None], len(chain.angles), axis=0)
+            block = np.repeat(lead.pose[None], len(chain.angles), axis=0)
             block[:, self.body.skeleton.chain_dofs[chain.chain]] = chain.angles
             poses.append(block)
-        everything = np.concatenate(poses)
-        value = self.evaluate(everything, observation, textures, np.full(len(everything), row))
+        value = self._values(lead, np.concatenate(poses))
         ends = np.cumsum([1] + [len(c.angles) for c in alternatives])
         return [value[a:b] - value[0] for a, b in pairwise(ends)], float(value[0])
+
+    def _values(self, lead: _Lead, poses: Array) -> Array:
+        """Energies (N,) of poses (N, d) that carry the textures of a lead."""
+        rows = np.full(len(poses), lead.row)
+        return self.evaluate(poses, lead.observation, lead.textures, rows)
