@@ -98,8 +98,8 @@ class EdgeJumps:
         own, step = self.dofs, 1e-5
         poses = np.repeat(pose[None], len(own) + 1, axis=0)
         poses[np.arange(len(own)), own] += step
-        points = self.camera.project(chain_points(self.body, poses, self.chain)[:, 1:3])
-        slopes = (points[:-1, 1] - points[-1, 1]) / step
+        points = self.camera.project(chain_points(self.body, poses, self.chain)[:, 2])
+        slopes = (points[:-1] - points[-1]) / step
         placed = self._sideways(pose)
         if placed is None or not np.isfinite(slopes).all():
             return 0.0, 0.0
