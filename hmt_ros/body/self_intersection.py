@@ -198,20 +198,20 @@ def _overlap(parts, i, j, columns, centres, others, middles):  # type: ignore[no
     distance = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
     away = max(distance, SMALL)
     d0, d1, d2 = d0 / away, d1 / away, d2 / away
-    reach = 0.0
-    total = 0.0
-    for k in range(3):
-        x = columns[a, k, 0] * d0 + columns[a, k, 1] * d1
-        x = (x + columns[a, k, 2] * d2) * parts.radii[i, k]
-        total += x * x
-    reach += np.sqrt(total)
-    total = 0.0
-    for k in range(3):
-        x = others[b, k, 0] * d0 + others[b, k, 1] * d1
-        x = (x + others[b, k, 2] * d2) * parts.radii[j, k]
-        total += x * x
-    reach += np.sqrt(total)
+    reach = _width(parts, i, columns, d0, d1, d2) + _width(parts, j, others, d0, d1, d2)
     return p0, p1, p2, q0, q1, q2, d0, d1, d2, reach - distance
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _width(parts, i, columns, d0, d1, d2):  # type: ignore[no-untyped-def]
+    """How far a part reaches from its axis along a unit vector."""
+    s = parts.segments[i]
+    total = 0.0
+    for k in range(3):
+        x = columns[s, k, 0] * d0 + columns[s, k, 1] * d1 + columns[s, k, 2] * d2
+        x *= parts.radii[i, k]
+        total += x * x
+    return np.sqrt(total)
 
 
 @njit(cache=True, nogil=True)
