@@ -69,7 +69,7 @@ class MixtureFilter:
         self._modes: Modes | None = None
         self._flesh = FleshFit(body)
         self._usual_energy = np.inf
-        self._least_energy = 0.0
+        self._outline_costs = np.empty((0, 0))
         self._bad_images = 0
         self._energy = PoseEnergy(body, camera, settings)
         self._use_body(body)
@@ -147,8 +147,8 @@ class MixtureFilter:
 
     def keep_still(self, solved: Minimum, log_weights: Array, observation: Observation) -> None:
         """Makes modes that do not move from minima and the log weights (N,) they had before."""
-        self._keep(solved, log_weights, np.zeros_like(solved.x), observation)
-        self.log_evidence = -self.settings.temperature * self._least_energy
+        least = self._keep(solved, log_weights, np.zeros_like(solved.x), observation)
+        self.log_evidence = -self.settings.temperature * least
 
     def twin(self) -> MixtureFilter:
         """Another filter of the same person, without modes, with random numbers of its own."""
@@ -217,9 +217,9 @@ class MixtureFilter:
         if s.reweighting == 'bhattacharyya':
             log_priors = np.zeros(len(solved.x))
             predicted_mixture = GaussianMixture(np.exp(m.log_weights), moved, covariances)
-        self._keep(solved, log_priors, velocities, observation, predicted_mixture)
+        least = self._keep(solved, log_priors, velocities, observation, predicted_mixture)
+        self.log_evidence -= s.temperature * least
         self._fit_flesh(observation)
-        self.log_evidence -= s.temperature * self._least_energy
 
     def judge(self, observation: Observation) -> None:
         """Takes in how much of an image no mode explains, and whether the track is lost."""
@@ -392,8 +392,8 @@ class MixtureFilter:
         velocities: Array,
         observation: Observation,
         predicted: GaussianMixture | None = None,
-    ) -> None:
-        """Makes the modes of the next mixture from optimised candidates.
+    ) -> float:
+        """Makes the modes of the next mixture from optimised candidates; returns the least energy.
 
         A predicted mixture, where there is one, gives its weights to the modes nearest to it.
         """
@@ -401,7 +401,6 @@ class MixtureFilter:
         usable = np.flatnonzero(np.isfinite(solved.value))
         if len(usable) == 0:
             raise ValueError('no hypothesis has a finite energy')
-        self._least_energy = float(solved.value[usable].min())
         log_weights = log_priors[usable] - s.temperature * solved.value[usable]
         kept = choose_hypotheses(
             relative_joints(self.body, solved.x[usable]),
@@ -434,6 +433,7 @@ class MixtureFilter:
             poses, velocities[rows], covariances, filtered, weights[order], -image.value, textures
         )
         self._outline_costs = image.costs
+        return float(solved.value[usable].min())
 
     def _textures(self, frames: Frames, observation: Observation) -> Textures | None:
         """What an image shows on the surfaces of poses."""
