@@ -23,6 +23,8 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs, dtrtri
 
+from hmt_ros.inference.exact_sums import dot, fma
+
 Array = NDArray[np.float64]
 
 
@@ -229,7 +231,7 @@ def fill_lower(columns: Array, lower: Array) -> None:
                 columns[t * n + b, n + a - b] = lower[t, a, b]
 
 
-@njit(cache=True, nogil=True, fastmath={'reassoc', 'contract', 'nsz'})
+@njit(cache=True, nogil=True)
 def add_band_product(columns: Array, x: Array, result: Array) -> None:
     """Adds P x, (S, T n), of vectors x (S, T n) and P in the columns (T n, width + 1) of a band."""
     total, width = columns.shape
@@ -237,8 +239,6 @@ def add_band_product(columns: Array, x: Array, result: Array) -> None:
         for c in range(total):
             last = min(width, total - c)
             own = x[s, c]
-            dot = columns[c, 0] * own
+            result[s, c] += dot(columns[c], x[s], c, last)
             for b in range(1, last):
-                dot += columns[c, b] * x[s, c + b]
-                result[s, c + b] += columns[c, b] * own
-            result[s, c] += dot
+                result[s, c + b] = fma(columns[c, b], own, result[s, c + b])

@@ -19,6 +19,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hmt_ros.inference.exact_sums import dot, fma
+
 Array = NDArray[np.float64]
 
 # Logarithms of overlaps and of densities that make no difference.
@@ -28,7 +30,7 @@ NEGLIGIBLE_DENSITY = 40.0
 STRIDE = 32
 
 
-@njit(cache=True, nogil=True, fastmath={'reassoc', 'contract', 'nsz'})
+@njit(cache=True, nogil=True)
 def add_overlaps(
     own: int,
     samples: Array,
@@ -84,9 +86,8 @@ def add_overlaps(
             log = log_weights[j] + log_scales[j]
             square = 0.0
             if j == own:
-                for c in range(total):
-                    white[j, c] = noise[s, c]
-                    square += noise[s, c] * noise[s, c]
+                white[j] = noise[s]
+                square = dot(noise[s], noise[s], 0, total)
                 log -= 0.5 * square
             else:
                 if not near[j]:
@@ -99,11 +100,9 @@ def add_overlaps(
                     c = begin[j] + i
                     if c >= total:
                         c -= total
-                    y = 0.0
-                    for b in range(width):
-                        y += bands[j, c, b] * delta[c + b]
+                    y = dot(bands[j, c], delta, c, width)
                     white[j, c] = y
-                    square += y * y
+                    square = fma(y, y, square)
                     if i % STRIDE == 0 and log - 0.5 * square < best - NEGLIGIBLE_DENSITY:
                         break
                 log -= 0.5 * square
@@ -131,19 +130,19 @@ def add_overlaps(
                 y = white[j, c]
                 last = min(width, total - c)
                 for b in range(last):
-                    pull[c + b] += y * bands[j, c, b]
+                    pull[c + b] = fma(y, bands[j, c, b], pull[c + b])
             factor = responsibility / inflation[j]
             for c in range(total):
                 move = factor * pull[c]
                 gradient[s, c] -= move
-                mean_gradient[j, c] += share * move
+                mean_gradient[j, c] = fma(share, move, mean_gradient[j, c])
             if len(band_gradient):
                 for c in range(total):
                     delta[c] = (samples[s, c] - means[j, c]) / inflation[j]
                 for c in range(total):
                     y = share * responsibility * white[j, c]
                     for b in range(min(width, total - c)):
-                        band_gradient[j, c, b] -= y * delta[c + b]
+                        band_gradient[j, c, b] = fma(-y, delta[c + b], band_gradient[j, c, b])
             inflation_gradient[j] += share * responsibility * (squares[j] - total)
             weight_gradient[j] += share * responsibility
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.exact_sums import dot, fma
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -217,7 +218,7 @@ def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = Tru
             raise ValueError(f'mixture {t} of {len(mixtures)}: {error}') from None
 
 
-@njit(cache=True, nogil=True, fastmath={'reassoc', 'contract', 'nsz', 'arcp'})
+@njit(cache=True, nogil=True)
 def add_mixture_energy(
     poses: Array,
     times: NDArray[np.int64],
@@ -263,9 +264,7 @@ def add_mixture_energy(
             log = log_scales[mode]
             floor = best - NEGLIGIBLE
             for a in range(d):
-                total = 0.0
-                for b in range(a + 1):
-                    total += whiteners[mode, a, b] * delta[b]
+                total = dot(whiteners[mode, a], delta, 0, a + 1)
                 white[k, a] = total
                 log -= 0.5 * total * total
                 if log < floor:
@@ -291,9 +290,9 @@ def add_mixture_energy(
             for a in range(d):
                 factor = white[k, a]
                 for b in range(a + 1):
-                    pull[k, b] += factor * whiteners[mode, a, b]
+                    pull[k, b] = fma(factor, whiteners[mode, a, b], pull[k, b])
             for a in range(d):
-                gradient[i, a] += logs[k] * pull[k, a]
+                gradient[i, a] = fma(logs[k], pull[k, a], gradient[i, a])
         if curvature == 0:
             continue
         opened = False
@@ -305,7 +304,7 @@ def add_mixture_energy(
             if opened:
                 for a in range(d):
                     for b in range(d):
-                        hessian[i, a, b] += share * precisions[mode, a, b]
+                        hessian[i, a, b] = fma(share, precisions[mode, a, b], hessian[i, a, b])
             else:
                 for a in range(d):
                     for b in range(d):
@@ -318,4 +317,4 @@ def add_mixture_energy(
                 for a in range(d):
                     one = logs[k] * (pull[k, a] - gradient[i, a])
                     for b in range(d):
-                        hessian[i, a, b] -= one * (pull[k, b] - gradient[i, b])
+                        hessian[i, a, b] = fma(-one, pull[k, b] - gradient[i, b], hessian[i, a, b])
