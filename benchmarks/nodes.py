@@ -17,7 +17,8 @@ import hmt_ros
 from benchmarks.clips import COMPRESSED, find_clips, index_back_and_forth, read_messages, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.publisher import with_stamp
-from hmt_ros.app.live_node import LiveNode, LiveNodeError, Player, changed_environment
+from hmt_ros.app.live_node import LiveNode
+from hmt_ros.app.player import LiveNodeError, Player, changed_environment
 from hmt_ros.nodes import bme_session, track_messages
 from hmt_ros.nodes.bme_parameters import BmeParameters
 from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE

@@ -15,7 +15,7 @@ from benchmarks.publisher import STEP_NS, as_file
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.scenes import stamped
 from benchmarks.soak.watched_node import PATIENCE, Silent, Watched
-from hmt_ros.app.live_node import LiveNodeError, environment
+from hmt_ros.app.player import LiveNodeError, environment
 from hmt_ros.nodes.handled import Handled
 from msg_tools.cdr import serialise
 

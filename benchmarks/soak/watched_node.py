@@ -8,7 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.soak.scenes import Scene
-from hmt_ros.app.live_node import LiveNode, LiveNodeError, Player
+from hmt_ros.app.live_node import LiveNode
+from hmt_ros.app.player import LiveNodeError, Player
 from hmt_ros.nodes.handled import Handled
 from hmt_ros.nodes.smoother_session import BODY
 

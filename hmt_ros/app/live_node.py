@@ -2,26 +2,25 @@
 
 Every message is published as it is in the bag; the next one follows when the node has told on
 `~/handled` what became of it and all that it published has arrived. Nothing is lost and nothing
-overtakes, so what comes out does not depend on how fast the machine is. The nodes run in a ROS
-domain that nobody else uses, on this machine only.
+overtakes, so what comes out does not depend on how fast the machine is. The nodes run in the domain
+of their player, which nobody else uses.
 """
 
 from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import hmt_ros
+from hmt_ros.app.player import LiveNodeError, Player, environment
 from hmt_ros.nodes.declared_parameters import values_of
 from hmt_ros.nodes.handled import Handled
 from hmt_ros.nodes.parameter_file import yaml_scalar
@@ -32,70 +31,6 @@ from msg_tools.cdr import canonical, deserialise, serialise
 START_SECONDS = 120.0
 MESSAGE_SECONDS = 600.0  # the first image may have to wait until kernels are compiled
 STOP_SECONDS = 20.0
-
-
-class LiveNodeError(ValueError):
-    """A node did not start, or does not answer; one line."""
-
-
-class Player:
-    """Somebody in a ROS domain of their own who talks to nodes.
-
-    Args:
-        opened: closes what is opened here.
-
-    Raises:
-        LiveNodeError: there is no ROS.
-    """
-
-    def __init__(self, opened: ExitStack) -> None:
-        self.folder = Path(opened.enter_context(TemporaryDirectory(prefix='hmt_ros.')))
-        self.domain = opened.enter_context(reserved_domain())
-        try:
-            import rclpy
-            from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-            from hmt_msgs.msg import Body, Keypoints2D, PoseMixture, TrajectoryMixture
-            from rclpy.executors import SingleThreadedExecutor
-            from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-            from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
-            from std_msgs.msg import String
-            from tf2_msgs.msg import TFMessage
-            from visualization_msgs.msg import MarkerArray
-        except ImportError as error:
-            raise LiveNodeError(
-                f'--live needs a sourced ROS 2 workspace ({error}): source install/setup.bash'
-            ) from error
-        kinds = (
-            Body, CameraInfo, CompressedImage, DiagnosticStatus, Image, JointState, Keypoints2D,
-            MarkerArray, PoseMixture, String, TFMessage, TrajectoryMixture,
-        )  # fmt: skip
-        self.classes: dict[str, Any] = {
-            f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}': kind for kind in kinds
-        }
-        self.reliable = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-        self.latched = QoSProfile(
-            depth=1,
-            reliability=ReliabilityPolicy.RELIABLE,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL,
-        )
-        context = rclpy.Context()
-        with changed_environment(environment(self.domain)):
-            rclpy.init(context=context, domain_id=self.domain)
-        opened.callback(rclpy.try_shutdown, context=context)
-        self.node = rclpy.create_node('replay', context=context)
-        opened.callback(self.node.destroy_node)
-        self.executor = SingleThreadedExecutor(context=context)
-        opened.callback(self.executor.shutdown)
-        self.executor.add_node(self.node)
-        # The values of the diagnostics of each node, by its name.
-        self.diagnostics: dict[str, dict[str, str]] = {}
-
-        def diagnosed(message: DiagnosticArray) -> None:
-            for status in message.status:
-                name = status.name.partition(':')[0]
-                self.diagnostics[name] = {value.key: value.value for value in status.values}
-
-        self.node.create_subscription(DiagnosticArray, '/diagnostics', diagnosed, self.reliable)
 
 
 class LiveNode:
@@ -416,41 +351,3 @@ def _into(queue: deque[bytes]) -> Callable[[bytes], None]:
         queue.append(data)
 
     return receive
-
-
-@contextmanager
-def reserved_domain() -> Iterator[int]:
-    """Number of a ROS domain that no other replay or test run on this machine uses.
-
-    A domain is taken while port 32768 + domain is bound, as ament's domain_coordinator does it.
-    """
-    for offset in range(100):
-        domain = 1 + (os.getpid() + offset) % 100
-        with socket.socket() as reservation:
-            try:
-                reservation.bind(('', 32768 + domain))
-            except OSError:
-                continue
-            yield domain
-            return
-    raise LiveNodeError('all ROS domains from 1 to 100 are in use')
-
-
-def environment(domain: int) -> dict[str, str]:
-    """What a process needs to be in a domain, on this machine only."""
-    return {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
-
-
-@contextmanager
-def changed_environment(changes: dict[str, str]) -> Iterator[None]:
-    """This process with other environment variables for a while."""
-    before = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -13,7 +13,8 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol
 
-from hmt_ros.app.live_node import LiveNode, Player
+from hmt_ros.app.live_node import LiveNode
+from hmt_ros.app.player import Player
 from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
 from hmt_ros.nodes.bme_parameters import BmeParameters
 from hmt_ros.nodes.bme_session import BmeSession

@@ -2,14 +2,20 @@
 
 import os
 import socket
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hmt_ros.app import live_node
-from hmt_ros.app.live_node import LiveNodeError
 from hmt_ros.app.played_track import LiveTrack, NodeParameters
+from hmt_ros.app.player import (
+    LiveNodeError,
+    changed_environment,
+    environment,
+    reserved_domain,
+)
 from hmt_ros.app.replay import main
 from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
 from hmt_ros.nodes.declared_parameters import with_values
@@ -178,7 +184,7 @@ def test_node_that_is_silent_or_dies_is_told(parameters, monkeypatch):
 
 
 def test_node_that_does_not_start_is_told(parameters, monkeypatch):
-    monkeypatch.setattr(live_node.sys, 'executable', '/bin/false')
+    monkeypatch.setattr(sys, 'executable', '/bin/false')
     with (
         pytest.raises(LiveNodeError, match='ended with code 1: it has said nothing'),
         LiveTrack(NodeParameters(parameters, SmootherParameters()), lambda *output: None),
@@ -187,7 +193,7 @@ def test_node_that_does_not_start_is_told(parameters, monkeypatch):
 
 
 def test_without_ros_it_is_one_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(live_node.sys.modules, 'rclpy', None)
+    monkeypatch.setitem(sys.modules, 'rclpy', None)
     out = tmp_path / 'out'
     assert main([str(REACH), '-o', str(out), *PERSON, '--live']) == 1
     (line,) = capsys.readouterr().err.splitlines()
@@ -196,13 +202,13 @@ def test_without_ros_it_is_one_line(tmp_path, monkeypatch, capsys):
 
 
 def test_every_replay_has_a_domain_of_its_own():
-    with live_node.reserved_domain() as one, live_node.reserved_domain() as other:
+    with reserved_domain() as one, reserved_domain() as other:
         assert one != other
         assert 1 <= min(one, other) <= max(one, other) <= 100
         for domain in (one, other):
             with socket.socket() as taken, pytest.raises(OSError, match='in use'):
                 taken.bind(('', 32768 + domain))
-    with live_node.reserved_domain() as again:
+    with reserved_domain() as again:
         assert again == one
 
 
@@ -210,7 +216,7 @@ def test_environment_is_left_as_it_was(monkeypatch):
     monkeypatch.setenv('ROS_DOMAIN_ID', '7')
     monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE', raising=False)
     before = dict(os.environ)
-    with live_node.changed_environment(live_node.environment(3)):
+    with changed_environment(environment(3)):
         assert os.environ['ROS_DOMAIN_ID'] == '3'
         assert os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
     assert dict(os.environ) == before
