@@ -18,7 +18,7 @@ from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.evaluate import as_text
 from hmt_ros.app.pictures import draw_overlays, draw_overview, draw_side_views, draw_weights
 from hmt_ros.app.recorded_track import RecordedTrack, read_images, read_track, spread
-from hmt_ros.app.truth import Truth, read_truth, truth_of, truth_topic
+from hmt_ros.app.truth import Truth, read_truth, recorded_truth
 from msg_tools import BagReader
 
 # Times that are shown in the overview and on the sheets.
@@ -105,12 +105,9 @@ def draw(
 
 def _truth(source: Path, target: Path) -> Truth | None:
     """The truth in the bag, or beside its source."""
-    with BagReader(target) as bag:
-        topic = truth_topic(bag)
-        if topic is not None:
-            return truth_of(bag, topic)
+    recorded = recorded_truth(target)
     beside = source / 'truth.npz'
-    return read_truth(beside) if beside.is_file() else None
+    return read_truth(beside) if recorded is None and beside.is_file() else recorded
 
 
 def _summary(track: RecordedTrack, spent: float) -> str:

@@ -14,9 +14,8 @@ from tqdm import tqdm
 
 from hmt_ros.app.bag_scores import TopicScores, score_bag
 from hmt_ros.app.command_line import CommandParser, run_command
-from hmt_ros.app.truth import Truth, read_truth, truth_of, truth_topic
+from hmt_ros.app.truth import Truth, read_truth, recorded_truth
 from hmt_ros.tracking.evaluation import MODEL_SIGMA
-from msg_tools import BagReader
 
 EPILOG = """\
 Errors are mean distances of hips, knees, ankles, shoulders, elbows, wrists and neck from where
@@ -105,13 +104,12 @@ def _evaluate(options: argparse.Namespace) -> int:
 def _truth(options: argparse.Namespace) -> Truth:
     if options.truth is not None:
         return read_truth(options.truth)
-    with BagReader(options.bag) as bag:
-        topic = truth_topic(bag)
-        if topic is None:
-            raise ValueError(
-                f'{options.bag} has no ground truth: name a .npz file or a bag with --truth'
-            )
-        return truth_of(bag, topic)
+    truth = recorded_truth(options.bag)
+    if truth is None:
+        raise ValueError(
+            f'{options.bag} has no ground truth: name a .npz file or a bag with --truth'
+        )
+    return truth
 
 
 def _scores(options: argparse.Namespace, truth: Truth) -> dict[str, TopicScores]:

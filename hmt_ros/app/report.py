@@ -16,7 +16,7 @@ from hmt_ros.app.recorded_bodies import BODY
 from hmt_ros.app.recorded_mixtures import RecordedMixtures, read_mixtures
 from hmt_ros.app.report_page import Content, data_size, page_html
 from hmt_ros.app.report_pictures import PICTURES, draw_pictures, shown_in_pictures
-from hmt_ros.app.truth import Truth, read_truth, truth_of, truth_topic
+from hmt_ros.app.truth import Truth, read_truth, recorded_truth
 from msg_tools import BagError, BagReader
 
 PAGE = 'report.html'
@@ -138,7 +138,8 @@ def _reported(options: argparse.Namespace) -> str:
 
 def _content(options: argparse.Namespace, source: ImageSource | None, bar: tqdm) -> Content:
     """What is to be shown."""
-    truth = _truth(options)
+    named = options.truth is not None
+    truth = read_truth(options.truth) if named else recorded_truth(options.bag)
     with BagReader(options.bag) as bag:
         topics = chosen_topics(bag, options.topic)
         bodies = [topic.name for topic in bag.topics.values() if topic.msgtype == BODY]
@@ -181,15 +182,6 @@ def _content(options: argparse.Namespace, source: ImageSource | None, bar: tqdm)
             notes.append(f'{len(stamps) - len(images.jpegs)} times are shown without an image')
     title = f'{options.bag.resolve().name}: mixtures over poses'
     return Content(title, stamps, mixtures, images, truth, scores, notes)
-
-
-def _truth(options: argparse.Namespace) -> Truth | None:
-    """The truth that is named, or that the bag has itself."""
-    if options.truth is not None:
-        return read_truth(options.truth)
-    with BagReader(options.bag) as bag:
-        topic = truth_topic(bag)
-        return None if topic is None else truth_of(bag, topic)
 
 
 def _with_truth(mixtures: RecordedMixtures, truth: Truth) -> list[str]:

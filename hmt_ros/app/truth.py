@@ -67,14 +67,24 @@ def read_truth(path: Path) -> Truth:
     """
     if path.suffix == '.npz':
         return _from_arrays(path)
+    truth = recorded_truth(path)
+    if truth is None:
+        raise ValueError(
+            f'{path} has no ground truth: wanted a .npz file with {", ".join(FIELDS)}, or a '
+            'bag with a topic of PoseMixture whose kind is GROUND_TRUTH'
+        )
+    return truth
+
+
+def recorded_truth(path: Path) -> Truth | None:
+    """The truth that a bag carries, None when it has none.
+
+    Raises:
+        ValueError: there are several, or messages that can not be understood.
+    """
     with BagReader(path) as bag:
-        topic = truth_topic(bag)
-        if topic is None:
-            raise ValueError(
-                f'{path} has no ground truth: wanted a .npz file with {", ".join(FIELDS)}, or a '
-                'bag with a topic of PoseMixture whose kind is GROUND_TRUTH'
-            )
-        return truth_of(bag, topic)
+        topic = _truth_topic(bag)
+        return None if topic is None else _truth_of(bag, topic)
 
 
 def _from_arrays(path: Path) -> Truth:
@@ -98,7 +108,7 @@ def _from_arrays(path: Path) -> Truth:
     return Truth(str(path), tuple(str(name) for name in np.ravel(names)), frames)
 
 
-def truth_topic(bag: BagReader) -> str | None:
+def _truth_topic(bag: BagReader) -> str | None:
     """The topic of a bag that carries the ground truth, None when it has none.
 
     Raises:
@@ -125,7 +135,7 @@ def is_truth(bag: BagReader, topic: str) -> bool:
     return first is not None and int(first.message.kind) == MixtureKind.GROUND_TRUTH
 
 
-def truth_of(bag: BagReader, topic: str) -> Truth:
+def _truth_of(bag: BagReader, topic: str) -> Truth:
     """The truth that a topic of a bag carries.
 
     Raises:
