@@ -11,6 +11,9 @@ from typing import NoReturn
 from hmt_ros.app.printing import until_nobody_reads
 from msg_tools.error_line import error_line
 
+# As shells tell of a program that the interrupt key has ended.
+INTERRUPTED = 130
+
 
 class CommandParser(argparse.ArgumentParser):
     """Bad arguments are bad input: one line and exit code 1."""
@@ -24,6 +27,8 @@ def run_command(
     parser: CommandParser,
     work: Callable[[argparse.Namespace], int],
     argv: Sequence[str] | None = None,
+    *,
+    whole_or_nothing: bool = False,
 ) -> int:
     """Runs a command.
 
@@ -31,10 +36,11 @@ def run_command(
         parser: of its arguments; its `prog` is the name of the command.
         work: what it does with them; bad input is a ValueError or an OSError.
         argv: arguments; None: of the process.
+        whole_or_nothing: where the interrupt key ends it, nothing is written, and a line says so.
 
     Returns:
-        The exit code: that of `work`; 1 after bad input, which one line on stderr tells; 141 where
-        nobody reads what is printed any more.
+        The exit code: that of `work`; 1 after bad input, which one line on stderr tells;
+        `INTERRUPTED`; 141 where nobody reads what is printed any more.
     """
 
     def run() -> int:
@@ -45,12 +51,19 @@ def run_command(
         except (ValueError, OSError) as error:
             print(f'{parser.prog}: {error_line(error)}', file=sys.stderr)
             return 1
+        except KeyboardInterrupt:
+            if not whole_or_nothing:
+                raise
+            print(f'{parser.prog}: interrupted, nothing is written', file=sys.stderr)
+            return INTERRUPTED
 
     return until_nobody_reads(run)
 
 
-def number(low: float, high: float) -> Callable[[str], float]:
-    """Reader of a number in a range."""
+def number(
+    low: float, high: float, *, what: str = 'a number', unit: str = ''
+) -> Callable[[str], float]:
+    """Reader of a number in a range; what is said to be wanted, and in which unit."""
 
     def read(text: str) -> float:
         try:
@@ -59,7 +72,7 @@ def number(low: float, high: float) -> Callable[[str], float]:
             value = math.nan
         if not low <= value <= high:
             raise argparse.ArgumentTypeError(
-                f'wanted a number from {low:g} to {high:g}, saw {text!r}'
+                f'wanted {what} from {low:g} to {high:g}{unit}, saw {text!r}'
             )
         return value
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from hmt_ros.app.bag_scores import TopicScores, score_bag
-from hmt_ros.app.command_line import CommandParser, run_command
+from hmt_ros.app.command_line import CommandParser, number, run_command
 from hmt_ros.app.truth import Truth, read_truth, recorded_truth
 from hmt_ros.tracking.evaluation import MODEL_SIGMA
 
@@ -64,7 +63,7 @@ def _parser() -> CommandParser:
     )
     parser.add_argument(
         '--model-sigma',
-        type=_length,
+        type=number(1e-4, 1, what='a length', unit=' m'),
         default=MODEL_SIGMA,
         metavar='M',
         help='standard deviation, in m, that every coordinate of a joint has besides what the '
@@ -79,16 +78,6 @@ def _parser() -> CommandParser:
     parser.add_argument('--json', action='store_true', help='print one JSON object')
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     return parser
-
-
-def _length(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 1e-4 <= value <= 1:
-        raise argparse.ArgumentTypeError(f'wanted a length from 0.0001 to 1 m, saw {text!r}')
-    return value
 
 
 def _evaluate(options: argparse.Namespace) -> int:
@@ -113,10 +102,10 @@ def _truth(options: argparse.Namespace) -> Truth:
 
 
 def _scores(options: argparse.Namespace, truth: Truth) -> dict[str, TopicScores]:
-    hidden = options.quiet or not sys.stderr.isatty()
     if options.seed < 0:
         raise ValueError(f'--seed must not be negative, saw {options.seed}')
-    with tqdm(unit='message', desc='evaluate', disable=hidden) as bar:
+    # None: shown where stderr is a terminal.
+    with tqdm(unit='message', desc='evaluate', disable=options.quiet or None) as bar:
         return score_bag(
             options.bag,
             truth,

@@ -9,7 +9,6 @@ need: `background.png` (the empty scene), `subject.yaml` (joints as clicked in t
 from __future__ import annotations
 
 import math
-import sys
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,7 +93,8 @@ def write_bag(
     subject = subject_text(take, camera, pixels[0], scene.seed)
     messages = RosbagsMessages()
     masks = np.empty((len(take.poses), camera.height, (camera.width + 7) // 8), dtype=np.uint8)
-    hidden = not progress or not sys.stderr.isatty()
+    # None: shown where stderr is a terminal.
+    hidden = None if progress else True
     with (
         BagWriter(folder) as bag,
         tqdm(total=len(take.poses), unit='image', desc=folder.name, disable=hidden) as bar,

@@ -57,7 +57,7 @@ replayed (a line each), 130 interrupted
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; 0: the bag is there, 1: bad input, and one line on stderr says which."""
-    return run_command(_parser(), _replay, argv)
+    return run_command(_parser(), _replay, argv, whole_or_nothing=True)
 
 
 def _parser() -> CommandParser:
@@ -167,13 +167,9 @@ def _parser() -> CommandParser:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    try:
-        if is_many(options):
-            return replay_many(options, _tell)
-        replayed = replay_bag(of_bag(options, options.bags[0], options.output), _tell)
-    except KeyboardInterrupt:
-        print('replay: interrupted, nothing is written', file=sys.stderr)
-        return 130
+    if is_many(options):
+        return replay_many(options, _tell)
+    replayed = replay_bag(of_bag(options, options.bags[0], options.output), _tell)
     if not options.quiet:
         print(replayed)
     return 0

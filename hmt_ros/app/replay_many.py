@@ -23,6 +23,7 @@ from typing import Any
 from tqdm import tqdm
 
 import hmt_ros
+from hmt_ros.app.command_line import INTERRUPTED
 from hmt_ros.app.dask_cluster import through_dask
 from hmt_ros.app.replayed_bag import Tell, parameters_of, replay_bag
 from msg_tools import BagError
@@ -108,7 +109,7 @@ def replay_many(options: argparse.Namespace, tell: Tell) -> int:
     except KeyboardInterrupt:
         done = counts[DONE] + counts[BEFORE]
         tell(f'interrupted, {done} of {len(jobs)} bags are done; the same command goes on')
-        return 130
+        return INTERRUPTED
     if not options.quiet:
         print(
             f'{options.output}: {counts[DONE]} replayed, {counts[BEFORE]} done before, '

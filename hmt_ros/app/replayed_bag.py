@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -241,7 +240,6 @@ def _play(
     if not parameters.use_keypoints:
         recorded = replace(recorded, keypoints=None)
     copied = {GROUND_TRUTH, IMAGE, CAMERA_INFO} if options.with_images else {GROUND_TRUTH}
-    hidden = options.quiet or not sys.stderr.isatty()
     messages = recorded.messages(bag)
     with (
         ReadAhead(partial(_read, messages, not options.live), messages.close) as ahead,
@@ -249,7 +247,7 @@ def _play(
             total=recorded.image.message_count,
             unit='image',
             desc=str(options.output),
-            disable=hidden,
+            disable=options.quiet or None,  # None: shown where stderr is a terminal
         ) as bar,
     ):
 

@@ -49,7 +49,7 @@ exit code: 0 done, 1 bad input (one line on stderr says which), 130 interrupted
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command; 0: the report is there, 1: bad input, and one line on stderr says which."""
-    return run_command(_parser(), _report, argv)
+    return run_command(_parser(), _report, argv, whole_or_nothing=True)
 
 
 def _parser() -> CommandParser:
@@ -102,11 +102,7 @@ def _parser() -> CommandParser:
 
 
 def _report(options: argparse.Namespace) -> int:
-    try:
-        summary = _reported(options)
-    except KeyboardInterrupt:
-        print('report: interrupted, nothing is written', file=sys.stderr)
-        return 130
+    summary = _reported(options)
     if not options.quiet:
         print(summary)
     return 0
@@ -121,8 +117,8 @@ def _reported(options: argparse.Namespace) -> str:
     source = image_source(
         options.bag, options.images, options.image_topic, options.camera_info_topic
     )
-    hidden = options.quiet or not sys.stderr.isatty()
-    with tqdm(unit='message', desc=str(options.output), disable=hidden) as bar:
+    # None: shown where stderr is a terminal.
+    with tqdm(unit='message', desc=str(options.output), disable=options.quiet or None) as bar:
         content = _content(options, source, bar)
         with _FOLDER.new(options.output, overwrite=options.overwrite) as folder:
             folder.mkdir()
