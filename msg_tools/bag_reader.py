@@ -144,6 +144,11 @@ class BagReader:
     ) -> None:
         self.close()
 
+    def raise_damage(self) -> None:
+        """Raises BagError where something is already known to be wrong."""
+        if self.damage is not None:
+            raise BagError(f'{self.path} {self.damage}')
+
     def message_count(self, topics: Iterable[str] | None = None) -> int:
         """Number of messages of some topics, or of all.
 
@@ -162,7 +167,7 @@ class BagReader:
         for candidate in (name, f'/{name}', name.removeprefix('/')):
             if candidate in self.topics:
                 return self.topics[candidate]
-        self._raise_damage()
+        self.raise_damage()
         raise BagError(f'{self.path} has no topic {name}; it has {self._topic_names()}')
 
     def find_topic(self, msgtypes: Iterable[str], name: str | None = None) -> Topic:
@@ -191,13 +196,13 @@ class BagReader:
                 names = ', '.join(topic.name for topic in used)
                 raise BagError(f'{self.path} has several topics of {short}: name one of {names}')
             if not found:
-                self._raise_damage()
+                self.raise_damage()
                 raise BagError(
                     f'{self.path} has no topic of type {short}; it has {self._topic_names()}'
                 )
             topic = (used or found)[0]
         if not topic.message_count:
-            self._raise_damage()
+            self.raise_damage()
             raise BagError(f'{self.path}: topic {topic.name} has no messages')
         return topic
 
@@ -276,10 +281,6 @@ class BagReader:
                 f'{self.path}: messages of {topic} are encoded as {encoding!r}, wanted cdr as '
                 'ROS 2 records it'
             )
-
-    def _raise_damage(self) -> None:
-        if self.damage is not None:
-            raise BagError(f'{self.path} {self.damage}')
 
     def _topic_names(self) -> str:
         return ', '.join(self.topics) or 'none'

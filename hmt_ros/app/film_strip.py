@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.app.recorded_input import CAMERA_INFO_TYPE, COMPRESSED, RAW, recorded_input
 from hmt_ros.body import Camera
-from msg_tools import BagError, BagReader
+from msg_tools import BagReader
 from msg_tools.camera_info import camera_from_info
 from msg_tools.headers import time_ns
 from msg_tools.images import decode_image, encode_jpeg
@@ -78,8 +78,7 @@ def image_source(
     """
     path = out if images is None else images
     with BagReader(path) as bag:
-        if bag.damage is not None:
-            raise BagError(f'{path} {bag.damage}')
+        bag.raise_damage()
         if images is None and image_topic is None:
             found = [
                 topic.name

@@ -82,8 +82,8 @@ def replay_bag(options: argparse.Namespace, tell: Tell) -> Replayed:
     if target.exists() and target.resolve() in (source.resolve(), source.resolve().parent):
         raise ValueError(f'{target} is the bag that is read; give another name')
     with BagReader(source) as bag:
-        if bag.damage is not None and not options.keep_going:
-            raise BagError(f'{source} {bag.damage}')
+        if not options.keep_going:
+            bag.raise_damage()
         recorded = recorded_input(bag, options.image_topic, options.camera_info_topic)
         parameters = _node_parameters(options, recorded)
         # What the parameters name is looked at before a node is started.

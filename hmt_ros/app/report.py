@@ -17,7 +17,7 @@ from hmt_ros.app.recorded_mixtures import RecordedMixtures, read_mixtures
 from hmt_ros.app.report_page import Content, data_size, page_html
 from hmt_ros.app.report_pictures import PICTURES, draw_pictures, shown_in_pictures
 from hmt_ros.app.truth import Truth, read_truth, recorded_truth
-from msg_tools import BagError, BagReader
+from msg_tools import BagReader
 
 PAGE = 'report.html'
 # Bytes of the page at most, and what of it data may take before times are left out.
@@ -112,8 +112,7 @@ def _reported(options: argparse.Namespace) -> str:
     """Makes the report; lines that sum up what came out."""
     _FOLDER.check_place(options.output, overwrite=options.overwrite)
     with BagReader(options.bag) as bag:
-        if bag.damage is not None:
-            raise BagError(f'{options.bag} {bag.damage}')
+        bag.raise_damage()
     source = image_source(
         options.bag, options.images, options.image_topic, options.camera_info_topic
     )
