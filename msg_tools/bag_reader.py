@@ -16,10 +16,10 @@ import os
 import stat
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from rosbags.typesys.store import Typestore
@@ -87,7 +87,7 @@ class BagMessage:
         return self._deserialise(self)
 
 
-class BagReader:
+class BagReader(AbstractContextManager['BagReader']):
     """A bag that is open for reading.
 
     Args:
@@ -133,15 +133,7 @@ class BagReader:
             self._scratch.cleanup()
             self._scratch = None
 
-    def __enter__(self) -> BagReader:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def raise_damage(self) -> None:

@@ -11,7 +11,7 @@ Time is what the caller says, the stamp of the message: log time and publish tim
 from __future__ import annotations
 
 import os
-from types import TracebackType
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 from msg_tools.bag_error import BagError, reason
@@ -27,7 +27,7 @@ class _Topic(NamedTuple):
     channel: int
 
 
-class BagWriter:
+class BagWriter(AbstractContextManager['BagWriter']):
     """A bag that is open for writing; a context manager, which closes it, or drops it on an error.
 
     Args:
@@ -43,15 +43,7 @@ class BagWriter:
         self.path = self._folder.path
         self._topics: dict[str, _Topic] = {}
 
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.close()
         else:

@@ -9,8 +9,7 @@ there is no more: the node, to which no message says so, is deactivated.
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
-from types import TracebackType
+from contextlib import AbstractContextManager, ExitStack
 from typing import Any, NamedTuple, Protocol
 
 from hmt_ros.app.live_node import LiveNode
@@ -43,19 +42,8 @@ class NodeParameters(NamedTuple):
     bme: BmeParameters | None = None
 
 
-class PlayedTrack(Protocol):
+class PlayedTrack(AbstractContextManager['PlayedTrack'], Protocol):
     """Takes the messages of a bag, one after the other; a context manager."""
-
-    def __enter__(self) -> PlayedTrack:
-        """Starts."""
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Ends."""
 
     def take(self, source: str, message: Any) -> Handled:
         """Hands a message over and returns when all that it leads to is written."""
@@ -64,7 +52,7 @@ class PlayedTrack(Protocol):
         """Returns when all is written that waited for more messages."""
 
 
-class OfflineTrack:
+class OfflineTrack(PlayedTrack):
     """Without ROS.
 
     Args:
@@ -86,16 +74,8 @@ class OfflineTrack:
         if parameters.smoother is not None:
             self._smoother = SmootherSession(parameters.smoother, lambda output: write(*output))
 
-    def __enter__(self) -> OfflineTrack:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        pass
+    def __exit__(self, *_: object) -> None:
+        """See `PlayedTrack`; nothing is open."""
 
     def take(self, source: str, message: Any) -> Handled:
         """See `PlayedTrack`."""
@@ -130,7 +110,7 @@ class OfflineTrack:
             self._handed.append(output)
 
 
-class LiveTrack:
+class LiveTrack(PlayedTrack):
     """The real nodes, over DDS in lock step.
 
     Args:
@@ -199,12 +179,7 @@ class LiveTrack:
             self._opened = opened.pop_all()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         with self._opened:
             if kind is None:
                 for node in (self._bme, self._filter, self._smoother):

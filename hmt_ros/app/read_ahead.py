@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from types import TracebackType
+from contextlib import AbstractContextManager
 from typing import Generic, TypeVar
 
 Item = TypeVar('Item')
 
 
-class ReadAhead(Generic[Item]):
+class ReadAhead(AbstractContextManager['ReadAhead[Item]'], Generic[Item]):
     """An iterator whose next item is made meanwhile; a context manager, which ends the thread.
 
     After an error it may be asked for the next item, as whoever makes them can be.
@@ -34,15 +34,7 @@ class ReadAhead(Generic[Item]):
             self._next = self._thread.submit(self._make)
         return made.result()
 
-    def __enter__(self) -> ReadAhead[Item]:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._next.cancel()
         self._thread.submit(self._close)
         self._thread.shutdown(wait=True)

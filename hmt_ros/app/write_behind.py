@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from types import TracebackType
+from contextlib import AbstractContextManager
 from typing import Any
 
 # So many calls may wait; a message or a picture each.
 _MOST_WAITING = 32
 
 
-class WriteBehind:
+class WriteBehind(AbstractContextManager['WriteBehind']):
     """A context manager, which waits for all calls at its end, or drops them on an error.
 
     What a call raises is raised by `check`, or at the end; those behind it are not made. `call`
@@ -24,15 +24,7 @@ class WriteBehind:
         self._waiting: deque[Future[None]] = deque()
         self._error: BaseException | None = None
 
-    def __enter__(self) -> WriteBehind:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._thread.shutdown(wait=True, cancel_futures=kind is not None)
         if kind is None:
             self.check()
