@@ -17,7 +17,6 @@ whole. So the framing is done here:
 from __future__ import annotations
 
 import os
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -25,7 +24,6 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from msg_tools.bag_error import BagError, reason
-from msg_tools.decompression import DecompressionError, decompress
 from msg_tools.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -42,8 +40,10 @@ from msg_tools.mcap_records import (
     DamageError,
     Fields,
     checksum_of,
+    chunk_records,
     read_exactly,
     record_head,
+    records_in,
 )
 from msg_tools.stored_message import Channel, StoredMessage
 from msg_tools.time_order import Source, merge
@@ -284,40 +284,18 @@ class McapFile:
         data = read_exactly(file, block.size)
         if not block.is_chunk:
             return memoryview(data)
-        fields = Fields(data, block.offset)
-        _, _, size, checksum = CHUNK_HEAD.unpack(fields.take(CHUNK_HEAD.size))
-        compression = fields.text()
-        try:
-            data = decompress(fields.take(fields.u64()), compression, size)
-        except DecompressionError as error:
-            raise DamageError(f'is damaged in the chunk at byte {block.offset}: {error}') from None
-        if checksum and zlib.crc32(data) != checksum:
-            raise DamageError(
-                f'is damaged in the chunk at byte {block.offset}: its checksum differs'
-            )
-        return memoryview(data)
+        return chunk_records(data, block.offset)
 
     def _messages_in(
         self, data: memoryview, block: _Block
     ) -> Iterator[tuple[int, int, memoryview]]:
         """Log time, channel and data of the messages, in the order of the file."""
-        place = f'the chunk at byte {block.offset}'
-        offset = 0
-        while offset < len(data):
-            body = offset + RECORD.size
-            if body > len(data):
-                raise DamageError(f'is damaged in {place}: a record breaks off')
-            opcode, length = RECORD.unpack_from(data, offset)
-            offset = body + length
-            if offset > len(data):
-                raise DamageError(f'is damaged in {place}: a record breaks off')
+        for opcode, start, end in records_in(data, block.offset):
             if opcode == MESSAGE:
-                if length < MESSAGE_HEAD.size:
-                    raise DamageError(f'is damaged in {place}: a message has {length} bytes')
-                key, _, time, _ = MESSAGE_HEAD.unpack_from(data, body)
-                yield time, key, data[body + MESSAGE_HEAD.size : offset]
+                key, _, time, _ = MESSAGE_HEAD.unpack_from(data, start)
+                yield time, key, data[start + MESSAGE_HEAD.size : end]
             elif opcode in (SCHEMA, CHANNEL):
-                self._register(opcode, data[body:offset], block.offset)
+                self._register(opcode, data[start:end], block.offset)
 
     def _register(self, opcode: int, body: bytes | memoryview, offset: int) -> None:
         fields = Fields(body, offset)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import Counter
+from collections.abc import Iterator
 from typing import BinaryIO
 
-from msg_tools.decompression import MAX_BYTES, PIECE_BYTES
+from msg_tools.decompression import MAX_BYTES, PIECE_BYTES, DecompressionError, decompress
 
 MAGIC = b'\x89MCAP0\r\n'
 
@@ -144,6 +145,47 @@ def read_exactly(file: BinaryIO, count: int) -> bytes:
     if len(data) != count:
         raise DamageError('became shorter while it was read')
     return data
+
+
+def chunk_records(body: bytes, offset: int) -> memoryview:
+    """The records of a chunk, decompressed and compared with its checksum.
+
+    Args:
+        body: of the record of the chunk.
+        offset: by which texts of errors name the chunk.
+    """
+    fields = Fields(body, offset)
+    _, _, size, checksum = CHUNK_HEAD.unpack(fields.take(CHUNK_HEAD.size))
+    compression = fields.text()
+    try:
+        data = decompress(fields.take(fields.u64()), compression, size)
+    except DecompressionError as error:
+        raise DamageError(f'is damaged in the chunk at byte {offset}: {error}') from None
+    if checksum and zlib.crc32(data) != checksum:
+        raise DamageError(f'is damaged in the chunk at byte {offset}: its checksum differs')
+    return memoryview(data)
+
+
+def records_in(data: memoryview, offset: int) -> Iterator[tuple[int, int, int]]:
+    """Type, start and end of the body of records that follow each other, those of a chunk say.
+
+    Args:
+        data: the records.
+        offset: by which texts of errors name the chunk.
+    """
+    place = f'the chunk at byte {offset}'
+    at = 0
+    while at < len(data):
+        body = at + RECORD.size
+        if body > len(data):
+            raise DamageError(f'is damaged in {place}: a record breaks off')
+        opcode, length = RECORD.unpack_from(data, at)
+        at = body + length
+        if at > len(data):
+            raise DamageError(f'is damaged in {place}: a record breaks off')
+        if opcode == MESSAGE and length < MESSAGE_HEAD.size:
+            raise DamageError(f'is damaged in {place}: a message has {length} bytes')
+        yield opcode, body, at
 
 
 def checksum_of(file: BinaryIO, start: int, end: int) -> int:

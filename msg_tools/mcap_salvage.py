@@ -1,7 +1,7 @@
 """What is whole in a damaged MCAP file, in the order of the file, one chunk in memory at a time.
 
 A chunk is whole when its checksum says so, or, where it has none, when it can be decompressed and
-divided into records; outside of chunks a record is whole when it lies in the file to its end.
+records_in into records; outside of chunks a record is whole when it lies in the file to its end.
 Behind damage the next chunk is looked for. The summary, where it is whole, tells of channels whose
 description was lost, and how many messages there have been.
 """
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from msg_tools.bag_error import BagError, reason
-from msg_tools.decompression import MAX_BYTES, DecompressionError, decompress
+from msg_tools.decompression import MAX_BYTES
 from msg_tools.mcap_records import (
     ATTACHMENT,
     CHANNEL,
@@ -38,8 +38,10 @@ from msg_tools.mcap_records import (
     DamageError,
     Fields,
     checksum_of,
+    chunk_records,
     read_exactly,
     record_head,
+    records_in,
 )
 from msg_tools.stored_message import Channel
 
@@ -255,20 +257,12 @@ class McapSalvage:
                 raise DamageError(f'is damaged at byte {offset}: an index of {length} bytes')
 
     def _chunk(self, body: bytes, offset: int) -> Iterator[Saved]:
-        place = f'the chunk at byte {offset}'
-        fields = Fields(body, offset)
-        _, _, size, checksum = CHUNK_HEAD.unpack(fields.take(CHUNK_HEAD.size))
-        compression = fields.text()
-        try:
-            data = memoryview(decompress(fields.take(fields.u64()), compression, size))
-        except DecompressionError as error:
-            raise DamageError(f'is damaged in {place}: {error}') from None
-        if checksum and zlib.crc32(data) != checksum:
-            raise DamageError(f'is damaged in {place}: its checksum differs')
         # Wholly, before anything of it is given out.
-        records = list(_records(data, place))
+        data = chunk_records(body, offset)
+        records = list(records_in(data, offset))
         undescribed: Counter[int] = Counter()
-        for opcode, record in records:
+        for opcode, start, end in records:
+            record = data[start:end]
             if opcode == MESSAGE:
                 message = self._message(record)
                 if message is None:
@@ -282,7 +276,8 @@ class McapSalvage:
                 Loss(
                     offset,
                     offset + RECORD.size + len(body),
-                    f'has {undescribed.total()} messages in {place} that nothing describes',
+                    f'has {undescribed.total()} messages in the chunk at byte {offset} that '
+                    'nothing describes',
                 )
             )
 
@@ -372,20 +367,6 @@ def _places(piece: bytes, mark: bytes, before: int) -> Iterator[int]:
     while at >= 0:
         yield at - before
         at = piece.find(mark, at + 1)
-
-
-def _records(data: memoryview, place: str) -> Iterator[tuple[int, memoryview]]:
-    """Type and body of the records of a chunk."""
-    offset = 0
-    while offset < len(data):
-        body = offset + RECORD.size
-        if body > len(data):
-            raise DamageError(f'is damaged in {place}: a record breaks off')
-        opcode, length = RECORD.unpack_from(data, offset)
-        offset = body + length
-        if offset > len(data) or (opcode == MESSAGE and length < MESSAGE_HEAD.size):
-            raise DamageError(f'is damaged in {place}: a record breaks off')
-        yield opcode, data[body:offset]
 
 
 def _attachment(body: bytes, offset: int) -> SavedAttachment:
