@@ -22,13 +22,12 @@ from typing import Any, BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from msg_tools.bag_error import BagError, reason
-from msg_tools.bag_metadata import FILE_NAME, VERSION, as_yaml
+from msg_tools.bag_metadata import FILE_NAME, SUFFIXES, VERSION, as_yaml
 from msg_tools.stored_message import Channel
 
 LIBRARY = 'hmt_ros'
 CHUNK_BYTES = 2**20
 _PARTIAL = '.partial'
-_SUFFIXES = ('.mcap', '.mcap.zstd', '.db3', '.db3.zstd')
 
 
 @dataclass
@@ -202,7 +201,7 @@ class BagFolder:
             names = sorted(path.name for path in self.path.iterdir())
         except OSError as error:
             raise BagError(f'{self.path} can not be replaced: {reason(error)}') from error
-        foreign = [name for name in names if name != FILE_NAME and not name.endswith(_SUFFIXES)]
+        foreign = [name for name in names if name != FILE_NAME and not name.endswith(SUFFIXES)]
         if self.path.is_symlink() or (names and FILE_NAME not in names) or foreign:
             what = f'it has {foreign[0]}' if foreign else 'it is not the folder of a bag'
             raise BagError(f'{self.path} is not replaced: {what}; give another name')

@@ -12,6 +12,10 @@ from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReli
 from msg_tools.bag_error import BagError, reason
 
 FILE_NAME = 'metadata.yaml'
+# What the names of the other files of a bag end with.
+MCAP_SUFFIXES = ('.mcap', '.mcap.zstd')
+DATABASE_SUFFIXES = ('.db3', '.db3.zstd')
+SUFFIXES = (*MCAP_SUFFIXES, *DATABASE_SUFFIXES)
 VERSION = 9
 MAX_BYTES = 2**24
 

@@ -12,7 +12,13 @@ from pathlib import Path
 
 from msg_tools.bag_error import BagError, reason
 from msg_tools.bag_folder import BagFolder, unfinished_folders
-from msg_tools.bag_metadata import FILE_NAME, read_file_names, recorded_quality_of_service
+from msg_tools.bag_metadata import (
+    DATABASE_SUFFIXES,
+    FILE_NAME,
+    MCAP_SUFFIXES,
+    read_file_names,
+    recorded_quality_of_service,
+)
 from msg_tools.decompression import ZSTD_MAGIC, DecompressionError, decompress_file
 from msg_tools.mcap_salvage import (
     Loss,
@@ -25,7 +31,6 @@ from msg_tools.mcap_salvage import (
 )
 from msg_tools.stored_message import Channel
 
-_SUFFIXES = ('.mcap', '.mcap.zstd')
 # Written anew.
 _OWN_METADATA = 'rosbag2'
 
@@ -153,7 +158,7 @@ def _files(source: Path) -> tuple[list[Path], list[str]]:
         if isinstance(error, BagError):
             raise
         raise BagError(f'{source} can not be read: {reason(error)}') from error
-    paths = [path for path in inside if path.name.endswith(_SUFFIXES) and path.is_file()]
+    paths = [path for path in inside if path.name.endswith(MCAP_SUFFIXES) and path.is_file()]
     if not paths:
         _check_database(inside)
         raise BagError(f'{source} has no .mcap file')
@@ -188,7 +193,7 @@ def _by_number(path: Path) -> list[tuple[int, str]]:
 
 def _check_database(paths: list[Path]) -> None:
     for path in paths:
-        if path.name.endswith(('.db3', '.db3.zstd')):
+        if path.name.endswith(DATABASE_SUFFIXES):
             raise BagError(
                 f'{path} is a database, which keeps by itself what was written: it can be read as '
                 'it is, and `ros2 bag reindex` writes its metadata anew'

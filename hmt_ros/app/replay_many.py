@@ -28,10 +28,9 @@ from hmt_ros.app.dask_cluster import through_dask
 from hmt_ros.app.replayed_bag import Tell, parameters_of, replay_bag
 from msg_tools import BagError
 from msg_tools.bag_folder import unfinished_folders
-from msg_tools.bag_metadata import FILE_NAME
+from msg_tools.bag_metadata import FILE_NAME, SUFFIXES
 from msg_tools.error_line import error_line
 
-_SUFFIXES = ('.mcap', '.db3', '.mcap.zstd', '.db3.zstd')
 # Stands for the folder of a bag in the options that name files of one person.
 _BAG = '{bag}'
 _OF_A_PERSON = ('subject', 'background', 'bme', 'body')
@@ -188,7 +187,7 @@ def _made_from(options: argparse.Namespace) -> dict[str, Any]:
         'input': {
             path.name: [path.stat().st_size, path.stat().st_mtime_ns]
             for path in files
-            if path.name == FILE_NAME or path.name.endswith(_SUFFIXES)
+            if path.name == FILE_NAME or path.name.endswith(SUFFIXES)
         },
         'parameters': parameters,
         'options': {name: getattr(options, name) for name in _DECIDING},
@@ -277,7 +276,7 @@ def _bags_in(folder: Path, output: Path | None) -> Iterator[tuple[str, Path]]:
                 inside.append(name)
         folders[:] = inside
         for name in sorted(files):
-            if name.endswith(_SUFFIXES) and not name.startswith('.'):
+            if name.endswith(SUFFIXES) and not name.startswith('.'):
                 path = place / name
                 yield str(path.relative_to(folder).with_name(_name(path))), path
 
