@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.app.recorded_bodies import BODY, SAME_PLACE, RecordedBodies
+from hmt_ros.app.recorded_bodies import BODY, SAME_PLACE, RecordedBodies, body_topics
 from hmt_ros.app.recorded_track import bare_mixture
 from hmt_ros.app.truth import POSE_MIXTURE, Truth, is_truth, mixture_topics
 from hmt_ros.body import Body
@@ -198,8 +198,7 @@ def score_bag(
             for name in names
         }
         bodies = RecordedBodies(body_model)
-        carriers = [topic.name for topic in bag.topics.values() if topic.msgtype == BODY]
-        for stored in bag.messages([*carriers, *names]):
+        for stored in bag.messages([*body_topics(bag), *names]):
             if stored.msgtype == BODY:
                 bodies.learn(stored)
             elif stored.msgtype == POSE_MIXTURE:

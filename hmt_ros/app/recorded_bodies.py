@@ -5,12 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
-from msg_tools import BagMessage
+from msg_tools import BagMessage, BagReader
 from msg_tools.pose_mixtures import PoseMixture
 
 BODY = 'hmt_msgs/msg/Body'
 # Positions of joints in a message agree with the body's kinematics up to this, m.
 SAME_PLACE = 1e-3
+
+
+def body_topics(bag: BagReader) -> list[str]:
+    """Topics of a bag on which bodies are described."""
+    return [topic.name for topic in bag.topics.values() if topic.msgtype == BODY]
 
 
 class RecordedBodies:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.app.bag_scores import chosen_topics
-from hmt_ros.app.recorded_bodies import BODY, RecordedBodies
+from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
 from hmt_ros.app.recorded_track import Moment, RecordedTrack, bare_mixture
 from hmt_ros.app.truth import POSE_MIXTURE
 from msg_tools import BagMessage, BagReader
@@ -144,8 +144,7 @@ def read_mixtures(
     with BagReader(path) as bag:
         names = chosen_topics(bag, topics)
         reading = _Reading(body_model)
-        carriers = [topic.name for topic in bag.topics.values() if topic.msgtype == BODY]
-        for stored in bag.messages([*carriers, *names]):
+        for stored in bag.messages([*body_topics(bag), *names]):
             reading.take(stored)
             if progress is not None:
                 progress(1)

@@ -12,7 +12,7 @@ from hmt_ros.app.bag_scores import chosen_topics, score_bag
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
 from hmt_ros.app.film_strip import FilmStrip, ImageSource, film_strip, image_source
 from hmt_ros.app.new_folder import FolderKind
-from hmt_ros.app.recorded_bodies import BODY
+from hmt_ros.app.recorded_bodies import body_topics
 from hmt_ros.app.recorded_mixtures import RecordedMixtures, read_mixtures
 from hmt_ros.app.report_page import Content, data_size, page_html
 from hmt_ros.app.report_pictures import PICTURES, draw_pictures, shown_in_pictures
@@ -137,8 +137,7 @@ def _content(options: argparse.Namespace, source: ImageSource | None, bar: tqdm)
     truth = read_truth(options.truth) if named else recorded_truth(options.bag)
     with BagReader(options.bag) as bag:
         topics = chosen_topics(bag, options.topic)
-        bodies = [topic.name for topic in bag.topics.values() if topic.msgtype == BODY]
-        bar.total = bag.message_count({*topics, *bodies}) * (1 if truth is None else 2)
+        bar.total = bag.message_count({*topics, *body_topics(bag)}) * (1 if truth is None else 2)
     if source is not None:
         with BagReader(source.bag) as bag:
             bar.total += bag.message_count([source.topic])
