@@ -16,13 +16,10 @@ from hmt_ros.app import replay
 from hmt_ros.app.bag_scores import score_bag
 from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.evaluate import as_text
-from hmt_ros.app.pictures import draw_overlays, draw_overview, draw_side_views, draw_weights
-from hmt_ros.app.recorded_track import RecordedTrack, read_images, read_track, spread
+from hmt_ros.app.recorded_track import RecordedTrack, read_images, read_track
+from hmt_ros.app.report_pictures import PICTURES, draw_track, shown_in_pictures
 from hmt_ros.app.truth import Truth, read_truth, recorded_truth
 from msg_tools import BagReader
-
-# Times that are shown in the overview and on the sheets.
-IN_OVERVIEW, ON_SHEETS = 4, 8
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -87,20 +84,9 @@ def draw(
         track: what was tracked.
         truth: None: not known.
     """
-    few, many = spread(track, IN_OVERVIEW), spread(track, ON_SHEETS)
-    camera, images = read_images(source, {*few, *many})
-    pictures = [
-        (folder / 'overview.png', 'images with the heaviest modes, and the same from the side'),
-        (folder / 'overlays.png', 'the heaviest modes on more images'),
-        (folder / 'side_views.png', 'all modes from the side'),
-        (folder / 'weights.png', 'weights of the modes over time' + (', errors' if truth else '')),
-    ]
-    overview, overlays, side_views, weights = (path for path, _ in pictures)
-    draw_overview(overview, track, camera, {t: images[t] for t in few}, truth)
-    draw_overlays(overlays, track, camera, {t: images[t] for t in many})
-    draw_side_views(side_views, track, many, truth)
-    draw_weights(weights, track, truth)
-    return pictures
+    camera, images = read_images(source, shown_in_pictures(track))
+    what = PICTURES | ({'weights.png': f'{PICTURES["weights.png"]}, errors'} if truth else {})
+    return [(folder / x, what[x]) for x in draw_track(folder, track, camera, images, truth)]
 
 
 def _truth(source: Path, target: Path) -> Truth | None:
