@@ -1,0 +1,228 @@
+"""The page of a report: what it does in a browser."""
+
+import html
+import json
+import os
+import re
+import shutil
+import subprocess
+
+import pytest
+
+from test.app.conftest import FRAMES, TRAJECTORIES, make
+
+BROWSERS = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable', 'chrome')
+BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
+in_a_browser = pytest.mark.skipif(
+    BROWSER is None, reason=f'no Chromium is installed: looked for {", ".join(BROWSERS)}'
+)
+
+# Before anything else in the page: what it complains about.
+COMPLAINTS = """<script>
+const complaints = [];
+const complain = (...words) => complaints.push(words.join(' '));
+['error', 'warn'].forEach((kind) => { console[kind] = complain; });
+['error', 'unhandledrejection', 'securitypolicyviolation'].forEach((kind) => addEventListener(
+  kind, (event) => complain(kind, event.message || event.reason || event.blockedURI), true,
+));
+</script>
+"""
+# After everything else: what a person does, and what is seen then.
+VISIT = """<script>
+const seen = {};
+function look(name, id = 'space') {
+  const canvas = document.getElementById(id);
+  const { width, height } = canvas;
+  // A copy: reading a canvas often would change how it is kept.
+  const copy = new OffscreenCanvas(width, height);
+  const context = copy.getContext('2d', { willReadFrequently: true });
+  context.drawImage(canvas, 0, 0);
+  const pixels = context.getImageData(0, 0, width, height).data;
+  let hash = 0;
+  let drawn = 0;
+  for (let i = 0; i < pixels.length; i += 4) {
+    for (let c = 0; c < 4; c += 1) hash = (Math.imul(hash, 31) + pixels[i + c]) | 0;
+    if (pixels[i + 3]) drawn += 1;
+  }
+  seen[name] = `${hash}`;
+  seen[`${name} drawn`] = drawn;
+}
+const get = (id) => document.getElementById(id);
+const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+function pointer(target, kind, x, y) {
+  target.dispatchEvent(new PointerEvent(kind, { clientX: x, clientY: y, bubbles: true }));
+}
+function key(target, name) {
+  const options = { key: name, bubbles: true, cancelable: true };
+  target.dispatchEvent(new KeyboardEvent('keydown', options));
+}
+async function visit() {
+  await pause(300);
+STEPS
+}
+visit().catch((error) => complaints.push(`visit: ${error}`)).finally(() => {
+  const result = document.createElement('pre');
+  result.id = 'seen';
+  result.textContent = JSON.stringify({ ...seen, complaints });
+  document.body.append(result);
+});
+</script>
+"""
+
+
+def visit(page, steps, folder, fragment=''):
+    """What a browser sees that opens the page from its file and takes some steps."""
+    path = folder / 'visited.html'
+    path.write_text(
+        page.replace('<head>\n', f'<head>\n{COMPLAINTS}', 1).replace(
+            '</body>', f'{VISIT.replace("STEPS", steps)}</body>', 1
+        ),
+        'utf-8',
+    )
+    result = subprocess.run(
+        [
+            BROWSER, '--headless', '--no-sandbox', '--disable-gpu', '--disable-dev-shm-usage',
+            '--no-first-run', '--disable-extensions', '--disable-background-networking',
+            '--host-resolver-rules=MAP * ~NOTFOUND', f'--user-data-dir={folder / "profile"}',
+            '--enable-logging=stderr', '--window-size=1200,900', '--virtual-time-budget=20000',
+            '--dump-dom', f'{path.as_uri()}{fragment}',
+        ],
+        capture_output=True, text=True, timeout=300, check=False,
+        env={**os.environ, 'HOME': str(folder)},
+    )  # fmt: skip
+    found = re.findall(r'<pre id="seen">(.*?)</pre>', result.stdout, re.S)
+    assert found, f'{result.stderr[-2000:]} {result.stdout[-500:]}'
+    seen = json.loads(html.unescape(found[0]))
+    assert seen.pop('complaints') == []
+    assert 'CONSOLE' not in result.stderr
+    return seen
+
+
+@in_a_browser
+def test_slider_mouse_and_keys_change_the_view(page, tmp_path):
+    seen = visit(
+        page,
+        """
+        look('first'); look('first image', 'image'); look('first weights', 'weights');
+        get('time').value = 5; get('time').dispatchEvent(new Event('input', { bubbles: true }));
+        await pause(300);
+        look('later'); look('later image', 'image'); look('later weights', 'weights');
+        seen.clock = get('clock').value; seen.spoken = get('time').getAttribute('aria-valuetext');
+        const space = get('space');
+        const place = space.getBoundingClientRect();
+        pointer(space, 'pointerdown', place.left + 100, place.top + 100);
+        pointer(space, 'pointermove', place.left + 220, place.top + 110);
+        look('dragged');
+        pointer(space, 'pointerup', place.left + 220, place.top + 110);
+        pointer(space, 'pointermove', place.left + 20, place.top + 10);
+        look('let go');
+        key(space, 'ArrowLeft'); look('key');
+        space.dispatchEvent(new WheelEvent('wheel', { deltaY: -300, cancelable: true }));
+        look('wheel');
+        document.querySelector('[data-look="0 0"]').click(); look('from the camera');
+        key(space, '0'); look('reset');
+        key(document.body, 'ArrowLeft'); seen['clock after a key'] = get('clock').value;
+        """,
+        tmp_path,
+    )
+    views = ['first', 'later', 'dragged', 'key', 'wheel', 'from the camera']
+    assert len({seen[name] for name in views}) == len(views)
+    assert min(seen[f'{name} drawn'] for name in views) > 1000
+    assert seen['let go'] == seen['dragged']
+    assert seen['reset'] == seen['later']
+    assert seen['first image'] != seen['later image']
+    assert seen['first image drawn'] > 100_000
+    assert seen['first weights'] != seen['later weights']
+    assert seen['clock'] == seen['spoken'] == f'0.50 s, 6 of {FRAMES}'
+    assert seen['clock after a key'] == f'0.40 s, 5 of {FRAMES}'
+
+
+@in_a_browser
+def test_layers_modes_and_play(page, tmp_path):
+    seen = visit(
+        page,
+        """
+        look('first');
+        get('layer-1').click(); look('both'); get('layer-1').click(); look('again');
+        get('show-truth').click(); look('without truth'); get('show-truth').click();
+        get('show-trajectories').click(); look('ways'); get('show-trajectories').click();
+        get('align').click(); look('aligned'); get('align').click();
+        look('image with', 'image'); get('with-modes').click(); look('image without', 'image');
+        seen.rows = document.querySelectorAll('#modes tbody tr').length;
+        document.querySelector('#modes button').click(); look('alone');
+        document.querySelector('#modes button').click(); look('all');
+        get('chosen').value = 2; get('chosen').dispatchEvent(new Event('change'));
+        seen.trajectories = document.querySelectorAll('#modes tbody tr').length;
+        seen.errors = get('errors-figure').hidden;
+        get('play').click(); seen.playing = get('play').getAttribute('aria-pressed');
+        for (let i = 0; i < 100 && Number(get('time').value) < 2; i += 1) await pause(50);
+        get('play').click(); seen.time = Number(get('time').value);
+        seen.paused = get('play').textContent;
+        ['together', 'each', 'free-energy', 'iterations'].forEach((id) => look(id, id));
+        seen.scores = document.querySelectorAll('#scores tbody tr').length;
+        seen.named = [...document.querySelectorAll('button, input, select, canvas')].every((x) => (
+          x.textContent.trim() || x.getAttribute('aria-label') || (x.labels && x.labels.length)
+        ));
+        seen.title = get('title').textContent;
+        """,
+        tmp_path,
+    )
+    views = ['first', 'both', 'without truth', 'ways', 'aligned', 'alone']
+    assert len({seen[name] for name in views}) == len(views)
+    assert seen['again'] == seen['all'] == seen['first']
+    assert seen['image with'] != seen['image without']
+    assert seen['rows'] == 3
+    assert seen['trajectories'] == TRAJECTORIES
+    assert seen['errors'] is True
+    assert seen['playing'] == 'true'
+    assert 2 <= seen['time'] < FRAMES
+    assert seen['paused'] == 'Play'
+    assert (
+        min(seen[f'{name} drawn'] for name in ('together', 'each', 'free-energy', 'iterations'))
+        > 500
+    )
+    assert seen['scores'] == 3
+    assert seen['named'] is True
+    assert seen['title'] == 'out: mixtures over poses'
+
+
+@in_a_browser
+def test_pages_with_less_in_them(made, body, poses, tmp_path):
+    bare = make(made.out, tmp_path / 'bare', '--topic', 'pose_mixture')
+    steps = "look('space'); seen.image = get('image-figure').hidden; look('weights', 'weights');"
+    seen = visit(bare, steps, tmp_path)
+    assert seen['image'] is True
+    assert min(seen['space drawn'], seen['weights drawn']) > 1000
+
+    ways = make(made.out, tmp_path / 'ways', '--topic', 'trajectory_mixture')
+    seen = visit(
+        ways,
+        "look('space'); get('time').value = 3; get('time').dispatchEvent(new Event('input'));"
+        "look('later');",
+        tmp_path,
+    )
+    assert seen['space drawn'] > 1000
+    assert seen['space'] != seen['later']
+
+    single = make(
+        made.out,
+        tmp_path / 'single',
+        '--times',
+        '1',
+        '--images',
+        made.images,
+        '--truth',
+        made.truth,
+    )
+    seen = visit(single, "look('space'); get('play').click(); await pause(200);", tmp_path)
+    assert seen['space drawn'] > 1000
+
+
+@in_a_browser
+def test_the_address_tells_what_is_shown(page, tmp_path):
+    steps = "look('space'); seen.clock = get('clock').value; seen.second = get('layer-1').checked;"
+    plain = visit(page, steps, tmp_path)
+    given = visit(page, steps, tmp_path, '#frame=4&yaw=90&pitch=10&show=0,1')
+    assert given['clock'] == f'0.40 s, 5 of {FRAMES}'
+    assert (plain['second'], given['second']) == (False, True)
+    assert given['space'] != plain['space']
