@@ -1,7 +1,5 @@
 """replay, offline."""
 
-import resource
-import signal
 import sys
 from pathlib import Path
 
@@ -20,6 +18,7 @@ from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.headers import header_message, time_ns
 from msg_tools.images import decode_image, image_message
 from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
+from test.msg_tools.conftest import limited_file_size
 
 ROOT = Path(__file__).resolve().parents[2]
 REACH = ROOT / 'bags' / 'reach'
@@ -370,14 +369,8 @@ def test_interruption_leaves_nothing(short, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize('options', [[], ['--keep-going']])
 def test_full_disk(still, short, tmp_path, capsys, options):
     """It is no fault of an image that could be passed over."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
-    try:
+    with limited_file_size(20_000):
         assert main([str(short), '-o', str(tmp_path / 'out'), *SUBJECT, *options]) == 1
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, handler)
     (line,) = capsys.readouterr().err.splitlines()
     assert line == f'replay: {tmp_path / "out"} can not be written: File too large'
     assert list(tmp_path.iterdir()) == []

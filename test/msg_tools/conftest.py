@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import resource
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,19 @@ from msg_tools.headers import header_message
 from msg_tools.pose_mixtures import MixtureKind, PoseMixture
 
 Read = Callable[[Path], tuple[list[tuple[int, str, bytes]], str | None]]
+
+
+@contextmanager
+def limited_file_size(count: int) -> Iterator[None]:
+    """A file that becomes longer than this is an error, as a full disk is."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (count, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
 
 
 @pytest.fixture(scope='session')

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import os
-import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -27,9 +25,9 @@ from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.bag_metadata import quality_of_service, recorded_quality_of_service
 from msg_tools.bag_recovery import recover_bag
 from msg_tools.cdr import serialise
+from test.msg_tools.conftest import Read, limited_file_size
 
 STRING = 'std_msgs/msg/String'
-Read = Callable[[Path], tuple[list[tuple[int, str, bytes]], str | None]]
 # tmp_path is the same for all examples: each takes a name of its own.
 EXAMPLES = settings(
     max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -356,15 +354,11 @@ def test_nothing_is_overwritten(tmp_path: Path, whole: Path) -> None:
 
 
 def test_full_disk(tmp_path: Path, whole: Path) -> None:
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000, before[1]))
-    try:
-        with pytest.raises(BagError, match=r'out can not be written: File too large'):
-            recover_bag(whole, tmp_path / 'out')
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, handler)
+    with (
+        pytest.raises(BagError, match=r'out can not be written: File too large'),
+        limited_file_size(1_500_000),
+    ):
+        recover_bag(whole, tmp_path / 'out')
     assert list(tmp_path.iterdir()) == []
 
 

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import os
-import resource
-import signal
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -27,6 +24,7 @@ from rosbags.rosbag2 import Reader
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages, bag_folder
 from msg_tools.headers import header_message
 from msg_tools.typestore import typestore
+from test.msg_tools.conftest import limited_file_size
 
 STRING = 'std_msgs/msg/String'
 
@@ -332,19 +330,6 @@ def test_overwrite_never_touches_anything_but_a_bag(
             bag.close()
     assert (tmp_path / 'new' / 'meanwhile.txt').read_text() == 'mine'
     assert not list(tmp_path.glob('.*'))
-
-
-@contextmanager
-def limited_file_size(count: int) -> Iterator[None]:
-    """A file that becomes longer than this is an error, as a full disk is."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (count, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, handler)
 
 
 @pytest.mark.parametrize('limit', [1_000, 1_500_000])
