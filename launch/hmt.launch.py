@@ -11,10 +11,12 @@ and from the file that params_file names.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 from ament_index_python.packages import get_package_share_directory
@@ -22,7 +24,6 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 
 PACKAGE = 'hmt_ros'
 NODES = ('filter_node', 'smoother_node', 'bme_node')
@@ -133,7 +134,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
             executable=name,
             name=name,
             namespace=namespace,
-            parameters=[str(share / 'config' / f'{name}.yaml'), values[name], *own],
+            parameters=[str(share / 'config' / f'{name}.yaml'), _file(name, values[name]), *own],
             remappings=[] if name == 'smoother_node' else remappings,
             ros_arguments=['--log-level', f'{_logger(namespace, name)}:={given["log_level"]}'],
             output='both',
@@ -147,7 +148,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
         options = [str(x) for key, value in {**frames, **TURN}.items() for x in (f'--{key}', value)]
         actions.append(
             Node(
-                package='tf2_ros',
+                package=_installed('tf2_ros', 'rviz' if rviz else 'camera_frame'),
                 executable='static_transform_publisher',
                 name=UPRIGHT,
                 namespace=namespace,
@@ -159,7 +160,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
         # Its topics are relative: the namespace says whose they are.
         actions.append(
             Node(
-                package='rviz2',
+                package=_installed('rviz2', 'rviz'),
                 executable='rviz2',
                 name='rviz2',
                 namespace=namespace,
@@ -198,10 +199,37 @@ def _namespace(given: Mapping[str, str]) -> str:
     return namespace
 
 
-def _named(given: Mapping[str, str], name: str) -> dict[str, Any]:
+def _named(given: Mapping[str, str], name: str) -> dict[str, str]:
     """The file that an argument names, as a parameter; none where it is empty."""
-    # Told that it is text, or a file named 12 would be a number.
-    return {name: ParameterValue(given[name], value_type=str)} if given[name] else {}
+    return {name: given[name]} if given[name] else {}
+
+
+def _file(name: str, values: Mapping[str, Any]) -> str:
+    """Values for a node as a parameter file, with the section that the files in config/ have.
+
+    launch_ros would name the node in full, and no section of params_file but such a one would go
+    before that: ROS merges sections of one name where the first of them is.
+    """
+    prefix, section = f'{name}_', {f'/**/{name}': {'ros__parameters': values}}
+    with NamedTemporaryFile(
+        'w', encoding='utf-8', prefix=prefix, suffix='.yaml', delete=False
+    ) as file:
+        # JSON is YAML in which all text is quoted: a file named 12 is not a number.
+        json.dump(section, file, ensure_ascii=False)
+    return file.name
+
+
+def _installed(package: str, argument: str) -> str:
+    """Name of a package, which is there.
+
+    Raises:
+        ValueError: it is not. launch would see that after it has started nodes, and leave those.
+    """
+    try:
+        get_package_share_directory(package)
+    except LookupError:
+        raise ValueError(f'{argument}: package {package} is not installed') from None
+    return package
 
 
 def _frame(namespace: str) -> str:

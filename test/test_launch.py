@@ -12,6 +12,7 @@ import re
 import runpy
 import subprocess
 import sys
+import tempfile
 import time
 import types
 import xml.etree.ElementTree as ET
@@ -27,7 +28,7 @@ from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
 from hmt_ros.nodes.bme_parameters import BmeParameters
 from hmt_ros.nodes.declared_parameters import values_of, with_values
 from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.parameter_file import read_parameter_file, yaml_scalar
+from hmt_ros.nodes.parameter_file import read_parameter_file
 from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from msg_tools import BagReader
 
@@ -73,7 +74,6 @@ STAND_INS = {
     'launch.substitutions': {'LaunchConfiguration': Configuration},
     'launch_ros': {},
     'launch_ros.actions': {'Node': type('Node', (Kept,), {})},
-    'launch_ros.parameter_descriptions': {'ParameterValue': Kept},
     'ament_index_python': {},
     'ament_index_python.packages': {
         'get_package_share_directory': lambda package: str(ROOT / package)
@@ -93,8 +93,9 @@ def description():
 
 
 @pytest.fixture
-def actions(description):
+def actions(description, tmp_path, monkeypatch):
     """Makes the options of all actions, by their executable."""
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
 
     def make(**given):
         entities = description['generate_launch_description']().arguments[0]
@@ -108,16 +109,10 @@ def actions(description):
 
 
 def parameters(options: dict[str, Any]) -> dict[str, Any]:
-    """What a node is given beside its file in config/, without the type of its texts."""
+    """What a node is given beside its file in config/."""
     file, values, *_ = options['parameters']
     assert file == str(ROOT / 'hmt_ros' / 'config' / f'{options["name"]}.yaml')
-    plain = {}
-    for name, value in values.items():
-        if isinstance(value, Kept):
-            assert value.options == {'value_type': str}
-            (value,) = value.arguments
-        plain[name] = value
-    return plain
+    return read_parameter_file(values, options['name'])
 
 
 def test_three_nodes_in_the_namespace_of_a_person(actions):
@@ -233,6 +228,31 @@ def test_wrong_arguments_are_told_in_one_line(actions, given, message):
     assert '\n' not in str(caught.value)
 
 
+def test_what_is_not_installed_is_told_before_a_node_starts(actions, description, monkeypatch):
+    def directory(package):
+        if package == missing:
+            raise KeyError(f'package {package!r} not found')
+        return str(ROOT / package)
+
+    names = description['actions_of'].__globals__
+    monkeypatch.setitem(names, 'get_package_share_directory', directory)
+    for missing, argument, value in (
+        ('tf2_ros', 'rviz', 'true'),
+        ('tf2_ros', 'camera_frame', 'lens'),
+        ('rviz2', 'rviz', 'true'),
+    ):
+        with pytest.raises(ValueError, match=f'^{argument}: package {missing} is not installed$'):
+            actions(**{argument: value})
+    assert len(actions(camera_frame='lens')) == 4
+
+
+def test_values_are_in_the_section_of_the_configuration_file(actions):
+    """ROS merges sections of one name: the same one in a params_file then goes before both."""
+    for name, options in actions().items():
+        config, values = (yaml.safe_load(Path(one).read_text()) for one in options['parameters'])
+        assert list(values) == list(config) == [f'/**/{name}']
+
+
 def test_views_are_upright(actions):
     made = actions(rviz='true', camera_frame='lens', body_id='anna')
     rviz = made['rviz2']
@@ -341,9 +361,10 @@ def test_a_configuration_file_alone_changes_nothing(actions):
     importlib.util.find_spec('launch_ros') is None,
     reason='launch and launch_ros are not installed (they come with ROS 2, not as wheels)',
 )
-def test_the_real_launch_package_understands_the_file():
+def test_the_real_launch_package_understands_the_file(tmp_path, monkeypatch):
     from launch import LaunchContext, LaunchDescription
 
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
     made = runpy.run_path(str(FILE))['generate_launch_description']()
     assert isinstance(made, LaunchDescription)
     context = LaunchContext()
@@ -356,21 +377,11 @@ def test_the_real_launch_package_understands_the_file():
 # The nodes, started with what the launch file gives launch_ros.
 
 
-def command(options: dict[str, Any], folder: Path) -> list[str]:
+def command(options: dict[str, Any]) -> list[str]:
     """Arguments of a node as launch_ros makes them."""
     name, namespace = options['name'], options['namespace']
     words = ['--ros-args', '-r', f'__node:={name}', '-r', f'__ns:={namespace}']
-    config, _, *own = options['parameters']
-    text = '\n'.join(
-        [
-            f'{namespace}/{name}:',
-            '  ros__parameters:',
-            *(f'    {key}: {yaml_scalar(value)}' for key, value in parameters(options).items()),
-        ]
-    )
-    path = folder / f'{name}.yaml'
-    path.write_text(text + '\n', 'utf-8')
-    for file in (config, str(path), *own):
+    for file in options['parameters']:
         words += ['--params-file', file]
     for source, target in options['remappings']:
         words += ['-r', f'{source}:={target}']
@@ -499,20 +510,27 @@ def started(description, tmp_path_factory):
 
     folder = tmp_path_factory.mktemp('launched')
     own = folder / 'own.yaml'
-    own.write_text('/**/filter_node:\n  ros__parameters:\n    max_hypotheses: 5\n', 'utf-8')
+    own.write_text(
+        '/**/filter_node:\n  ros__parameters:\n    max_hypotheses: 5\n'
+        f'    subject_file: {REACH / "subject.yaml"}\n',
+        'utf-8',
+    )
     entities = description['generate_launch_description']().arguments[0]
     context = {one.arguments[0]: one.options['default_value'] for one in entities[:-1]}
     context.update(
         params_file=str(own),
         image_transport='compressed',
-        subject_file=str(REACH / 'subject.yaml'),
+        # What the user's own file says goes before it.
+        subject_file='12',
         background_file=str(REACH / 'background.png'),
     )
-    made = entities[-1].options['function'](context)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tempfile, 'tempdir', str(folder))
+        made = entities[-1].options['function'](context)
     processes = []
     for one in made:
         output = (folder / f'{one.options["name"]}.output').open('wb')
-        words = command(one.options, folder)
+        words = command(one.options)
         processes.append(subprocess.Popen(words, cwd=ROOT, stdout=output, stderr=output))
         output.close()
     ros = rclpy.Context()
@@ -536,12 +554,14 @@ def test_nodes_are_active_with_the_parameters_of_the_launch_file(started):
     for name in SETTINGS:
         started.wait_until_active(name)
     names = ['max_hypotheses', 'frame_prefix', 'use_predictions', 'image_transport']
+    names.append('subject_file')
     answer = started.call(GetParameters, 'filter_node', 'get_parameters', names=names)
     values = answer.values
     assert values[0].integer_value == 5
     assert values[1].string_value == 'body_p1/'
     assert values[2].bool_value is True
     assert values[3].string_value == 'compressed'
+    assert values[4].string_value == str(REACH / 'subject.yaml')
 
 
 @pytest.mark.ros
