@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,7 +28,7 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
         MessageError: another number of values.
     """
     array = np.array(values, dtype=np.float64)
-    count = int(np.prod(shape))
+    count = math.prod(shape)
     if array.shape != (count,):
         raise MessageError(f'{what} has {array.size} values, wanted {count}')
     return array.reshape(shape)
@@ -54,10 +55,11 @@ def check_covariances(covariances: Array, what: str) -> None:
     check_finite(covariances, f'covariance of {what}')
     if covariances.size == 0:
         return
-    transposed = np.swapaxes(covariances, -1, -2)
-    scale = np.abs(covariances).max(axis=(-1, -2), keepdims=True)
-    if (np.abs(covariances - transposed) > SYMMETRY_TOLERANCE * scale).any():
-        raise MessageError(f'covariance of {what} is not symmetric')
+    asymmetry = covariances - np.swapaxes(covariances, -1, -2)
+    if asymmetry.any():
+        scale = np.abs(covariances).max(axis=(-1, -2), keepdims=True)
+        if (np.abs(asymmetry) > SYMMETRY_TOLERANCE * scale).any():
+            raise MessageError(f'covariance of {what} is not symmetric')
     try:
         np.linalg.cholesky(covariances)
     except np.linalg.LinAlgError:
