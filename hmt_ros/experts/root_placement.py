@@ -55,6 +55,7 @@ class RootPlacement:
         misfits: (M,) root mean squared distance between the sides of the boxes, px; of sides that
             are cut what is missing.
         cut: whether the border of the image cuts the person, so that the depth is a guess at best.
+        jacobians: of the encoding at the postures and their roots.
     """
 
     roots: Array
@@ -62,6 +63,7 @@ class RootPlacement:
     by_targets: Array
     misfits: Array
     cut: bool
+    jacobians: tuple[Array, Array]
 
 
 def place_roots(
@@ -129,7 +131,7 @@ def place_roots(
     relative = size_spread**2 + (CUT_SPREAD**2 if cut.any() else 0.0)
     own += relative * roots[:, :, None] * roots[:, None, :]
     misfits = np.sqrt((residual**2).mean(1))
-    return RootPlacement(roots, own, -gain @ by_target, misfits, bool(cut.any()))
+    return RootPlacement(roots, own, -gain @ by_target, misfits, bool(cut.any()), slopes)
 
 
 def placed_gaussians(
@@ -144,7 +146,7 @@ def placed_gaussians(
         targets, covariances: (M, D), (M, D, D) of the postures.
         placement: of the same postures.
     """
-    by_target, by_root = encoding.jacobians(targets, placement.roots)
+    by_target, by_root = placement.jacobians
     whole = by_target + by_root @ placement.by_targets
     result = whole @ covariances @ whole.transpose(0, 2, 1)
     result += by_root @ placement.covariances @ by_root.transpose(0, 2, 1)
