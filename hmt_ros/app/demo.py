@@ -1,4 +1,4 @@
-"""The demonstration that `make demo` runs: a bag through the tracker, pictures, a table of errors.
+"""The demonstration that `make demo` runs: a bag through the tracker, a table of errors, a report.
 
 `python -m hmt_ros.app.demo bags/reach -o build/demo --live`
 """
@@ -12,14 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from hmt_ros.app import replay
+from hmt_ros.app import replay, report
 from hmt_ros.app.bag_scores import score_bag
 from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.evaluate import as_text
-from hmt_ros.app.recorded_track import RecordedTrack, read_images, read_track
-from hmt_ros.app.report_pictures import PICTURES, draw_track, shown_in_pictures
+from hmt_ros.app.recorded_track import RecordedTrack, read_track
 from hmt_ros.app.truth import Truth, read_truth, recorded_truth
 from msg_tools import BagReader
+
+REPORT = 'report'
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -30,8 +31,8 @@ def main(argv: list[str] | None = None) -> int:
 def _parser() -> CommandParser:
     parser = CommandParser(
         prog='demo',
-        description='Tracks the person of a bag, draws pictures of the track and, where the truth '
-        'is known, prints errors.',
+        description='Tracks the person of a bag, prints errors, where the truth is known, and '
+        'leaves pictures and a page for a browser.',
     )
     parser.add_argument(
         'bag',
@@ -40,7 +41,7 @@ def _parser() -> CommandParser:
     )
     parser.add_argument(
         '-o', '--output', type=Path, required=True, metavar='DIR',
-        help='folder for the bag of the track and the pictures',
+        help='folder for the bag of the track and the report',
     )  # fmt: skip
     parser.add_argument('--live', action='store_true', help='through the real node, over DDS')
     return parser
@@ -61,39 +62,23 @@ def _demonstrate(options: argparse.Namespace) -> int:
         return code
     spent = time.monotonic() - start
     track = read_track(target)
-    truth = _truth(source, target)
-    pictures = draw(source, folder, track, truth)
+    truth, beside = _truth(source, target)
     print(_summary(track, spent))
     if truth is not None:
         print(as_text(score_bag(target, truth), truth, by_joint=False))
-        print('docs/evaluation.md tells what the numbers mean')
-    print('\nwhat came out')
-    for path, what in ((target, 'bag: ' + ', '.join(_topics(target))), *pictures):
-        print(f'  {path!s:{max(len(str(x)) for x, _ in pictures)}}  {what}')
-    return 0
+        print('docs/evaluation.md tells what the numbers mean\n')
+    print(f'what came out\n{target}: bag of {", ".join(_topics(target))}', flush=True)
+    arguments = [str(target), '-o', str(folder / REPORT), '--overwrite', '--images', str(source)]
+    return report.main([*arguments, *(['--truth', str(beside)] if beside else [])])
 
 
-def draw(
-    source: Path, folder: Path, track: RecordedTrack, truth: Truth | None
-) -> list[tuple[Path, str]]:
-    """Draws all pictures of a track; each with what it shows.
-
-    Args:
-        source: bag of the images.
-        folder: for the pictures.
-        track: what was tracked.
-        truth: None: not known.
-    """
-    camera, images = read_images(source, shown_in_pictures(track))
-    what = PICTURES | ({'weights.png': f'{PICTURES["weights.png"]}, errors'} if truth else {})
-    return [(folder / x, what[x]) for x in draw_track(folder, track, camera, images, truth)]
-
-
-def _truth(source: Path, target: Path) -> Truth | None:
-    """The truth in the bag, or beside its source."""
+def _truth(source: Path, target: Path) -> tuple[Truth | None, Path | None]:
+    """The truth in the bag, or beside its source, and then in which file."""
     recorded = recorded_truth(target)
     beside = source / 'truth.npz'
-    return read_truth(beside) if recorded is None and beside.is_file() else recorded
+    if recorded is not None or not beside.is_file():
+        return recorded, None
+    return read_truth(beside), beside
 
 
 def _summary(track: RecordedTrack, spent: float) -> str:

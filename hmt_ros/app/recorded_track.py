@@ -1,4 +1,4 @@
-"""A track that was recorded in a bag, with the images that it explains."""
+"""A track that was recorded in a bag."""
 
 from __future__ import annotations
 
@@ -9,14 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.app.recorded_input import recorded_input
 from hmt_ros.app.truth import POSE_MIXTURE, Truth
-from hmt_ros.body import Camera
 from hmt_ros.tracking.evaluation import EVALUATED_JOINTS, ORIGIN
 from msg_tools import BagReader
-from msg_tools.camera_info import camera_from_info
-from msg_tools.headers import time_ns
-from msg_tools.images import decode_image
 from msg_tools.message_error import MessageError, check_finite, check_weights, names_of
 from msg_tools.pose_mixtures import pose_mixture_of
 
@@ -73,26 +68,6 @@ def read_track(path: Path, topic: str = 'pose_mixture') -> RecordedTrack:
                 )
             )
     return RecordedTrack(names, moments)
-
-
-def read_images(path: Path, stamps: set[int]) -> tuple[Camera, dict[int, Image]]:
-    """The camera of a bag, and some of its images by stamp.
-
-    Raises:
-        ValueError: no images, no calibration, or an image that can not be decoded.
-    """
-    images: dict[int, Image] = {}
-    with BagReader(path) as bag:
-        recorded = recorded_input(bag)
-        for stored in bag.messages([recorded.image.name]):
-            stamp = time_ns(stored.message.header.stamp)
-            if stamp in stamps:
-                images[stamp] = decode_image(stored.message)
-        info = next(bag.messages([recorded.camera_info.name])).message
-    if not images:
-        raise ValueError(f'{path} has none of the images of the track')
-    height, width = next(iter(images.values())).shape[:2]
-    return camera_from_info(info, (width, height)), images
 
 
 def bare_mixture(message: Any) -> tuple[Array, Array, tuple[str, ...]]:

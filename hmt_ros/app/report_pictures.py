@@ -63,7 +63,7 @@ def draw_pictures(
     """
     drawn = []
     if mixtures.layers:
-        drawn += draw_track(folder, mixtures.layers[0].track, images.camera, images.kept, truth)
+        drawn += _draw_track(folder, mixtures.layers[0].track, images.camera, images.kept, truth)
     if any(topic.scores.levels is not None for topic in scores.values()):
         draw_calibration(folder / 'calibration.png', scores)
         drawn.append('calibration.png')
@@ -76,7 +76,7 @@ def draw_pictures(
     return drawn
 
 
-def draw_track(
+def _draw_track(
     folder: Path,
     track: RecordedTrack,
     camera: Camera | None,
