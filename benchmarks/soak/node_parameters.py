@@ -66,6 +66,7 @@ def _any_value(parameter: DeclaredParameter, rng: np.random.Generator) -> Any:
     low, high = parameter.limits or (-1e9, 1e9)
     if kind < 0.2:
         value = (low - 1, high + 1, -1e300, np.inf, -np.inf)[int(rng.integers(0, 5))]
-        return value if isinstance(default, float) or not np.isfinite(value) else int(value)
+        whole = isinstance(default, int) and np.isfinite(value)
+        return int(max(value, -(2.0**63))) if whole else value  # as small as a message holds
     near = float(np.clip(default * np.exp2(rng.uniform(-1.0, 1.0)), low, high))
     return near if isinstance(default, float) else round(near)
