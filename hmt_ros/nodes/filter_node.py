@@ -35,6 +35,7 @@ from hmt_ros.nodes.subscribed_topic import (
 )
 from hmt_ros.nodes.track_messages import TOPICS
 from hmt_ros.nodes.track_start import prepare_start
+from msg_tools.error_line import error_line
 
 NAME = 'filter_node'
 _FILES = ('subject_file', 'background_file', 'body_model')
@@ -88,7 +89,7 @@ class FilterNode(SessionNode):
         try:
             start = prepare_start(self._settings, request.initial, session.state.body)
         except ValueError as error:
-            response.success, response.message = False, str(error)
+            response.success, response.message = False, error_line(error)
             return response
         thread.restart(start)
         response.success = True

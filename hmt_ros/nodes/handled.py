@@ -6,6 +6,8 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from msg_tools.error_line import one_line
+
 
 class Output(NamedTuple):
     """A message that is to be published.
@@ -65,15 +67,15 @@ class HandlingLog:
 
     def fault(self, kind: str, text: str) -> None:
         """Something could not be used."""
-        self._told.append(text)
+        self._told.append(one_line(text))
         self.note(kind, text)
 
     def note(self, kind: str, text: str) -> None:
         """A warning about the first of a kind; the others are counted."""
         self.faults[kind] += 1
-        self.last_fault = text
+        self.last_fault = one_line(text)
         if self.faults[kind] == 1:
-            self._warned.append(text)
+            self._warned.append(self.last_fault)
 
     def skip(self, kind: str, text: str) -> None:
         """A message that would be estimated from can not be used."""

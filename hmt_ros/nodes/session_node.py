@@ -183,7 +183,7 @@ class SessionNode(LifecycleNode):
         try:
             self._session = self._new_session(self._publish, self._is_wanted)
         except ValueError as error:
-            self._failure = str(error)
+            self._failure = error_line(error)
             self.get_logger().error(self._failure)
             self._diagnose()
             return TransitionCallbackReturn.FAILURE
@@ -337,7 +337,7 @@ class SessionNode(LifecycleNode):
             settings = with_values(self._defaults, {**self._values, **changed})
             self._check_changed(settings, changed)
         except ValueError as error:
-            return SetParametersResult(successful=False, reason=str(error))
+            return SetParametersResult(successful=False, reason=error_line(error))
         self._values.update(changed)
         self._settings = settings
         if self._session is not None:

@@ -112,6 +112,7 @@ def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
         ({'proposals': 'guess'}, "saw 'guess'"),
         ({'likelihood__edges__sigma': 0.0}, 'sigma > 0'),
         ({'subject_file': str(tmp_path / 'none.yaml')}, 'none.yaml: can not be read'),
+        ({'background_file': str(tmp_path / 'two\nlines')}, 'two lines: can not be read'),
         ({'body_model': 'nobody'}, "no body 'nobody'"),
         ({'autostart': False}, 'read-only'),
         ({'max_hypotheses': 8.0}, 'type'),
