@@ -1,4 +1,4 @@
-"""Flips of limbs in vectorised numpy, as `hmt_ros.body.interpretation_tree` compiles them."""
+"""Flips of limbs in vectorised numpy, as `hmt_ros.body.tree_growth` compiles them."""
 
 from __future__ import annotations
 
