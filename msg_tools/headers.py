@@ -7,6 +7,7 @@ from typing import Any
 from msg_tools.message_factory import MessageFactory
 
 SECOND_NS = 1_000_000_000
+EARLIEST_NS = -(2**31) * SECOND_NS  # that a message can tell
 
 
 def time_message(messages: MessageFactory, stamp_ns: int) -> Any:

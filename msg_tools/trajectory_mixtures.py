@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_tools.headers import header_message, time_message, time_ns
+from msg_tools.headers import EARLIEST_NS, header_message, time_message, time_ns
 from msg_tools.message_error import (
     MessageError,
     check_covariances,
@@ -108,7 +108,8 @@ def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixt
         body_model=content.body_model,
         dof_names=list(content.dof_names),
         stamps=[time_message(messages, stamp) for stamp in content.stamps_ns],
-        final_until=time_message(messages, content.final_until_ns),
+        # Before the first of all stamps there is none.
+        final_until=time_message(messages, max(content.final_until_ns, EARLIEST_NS)),
         free_energy=content.free_energy,
         components=components,
     )

@@ -16,8 +16,8 @@ def changed_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> No
     """Random values, valid or not, between messages; what was agreed to is there."""
     rng = np.random.default_rng(0)
     declared = [p for p in declared_parameters(watched.scene.parameters) if p.effect != 'at launch']
-    usual = {p.name: p.default for p in declared}
-    usual['reset_on_time_jump'] = True
+    names = [parameter.name for parameter in declared]
+    usual = dict(zip(names, watched.get(names), strict=True))
     known = dict(usual)
     for number in amount.counted():
         chosen = declared[int(rng.integers(0, len(declared)))]

@@ -138,7 +138,8 @@ class EstimatingThread:
                 # A fault of ours. What comes next may not suffer from it.
                 self._inner_faults.add(error)
                 self._log_error(''.join(traceback.format_exception(error)))
-                session.restart(session.start)
+                text = f'the node itself failed: {self._inner_faults.last}'
+                self._tell(session.break_off(waiting.source, text))
             after = session.state
             if (after.status, after.faults.keys()) != (before.status, before.faults.keys()):
                 self._tell_change()

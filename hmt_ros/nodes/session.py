@@ -68,6 +68,13 @@ class Session(ABC):
         self.state = self._present_state()
         return self._log.handled(source, 0)
 
+    def break_off(self, source: str, text: str) -> Handled:
+        """What became of a message over which the session itself has failed; it starts anew."""
+        self._log.fault('node itself', text)
+        handled = self._log.handled(source, 0)
+        self.restart(self.start)
+        return handled
+
     def count_dropped(self, messages: int) -> None:
         """Counts messages that were dropped before they came here, because the node was late."""
         if messages:

@@ -7,6 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from test.nodes.conftest import values_of
+
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -163,11 +165,11 @@ def test_errors_of_the_node_itself_are_in_the_diagnostics(running, small_camera,
     running.send('image', small_camera.image(0))
     assert running.diagnosis()[2]['errors of the node itself'] == '0'
     stub_tracker.fault = TypeError('a fault of ours')
-    running.publishers['image'].publish(running.of_ros(small_camera.image(1)))
-    running.spin_until(
-        lambda: running.diagnosis()[2]['errors of the node itself'] == '1', 'the error'
-    )
+    # Whoever waits for an answer gets one.
+    handled = running.send('image', small_camera.image(1))
+    assert values_of(handled, 'fault') == ['the node itself failed: TypeError: a fault of ours']
     values = running.diagnosis()[2]
+    assert values['errors of the node itself'] == '1'
     assert values['last error of the node itself'] == 'TypeError: a fault of ours'
 
 

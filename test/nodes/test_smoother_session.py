@@ -1,5 +1,7 @@
 """The rules of the session that smooths."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from hmt_ros.nodes.smoother_parameters import SmootherParameters
 from hmt_ros.nodes.smoother_session import BODY, FINISH, MIXTURE, SmootherSession
 from hmt_ros.smoothing import MixtureSmoother
 from msg_tools.cdr import deserialise
+from msg_tools.headers import EARLIEST_NS, header_message, time_ns
 from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
 from msg_tools.trajectory_mixtures import trajectory_mixture_of
 
@@ -282,6 +285,15 @@ def test_time_that_stands_still_or_jumps_back_is_skipped(running, outputs, likel
     assert 'with reset_on_time_jump a new window would begin' in handled[2].warnings[0]
     one.finish()
     assert smoothed(outputs) == [likelihoods.stamp(1), likelihoods.stamp(2)]
+
+
+def test_the_earliest_of_all_times(running, outputs, likelihoods):
+    """Nothing is before it, not even the end of what was final before."""
+    message = likelihoods.message(0)
+    header = header_message(likelihoods.messages, EARLIEST_NS, 'lens')
+    assert running().take(MIXTURE, replace(message, header=header)).faults == ()
+    (window,) = read(outputs, 'trajectory_mixture')
+    assert time_ns(window.final_until) == time_ns(window.stamps[0]) == EARLIEST_NS
 
 
 def test_time_that_jumps_back_begins_a_new_window(running, outputs, likelihoods):
