@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -36,6 +37,7 @@ _FAULTS = (
     SyntaxError,
     TypeError,
     OverflowError,
+    tokenize.TokenError,  # numpy reads the heads of old versions as Python
 )
 
 
