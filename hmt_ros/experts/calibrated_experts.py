@@ -29,6 +29,7 @@ from hmt_ros.experts.model_file import (
     nested,
     parameters_of,
     part,
+    shape_of,
 )
 from hmt_ros.experts.stored_models import stored_model
 from hmt_ros.experts.training_pairs import checked_pairs
@@ -179,7 +180,7 @@ class CalibratedExperts(ConditionalDensity):
         try:
             own = part('model', arrays)
             result = cls(stored_model(own, where), **parameters_of(arrays))
-            result.n_inputs_, result.n_outputs_ = (int(n) for n in arrays['shape'])
+            result.n_inputs_, result.n_outputs_ = shape_of(arrays)
             result._set_learned(arrays)
             result.components(np.zeros((1, result.n_inputs_)))
         except FAULTS as fault:

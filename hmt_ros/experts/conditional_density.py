@@ -28,6 +28,7 @@ from hmt_ros.experts.model_file import (
     header,
     parameters_of,
     read_arrays,
+    shape_of,
     write_arrays,
 )
 from hmt_ros.experts.training_pairs import checked_inputs, finite_matrix
@@ -183,7 +184,7 @@ class ConditionalDensity(ABC):
         check_header(arrays, cls.kind, where)
         try:
             model = cls(**parameters_of(arrays))
-            model.n_inputs_, model.n_outputs_ = (int(n) for n in arrays['shape'])
+            model.n_inputs_, model.n_outputs_ = shape_of(arrays)
             model._set_learned(arrays)
             model.components(np.zeros((1, model.n_inputs_)))
         except FAULTS as fault:

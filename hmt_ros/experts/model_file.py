@@ -24,6 +24,8 @@ VERSION = 1
 
 Arrays = dict[str, NDArray[Any]]
 
+# Inputs and outputs of a model at most; a descriptor has a few hundred numbers, a pose forty.
+MOST_NUMBERS = 10_000
 # What wrong arrays lead to, wherever they are looked at.
 FAULTS = (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError)
 
@@ -76,6 +78,18 @@ def parameters_of(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     if not isinstance(result, dict):
         raise ValueError(f'parameters are a {type(result).__name__}, wanted a mapping')
     return result
+
+
+def shape_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
+    """Numbers of inputs and outputs of a stored model.
+
+    Raises:
+        ValueError: numbers that no model has.
+    """
+    inputs, outputs = (int(n) for n in arrays['shape'])
+    if not (1 <= inputs <= MOST_NUMBERS and 1 <= outputs <= MOST_NUMBERS):
+        raise ValueError(f'{inputs} inputs and {outputs} outputs, wanted 1 to {MOST_NUMBERS}')
+    return inputs, outputs
 
 
 def damaged(where: str, fault: Exception) -> ValueError:

@@ -58,6 +58,13 @@ def test_damaged_model_is_refused(model):
         NearestNeighbours.from_arrays(arrays)
 
 
+def test_sizes_that_no_model_has_are_refused(model):
+    for shape in ([2**30, 2], [3, 0], [-1, 2]):
+        arrays = model.to_arrays() | {'shape': np.array(shape)}
+        with pytest.raises(ValueError, match=f'{shape[0]} inputs and {shape[1]} outputs, wanted'):
+            NearestNeighbours.from_arrays(arrays)
+
+
 def test_parts_come_back():
     arrays = {'a': np.arange(3), 'b/c': np.ones(2)}
     whole = nested('x', arrays) | {'y': np.zeros(1)}
