@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -71,9 +72,9 @@ class Session(ABC):
     def break_off(self, source: str, text: str) -> Handled:
         """What became of a message over which the session itself has failed; it starts anew."""
         self._log.fault('node itself', text)
-        handled = self._log.handled(source, 0)
         self.restart(self.start)
-        return handled
+        # A trace is in the log already.
+        return replace(self._log.handled(source, 0), warnings=())
 
     def count_dropped(self, messages: int) -> None:
         """Counts messages that were dropped before they came here, because the node was late."""

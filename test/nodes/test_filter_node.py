@@ -51,6 +51,22 @@ def published(handled):
     return [value.key for value in handled.values if value.key in TOPICS]
 
 
+@pytest.fixture
+def held_estimate(stub_tracker, monkeypatch, world):
+    """Two events: an estimate has begun, and estimates may go on."""
+    begun, go = threading.Event(), threading.Event()
+    step = stub_tracker.step
+
+    def slow(self, *arguments):
+        begun.set()
+        assert go.wait(PATIENCE)
+        return step(self, *arguments)
+
+    monkeypatch.setattr(stub_tracker, 'step', slow)
+    yield begun, go
+    go.set()
+
+
 def test_images_become_messages(running, small_camera):
     from hmt_msgs.msg import Body, PoseMixture
     from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -184,8 +200,9 @@ def test_faults_of_our_own_do_not_end_the_node(running, small_camera, stub_track
     running.send('camera_info', small_camera.info())
     running.send('image', small_camera.image(0))
     stub_tracker.fault = TypeError('a fault of ours')
-    running.publishers['image'].publish(serialise(small_camera.image(1)))
-    running.spin_until(lambda: len(running.warnings()) == 1)
+    told = faults(running.send('image', small_camera.image(1)))
+    assert told == ['the node itself failed: TypeError: a fault of ours']
+    assert len(running.warnings()) == 1
     assert 'TypeError: a fault of ours' in running.warnings()[0]
     assert 'Traceback' in running.warnings()[0]
     stub_tracker.fault = None
@@ -245,20 +262,10 @@ def test_node_without_its_subject_lives(world, subject_file, small_camera):
     assert published(one.send('image', small_camera.image(0))) == STARTS
 
 
-def test_reset_counts_though_the_node_is_deactivated(
-    world, small_camera, stub_tracker, monkeypatch
-):
+def test_reset_counts_though_the_node_is_deactivated(world, small_camera, held_estimate):
     from hmt_msgs.srv import Reset
 
-    begun, go = threading.Event(), threading.Event()
-    step = stub_tracker.step
-
-    def slow(self, *arguments):
-        begun.set()
-        assert go.wait(PATIENCE)
-        return step(self, *arguments)
-
-    monkeypatch.setattr(stub_tracker, 'step', slow)
+    begun, go = held_estimate
     one = world().start()
     one.send('camera_info', small_camera.info())
     one.publishers['image'].publish(serialise(small_camera.image(0)))
@@ -318,30 +325,20 @@ def test_reset(running, small_camera, stub_tracker, subject_file, body):
 
 
 def test_late_node_drops_the_oldest_and_answers_meanwhile(
-    world, small_camera, stub_tracker, monkeypatch
+    world, small_camera, stub_tracker, held_estimate
 ):
-    begun, go = threading.Event(), threading.Event()
-    step = stub_tracker.step
-
-    def slow(self, *arguments):
-        begun.set()
-        assert go.wait(PATIENCE)
-        return step(self, *arguments)
-
-    monkeypatch.setattr(stub_tracker, 'step', slow)
+    begun, go = held_estimate
     one = world(queue_size=2).start()
     one.send('camera_info', small_camera.info())
-    try:
-        queue = one.node._thread.queue
-        for index in range(12):
-            one.publishers['image'].publish(serialise(small_camera.image(index)))
-            one.spin_until(begun.is_set, 'the estimate of the first image')
-            one.spin_until(lambda index=index: len(queue) + queue._dropped == index)
-        assert (len(queue), queue._dropped) == (2, 9)
-        assert one.state == 'active'
-        assert one.set(overlay_modes=1) == (True, '')
-    finally:
-        go.set()
+    queue = one.node._thread.queue
+    for index in range(12):
+        one.publishers['image'].publish(serialise(small_camera.image(index)))
+        one.spin_until(begun.is_set, 'the estimate of the first image')
+        one.spin_until(lambda index=index: len(queue) + queue._dropped == index)
+    assert (len(queue), queue._dropped) == (2, 9)
+    assert one.state == 'active'
+    assert one.set(overlay_modes=1) == (True, '')
+    go.set()
     one.spin_until(lambda: one.node._session.state.images['tracked'] == 3)
     stamps = [stamp for stamp, _ in stub_tracker.made[0].seen]
     assert stamps == [small_camera.stamp(index) for index in (0, 10, 11)]
