@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hmt_ros.app import replay, report
-from hmt_ros.app.bag_scores import score_bag
+from hmt_ros.app import replay
 from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.evaluate import as_text
-from hmt_ros.app.recorded_track import RecordedTrack, read_track
-from hmt_ros.app.truth import Truth, read_truth, recorded_truth
+from hmt_ros.app.report import write_report
+from hmt_ros.app.report_page import Content
+from hmt_ros.app.truth import recorded_truth
 from msg_tools import BagReader
 
 REPORT = 'report'
@@ -61,33 +61,26 @@ def _demonstrate(options: argparse.Namespace) -> int:
     if code != 0:
         return code
     spent = time.monotonic() - start
-    track = read_track(target)
-    truth, beside = _truth(source, target)
-    print(_summary(track, spent))
-    if truth is not None:
-        print(as_text(score_bag(target, truth), truth, by_joint=False))
-        print('docs/evaluation.md tells what the numbers mean\n')
-    print(f'what came out\n{target}: bag of {", ".join(_topics(target))}', flush=True)
-    arguments = [str(target), '-o', str(folder / REPORT), '--overwrite', '--images', str(source)]
-    return report.main([*arguments, *(['--truth', str(beside)] if beside else [])])
-
-
-def _truth(source: Path, target: Path) -> tuple[Truth | None, Path | None]:
-    """The truth in the bag, or beside its source, and then in which file."""
-    recorded = recorded_truth(target)
     beside = source / 'truth.npz'
-    if recorded is not None or not beside.is_file():
-        return recorded, None
-    return read_truth(beside), beside
+    arguments = [str(target), '-o', str(folder / REPORT), '--overwrite', '--images', str(source)]
+    if beside.is_file() and recorded_truth(target) is None:
+        arguments += ['--truth', str(beside)]
+    shown, made = write_report(arguments)
+    print(_summary(shown, spent))
+    if shown.truth is not None:
+        print(as_text(shown.scores, shown.truth, by_joint=False))
+        print('docs/evaluation.md tells what the numbers mean\n')
+    print(f'what came out\n{target}: bag of {", ".join(_topics(target))}\n{made}')
+    return 0
 
 
-def _summary(track: RecordedTrack, spent: float) -> str:
-    count = len(track.moments)
+def _summary(shown: Content, spent: float) -> str:
+    (track,) = (x.track for x in shown.mixtures.layers if x.topic == 'pose_mixture')
     modes = np.mean([len(moment.weights) for moment in track.moments])
     heaviest = np.mean([moment.weights[0] for moment in track.moments])
     return (
-        f'{spent:.1f} s for {count} images; {modes:.1f} modes an image, the heaviest with '
-        f'{100 * heaviest:.0f} % of the weight on average\n'
+        f'{spent:.1f} s; {modes:.1f} modes an image, the heaviest with {100 * heaviest:.0f} % of '
+        'the weight on average\n'
     )
 
 

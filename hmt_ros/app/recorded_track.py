@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.app.truth import POSE_MIXTURE, Truth
+from hmt_ros.app.truth import Truth
 from hmt_ros.tracking.evaluation import EVALUATED_JOINTS, ORIGIN
-from msg_tools import BagReader
 from msg_tools.message_error import MessageError, check_finite, check_weights, names_of
-from msg_tools.pose_mixtures import pose_mixture_of
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,29 +41,6 @@ class RecordedTrack:
 
     joint_names: tuple[str, ...]
     moments: list[Moment]
-
-
-def read_track(path: Path, topic: str = 'pose_mixture') -> RecordedTrack:
-    """The mixtures of a topic; of each the joints only.
-
-    Raises:
-        ValueError: no such topic, no messages, or messages that can not be understood.
-    """
-    moments = []
-    names: tuple[str, ...] = ()
-    with BagReader(path) as bag:
-        for stored in bag.messages([bag.find_topic([POSE_MIXTURE], topic).name]):
-            content = pose_mixture_of(stored.message, joint_names=names or None)
-            names = content.joint_names
-            order = np.argsort(-content.mixture.weights, kind='stable')
-            moments.append(
-                Moment(
-                    content.stamp_ns,
-                    content.mixture.weights[order],
-                    content.joint_positions[order],
-                )
-            )
-    return RecordedTrack(names, moments)
 
 
 def bare_mixture(message: Any) -> tuple[Array, Array, tuple[str, ...]]:

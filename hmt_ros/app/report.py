@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from tqdm import tqdm
@@ -102,14 +103,28 @@ def _parser() -> CommandParser:
 
 
 def _report(options: argparse.Namespace) -> int:
-    summary = _reported(options)
+    _, summary = _write_report(options)
     if not options.quiet:
         print(summary)
     return 0
 
 
-def _reported(options: argparse.Namespace) -> str:
-    """Makes the report; lines that sum up what came out."""
+def write_report(arguments: Sequence[str]) -> tuple[Content, str]:
+    """Writes a report.
+
+    Args:
+        arguments: of the command.
+
+    Returns:
+        What it shows, and lines that sum up what came out.
+
+    Raises:
+        ValueError, OSError: bad input; one line that says why.
+    """
+    return _write_report(_parser().parse_args(arguments))
+
+
+def _write_report(options: argparse.Namespace) -> tuple[Content, str]:
     _FOLDER.check_place(options.output, overwrite=options.overwrite)
     with BagReader(options.bag) as bag:
         bag.raise_damage()
@@ -128,7 +143,7 @@ def _reported(options: argparse.Namespace) -> str:
             )
     lines = [f'{options.output / PAGE}: {len(content.stamps)} times, {len(page) / 1e6:.1f} MB']
     lines += [f'{options.output / name}: {PICTURES[name]}' for name in drawn]
-    return '\n'.join([*lines, *content.notes])
+    return content, '\n'.join([*lines, *content.notes])
 
 
 def _content(options: argparse.Namespace, source: ImageSource | None, bar: tqdm) -> Content:

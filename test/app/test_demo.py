@@ -10,7 +10,8 @@ import pytest
 from hmt_ros.app import make_bag
 from hmt_ros.app.demo import main
 from hmt_ros.app.pictures import LEFT, RIGHT, draw_overview
-from hmt_ros.app.recorded_track import Moment, RecordedTrack, read_track
+from hmt_ros.app.recorded_mixtures import read_mixtures
+from hmt_ros.app.recorded_track import Moment, RecordedTrack
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import Camera
 from msg_tools import BagReader
@@ -97,7 +98,8 @@ def test_the_same_track_gives_the_same_picture(source, truth, tmp_path):
 
 
 def test_recorded_mixtures_are_read_heaviest_first(output):
-    track = read_track(output[0] / 'small')
+    layers = read_mixtures(output[0] / 'small').layers
+    (track,) = (layer.track for layer in layers if layer.topic == 'pose_mixture')
     assert len(track.moments) == 5
     for moment in track.moments:
         assert (np.diff(moment.weights) <= 0).all()
