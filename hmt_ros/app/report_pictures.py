@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hmt_ros.app.bag_scores import TopicScores
-from hmt_ros.app.film_strip import FilmStrip, Image
+from hmt_ros.app.film_strip import FilmStrip
 from hmt_ros.app.pictures import (
     STYLE,
     draw_overlays,
@@ -24,7 +24,6 @@ from hmt_ros.app.recorded_mixtures import RecordedMixtures, Trajectories
 from hmt_ros.app.recorded_track import RecordedTrack, spread
 from hmt_ros.app.report_page import PROBABILITIES
 from hmt_ros.app.truth import Truth
-from hmt_ros.body import Camera
 from hmt_ros.inference.calibration import coverage
 
 # Times that are shown in the overview and on the sheets.
@@ -63,7 +62,21 @@ def draw_pictures(
     """
     drawn = []
     if mixtures.layers:
-        drawn += _draw_track(folder, mixtures.layers[0].track, images.camera, images.kept, truth)
+        track = mixtures.layers[0].track
+        few, many = spread(track, IN_OVERVIEW), spread(track, ON_SHEETS)
+        if images.camera is not None:
+            for name, stamps in (('overview.png', few), ('overlays.png', many)):
+                kept = {t: images.kept[t] for t in stamps if t in images.kept}
+                if not kept:
+                    continue
+                if name == 'overview.png':
+                    draw_overview(folder / name, track, images.camera, kept, truth)
+                else:
+                    draw_overlays(folder / name, track, images.camera, kept)
+                drawn.append(name)
+        draw_side_views(folder / 'side_views.png', track, many, truth)
+        draw_weights(folder / 'weights.png', track, truth)
+        drawn += ['side_views.png', 'weights.png']
     if any(topic.scores.levels is not None for topic in scores.values()):
         draw_calibration(folder / 'calibration.png', scores)
         drawn.append('calibration.png')
@@ -74,39 +87,6 @@ def draw_pictures(
         draw_free_energy(folder / 'free_energy.png', recorded)
         drawn.append('free_energy.png')
     return drawn
-
-
-def _draw_track(
-    folder: Path,
-    track: RecordedTrack,
-    camera: Camera | None,
-    images: dict[int, Image],
-    truth: Truth | None,
-) -> list[str]:
-    """Draws a track; the names of the files.
-
-    Args:
-        folder: for the pictures.
-        track: with moments.
-        camera: None: not known, and nothing is drawn on images.
-        images: (H, W, 3) BGR by stamp, those of `shown_in_pictures`, where there are some.
-        truth: None: not known.
-    """
-    drawn = []
-    few, many = spread(track, IN_OVERVIEW), spread(track, ON_SHEETS)
-    if camera is not None:
-        for name, stamps in (('overview.png', few), ('overlays.png', many)):
-            kept = {t: images[t] for t in stamps if t in images}
-            if not kept:
-                continue
-            if name == 'overview.png':
-                draw_overview(folder / name, track, camera, kept, truth)
-            else:
-                draw_overlays(folder / name, track, camera, kept)
-            drawn.append(name)
-    draw_side_views(folder / 'side_views.png', track, many, truth)
-    draw_weights(folder / 'weights.png', track, truth)
-    return [*drawn, 'side_views.png', 'weights.png']
 
 
 def draw_calibration(path: Path, scores: dict[str, TopicScores]) -> None:
