@@ -127,7 +127,6 @@ class SmootherSession(Session):
             known_body(parameters.body_model)
         super().__init__(parameters, publish, wanted)
         self._of: SmoothedBody | None = None
-        self._model: tuple[str, Body] | None = None  # as it was read last, by its name
         self._window: SlidingWindow | None = None
         self._waiting: deque[Any] = deque()
         self._newest: int | None = None
@@ -193,10 +192,8 @@ class SmootherSession(Session):
     def _body_of(self, message: Any) -> Body:
         chosen = self.parameters.body_model
         name = chosen or str(message.name)
-        if self._model is None or self._model[0] != name:
-            # A message must not have files read: what it names ships with the package.
-            self._model = name, known_body(name, load_body if chosen else named_body)
-        body = self._model[1]
+        # A message must not have files read: what it names ships with the package.
+        body = known_body(name, load_body if chosen else named_body)
         lengths = dict(
             zip(map(str, message.segment_names), map(float, message.segment_lengths), strict=False)
         )
