@@ -1,7 +1,7 @@
 """What is whole in a damaged MCAP file, in the order of the file, one chunk in memory at a time.
 
 A chunk is whole when its checksum says so, or, where it has none, when it can be decompressed and
-records_in into records; outside of chunks a record is whole when it lies in the file to its end.
+divided into records; outside of chunks a record is whole when it lies in the file to its end.
 Behind damage the next chunk is looked for. The summary, where it is whole, tells of channels whose
 description was lost, and how many messages there have been.
 """
