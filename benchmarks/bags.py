@@ -15,15 +15,15 @@ from benchmarks.clips import COMPRESSED, find_clips, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.stages import StageClock, Stages
-from hmt_ros.app import replay
+from hmt_ros.app.replay import command as replay
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.nodes import smoother_session
+from hmt_ros.sessions import smoother_session
 from hmt_ros.smoothing import SlidingWindow, TrajectoryMixture
 from hmt_ros.tracking import Tracker
 from msg_tools import BagReader, BagWriter, RosbagsMessages, typestore
-from msg_tools.headers import header_message
+from msg_tools.messages.headers import header_message
 
 STAGES = ('reading', 'memory', 'replay')
 ROUNDS = 5

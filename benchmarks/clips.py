@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from hmt_ros.app.truth import Truth, read_truth
 from hmt_ros.body import Camera
 from msg_tools import BagReader
-from msg_tools.camera_info import camera_from_info
-from msg_tools.headers import time_ns
-from msg_tools.images import decode_image
+from msg_tools.messages.camera_info import camera_from_info
+from msg_tools.messages.headers import time_ns
+from msg_tools.messages.images import decode_image
 
 ROOT = Path(__file__).resolve().parents[1]
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'

@@ -14,7 +14,7 @@ from benchmarks.experts_motion import BEST_OF, COLUMNS, Learned, SeenMotion
 from benchmarks.machine import best_time
 from hmt_ros.body import Camera, load_body
 from hmt_ros.experts.training_set import procedural_sequence
-from hmt_ros.image.renderer import render_silhouettes
+from hmt_ros.rendering.renderer import render_silhouettes
 
 STAGES = ('toy', 'oracle', 'learning', 'motion', 'clips', 'start', 'speed')
 SAMPLES = 6000

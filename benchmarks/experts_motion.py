@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 
 from benchmarks.clips import ROOT
 from hmt_ros.body import Body, load_body
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score
+from hmt_ros.experts.descriptor.shape_context import cluster_centres, squared_distances
+from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
 from hmt_ros.experts.learned_models import KINDS, new_model
 from hmt_ros.experts.pose_encoding import PoseEncoding
 from hmt_ros.experts.pose_predictor import JITTER, PosePredictor
@@ -39,11 +42,8 @@ from hmt_ros.experts.training_set import (
     training_set,
     typical_body,
 )
-from hmt_ros.image.shape_context import cluster_centres, squared_distances
-from hmt_ros.image.silhouette_descriptor import silhouette_parts
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.calibration import coverage
-from hmt_ros.tracking.evaluation import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score
 
 Array = NDArray[np.float64]
 

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
 from benchmarks.machine import description, dgemm_rate
-from hmt_ros.body import Body, Camera, enumerate_flips, load_body
-from hmt_ros.body.distinct_poses import distinct_poses
-from hmt_ros.body.flip_products import full_body_flips
-from hmt_ros.body.interpretation_tree import flip_counts
+from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
+from hmt_ros.flips import enumerate_flips
+from hmt_ros.flips.distinct_poses import distinct_poses
+from hmt_ros.flips.interpretation_tree import flip_counts
+from hmt_ros.flips.whole_body_flips import full_body_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
 from hmt_ros.image.observation import Keypoints, Observation
 from hmt_ros.inference.bounded_newton import Minimum, Status, minimise

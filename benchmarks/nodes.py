@@ -17,17 +17,17 @@ import hmt_ros
 from benchmarks.clips import COMPRESSED, find_clips, index_back_and_forth, read_messages, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.publisher import with_stamp
-from hmt_ros.app.live_node import LiveNode
-from hmt_ros.app.player import LiveNodeError, Player, changed_environment
-from hmt_ros.nodes import bme_session, track_messages
-from hmt_ros.nodes.bme_parameters import BmeParameters
-from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
-from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.published_topic import PublishedTopic
+from hmt_ros.app.replay.live_node import LiveNode
+from hmt_ros.app.replay.player import LiveNodeError, Player, changed_environment
+from hmt_ros.sessions import bme_session, track_messages
+from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.published_topic import PublishedTopic
 from msg_tools import RosbagsMessages
-from msg_tools.cdr import serialise
-from msg_tools.headers import time_ns
-from msg_tools.images import compressed_image_message, decode_image, image_message
+from msg_tools.messages.cdr import serialise
+from msg_tools.messages.headers import time_ns
+from msg_tools.messages.images import compressed_image_message, decode_image, image_message
 
 RATE = 30.0  # images a second
 SECONDS = 20.0

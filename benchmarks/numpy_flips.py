@@ -1,4 +1,4 @@
-"""Flips of limbs in vectorised numpy, as `hmt_ros.body.tree_growth` compiles them."""
+"""Flips of limbs in vectorised numpy, as `hmt_ros.flips.tree_growth` compiles them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.body.skeleton import Skeleton
-from hmt_ros.body.tree_growth import LIMIT_TOLERANCE, STRAIGHT, TOUCHING
+from hmt_ros.flips.tree_growth import LIMIT_TOLERANCE, STRAIGHT, TOUCHING
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.flesh import occluding_contour
 from hmt_ros.body.kinematics import Frames, assemble, forward, segment_sums
-from hmt_ros.image.edge_term import FEWEST
-from hmt_ros.image.intensity_term import FLOW_ERROR
 from hmt_ros.image.likelihood import ImageLikelihood, TermSettings
 from hmt_ros.image.observation import Observation, Outline
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.silhouette_term import SPACING, TURN
 from hmt_ros.image.surface import COVER, HIDDEN
+from hmt_ros.image.terms.edges import FEWEST
+from hmt_ros.image.terms.silhouette import SPACING, TURN
+from hmt_ros.image.terms.texture_terms import FLOW_ERROR
 from hmt_ros.image.texture import FACING, Textures, coarse_mesh
 
 Array = NDArray[np.float64]

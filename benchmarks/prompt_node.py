@@ -17,10 +17,10 @@ import numpy as np
 from hmt_ros.body import Camera
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.nodes.bme_node import NAME, BmeNode
-from hmt_ros.nodes.bme_session import BmeSession
-from hmt_ros.nodes.camera_input import WaitingImage
-from hmt_ros.nodes.handled import Output
 from hmt_ros.nodes.run_node import run
+from hmt_ros.sessions.bme_session import BmeSession
+from hmt_ros.sessions.camera_input import WaitingImage
+from hmt_ros.sessions.handled import Output
 
 
 class PromptSession(BmeSession):

@@ -18,16 +18,16 @@ from scipy.ndimage import gaussian_filter1d
 from benchmarks.clips import Clip, find_clips, read_clip
 from benchmarks.tracking import new_tracker
 from hmt_ros.body import Body, load_body
-from hmt_ros.inference import GaussianMixture
-from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
-from hmt_ros.tracking import TrackerSettings
-from hmt_ros.tracking.evaluation import (
+from hmt_ros.evaluation.pose_scores import (
     EVALUATED_JOINTS,
     ORIGIN,
     JointMixture,
     joint_mixtures,
     score,
 )
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
+from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.pruning import choose_hypotheses
 
 Array = NDArray[np.float64]

@@ -27,12 +27,12 @@ from benchmarks.machine import description, forget_peak, peak_memory, resident_m
 from benchmarks.stages import StageClock
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, Scores, joint_mixtures, score
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import TermSettings
 from hmt_ros.image.observation import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings, read_subject
-from hmt_ros.tracking.evaluation import EVALUATED_JOINTS, ORIGIN, Scores, joint_mixtures, score
 from hmt_ros.tracking.initialisation import start_from_keypoints
 
 PARTS = ('accuracy', 'speed')

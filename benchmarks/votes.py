@@ -26,18 +26,18 @@ from benchmarks.flips import random_poses
 from benchmarks.machine import description
 from benchmarks.tracking import keypoints_only
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.body.interpretation_tree import enumerate_flips
-from hmt_ros.body.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
-from hmt_ros.body.viewpoint import Viewpoint
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score
+from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Keypoints, Observation
-from hmt_ros.image.renderer import render_frames
-from hmt_ros.image.scene import Scene
 from hmt_ros.inference.bounded_newton import Minimum, minimise
+from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
+from hmt_ros.motion.viewpoint import Viewpoint
+from hmt_ros.rendering.renderer import render_frames
+from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.chain_votes import VOTES, chain_votes
-from hmt_ros.tracking.evaluation import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score
 from hmt_ros.tracking.proposals import covariance_scaled_samples
 
 Array = NDArray[np.float64]

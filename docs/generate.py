@@ -74,10 +74,10 @@ def part(name: str) -> str:
 
 def parameter_table(node: str) -> str:
     """All parameters of a node, as it declares them."""
-    from hmt_ros.nodes.bme_parameters import BmeParameters
-    from hmt_ros.nodes.declared_parameters import declared_parameters
-    from hmt_ros.nodes.filter_parameters import FilterParameters
-    from hmt_ros.nodes.smoother_parameters import SmootherParameters
+    from hmt_ros.sessions.bme_parameters import BmeParameters
+    from hmt_ros.sessions.declared_parameters import declared_parameters
+    from hmt_ros.sessions.filter_parameters import FilterParameters
+    from hmt_ros.sessions.smoother_parameters import SmootherParameters
 
     settings = {
         'filter_node': FilterParameters(),

@@ -16,7 +16,7 @@ from benchmarks.command import run_stages
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.stages import STAGES, StageClock
 from hmt_ros.body import load_body
-from hmt_ros.body.interpretation_tree import enumerate_flips
+from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.tracking import TrackerSettings
 
 ROOT = Path(__file__).resolve().parents[1]

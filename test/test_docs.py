@@ -17,12 +17,12 @@ import yaml
 from benchmarks import BENCHMARKS
 from hmt_ros.app import COMMANDS
 from hmt_ros.body import load_body
-from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
-from hmt_ros.nodes.bme_parameters import BmeParameters
-from hmt_ros.nodes.declared_parameters import declared_parameters
-from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.smoother_parameters import SmootherParameters
-from hmt_ros.tracking.evaluation import Scores
+from hmt_ros.evaluation.pose_scores import Scores
+from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
+from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.declared_parameters import declared_parameters
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.tracking.subject import parse_subject
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -24,12 +24,12 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
-from hmt_ros.nodes.bme_parameters import BmeParameters
-from hmt_ros.nodes.declared_parameters import values_of, with_values
-from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.parameter_file import read_parameter_file
-from hmt_ros.nodes.smoother_parameters import SmootherParameters
+from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
+from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.declared_parameters import values_of, with_values
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.parameter_file import read_parameter_file
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from msg_tools import BagReader
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from hmt_ros.body import model_file, rig
-from hmt_ros.inference import array_file
-from hmt_ros.nodes import parameter_file, picture_file
+from hmt_ros.body import model_file
+from hmt_ros.motion import rig
+from hmt_ros.sessions import parameter_file, picture_file
 from hmt_ros.tracking import subject
-from msg_tools import bag_metadata, decompression, images, keypoints, pose_mixtures
+from msg_tools.bags import bag_metadata, decompression
+from msg_tools.files import array_file
+from msg_tools.messages import images, keypoints, pose_mixtures
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted(
@@ -27,7 +29,7 @@ FORBIDDEN_MODULES = {
 # Where a module that others may not use is used for something that opens nothing.
 ALLOWED = {
     # Reserves the number of a ROS domain for a replay; nobody is listened to.
-    ('hmt_ros/app/player.py', 'socket'),
+    ('hmt_ros/app/replay/player.py', 'socket'),
 }
 FORBIDDEN_CALLS = {
     'eval', 'exec', 'compile', '__import__', 'os.system', 'os.popen', 'yaml.load_all',
@@ -86,7 +88,7 @@ def test_nothing_that_is_read_is_executed(path: Path) -> None:
     ],
 )
 def test_the_rules_find_what_they_forbid(text: str) -> None:
-    assert len(faults(text, 'hmt_ros/app/replay.py')) > 0
+    assert len(faults(text, 'hmt_ros/app/replay/command.py')) > 0
 
 
 def test_limits_are_those_of_the_page() -> None:

@@ -13,7 +13,8 @@ from benchmarks.clips import ROOT
 from benchmarks.soak.faults import place
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.scenes import CLIP
-from hmt_ros.app import make_bag, replay
+from hmt_ros.app import make_bag
+from hmt_ros.app.replay import command as replay
 from hmt_ros.experts.model_file import read_arrays, write_arrays
 from hmt_ros.experts.shipped_models import load_predictor
 from msg_tools import BagReader

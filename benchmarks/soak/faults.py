@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from msg_tools.error_line import error_line
+from msg_tools.files.error_line import error_line
 
 
 @contextmanager

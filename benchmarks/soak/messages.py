@@ -16,12 +16,12 @@ from benchmarks.soak.faults import place, warnings_as_errors
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.scenes import Scene, scenes, stamped
 from hmt_ros.body import load_body
-from hmt_ros.nodes.filter_session import PREDICTION, FilterSession
-from hmt_ros.nodes.session import Session
-from hmt_ros.nodes.smoother_session import SmootherSession
-from hmt_ros.nodes.track_start import prepare_start
-from msg_tools.cdr import deserialise, serialise
-from msg_tools.error_line import error_line
+from hmt_ros.sessions.filter_session import PREDICTION, FilterSession
+from hmt_ros.sessions.session import Session
+from hmt_ros.sessions.smoother_session import SmootherSession
+from hmt_ros.sessions.track_start import prepare_start
+from msg_tools.files.error_line import error_line
+from msg_tools.messages.cdr import deserialise, serialise
 
 # Share of the messages that hypothesis makes up by their type, which takes longer than damage.
 _MADE_UP = 0.05

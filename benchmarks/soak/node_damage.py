@@ -7,8 +7,8 @@ import numpy as np
 from benchmarks.mutations import damaged
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.watched_node import SHORT, Silent, Watched
-from hmt_ros.nodes.filter_session import PREDICTION
-from msg_tools.cdr import canonical, serialise
+from hmt_ros.sessions.filter_session import PREDICTION
+from msg_tools.messages.cdr import canonical, serialise
 
 
 def damaged_bytes(watched: Watched, amount: Amount, outcome: Outcome) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.watched_node import Watched
-from hmt_ros.app.player import LiveNodeError
+from hmt_ros.app.replay.player import LiveNodeError
 
 # States are 1 unconfigured, 2 inactive, 3 active.
 _FINALIZED = 4

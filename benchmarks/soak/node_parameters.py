@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.watched_node import Watched
-from hmt_ros.nodes.declared_parameters import DeclaredParameter, declared_parameters
+from hmt_ros.sessions.declared_parameters import DeclaredParameter, declared_parameters
 
 
 def changed_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> None:

@@ -15,9 +15,9 @@ from benchmarks.publisher import STEP_NS, as_file
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.scenes import stamped
 from benchmarks.soak.watched_node import PATIENCE, Silent, Watched
-from hmt_ros.app.player import LiveNodeError, environment
-from hmt_ros.nodes.handled import Handled
-from msg_tools.cdr import serialise
+from hmt_ros.app.replay.player import LiveNodeError, environment
+from hmt_ros.sessions.handled import Handled
+from msg_tools.messages.cdr import serialise
 
 # Images a second, over what the node can take.
 OVERLOAD = 5.0

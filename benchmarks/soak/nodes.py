@@ -19,8 +19,8 @@ from benchmarks.soak.node_streams import (
 from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.scenes import scenes
 from benchmarks.soak.watched_node import Silent, Watched
-from hmt_ros.app.player import LiveNodeError
-from msg_tools.error_line import error_line
+from hmt_ros.app.replay.player import LiveNodeError
+from msg_tools.files.error_line import error_line
 
 Case = Callable[[Watched, Amount, Outcome], None]
 

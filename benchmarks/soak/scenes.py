@@ -13,22 +13,22 @@ from benchmarks.clips import COMPRESSED, ROOT, index_back_and_forth, read_messag
 from benchmarks.publisher import STEP_NS
 from hmt_ros.body import load_body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.nodes import bme_session, smoothed_messages, track_messages
-from hmt_ros.nodes.bme_parameters import BmeParameters
-from hmt_ros.nodes.bme_session import BmeSession
-from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
-from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.filter_session import KEYPOINTS, PREDICTION, FilterSession
-from hmt_ros.nodes.published_topic import PublishedTopic
-from hmt_ros.nodes.session import Session
-from hmt_ros.nodes.smoother_parameters import SmootherParameters
-from hmt_ros.nodes.smoother_session import BODY, MIXTURE, SmootherSession
+from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
+from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.bme_session import BmeSession
+from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
+from hmt_ros.sessions.published_topic import PublishedTopic
+from hmt_ros.sessions.session import Session
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.smoother_session import BODY, MIXTURE, SmootherSession
 from hmt_ros.tracking import TrackerSettings
 from msg_tools import RosbagsMessages
-from msg_tools.bodies import message_of_body
-from msg_tools.headers import header_message, time_ns
-from msg_tools.images import decode_image, image_message
-from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.bodies import message_of_body
+from msg_tools.messages.headers import header_message, time_ns
+from msg_tools.messages.images import decode_image, image_message
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 CLIP = ROOT / 'bags' / 'reach'
 _SMALL = TrackerSettings(max_hypotheses=2, candidates=4, combinations=16)

@@ -8,10 +8,10 @@ from dataclasses import replace
 from typing import Any
 
 from benchmarks.soak.scenes import Scene
-from hmt_ros.app.live_node import LiveNode
-from hmt_ros.app.player import LiveNodeError, Player
-from hmt_ros.nodes.handled import Handled
-from hmt_ros.nodes.smoother_session import BODY
+from hmt_ros.app.replay.live_node import LiveNode
+from hmt_ros.app.replay.player import LiveNodeError, Player
+from hmt_ros.sessions.handled import Handled
+from hmt_ros.sessions.smoother_session import BODY
 
 # How long one message may take, s.
 PATIENCE = 60.0

@@ -10,11 +10,14 @@ from hmt_ros.app.printing import until_nobody_reads
 
 # Command: (module, what it does). A module is imported when its command is given.
 COMMANDS = {
-    'replay': ('hmt_ros.app.replay', 'track the person in a bag, into a new bag'),
+    'replay': ('hmt_ros.app.replay.command', 'track the person in a bag, into a new bag'),
     'recover': ('hmt_ros.app.recover', 'save what is whole in a damaged bag'),
     'make-bag': ('hmt_ros.app.make_bag', 'render a motion into a bag with ground truth'),
     'train': ('hmt_ros.app.train', 'learn to predict poses from silhouettes'),
-    'report': ('hmt_ros.app.report', 'pictures and a page with a 3D view of the mixtures in a bag'),
+    'report': (
+        'hmt_ros.app.report.command',
+        'pictures and a page with a 3D view of the mixtures in a bag',
+    ),
     'evaluate': ('hmt_ros.app.evaluate', 'errors and calibration of mixtures against ground truth'),
 }
 

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.app.recorded_bodies import BODY, SAME_PLACE, RecordedBodies, body_topics
-from hmt_ros.app.recorded_track import bare_mixture
+from hmt_ros.app.report.recorded_track import bare_mixture
 from hmt_ros.app.truth import POSE_MIXTURE, Truth, is_truth, mixture_topics
 from hmt_ros.body import Body
-from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking.evaluation import (
+from hmt_ros.evaluation.pose_scores import (
     BATCH,
     EVALUATED_JOINTS,
     MODEL_SIGMA,
@@ -28,10 +27,11 @@ from hmt_ros.tracking.evaluation import (
     joint_mixtures,
     score,
 )
+from hmt_ros.inference import GaussianMixture
 from msg_tools import BagMessage, BagReader
-from msg_tools.headers import time_ns
-from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
-from msg_tools.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_of
+from msg_tools.messages.headers import time_ns
+from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_of
 
 Array = NDArray[np.float64]
 
@@ -181,7 +181,7 @@ def score_bag(
         path: of the bag.
         truth: where the joints were.
         topics: names of those to score; none: all with mixtures.
-        model_sigma: see `hmt_ros.tracking.evaluation`, m.
+        model_sigma: see `hmt_ros.evaluation.pose_scores`, m.
         body_model: name or file of the body where the bag's own name for it is not known; None: the
             bag's.
         seed: of the samples that coverage is estimated with.

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 from hmt_ros.app.printing import until_nobody_reads
-from msg_tools.error_line import error_line
+from msg_tools.files.error_line import error_line
 
 # As shells tell of a program that the interrupt key has ended.
 INTERRUPTED = 130

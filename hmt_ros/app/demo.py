@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hmt_ros.app import replay
 from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.evaluate import as_text
-from hmt_ros.app.report import write_report
-from hmt_ros.app.report_page import Content
+from hmt_ros.app.replay import command as replay
+from hmt_ros.app.report.command import write_report
+from hmt_ros.app.report.page import Content
 from hmt_ros.app.truth import recorded_truth
 from msg_tools import BagReader
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from hmt_ros.app.bag_scores import TopicScores, score_bag
 from hmt_ros.app.command_line import CommandParser, number, run_command
 from hmt_ros.app.truth import Truth, read_truth, recorded_truth
-from hmt_ros.tracking.evaluation import MODEL_SIGMA
+from hmt_ros.evaluation.pose_scores import MODEL_SIGMA
 
 EPILOG = """\
 Errors are mean distances of hips, knees, ankles, shoulders, elbows, wrists and neck from where

@@ -6,7 +6,7 @@ import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
 from msg_tools import BagMessage, BagReader
-from msg_tools.pose_mixtures import PoseMixture
+from msg_tools.messages.pose_mixtures import PoseMixture
 
 BODY = 'hmt_msgs/msg/Body'
 # Positions of joints in a message agree with the body's kinematics up to this, m.

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from hmt_ros.app.command_line import CommandParser, run_command
-from msg_tools.bag_recovery import recover_bag
+from msg_tools.bags.bag_recovery import recover_bag
 
 # More lines about losses than this tell nothing more.
 _MOST_LINES = 10

@@ -19,16 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from hmt_ros.app.new_folder import FolderKind
 from hmt_ros.body import Body, Camera
-from hmt_ros.image.renderer import render_frames
-from hmt_ros.image.scene import Scene
+from hmt_ros.rendering.renderer import render_frames
+from hmt_ros.rendering.scene import Scene
 from msg_tools import BagWriter, RosbagsMessages
-from msg_tools.bodies import message_of_body
-from msg_tools.camera_info import camera_info_message
-from msg_tools.headers import SECOND_NS, header_message
-from msg_tools.images import compressed_image_message
-from msg_tools.pose_mixtures import MixtureKind
+from msg_tools.files.new_folder import FolderKind
+from msg_tools.messages.bodies import message_of_body
+from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.headers import SECOND_NS, header_message
+from msg_tools.messages.images import compressed_image_message
+from msg_tools.messages.pose_mixtures import MixtureKind
 
 Array = NDArray[np.float64]
 

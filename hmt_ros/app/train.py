@@ -20,7 +20,6 @@ from tqdm import tqdm
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
 from hmt_ros.app.training_report import write_report
 from hmt_ros.body import Body, load_body
-from hmt_ros.body.procedural_motion import PROCEDURAL_MOTIONS
 from hmt_ros.experts.learned_models import KINDS, new_model
 from hmt_ros.experts.predictor_learning import described, learned_predictor
 from hmt_ros.experts.training_set import (
@@ -32,7 +31,8 @@ from hmt_ros.experts.training_set import (
     training_set,
     typical_body,
 )
-from msg_tools.error_line import error_line
+from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS
+from msg_tools.files.error_line import error_line
 
 Item = TypeVar('Item')
 

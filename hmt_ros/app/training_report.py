@@ -11,12 +11,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hmt_ros.app.pictures import STYLE
+from hmt_ros.app.report.pictures import STYLE
 from hmt_ros.body import Body
+from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
 from hmt_ros.experts.pose_encoding import AXES
 from hmt_ros.experts.predictor_learning import Described, affinities, multimodality
 from hmt_ros.experts.training_set import PoseSequence, TrainingSet, side_view
-from hmt_ros.image.silhouette_descriptor import silhouette_parts
 
 Array = NDArray[np.float64]
 

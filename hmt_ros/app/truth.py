@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.inference.array_file import read_archive
 from msg_tools import BagReader
-from msg_tools.headers import time_ns
-from msg_tools.pose_mixtures import MixtureKind
+from msg_tools.files.array_file import read_archive
+from msg_tools.messages.headers import time_ns
+from msg_tools.messages.pose_mixtures import MixtureKind
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body, PartShape
-from hmt_ros.body.plain_yaml import load_plain_yaml
 from hmt_ros.body.skeleton import Skeleton
+from msg_tools.files.plain_yaml import load_plain_yaml
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.inference.array_file import read_archive
+from msg_tools.files.array_file import read_archive
 
 FORMAT = 'hmt_ros model'
 VERSION = 1

@@ -21,6 +21,14 @@ from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.experts.calibrated_experts import CalibratedExperts
 from hmt_ros.experts.conditional_density import ConditionalDensity
 from hmt_ros.experts.density_propagation import propagate, reduced
+from hmt_ros.experts.descriptor.centred_view import centred_view
+from hmt_ros.experts.descriptor.contour import person_blob
+from hmt_ros.experts.descriptor.silhouette_descriptor import (
+    PlaceAndSize,
+    SilhouetteDescriptor,
+    place_and_size,
+    silhouette_parts,
+)
 from hmt_ros.experts.model_file import (
     FAULTS,
     Arrays,
@@ -40,14 +48,6 @@ from hmt_ros.experts.root_placement import (
     placed_gaussians,
 )
 from hmt_ros.experts.stored_models import stored_model
-from hmt_ros.image.centred_view import centred_view
-from hmt_ros.image.contour import person_blob
-from hmt_ros.image.silhouette_descriptor import (
-    PlaceAndSize,
-    SilhouetteDescriptor,
-    place_and_size,
-    silhouette_parts,
-)
 from hmt_ros.inference import GaussianMixture
 
 Array = NDArray[np.float64]

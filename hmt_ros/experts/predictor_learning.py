@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body
 from hmt_ros.experts.calibrated_experts import CalibratedExperts
 from hmt_ros.experts.conditional_density import ConditionalDensity
-from hmt_ros.experts.pose_encoding import PoseEncoding
-from hmt_ros.experts.pose_predictor import PosePredictor
-from hmt_ros.experts.training_pairs import finite_matrix
-from hmt_ros.experts.training_set import TrainingSet
-from hmt_ros.image.shape_context import cluster_centres, squared_distances
-from hmt_ros.image.silhouette_descriptor import (
+from hmt_ros.experts.descriptor.shape_context import cluster_centres, squared_distances
+from hmt_ros.experts.descriptor.silhouette_descriptor import (
     SilhouetteDescriptor,
     SilhouetteParts,
     silhouette_parts,
 )
+from hmt_ros.experts.pose_encoding import PoseEncoding
+from hmt_ros.experts.pose_predictor import PosePredictor
+from hmt_ros.experts.training_pairs import finite_matrix
+from hmt_ros.experts.training_set import TrainingSet
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

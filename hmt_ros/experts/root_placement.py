@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.experts.descriptor.silhouette_descriptor import PlaceAndSize
 from hmt_ros.experts.pose_encoding import PoseEncoding
-from hmt_ros.image.silhouette_descriptor import PlaceAndSize
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.mirror import mirror, root_angles, root_rotations
-from hmt_ros.body.motion_file import Motion, read_motion
-from hmt_ros.body.procedural_motion import procedural_motion
-from hmt_ros.body.retarget import body_from_motion, retarget
 from hmt_ros.experts.pose_encoding import AXES, PoseEncoding
-from hmt_ros.image.renderer import render_silhouettes
+from hmt_ros.motion.motion_file import Motion, read_motion
+from hmt_ros.motion.procedural_motion import procedural_motion
+from hmt_ros.motion.retarget import body_from_motion, retarget
+from hmt_ros.rendering.renderer import render_silhouettes
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -1,1 +1,1 @@
-"""What an image says about a pose: silhouette, edges, motion, likelihood terms, the renderer."""
+"""What an image says about a pose: background, observation, texture, likelihood."""

@@ -16,8 +16,11 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.body.self_intersection import self_intersection_energy
-from hmt_ros.image.accumulation import tree_of
-from hmt_ros.image.energy_kernel import (
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.surface import flesh_table_of, lens_of
+from hmt_ros.image.terms.accumulation import tree_of
+from hmt_ros.image.terms.compiled_pass import (
     TERM_COUNT,
     Evidence,
     Model,
@@ -26,10 +29,7 @@ from hmt_ros.image.energy_kernel import (
     Terms,
     add_energies,
 )
-from hmt_ros.image.joint_term import joint_energy
-from hmt_ros.image.observation import Observation
-from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import flesh_table_of, lens_of
+from hmt_ros.image.terms.keypoints import joint_energy
 from hmt_ros.image.texture import Textures, no_textures
 
 Array = NDArray[np.float64]

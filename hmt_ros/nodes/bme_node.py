@@ -11,15 +11,15 @@ from hmt_msgs.msg import PoseMixture
 from hmt_msgs.srv import PredictPose
 from rclpy.serialization import deserialize_message
 
-from hmt_ros.nodes.bme_parameters import BmeParameters
-from hmt_ros.nodes.bme_session import TOPICS, BmeSession, BmeState
-from hmt_ros.nodes.camera_input import IMAGE
-from hmt_ros.nodes.handled import Output
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import SubscribedTopic, camera_info_topic, image_topic
-from msg_tools.cdr import serialise
-from msg_tools.error_line import error_line
+from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.bme_session import TOPICS, BmeSession, BmeState
+from hmt_ros.sessions.camera_input import IMAGE
+from hmt_ros.sessions.handled import Output
+from msg_tools.files.error_line import error_line
+from msg_tools.messages.cdr import serialise
 
 NAME = 'bme_node'
 _CHECKED = ('model_file', 'background_file', 'stature')

@@ -8,7 +8,7 @@ from collections import Counter
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from hmt_ros.nodes.handled import Handled
+from hmt_ros.sessions.handled import Handled
 
 
 class Rates:

@@ -9,12 +9,12 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
-from hmt_ros.nodes.handled import Handled
 from hmt_ros.nodes.input_queue import InputQueue, Waiting
-from hmt_ros.nodes.session import Session
 from hmt_ros.nodes.subscribed_topic import SubscribedTopic
-from msg_tools.cdr import deserialise
-from msg_tools.error_line import error_line
+from hmt_ros.sessions.handled import Handled
+from hmt_ros.sessions.session import Session
+from msg_tools.files.error_line import error_line
+from msg_tools.messages.cdr import deserialise
 
 # Small messages that wait while an estimate is made.
 SMALL_QUEUE = 100

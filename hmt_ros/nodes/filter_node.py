@@ -16,15 +16,6 @@ from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
-from hmt_ros.nodes.camera_input import IMAGE
-from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.filter_session import (
-    KEYPOINTS,
-    PREDICTION,
-    FilterSession,
-    SessionState,
-)
-from hmt_ros.nodes.handled import Output
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
@@ -33,9 +24,18 @@ from hmt_ros.nodes.subscribed_topic import (
     camera_info_topic,
     image_topic,
 )
-from hmt_ros.nodes.track_messages import TOPICS
-from hmt_ros.nodes.track_start import prepare_start
-from msg_tools.error_line import error_line
+from hmt_ros.sessions.camera_input import IMAGE
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.filter_session import (
+    KEYPOINTS,
+    PREDICTION,
+    FilterSession,
+    SessionState,
+)
+from hmt_ros.sessions.handled import Output
+from hmt_ros.sessions.track_messages import TOPICS
+from hmt_ros.sessions.track_start import prepare_start
+from msg_tools.files.error_line import error_line
 
 NAME = 'filter_node'
 _FILES = ('subject_file', 'background_file', 'body_model')

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
-from hmt_ros.nodes.declared_parameters import AT_LAUNCH, EFFECTS, DeclaredParameter
+from hmt_ros.sessions.declared_parameters import AT_LAUNCH, EFFECTS, DeclaredParameter
 
 
 def parameter_descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:

@@ -14,7 +14,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from hmt_ros.nodes.session_node import SessionNode
-from msg_tools.error_line import error_line
+from msg_tools.files.error_line import error_line
 
 # Names, in the environment, the process without which a node ends.
 OWNER = 'HMT_ROS_OWNER'

@@ -27,16 +27,16 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from hmt_ros.nodes.declared_parameters import declared_parameters, with_values
 from hmt_ros.nodes.diagnostics import Rates, handled_message
 from hmt_ros.nodes.estimating_thread import EstimatingThread, InnerFaults
-from hmt_ros.nodes.handled import Handled, Output
 from hmt_ros.nodes.middleware_events import MiddlewareEvents
 from hmt_ros.nodes.parameter_descriptor import parameter_descriptor
-from hmt_ros.nodes.published_topic import SUBSCRIBERS, PublishedTopic
-from hmt_ros.nodes.session import Session
 from hmt_ros.nodes.subscribed_topic import ANSWERS, LATCHED, RELIABLE, SubscribedTopic
-from msg_tools.error_line import error_line
+from hmt_ros.sessions.declared_parameters import declared_parameters, with_values
+from hmt_ros.sessions.handled import Handled, Output
+from hmt_ros.sessions.published_topic import SUBSCRIBERS, PublishedTopic
+from hmt_ros.sessions.session import Session
+from msg_tools.files.error_line import error_line
 
 # An active node that is sent nothing for so long says so, s.
 _SILENCE = 3.0

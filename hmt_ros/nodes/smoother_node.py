@@ -19,22 +19,22 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
-from hmt_ros.nodes.handled import Output
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
-from hmt_ros.nodes.smoothed_messages import TOPICS
-from hmt_ros.nodes.smoother_parameters import SmootherParameters
-from hmt_ros.nodes.smoother_session import (
+from hmt_ros.nodes.subscribed_topic import LATCHED, SubscribedTopic
+from hmt_ros.sessions.handled import Output
+from hmt_ros.sessions.smoothed_messages import TOPICS
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.smoother_session import (
     BODY,
     MIXTURE,
     SmootherSession,
     SmootherState,
     known_body,
 )
-from hmt_ros.nodes.subscribed_topic import LATCHED, SubscribedTopic
-from msg_tools.cdr import serialise
-from msg_tools.error_line import error_line
-from msg_tools.headers import time_ns
+from msg_tools.files.error_line import error_line
+from msg_tools.messages.cdr import serialise
+from msg_tools.messages.headers import time_ns
 
 NAME = 'smoother_node'
 _MIXTURES = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)

@@ -7,8 +7,8 @@ from typing import NamedTuple
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
-from msg_tools.images import MAX_PIXELS
+from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from msg_tools.messages.images import MAX_PIXELS
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 # Of `~/handled`: whoever counts on an answer to each message must not miss those to a burst.

@@ -210,7 +210,7 @@ class TrajectoryMixture:
         )
 
     def message_content(self) -> dict[str, Any]:
-        """What a message needs besides names and frame: see `msg_tools.trajectory_mixtures`.
+        """What a message needs besides names and frame (`msg_tools.messages`).
 
         Raises:
             ValueError: the stamps are not known.

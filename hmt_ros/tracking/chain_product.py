@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.distinct_poses import distinct_poses
 from hmt_ros.body.kinematics import forward
+from hmt_ros.flips.distinct_poses import distinct_poses
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

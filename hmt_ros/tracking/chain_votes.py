@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.interpretation_tree import enumerate_flips
+from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.tracking.candidates import relative_joints
 
 Array = NDArray[np.float64]

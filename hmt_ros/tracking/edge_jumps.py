@@ -18,11 +18,10 @@ from scipy.ndimage import minimum_filter
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.interpretation_tree import chain_points, place_chain
 from hmt_ros.body.kinematics import forward
+from hmt_ros.flips.interpretation_tree import chain_points, place_chain
 from hmt_ros.image.likelihood import NO_MAP, LikelihoodSettings
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.robust import geman_mcclure
 from hmt_ros.image.sampling import sample_distance
 from hmt_ros.image.surface import (
     Contour,
@@ -33,6 +32,7 @@ from hmt_ros.image.surface import (
     lens_of,
     trace_contour,
 )
+from hmt_ros.image.terms.robust_kernel import geman_mcclure
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.distinct_poses import distinct_poses
-from hmt_ros.body.interpretation_tree import enumerate_flips
 from hmt_ros.body.kinematics import forward, joint_length_jacobians, point_jacobians
+from hmt_ros.flips.distinct_poses import distinct_poses
+from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
 from hmt_ros.image.observation import Keypoints, Observation, Outline
 from hmt_ros.inference.bounded_newton import Minimum, minimise

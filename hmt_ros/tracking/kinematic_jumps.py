@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.interpretation_tree import chain_points, enumerate_flips, rehang_chain
-from hmt_ros.body.torso_flips import flip_torso
+from hmt_ros.flips.interpretation_tree import chain_points, enumerate_flips, rehang_chain
+from hmt_ros.flips.torso_flips import flip_torso
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures, with_swapped_sides
 from hmt_ros.inference.bounded_newton import Minimum

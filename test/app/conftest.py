@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.app import report
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS, ground_truth
+from hmt_ros.app.report import command as report
 from hmt_ros.body import Camera, load_body
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagWriter, RosbagsMessages
-from msg_tools.bodies import message_of_body
-from msg_tools.camera_info import camera_info_message
-from msg_tools.images import compressed_image_message
-from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
-from msg_tools.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
+from msg_tools.messages.bodies import message_of_body
+from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.images import compressed_image_message
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
 
 MESSAGES = RosbagsMessages()
 FRAMES, WINDOW, TRAJECTORIES = 7, 3, 10

@@ -4,8 +4,8 @@ import threading
 
 import pytest
 
-from hmt_ros.app.read_ahead import ReadAhead
-from hmt_ros.app.write_behind import WriteBehind
+from hmt_ros.app.replay.read_ahead import ReadAhead
+from hmt_ros.app.replay.write_behind import WriteBehind
 
 
 def made(items):

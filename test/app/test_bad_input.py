@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.app.replay import main
+from hmt_ros.app.replay.command import main
 from hmt_ros.body import Camera
 from msg_tools import BagReader, BagWriter, RosbagsMessages
-from msg_tools.camera_info import camera_info_message
-from msg_tools.headers import header_message
-from msg_tools.images import compressed_image_message, image_message
+from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.headers import header_message
+from msg_tools.messages.images import compressed_image_message, image_message
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared'))

@@ -9,9 +9,9 @@ import pytest
 
 from hmt_ros.app import make_bag
 from hmt_ros.app.demo import main
-from hmt_ros.app.pictures import LEFT, RIGHT, draw_overview
-from hmt_ros.app.recorded_mixtures import read_mixtures
-from hmt_ros.app.recorded_track import Moment, RecordedTrack
+from hmt_ros.app.report.pictures import LEFT, RIGHT, draw_overview
+from hmt_ros.app.report.recorded_mixtures import read_mixtures
+from hmt_ros.app.report.recorded_track import Moment, RecordedTrack
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import Camera
 from msg_tools import BagReader

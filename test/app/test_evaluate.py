@@ -9,12 +9,12 @@ import pytest
 from hmt_ros.app.evaluate import main
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS, ground_truth
 from hmt_ros.body import load_body
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, joint_mixtures, score
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking.evaluation import EVALUATED_JOINTS, joint_mixtures, score
 from msg_tools import BagWriter, RosbagsMessages
-from msg_tools.bodies import message_of_body
-from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
-from msg_tools.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
+from msg_tools.messages.bodies import message_of_body
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
 
 MESSAGES = RosbagsMessages()
 FRAMES = 6

@@ -8,12 +8,12 @@ import pytest
 
 from hmt_ros.app.make_bag import main
 from hmt_ros.body import load_body
-from hmt_ros.body.viewpoint import Viewpoint
-from hmt_ros.image.renderer import render_silhouettes
+from hmt_ros.motion.viewpoint import Viewpoint
+from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking.subject import read_subject
 from msg_tools import BagReader
-from msg_tools.camera_info import camera_from_info
-from msg_tools.images import decode_image
+from msg_tools.messages.camera_info import camera_from_info
+from msg_tools.messages.images import decode_image
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared'))

@@ -9,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 
 from hmt_ros.app.recover import main
-from hmt_ros.app.replay import main as replay
+from hmt_ros.app.replay.command import main as replay
 from msg_tools import BagReader, BagWriter
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -6,18 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.app.recorded_input import recorded_input
-from hmt_ros.app.replay import main
+from hmt_ros.app.replay.command import main
+from hmt_ros.app.replay.recorded_input import recorded_input
 from hmt_ros.experts.shipped_models import load_predictor
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.nodes import track_start
-from hmt_ros.nodes.smoothed_messages import TOPICS as SMOOTHED_TOPICS
-from hmt_ros.nodes.track_messages import TOPICS
+from hmt_ros.sessions import track_start
+from hmt_ros.sessions.smoothed_messages import TOPICS as SMOOTHED_TOPICS
+from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.tracking import Status
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
-from msg_tools.headers import header_message, time_ns
-from msg_tools.images import decode_image, image_message
-from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.headers import header_message, time_ns
+from msg_tools.messages.images import decode_image, image_message
+from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 from test.msg_tools.conftest import limited_file_size
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -8,23 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.app import live_node
-from hmt_ros.app.played_track import LiveTrack, NodeParameters
-from hmt_ros.app.player import (
+from hmt_ros.app.replay.command import live_node, main
+from hmt_ros.app.replay.played_track import LiveTrack, NodeParameters
+from hmt_ros.app.replay.player import (
     LiveNodeError,
     changed_environment,
     environment,
     reserved_domain,
 )
-from hmt_ros.app.replay import main
-from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
-from hmt_ros.nodes.declared_parameters import with_values
-from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.filter_session import KEYPOINTS
-from hmt_ros.nodes.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.filter_session import KEYPOINTS
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from msg_tools import BagReader, BagWriter, RosbagsMessages
-from msg_tools.headers import header_message, time_ns
-from msg_tools.images import decode_image, image_message
+from msg_tools.messages.headers import header_message, time_ns
+from msg_tools.messages.images import decode_image, image_message
 
 pytestmark = pytest.mark.ros
 

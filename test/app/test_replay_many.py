@@ -5,9 +5,8 @@ import sys
 
 import pytest
 
-from hmt_ros.app import replay_many
 from hmt_ros.app.make_bag import main as make_bag
-from hmt_ros.app.replay import main
+from hmt_ros.app.replay.command import main, replay_many
 from msg_tools import BagReader
 
 TINY = ['--fps', '10', '--size', '240x180', '--fov', '40']
@@ -192,7 +191,7 @@ def test_through_dask_the_bags_are_the_same(archive, tracked, tmp_path, capfd):
 
 def test_a_scheduler_that_does_not_answer(archive, tmp_path, monkeypatch, capfd):
     pytest.importorskip('distributed', reason='Dask is not installed (pip install distributed)')
-    monkeypatch.setattr('hmt_ros.app.dask_cluster._PATIENCE', 0.2)
+    monkeypatch.setattr('hmt_ros.app.replay.dask_cluster._PATIENCE', 0.2)
     command = [str(archive), '-o', str(tmp_path / 'out'), *PERSON]
     for address in ('tcp://127.0.0.1:1', 'nonsense://x'):
         assert main([*command, '--scheduler', address]) == 1

@@ -7,20 +7,20 @@ import cv2
 import numpy as np
 import pytest
 
-from hmt_ros.app import report
 from hmt_ros.app.bag_scores import score_bag
-from hmt_ros.app.film_strip import ImageSource, film_strip
-from hmt_ros.app.pictures import BONES
-from hmt_ros.app.recorded_mixtures import ENDS, KEPT_TRAJECTORIES, read_mixtures
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
-from hmt_ros.app.report_page import data_size
+from hmt_ros.app.report import command as report
+from hmt_ros.app.report.film_strip import ImageSource, film_strip
+from hmt_ros.app.report.page import data_size
+from hmt_ros.app.report.pictures import BONES
+from hmt_ros.app.report.recorded_mixtures import ENDS, KEPT_TRAJECTORIES, read_mixtures
 from hmt_ros.app.truth import read_truth
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader, BagWriter
-from msg_tools.bodies import message_of_body
-from msg_tools.images import compressed_image_message
-from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
-from msg_tools.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
+from msg_tools.messages.bodies import message_of_body
+from msg_tools.messages.images import compressed_image_message
+from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
 from test.app.conftest import (
     CAMERA,
     FRAMES,

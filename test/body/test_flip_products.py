@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
-from hmt_ros.body.flip_products import full_body_flips
-from hmt_ros.body.flip_pruning import DepthOrder
-from hmt_ros.body.interpretation_tree import enumerate_flips
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import deepest_overlaps
-from hmt_ros.body.torso_flips import JOINTS
+from hmt_ros.flips.flip_pruning import DepthOrder
+from hmt_ros.flips.interpretation_tree import enumerate_flips
+from hmt_ros.flips.torso_flips import JOINTS
+from hmt_ros.flips.whole_body_flips import full_body_flips
 
 ALL = 10**6
 

@@ -10,8 +10,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from hmt_ros.body import Body, load_body
-from hmt_ros.body.flip_products import full_body_flips
-from hmt_ros.body.interpretation_tree import enumerate_flips
+from hmt_ros.flips.interpretation_tree import enumerate_flips
+from hmt_ros.flips.whole_body_flips import full_body_flips
 
 BODY = load_body('human34')
 NAMES = BODY.dof_names

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.body.interpretation_tree import enumerate_flips, flip_counts, rehang_chain
+from hmt_ros.flips.interpretation_tree import enumerate_flips, flip_counts, rehang_chain
 
 CAMERA = Camera(500.0, 510.0, 320.0, 240.0, 640, 480)
 LIMBS = {

@@ -15,7 +15,7 @@ from hmt_ros.body.kinematics import (
     point_jacobians,
     segment_sums,
 )
-from hmt_ros.body.motion_file import read_skeleton
+from hmt_ros.motion.motion_file import read_skeleton
 
 BODIES = {name: load_body(name) for name in ('human37', 'human34', 'human32')}
 STEP = 1e-6

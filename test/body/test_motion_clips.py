@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.body.motion_file import Motion, read_motion, read_skeleton
+from hmt_ros.motion.motion_file import Motion, read_motion, read_skeleton
 
 FRAMES = 6  # of each clip are evaluated the plain way
 

@@ -11,16 +11,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hmt_ros.body import load_body
-from hmt_ros.body.bvh import read_bvh
-from hmt_ros.body.motion_file import (
+from hmt_ros.motion.bvh import read_bvh
+from hmt_ros.motion.motion_file import (
     WORLD_FROM_FILE,
     Motion,
     MotionFileError,
     read_motion,
     read_skeleton,
 )
-from hmt_ros.body.rig import LARGEST_MOTION, rig_body
-from hmt_ros.body.rig_names import standard_names
+from hmt_ros.motion.rig import LARGEST_MOTION, rig_body
+from hmt_ros.motion.rig_names import standard_names
 
 BVH = """HIERARCHY
 ROOT base

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hmt_ros.body import load_body, model_names, named_body
-from hmt_ros.body.plain_yaml import load_plain_yaml
+from msg_tools.files.plain_yaml import load_plain_yaml
 
 MODEL = Path(__file__).resolve().parents[2] / 'hmt_ros' / 'body' / 'models' / 'human37.yaml'
 BOMB = 'a: &a [x, x, x, x, x, x, x, x, x, x]\n' + ''.join(

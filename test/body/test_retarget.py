@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
-from hmt_ros.body.limb_angles import limb_angles
-from hmt_ros.body.motion_file import Motion, read_motion, read_skeleton
-from hmt_ros.body.retarget import body_from_motion, retarget
+from hmt_ros.motion.limb_angles import limb_angles
+from hmt_ros.motion.motion_file import Motion, read_motion, read_skeleton
+from hmt_ros.motion.retarget import body_from_motion, retarget
 
 HUMAN = load_body('human37')
 PAIRED = ('hip', 'knee', 'ankle', 'shoulder', 'elbow', 'wrist')

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Body, load_body
-from hmt_ros.body.torso_flips import flip_torso
+from hmt_ros.flips.torso_flips import flip_torso
 
 TORSO = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
 # hips turned, trunk leaned the other way, shoulders turned

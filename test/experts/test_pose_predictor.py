@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
+from hmt_ros.experts.descriptor.contour import NoSilhouetteError
+from hmt_ros.experts.descriptor.silhouette_descriptor import SilhouetteDescriptor
 from hmt_ros.experts.local_experts import LocalExperts
 from hmt_ros.experts.nearest_neighbours import NearestNeighbours
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.experts.predictor_learning import Described, described, learned_predictor
 from hmt_ros.experts.training_set import TrainingSettings, procedural_sequence, training_set
-from hmt_ros.image.contour import NoSilhouetteError
-from hmt_ros.image.renderer import render_silhouettes
-from hmt_ros.image.silhouette_descriptor import SilhouetteDescriptor
-from hmt_ros.tracking.evaluation import EVALUATED_JOINTS
+from hmt_ros.rendering.renderer import render_silhouettes
 
 CAMERA = Camera(400.0, 400.0, 199.5, 149.5, 400, 300)
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_ros.image.contour import NoSilhouetteError, person_blob, sample_contour
+from hmt_ros.experts.descriptor.contour import NoSilhouetteError, person_blob, sample_contour
 
 
 def disc(height: int, width: int, row: int, column: int, radius: int) -> np.ndarray:

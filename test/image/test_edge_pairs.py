@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hmt_ros.image.contour import sample_contour
-from hmt_ros.image.edge_pairs import ANGLES, DISTANCES, SIZE, edge_pairs
+from hmt_ros.experts.descriptor.contour import sample_contour
+from hmt_ros.experts.descriptor.edge_pairs import ANGLES, DISTANCES, SIZE, edge_pairs
 
 
 def described(mask: np.ndarray) -> np.ndarray:

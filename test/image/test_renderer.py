@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.arm_posture import arm_posture
 from hmt_ros.body.flesh import Flesh, occluding_contour
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.procedural_motion import procedural_motion
-from hmt_ros.body.viewpoint import Viewpoint
-from hmt_ros.image.renderer import render, render_frames, render_silhouettes
-from hmt_ros.image.scene import Scene
+from hmt_ros.motion.arm_posture import arm_posture
+from hmt_ros.motion.procedural_motion import procedural_motion
+from hmt_ros.motion.viewpoint import Viewpoint
+from hmt_ros.rendering.renderer import render, render_frames, render_silhouettes
+from hmt_ros.rendering.scene import Scene
 
 VIEW = Viewpoint(distance=3.2)
 BARE = Scene(viewpoint=VIEW, noise=0.0, shadow=0.0, clutter=2)

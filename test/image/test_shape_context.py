@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_ros.image.shape_context import (
+from hmt_ros.experts.descriptor.shape_context import (
     ANGULAR,
     RADIAL,
     RADII,

@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.procedural_motion import procedural_motion
-from hmt_ros.body.viewpoint import Viewpoint
-from hmt_ros.image.centred_view import centred_view
-from hmt_ros.image.contour import NoSilhouetteError, person_blob
-from hmt_ros.image.renderer import render_silhouettes
-from hmt_ros.image.silhouette_descriptor import (
+from hmt_ros.experts.descriptor.centred_view import centred_view
+from hmt_ros.experts.descriptor.contour import NoSilhouetteError, person_blob
+from hmt_ros.experts.descriptor.silhouette_descriptor import (
     SilhouetteDescriptor,
     place_and_size,
     silhouette_parts,
 )
+from hmt_ros.motion.procedural_motion import procedural_motion
+from hmt_ros.motion.viewpoint import Viewpoint
+from hmt_ros.rendering.renderer import render_silhouettes
 
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
 

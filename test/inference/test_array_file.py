@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.inference.array_file import read_archive
+from msg_tools.files.array_file import read_archive
 
 
 def archive_of(path: Path, header: bytes, data: bytes) -> Path:

@@ -15,8 +15,8 @@ import pytest
 
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
-from msg_tools.headers import header_message
-from msg_tools.pose_mixtures import MixtureKind, PoseMixture
+from msg_tools.messages.headers import header_message
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
 
 Read = Callable[[Path], tuple[list[tuple[int, str, bytes]], str | None]]
 

@@ -22,9 +22,9 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
-from msg_tools.cdr import serialise
-from msg_tools.images import decode_image
-from msg_tools.typestore import typestore
+from msg_tools.messages.cdr import serialise
+from msg_tools.messages.images import decode_image
+from msg_tools.messages.typestore import typestore
 
 STRING = 'std_msgs/msg/String'
 

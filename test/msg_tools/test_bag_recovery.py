@@ -22,9 +22,9 @@ from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
-from msg_tools.bag_metadata import quality_of_service, recorded_quality_of_service
-from msg_tools.bag_recovery import recover_bag
-from msg_tools.cdr import serialise
+from msg_tools.bags.bag_metadata import quality_of_service, recorded_quality_of_service
+from msg_tools.bags.bag_recovery import recover_bag
+from msg_tools.messages.cdr import serialise
 from test.msg_tools.conftest import Read, limited_file_size
 
 STRING = 'std_msgs/msg/String'

@@ -11,7 +11,7 @@ import pytest
 
 from hmt_ros.body import Camera
 from msg_tools import BagReader, RosbagsMessages
-from msg_tools.camera_info import CameraInfoError, camera_from_info, camera_info_message
+from msg_tools.messages.camera_info import CameraInfoError, camera_from_info, camera_info_message
 
 K = [600.0, 0.0, 321.5, 0.0, 590.0, 243.25, 0.0, 0.0, 1.0]
 PLUMB_BOB = [-0.25, 0.08, 0.001, -0.002, 0.01]

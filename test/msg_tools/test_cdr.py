@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 from msg_tools import GeneratedMessages, MessageFactory, RosbagsMessages, typestore
-from msg_tools.bodies import body_message
-from msg_tools.cdr import canonical, deserialise, serialise
-from msg_tools.headers import header_message
-from msg_tools.images import compressed_image_message, image_message
-from msg_tools.joint_states import heaviest_joint_state
-from msg_tools.keypoints import Keypoints, keypoints_message
-from msg_tools.markers import skeleton_markers
-from msg_tools.pose_mixtures import PoseMixture, pose_mixture_message
-from msg_tools.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
-from msg_tools.transforms import transforms_message
+from msg_tools.messages.bodies import body_message
+from msg_tools.messages.cdr import canonical, deserialise, serialise
+from msg_tools.messages.headers import header_message
+from msg_tools.messages.images import compressed_image_message, image_message
+from msg_tools.messages.joint_states import heaviest_joint_state
+from msg_tools.messages.keypoints import Keypoints, keypoints_message
+from msg_tools.messages.markers import skeleton_markers
+from msg_tools.messages.pose_mixtures import PoseMixture, pose_mixture_message
+from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
+from msg_tools.messages.transforms import transforms_message
 
 STAMP = 1_700_000_000_987_654_321
 RNG = np.random.default_rng(11)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import zstandard
 
-from msg_tools import decompression
-from msg_tools.decompression import (
+from msg_tools.bags import decompression
+from msg_tools.bags.decompression import (
     DecompressionError,
     decompress,
     decompress_file,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from msg_tools import RosbagsMessages
-from msg_tools.images import (
+from msg_tools.messages.images import (
     ImageError,
     compressed_image_message,
     decode_image,

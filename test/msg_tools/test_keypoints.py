@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from msg_tools import MessageError, RosbagsMessages
-from msg_tools.keypoints import Keypoints, keypoints_message, keypoints_of
+from msg_tools.messages.keypoints import Keypoints, keypoints_message, keypoints_of
 
 
 def message(messages: RosbagsMessages, **changes: Any) -> Any:

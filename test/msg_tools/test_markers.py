@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from msg_tools import MessageError, RosbagsMessages
-from msg_tools.markers import skeleton_markers
+from msg_tools.messages.markers import skeleton_markers
 
 ADD, DELETE, LINE_LIST, SPHERE_LIST = 0, 2, 5, 7
 NAMES = ['pelvis', 'neck', 'head']

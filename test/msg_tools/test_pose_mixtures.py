@@ -11,8 +11,8 @@ import pytest
 
 from hmt_ros.inference import GaussianMixture
 from msg_tools import MessageError, RosbagsMessages, typestore
-from msg_tools.cdr import deserialise, serialise
-from msg_tools.pose_mixtures import (
+from msg_tools.messages.cdr import deserialise, serialise
+from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,
     pose_mixture_message,

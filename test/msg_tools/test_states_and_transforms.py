@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from msg_tools import MessageError, RosbagsMessages
-from msg_tools.bodies import body_message
-from msg_tools.headers import header_message, time_message, time_ns
-from msg_tools.joint_states import heaviest_joint_state, joint_state_message
-from msg_tools.pose_mixtures import PoseMixture
-from msg_tools.transforms import quaternions, transforms_message
+from msg_tools.messages.bodies import body_message
+from msg_tools.messages.headers import header_message, time_message, time_ns
+from msg_tools.messages.joint_states import heaviest_joint_state, joint_state_message
+from msg_tools.messages.pose_mixtures import PoseMixture
+from msg_tools.messages.transforms import quaternions, transforms_message
 
 
 @pytest.mark.parametrize('stamp', [0, 1, 999_999_999, 10**9, 1_700_000_000_123_456_789])

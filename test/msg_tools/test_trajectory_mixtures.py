@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from msg_tools import MessageError, RosbagsMessages
-from msg_tools.cdr import deserialise, serialise
-from msg_tools.trajectory_mixtures import (
+from msg_tools.messages.cdr import deserialise, serialise
+from msg_tools.messages.trajectory_mixtures import (
     TrajectoryMixture,
     trajectory_mixture_message,
     trajectory_mixture_of,

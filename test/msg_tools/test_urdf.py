@@ -10,7 +10,7 @@ import pytest
 
 from hmt_ros.body import load_body
 from msg_tools import MessageError
-from msg_tools.urdf import Freedom, Segment, body_urdf, roll_pitch_yaw, segments_of
+from msg_tools.messages.urdf import Freedom, Segment, body_urdf, roll_pitch_yaw, segments_of
 
 AXES = np.eye(3)
 

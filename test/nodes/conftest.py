@@ -20,17 +20,17 @@ import pytest
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.nodes import bme_session, track_start
-from hmt_ros.nodes.declared_parameters import EFFECTS, declared_parameters
-from hmt_ros.nodes.parameter_file import read_parameter_file
+from hmt_ros.sessions import bme_session, track_start
+from hmt_ros.sessions.declared_parameters import EFFECTS, declared_parameters
+from hmt_ros.sessions.parameter_file import read_parameter_file
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
 from msg_tools import RosbagsMessages
-from msg_tools.bodies import message_of_body
-from msg_tools.camera_info import camera_info_message
-from msg_tools.cdr import serialise
-from msg_tools.headers import header_message
-from msg_tools.images import compressed_image_message, image_message
-from msg_tools.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.bodies import message_of_body
+from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.cdr import serialise
+from msg_tools.messages.headers import header_message
+from msg_tools.messages.images import compressed_image_message, image_message
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAME_NS = 100_000_000

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hmt_ros.nodes.bme_parameters import BmeParameters
+from hmt_ros.sessions.bme_parameters import BmeParameters
 from test.nodes.conftest import values_of
 
 pytestmark = pytest.mark.ros

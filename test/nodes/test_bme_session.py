@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera
-from hmt_ros.nodes.bme_parameters import BmeParameters
-from hmt_ros.nodes.bme_session import CAMERA_INFO, IMAGE, BmeSession
-from hmt_ros.nodes.declared_parameters import with_values
-from hmt_ros.nodes.handled import Handled
+from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, BmeSession
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.handled import Handled
 from hmt_ros.tracking.dynamics import PoseRates
-from msg_tools.cdr import deserialise
-from msg_tools.images import compressed_image_message, image_message
-from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.images import compressed_image_message, image_message
+from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 
 FRAME_NS = 100_000_000
 

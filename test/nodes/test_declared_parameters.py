@@ -3,7 +3,7 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
-from hmt_ros.nodes.declared_parameters import (
+from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     EFFECT,
     EFFECTS,
@@ -16,7 +16,7 @@ from hmt_ros.nodes.declared_parameters import (
     values_of,
     with_values,
 )
-from hmt_ros.nodes.filter_parameters import FilterParameters
+from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.tracking import TrackerSettings
 
 

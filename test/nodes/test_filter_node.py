@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.track_messages import TOPICS
-from msg_tools.cdr import serialise
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.track_messages import TOPICS
+from msg_tools.messages.cdr import serialise
 from test.nodes.conftest import PATIENCE, values_of
 
 pytestmark = pytest.mark.ros

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera, load_body
-from hmt_ros.nodes.camera_input import CAMERA_INFO, IMAGE
-from hmt_ros.nodes.declared_parameters import with_values
-from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.filter_session import KEYPOINTS, PREDICTION, FilterSession
-from hmt_ros.nodes.track_messages import TOPICS
-from hmt_ros.nodes.track_start import prepare_start
-from msg_tools.cdr import deserialise
-from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
+from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
+from hmt_ros.sessions.track_messages import TOPICS
+from hmt_ros.sessions.track_start import prepare_start
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 from test.nodes.conftest import Likelihoods
 
 MIXTURES = ['pose_mixture', 'likelihood_mixture']

@@ -3,9 +3,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from hmt_ros.nodes.declared_parameters import ParameterError, values_of, with_values
-from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.parameter_file import parameter_file_text, read_parameter_file, yaml_scalar
+from hmt_ros.sessions.declared_parameters import ParameterError, values_of, with_values
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.parameter_file import parameter_file_text, read_parameter_file, yaml_scalar
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml'
@@ -14,7 +14,7 @@ CONFIG = ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml'
 def test_file_of_the_node_is_what_it_declares():
     wanted = parameter_file_text('filter_node', FilterParameters())
     assert CONFIG.read_text('utf-8') == wanted, (
-        'write it anew: python -m hmt_ros.nodes.filter_parameters > hmt_ros/config/filter_node.yaml'
+        'write it: python -m hmt_ros.sessions.filter_parameters > hmt_ros/config/filter_node.yaml'
     )
     assert max(len(line) for line in wanted.splitlines()) <= 100
     assert read_parameter_file(CONFIG, 'filter_node') == values_of(FilterParameters())

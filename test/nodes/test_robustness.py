@@ -10,7 +10,7 @@ from benchmarks.soak import cases, disk, files, messages, nodes
 from benchmarks.soak.outcome import MOST_GROWTH, Amount, Outcome
 from benchmarks.soak.scenes import scenes
 from hmt_ros.experts.model_file import read_arrays, write_arrays
-from msg_tools.cdr import deserialise, serialise
+from msg_tools.messages.cdr import deserialise, serialise
 
 
 def assert_met(outcomes, count):

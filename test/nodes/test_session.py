@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.nodes.session import entropy
+from hmt_ros.sessions.session import entropy
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -18,14 +18,14 @@ def test_runs_without_ros(name):
     program = (
         'import sys\n'
         'sys.modules["rclpy"] = sys.modules["hmt_msgs"] = None\n'
-        f'import hmt_ros.nodes.{name}_session as session, hmt_ros.nodes.{name}_parameters\n'
+        f'import hmt_ros.sessions.{name}_session as session, hmt_ros.sessions.{name}_parameters\n'
         'print(session.__name__, sys.modules["rclpy"], sys.modules["hmt_msgs"])\n'
     )
     result = subprocess.run(
         [sys.executable, '-c', program], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert (result.stdout, result.stderr, result.returncode) == (
-        f'hmt_ros.nodes.{name}_session None None\n', '', 0
+        f'hmt_ros.sessions.{name}_session None None\n', '', 0
     )  # fmt: skip
 
 

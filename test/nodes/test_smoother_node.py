@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from hmt_ros.nodes.smoothed_messages import TOPICS
-from hmt_ros.nodes.smoother_parameters import SmootherParameters
-from hmt_ros.nodes.smoother_session import SmootherSession
-from msg_tools.cdr import serialise
-from msg_tools.headers import time_ns
+from hmt_ros.sessions.smoothed_messages import TOPICS
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.smoother_session import SmootherSession
+from msg_tools.messages.cdr import serialise
+from msg_tools.messages.headers import time_ns
 from test.nodes.conftest import PATIENCE, values_of
 
 pytestmark = pytest.mark.ros

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hmt_ros.nodes.declared_parameters import with_values
-from hmt_ros.nodes.smoothed_messages import TOPICS
-from hmt_ros.nodes.smoother_parameters import SmootherParameters
-from hmt_ros.nodes.smoother_session import BODY, FINISH, MIXTURE, SmootherSession
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.smoothed_messages import TOPICS
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.smoother_session import BODY, FINISH, MIXTURE, SmootherSession
 from hmt_ros.smoothing import MixtureSmoother
-from msg_tools.cdr import deserialise
-from msg_tools.headers import EARLIEST_NS, header_message, time_ns
-from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
-from msg_tools.trajectory_mixtures import trajectory_mixture_of
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.headers import EARLIEST_NS, header_message, time_ns
+from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
 
 LAG = 2
 WINDOW = ['trajectory_mixture', 'trajectory_markers']

@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.nodes.overlay import draw_modes
-from hmt_ros.nodes.track_messages import TOPICS, Presentation, TrackedImage, track_messages
+from hmt_ros.sessions.overlay import draw_modes
+from hmt_ros.sessions.track_messages import TOPICS, Presentation, TrackedImage, track_messages
 from msg_tools import MessageError, RosbagsMessages
-from msg_tools.cdr import serialise
-from msg_tools.images import decode_image
-from msg_tools.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.cdr import serialise
+from msg_tools.messages.images import decode_image
+from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 STAMP = 1_700_000_000_123_456_789

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from hmt_ros.nodes import track_start
-from hmt_ros.nodes.declared_parameters import with_values
-from hmt_ros.nodes.filter_parameters import FilterParameters
-from hmt_ros.nodes.track_start import prepare_start
+from hmt_ros.sessions import track_start
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.track_start import prepare_start
 from msg_tools import RosbagsMessages
 
 

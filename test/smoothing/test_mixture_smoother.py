@@ -8,7 +8,8 @@ from scipy.stats import multivariate_normal
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother, TrajectoryMixture
-from msg_tools import RosbagsMessages, trajectory_mixtures
+from msg_tools import RosbagsMessages
+from msg_tools.messages import trajectory_mixtures
 
 FAST = LinearGaussianDynamics.constant_velocity([4.0, 4.0], 1.0)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_ros.body.interpretation_tree import enumerate_flips, flip_counts
+from hmt_ros.flips.interpretation_tree import enumerate_flips, flip_counts
 from hmt_ros.tracking.chain_votes import (
     VOTES,
     chain_votes,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera
-from hmt_ros.body.interpretation_tree import chain_points, place_chain, rehang_chain
 from hmt_ros.body.kinematics import forward
+from hmt_ros.flips.interpretation_tree import chain_points, place_chain, rehang_chain
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe

@@ -5,14 +5,14 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from hmt_ros.body import load_body
-from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking.evaluation import (
+from hmt_ros.evaluation.pose_scores import (
     EVALUATED_JOINTS,
     JointMixture,
     Scores,
     joint_mixtures,
     score,
 )
+from hmt_ros.inference import GaussianMixture
 
 
 @pytest.fixture(scope='module')

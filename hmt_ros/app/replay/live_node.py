@@ -1,0 +1,353 @@
+"""Real nodes in processes of their own, fed over DDS in lock step.
+
+Every message is published as it is in the bag; the next one follows when the node has told on
+`~/handled` what became of it and all that it published has arrived. Nothing is lost and nothing
+overtakes, so what comes out does not depend on how fast the machine is. The nodes run in the domain
+of their player, which nobody else uses.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import hmt_ros
+from hmt_ros.app.replay.player import LiveNodeError, Player, environment
+from hmt_ros.sessions.declared_parameters import values_of
+from hmt_ros.sessions.handled import Handled
+from hmt_ros.sessions.parameter_file import yaml_scalar
+from hmt_ros.sessions.published_topic import SUBSCRIBERS, PublishedTopic
+from msg_tools.messages.cdr import canonical, deserialise, serialise
+
+# Generous: they end a replay that hangs. A node that ends is noticed at once.
+START_SECONDS = 120.0
+MESSAGE_SECONDS = 600.0  # the first image may have to wait until kernels are compiled
+STOP_SECONDS = 20.0
+
+
+class LiveNode:
+    """A running node.
+
+    Args:
+        player: who talks to it.
+        opened: ends it.
+        name: of the node, 'filter_node' for example.
+        parameters: of the node.
+        inputs: topic and type by source, of what is published for it.
+        topics: that it publishes.
+        sensors: topics that it would take from sensors, which may lose data; a replay may not.
+        latched: inputs of which a subscriber that comes late wants the last message.
+        namespace: of the node and of all its topics, '/humans/bodies/7' for example.
+        module: that runs it; empty: the one in `hmt_ros.nodes` with its name.
+        write: takes topic, stamp and bytes of all that the node publishes, in its order.
+
+    Raises:
+        LiveNodeError: the node does not start.
+    """
+
+    def __init__(
+        self,
+        player: Player,
+        opened: ExitStack,
+        name: str,
+        parameters: Any,
+        *,
+        inputs: Mapping[str, tuple[str, str]],
+        topics: Mapping[str, PublishedTopic],
+        sensors: tuple[str, ...] = (),
+        latched: tuple[str, ...] = (),
+        namespace: str = '',
+        module: str = '',
+        write: Callable[[str, int, bytes], None],
+    ) -> None:
+        self.name = name
+        self.full_name = f'{namespace}/{name}'.strip('/')
+        self._namespace, self._module = namespace, module or f'hmt_ros.nodes.{name}'
+        self._player, self._topics, self._write = player, topics, write
+        self._arrived: dict[str, deque[bytes]] = {topic: deque() for topic in topics}
+        self._answers: deque[bytes] = deque()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._open_topics(inputs, latched)
+        opened.callback(self.stop)
+        self._process = self._start(parameters, sensors)
+
+    def publish(self, source: str, message: Any) -> None:
+        """Hands a message over."""
+        self.publish_bytes(source, serialise(message))
+
+    def publish_bytes(self, source: str, data: bytes) -> None:
+        """Hands over what may be a message."""
+        self._publishers[source].publish(data)
+
+    @property
+    def has_answered(self) -> bool:
+        """Whether `answer` would not wait for an answer."""
+        return bool(self._answers)
+
+    def answer(self, source: str, seconds: float | None = None) -> Handled:
+        """Waits for what became of the next message, and writes what it led to.
+
+        Args:
+            source: of the message.
+            seconds: that it may take; None: `MESSAGE_SECONDS`.
+
+        Raises:
+            LiveNodeError: the node has ended, or does not answer.
+        """
+        patience = MESSAGE_SECONDS if seconds is None else seconds
+        handled = self._handled(self._next(self._answers, patience, f'an answer to a {source}'))
+        for topic, stamp in handled.published:
+            data = self._next(self._arrived[topic], START_SECONDS, f'{topic} of {stamp} ns')
+            # On its way a message may get bytes behind its end, up to a multiple of four.
+            self._write(topic, stamp, canonical(data, self._topics[topic].msgtype))
+        return handled
+
+    def deactivate(self) -> None:
+        """Has the node come to the end of what it does.
+
+        Raises:
+            LiveNodeError: it does not.
+        """
+        from lifecycle_msgs.msg import Transition
+        from lifecycle_msgs.srv import ChangeState
+
+        transition = Transition(id=Transition.TRANSITION_DEACTIVATE)
+        if not self.call(ChangeState, 'change_state', transition=transition).success:
+            raise LiveNodeError(f'the {self.title} can not be deactivated: {self._last_words()}')
+
+    def call(self, kind: Any, service: str, **fields: Any) -> Any:
+        """The answer of one of its services, 'change_state' for example.
+
+        Raises:
+            LiveNodeError: none comes.
+        """
+        client = self._player.node.create_client(kind, f'/{self.full_name}/{service}')
+        try:
+            self._wait(client.service_is_ready, START_SECONDS, f'its service {service}')
+            future = client.call_async(kind.Request(**fields))
+            self._wait(future.done, MESSAGE_SECONDS, f'an answer of {service}')
+            return future.result()
+        finally:
+            self._player.node.destroy_client(client)
+
+    @property
+    def process(self) -> subprocess.Popen[bytes]:
+        """In which it runs."""
+        assert self._process is not None
+        return self._process
+
+    def output(self) -> str:
+        """All that it has written to its console."""
+        return self._output.read_text('utf-8', 'replace')
+
+    @property
+    def title(self) -> str:
+        """What one calls it."""
+        return self.name.replace('_', ' ')
+
+    def wait_until_active(self) -> None:
+        """Returns when the node is active and both sides know all topics of each other.
+
+        Raises:
+            LiveNodeError: it does not get active.
+        """
+        self._wait(self._state.service_is_ready, START_SECONDS, 'the node')
+        label = ''
+        end = time.monotonic() + START_SECONDS
+        while label != 'active':
+            if time.monotonic() > end:
+                raise LiveNodeError(f'the {self.title} is {label}: {self._last_words()}')
+            future = self._state.call_async(self._state_request)
+            self._wait(future.done, START_SECONDS, 'the state of the node')
+            label = future.result().current_state.label
+        publishers = self._publishers.values()
+        self._wait(
+            lambda: all(publisher.get_subscription_count() for publisher in publishers),
+            START_SECONDS,
+            'the subscriptions of the node',
+        )
+
+    def wait_until_heard(self, sources: tuple[str, ...], count: int) -> None:
+        """Returns when so many nodes, this one among them, hear what is published for it.
+
+        Raises:
+            LiveNodeError: they do not.
+        """
+        publishers = [self._publishers[source] for source in sources]
+        self._wait(
+            lambda: all(one.get_subscription_count() >= count for one in publishers),
+            START_SECONDS,
+            f'who hears {", ".join(sources)}',
+        )
+
+    def wait_for_subscribers(self, topics: tuple[str, ...], count: int) -> None:
+        """Returns when so many others, this player among them, are connected to topics of the node.
+
+        The graph does not tell: who is known to it may not have met the publisher yet. The node
+        itself does, in its diagnostics.
+
+        Raises:
+            LiveNodeError: they are not.
+        """
+
+        def connected() -> bool:
+            values = self._player.diagnostics.get(self.full_name, {})
+            return all(int(values.get(f'{SUBSCRIBERS}{x}', '0')) >= count for x in topics)
+
+        self._wait(
+            connected,
+            START_SECONDS,
+            f'who listens to {", ".join(topics)}',
+        )
+
+    def stop(self) -> int | None:
+        """Ends the node as the interrupt key would; its exit code."""
+        process = self._process
+        if process is None:
+            return None
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        try:
+            return process.wait(STOP_SECONDS)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            return process.wait()
+
+    def stop_well(self) -> None:
+        """Ends the node.
+
+        Raises:
+            LiveNodeError: it does not end as it should.
+        """
+        code = self.stop()
+        if code != 0:
+            raise LiveNodeError(f'the {self.title} ended with code {code}: {self._last_words()}')
+
+    def _start(self, parameters: Any, sensors: tuple[str, ...]) -> subprocess.Popen[bytes]:
+        values = {name: yaml_scalar(value) for name, value in values_of(parameters).items()}
+        # The last line that it says is to be the one that matters.
+        values['status_interval'] = '0'
+        for topic in sensors:
+            values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
+        lines = [f'    {name}: {text}' for name, text in values.items()]
+        file = self._player.folder / f'{self._file_name}.yaml'
+        file.write_text('\n'.join(['/**:', '  ros__parameters:', *lines, '']), encoding='utf-8')
+        sources = str(Path(hmt_ros.__file__).resolve().parents[1])
+        command = [sys.executable, '-m', self._module, '--ros-args', '--params-file', str(file)]
+        if self._namespace:
+            command += ['-r', f'__ns:={self._namespace}']
+        with self._output.open('wb') as output:
+            return subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env={
+                    **os.environ,
+                    **environment(self._player.domain),
+                    'PYTHONPATH': os.pathsep.join(
+                        [sources, *filter(None, [os.environ.get('PYTHONPATH')])]
+                    ),
+                    'ROS_LOG_DIR': str(self._player.folder),
+                    # As `hmt_ros.nodes.run_node.OWNER`: a killed replay leaves no nodes.
+                    'HMT_ROS_OWNER': str(os.getpid()),
+                },
+                # The interrupt key is for this process; it stops the node itself.
+                start_new_session=True,
+            )
+
+    @property
+    def _output(self) -> Path:
+        return self._player.folder / f'{self._file_name}.output'
+
+    @property
+    def _file_name(self) -> str:
+        return self.full_name.replace('/', '.')
+
+    def _topic(self, name: str) -> str:
+        return name if name.startswith('/') else f'{self._namespace}/{name}'
+
+    def _open_topics(self, inputs: Mapping[str, tuple[str, str]], latched: tuple[str, ...]) -> None:
+        from lifecycle_msgs.srv import GetState
+
+        player, node = self._player, self._player.node
+        self._publishers = {
+            source: node.create_publisher(
+                player.classes[msgtype],
+                self._topic(topic),
+                player.latched if source in latched else player.reliable,
+            )
+            for source, (topic, msgtype) in inputs.items()
+        }
+        for topic, published in self._topics.items():
+            node.create_subscription(
+                player.classes[published.msgtype],
+                self._topic(topic),
+                _into(self._arrived[topic]),
+                player.latched if published.latched else player.reliable,
+                raw=True,
+            )
+        node.create_subscription(
+            player.classes['diagnostic_msgs/msg/DiagnosticStatus'],
+            f'/{self.full_name}/handled',
+            _into(self._answers),
+            player.reliable,
+            raw=True,
+        )
+        # The last of all: discovery tells the node of the topics above before it tells of this.
+        self._state = node.create_client(GetState, f'/{self.full_name}/get_state')
+        self._state_request = GetState.Request()
+
+    def _next(self, queue: deque[bytes], seconds: float, what: str) -> bytes:
+        self._wait(lambda: bool(queue), seconds, what)
+        return queue.popleft()
+
+    def _wait(self, done: Callable[[], bool], seconds: float, what: str) -> None:
+        end = time.monotonic() + seconds
+        while not done():
+            self._player.executor.spin_once(timeout_sec=0.1)
+            assert self._process is not None
+            code = self._process.poll()
+            if code is not None and not done():
+                raise LiveNodeError(
+                    f'the {self.title} ended with code {code}: {self._last_words()}'
+                )
+            if time.monotonic() > end:
+                raise LiveNodeError(
+                    f'the {self.title} is silent: waited {seconds:.0f} s for {what}; '
+                    f'{self._last_words()}'
+                )
+
+    def _last_words(self) -> str:
+        """The last line that the node has written."""
+        lines = [line.strip() for line in self.output().splitlines() if line.strip()]
+        return lines[-1] if lines else 'it has said nothing'
+
+    def _handled(self, data: bytes) -> Handled:
+        """What a message on ~/handled says."""
+        message = deserialise(data, 'diagnostic_msgs/msg/DiagnosticStatus')
+        pairs = [(str(value.key), str(value.value)) for value in message.values]
+        return Handled(
+            source=str(message.name),
+            stamp_ns=int(dict(pairs)['stamp']),
+            faults=tuple(text for key, text in pairs if key == 'fault'),
+            warnings=tuple(text for key, text in pairs if key == 'warning'),
+            published=tuple((key, int(text)) for key, text in pairs if key in self._topics),
+        )
+
+
+def _into(queue: deque[bytes]) -> Callable[[bytes], None]:
+    """A callback; rclpy wants one whose signature it can read."""
+
+    def receive(data: bytes) -> None:
+        queue.append(data)
+
+    return receive

@@ -1,0 +1,1 @@
+"""The command `report`: figures and one HTML page of what a bag carries."""

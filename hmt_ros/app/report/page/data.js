@@ -1,0 +1,119 @@
+'use strict';
+
+// The data of the page, as arrays: what stands in it is told by hmt_ros.app.report.page.
+
+const report = JSON.parse(document.getElementById('data').textContent);
+
+/** Whole numbers of 16 bits, as they were written. */
+function integers(text) {
+  const binary = atob(text);
+  const bytes = new Uint8Array(binary.length);
+  for (let i = 0; i < binary.length; i += 1) bytes[i] = binary.charCodeAt(i);
+  const view = new DataView(bytes.buffer);
+  const result = new Int16Array(bytes.length / 2);
+  for (let i = 0; i < result.length; i += 1) result[i] = view.getInt16(2 * i, true);
+  return result;
+}
+
+/** Positions in metres: x to the right, y up, z towards the camera. */
+function metres(text) {
+  const raw = integers(text);
+  const result = new Float32Array(raw.length);
+  for (let i = 0; i < raw.length; i += 1) {
+    const axis = i % 3;
+    const value = report.origin[axis] + report.step * raw[i];
+    result[i] = axis === 0 ? value : -value;
+  }
+  return result;
+}
+
+const NOWHERE = -32768;
+
+/** Pixels as shares of the width of the image; NaN where a point can not be seen. */
+function shares(text) {
+  if (text === null) return null;
+  return Float32Array.from(integers(text), (x) => (x === NOWHERE ? NaN : x * report.pixel));
+}
+
+const TIMES = report.times;
+const LAST = TIMES.length - 1;
+
+const KINDS = ['posterior', 'smoothed', 'likelihood', 'prediction'];
+
+/** Layers with the number of the first mode of each time. */
+const layers = report.layers.map((layer) => {
+  const starts = [0];
+  layer.weights.forEach((weights) => starts.push(starts[starts.length - 1] + weights.length));
+  return {
+    ...layer,
+    starts,
+    style: KINDS.includes(layer.kind) ? layer.kind : 'prediction',
+    positions: metres(layer.positions),
+    pixels: shares(layer.pixels),
+  };
+});
+
+const truth = report.truth && (() => {
+  const starts = [];
+  let count = 0;
+  report.truth.known.forEach((known) => {
+    starts.push(known ? count : -1);
+    count += known ? 1 : 0;
+  });
+  return {
+    ...report.truth, starts, positions: metres(report.truth.positions), pixels: shares(report.truth.pixels),
+  };
+})();
+
+const trajectories = report.trajectories.map((topic) => ({
+  ...topic,
+  windows: topic.windows.map((window) => ({
+    ...window, ways: window.ways === null ? null : metres(window.ways),
+  })),
+}));
+
+/** For each time the window that ended then, else the newest that holds it, else null. */
+trajectories.forEach((topic) => {
+  topic.at = TIMES.map((time) => {
+    const own = topic.windows.filter((window) => (
+      window.times[0] <= time + 1e-6 && window.times[window.times.length - 1] >= time - 1e-6
+    ));
+    const ending = own.find((window) => Math.abs(window.times[window.times.length - 1] - time) < 1e-6);
+    return ending || own[own.length - 1] || null;
+  });
+});
+
+/** The time nearest to a number of seconds, as an index. */
+function nearest(seconds) {
+  let best = 0;
+  for (let i = 1; i <= LAST; i += 1) {
+    if (Math.abs(TIMES[i] - seconds) < Math.abs(TIMES[best] - seconds)) best = i;
+  }
+  return best;
+}
+
+/** A colour of the style sheet; those of the dark style where it is in use. */
+const colours = new Map();
+function colour(name) {
+  if (!colours.has(name)) {
+    colours.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
+  }
+  return colours.get(name);
+}
+
+/** A canvas that fits its place and the screen's pixels; its context, width and height in CSS px. */
+function prepared(canvas) {
+  const ratio = Math.min(window.devicePixelRatio || 1, 3);
+  const width = Math.max(canvas.clientWidth, 1);
+  const height = Math.max(canvas.clientHeight, 1);
+  const columns = Math.round(width * ratio);
+  const rows = Math.round(height * ratio);
+  if (canvas.width !== columns || canvas.height !== rows) {
+    canvas.width = columns;
+    canvas.height = rows;
+  }
+  const context = canvas.getContext('2d');
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  return { context, width, height };
+}

@@ -1,0 +1,1 @@
+"""Scores of mixtures and trajectories against ground truth."""

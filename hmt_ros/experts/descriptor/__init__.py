@@ -1,0 +1,1 @@
+"""Silhouettes as vectors: contour, shape contexts, edge pairs (BME 3)."""

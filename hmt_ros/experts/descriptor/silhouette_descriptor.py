@@ -1,0 +1,310 @@
+"""What a silhouette looks like, as a vector that a pose is predicted from (BME 3).
+
+Four views of the same outline, brought to one size first:
+
+- the histogram of shape contexts over a codebook: which local shapes occur, wherever they are;
+- pairs of edges across the inside: how thick and how bent limbs are;
+- a map of the signed distance to the outline: where the limbs are;
+- moments and proportions of the whole.
+
+All of them are unchanged by the place and the size of the person in the image; the pairs of edges
+alone are unchanged by rotation as well, because a camera stands upright and up means something. A
+silhouette and its mirror image have different descriptors. The parts are weighed against each other
+and projected on the directions in which the training silhouettes differ most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmt_ros.experts.descriptor.contour import PersonBlob, person_blob, sample_contour
+from hmt_ros.experts.descriptor.edge_pairs import edge_pairs
+from hmt_ros.experts.descriptor.shape_context import ShapeContextCodebook, shape_contexts
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+Array = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+SIZE = 128  # px; longer side of the person before anything is measured
+MAP = 16  # cells of a side of the map of distances
+EXTENT = 4.4  # width of the map in radii of gyration: arms and legs stretched out are inside
+DEEPEST, FURTHEST = 0.25, 0.60  # limits of the distances inside and outside, radii of gyration
+FOR_CODEBOOK = 20_000  # shape contexts that are clustered at most
+# Share of each part in the distance between two silhouettes.
+WEIGHTS = {'shape_contexts': 1.0, 'edge_pairs': 0.5, 'distances': 1.0, 'moments': 0.5}
+# Components are divided by their deviation to this power: 0 keeps the metric of the parts, 1 would
+# make noise as important as everything else.
+WHITENING = 0.3
+
+
+@dataclass(frozen=True)
+class PlaceAndSize:
+    """Where a person is in an image, and how large: what a descriptor does not tell.
+
+    Attributes:
+        box: left, top, right and bottom edge of the silhouette, px.
+        centre: centroid of the silhouette, px.
+        area: px^2.
+        cut: whether the border of the image cuts the person at the left, top, right, bottom; the
+            edge of the box is not that of the person there.
+        remarks: what a user should know: blobs left out, sides that are cut.
+    """
+
+    box: tuple[float, float, float, float]
+    centre: tuple[float, float]
+    area: float
+    cut: tuple[bool, bool, bool, bool]
+    remarks: tuple[str, ...] = ()
+
+
+def place_and_size(blob: PersonBlob) -> PlaceAndSize:
+    """Place and size of the person in a mask."""
+    moments = cv2.moments(blob.mask, binaryImage=True)
+    area = moments['m00']
+    centre = (moments['m10'] / area + blob.left, moments['m01'] / area + blob.top)
+    return PlaceAndSize(blob.box, centre, area, blob.cut, blob.remarks)
+
+
+@dataclass(frozen=True, eq=False)
+class SilhouetteParts:
+    """The views of one silhouette before they are weighed.
+
+    Attributes:
+        contexts: (n, 60) shape contexts of the points of the outline.
+        edge_pairs: (48,) histogram.
+        distances: (MAP * MAP,) signed distances to the outline, positive inside, radii of gyration.
+        moments: (12,) second and third moments, proportions.
+    """
+
+    contexts: Array
+    edge_pairs: Array
+    distances: Array
+    moments: Array
+
+
+def silhouette_parts(mask: ArrayLike, points: int = 100) -> SilhouetteParts:
+    """The views of the person in a mask (H, W), with so many points on the outline.
+
+    Raises:
+        NoSilhouetteError: nobody is seen.
+    """
+    person = _at_one_size(person_blob(mask).mask)
+    outline, directions = sample_contour(person, points)
+    distances, moments = _map_and_moments(person)
+    return SilhouetteParts(
+        shape_contexts(outline), edge_pairs(outline, directions, person), distances, moments
+    )
+
+
+class SilhouetteDescriptor:
+    """Vectors of silhouettes; learns its codebook and its components from masks.
+
+    Args:
+        codebook_size: centres that shape contexts vote for.
+        points: on the outline.
+        components: of the vector, at most; fewer than the silhouettes it learns from.
+        seed: of the codebook.
+
+    Attributes:
+        codebook_: of shape contexts.
+        centre_: (q,) mean of the weighed parts.
+        scale_: (q,) by which the parts are weighed.
+        basis_: (q, p) directions, scaled.
+    """
+
+    def __init__(
+        self, codebook_size: int = 50, points: int = 100, components: int = 64, seed: int = 0
+    ) -> None:
+        self.codebook_size = codebook_size
+        self.points = points
+        self.components = components
+        self.seed = seed
+
+    def fit(self, masks: Iterable[ArrayLike]) -> Self:
+        """Learns from masks (H, W), in which everybody sees one person.
+
+        Raises:
+            ValueError: too few masks, or one in which nobody is seen.
+        """
+        return self.fit_parts([silhouette_parts(mask, self.points) for mask in masks])
+
+    def fit_parts(self, parts: list[SilhouetteParts]) -> Self:
+        """Learns from the views of silhouettes; see `fit`."""
+        if len(parts) < 2:
+            raise ValueError(f'a descriptor needs 2 silhouettes at least, saw {len(parts)}')
+        step = max(len(parts) * self.points // FOR_CODEBOOK, 1)
+        rng = np.random.default_rng(self.seed)
+        chosen = rng.permutation(len(parts) * self.points)[: FOR_CODEBOOK * step : step]
+        contexts = np.concatenate([part.contexts for part in parts])[np.sort(chosen)]
+        self.codebook_ = ShapeContextCodebook.of(contexts, self.codebook_size, self.seed)
+        rows = [self._features(part) for part in parts]
+        names = list(rows[0])
+        columns = {name: np.array([row[name] for row in rows]) for name in names}
+        self.scale_ = np.concatenate(
+            [
+                np.full(columns[name].shape[1], WEIGHTS[name] / _spread(columns[name]))
+                if name != 'moments'
+                else WEIGHTS[name]
+                / np.sqrt(columns[name].shape[1])
+                / np.maximum(columns[name].std(0), 1e-6)
+                for name in names
+            ]
+        )
+        features = np.concatenate([columns[name] for name in names], axis=1) * self.scale_
+        self.centre_ = features.mean(0)
+        _, deviations, directions = np.linalg.svd(features - self.centre_, full_matrices=False)
+        count = min(self.components, int((deviations > 1e-6 * deviations[0]).sum()))
+        # The sign of a direction is arbitrary: make its largest entry positive.
+        signs = np.sign(directions[np.arange(count), np.abs(directions[:count]).argmax(1)])
+        stretch = (deviations[:count] / deviations[0]) ** -WHITENING
+        self.basis_ = directions[:count].T * (signs * stretch)
+        return self
+
+    def with_components(self, count: int) -> SilhouetteDescriptor:
+        """The same with the first components alone, those in which silhouettes differ most.
+
+        Raises:
+            ValueError: not between 1 and as many as there are.
+        """
+        if not 1 <= count <= self.size:
+            raise ValueError(f'{count} components of a descriptor that has {self.size}')
+        result = SilhouetteDescriptor(self.codebook_size, self.points, count, self.seed)
+        result.codebook_, result.centre_, result.scale_ = self.codebook_, self.centre_, self.scale_
+        result.basis_ = self.basis_[:, :count]
+        return result
+
+    @property
+    def size(self) -> int:
+        """Length of the vector, p."""
+        return int(self.basis_.shape[1])
+
+    def describe(self, mask: ArrayLike) -> Array:
+        """The vector (p,) of the person in a mask (H, W).
+
+        Raises:
+            NoSilhouetteError: nobody is seen.
+        """
+        result: Array = self.describe_parts([silhouette_parts(mask, self.points)])[0]
+        return result
+
+    def describe_parts(self, parts: Iterable[SilhouetteParts]) -> Array:
+        """The vectors (n, p) of silhouettes whose views are known."""
+        features = np.array([np.concatenate(list(self._features(x).values())) for x in parts])
+        result: Array = (features * self.scale_ - self.centre_) @ self.basis_
+        return result
+
+    def context_histogram(self, parts: SilhouetteParts) -> Array:
+        """Votes (C,) of the shape contexts of a silhouette for the codebook."""
+        return self.codebook_.histogram(parts.contexts)
+
+    def _features(self, parts: SilhouetteParts) -> dict[str, Array]:
+        # Square roots of shares, as in the codebook.
+        return {
+            'shape_contexts': np.sqrt(self.codebook_.histogram(parts.contexts)),
+            'edge_pairs': np.sqrt(parts.edge_pairs),
+            'distances': parts.distances,
+            'moments': parts.moments,
+        }
+
+    def parameters(self) -> dict[str, Any]:
+        """The constructor's arguments."""
+        return {
+            'codebook_size': self.codebook_size,
+            'points': self.points,
+            'components': self.components,
+            'seed': self.seed,
+        }
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """What it has learned, in single precision, for a file."""
+        return {
+            'codebook': self.codebook_.centres.astype(np.float32),
+            'scale': self.scale_.astype(np.float32),
+            'centre': self.centre_.astype(np.float32),
+            'basis': self.basis_.astype(np.float32),
+        }
+
+    @classmethod
+    def from_arrays(
+        cls, parameters: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+    ) -> SilhouetteDescriptor:
+        """The descriptor that `parameters` and `to_arrays` gave.
+
+        Raises:
+            ValueError, KeyError, TypeError: arrays that are missing or do not fit.
+        """
+        result = cls(**parameters)
+        result.codebook_ = ShapeContextCodebook(np.asarray(arrays['codebook'], dtype=np.float64))
+        for name in ('scale', 'centre', 'basis'):
+            value = np.asarray(arrays[name], dtype=np.float64)
+            if not np.isfinite(value).all():
+                raise ValueError(f'{name} of the descriptor must be finite')
+            setattr(result, f'{name}_', value)
+        length = len(result.codebook_.centres) + _FIXED
+        shapes = (result.scale_.shape, result.centre_.shape, result.basis_.shape[:1])
+        if shapes != ((length,),) * 3 or result.basis_.ndim != 2:
+            raise ValueError(f'arrays of the descriptor have shapes {shapes}, wanted ({length},)')
+        return result
+
+
+_FIXED = 48 + MAP * MAP + 12  # features besides the codebook's
+
+
+def _spread(columns: Array) -> float:
+    return max(float(np.sqrt(columns.var(0).sum())), 1e-9)
+
+
+def _at_one_size(mask: Bytes) -> Bytes:
+    """The person with the longer side at SIZE pixels, by areas."""
+    factor = SIZE / max(mask.shape)
+    height, width = (max(round(side * factor), 3) for side in mask.shape)
+    how = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
+    resized = cv2.resize(mask * np.uint8(255), (width, height), interpolation=how)
+    result: Bytes = (resized > 127).astype(np.uint8)
+    return result
+
+
+def _map_and_moments(mask: Bytes) -> tuple[Array, Array]:
+    """Signed distances (MAP * MAP,) around the centroid, and moments (12,)."""
+    m = cv2.moments(mask, binaryImage=True)
+    area = m['m00']
+    x, y = m['m10'] / area, m['m01'] / area
+    radius = np.sqrt((m['mu20'] + m['mu02']) / area)
+    half = 0.5 * EXTENT * radius
+    # As much room around the person as the map and its furthest distance want.
+    height, width = mask.shape
+    left, top = (max(int(half - at) + 2, 2) for at in (x, y))
+    right, bottom = (max(int(at + half) - side + 3, 2) for at, side in ((x, width), (y, height)))
+    wide = cv2.copyMakeBorder(mask, top, bottom, left, right, cv2.BORDER_CONSTANT, value=0)
+    inside = cv2.distanceTransform(wide, cv2.DIST_L2, 3)
+    outside = cv2.distanceTransform(1 - wide, cv2.DIST_L2, 3)
+    distance = np.clip((inside - outside) / radius, -FURTHEST, DEEPEST)
+    scale = MAP / (2 * half)
+    to_map = np.array(
+        [
+            [scale, 0.0, 0.5 * MAP - 0.5 - scale * (x + left)],
+            [0.0, scale, 0.5 * MAP - 0.5 - scale * (y + top)],
+        ]
+    )
+    cells = cv2.warpAffine(
+        distance.astype(np.float32), to_map, (MAP, MAP), flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT, borderValue=-FURTHEST,
+    )  # fmt: skip
+    second = np.array([m['mu20'], m['mu02'], m['mu11']]) / (area * radius**2)
+    third = np.array([m['mu30'], m['mu21'], m['mu12'], m['mu03']]) / (area * radius**3)
+    proportions = [
+        0.25 * height / radius,
+        0.25 * width / radius,
+        (x - 0.5 * width) / radius,
+        (y - 0.5 * height) / radius,
+        0.5 * np.sqrt(area) / radius,
+    ]
+    return cells.ravel().astype(np.float64), np.concatenate([second, third, proportions])

@@ -1,0 +1,214 @@
+"""Forwards/backwards flips of limbs: interpretation trees, closed-form inverse kinematics (KJS 3).
+
+For a link from a known joint P, of length l, to a joint seen along the unit ray r, the joint is at
+
+    s r,    s = r.P +- sqrt((r.P)^2 - |P|^2 + l^2).
+
+All choices of sign along a chain are the leaves of its interpretation tree; a branching body takes
+the product of the trees of its chains. Every leaf has the image and the segment lengths of the
+given pose, which is itself the first leaf. Branches whose ray misses the sphere, that put a joint
+behind the camera, or that no joint angles within the limits reach, are pruned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.flips.chain_links import ChainLinks, chain_links
+from hmt_ros.flips.tree_growth import grow_leaves
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+def enumerate_flips(
+    body: Body, camera: Camera | None, poses: ArrayLike, chains: Sequence[str] | str
+) -> tuple[Array, Index]:
+    """All poses with the image of the given ones that flips of some chains reach.
+
+    Args:
+        body: whose `chains` have the names.
+        camera: that looks; flips live on its rays, whatever its lens, so it only has to stand at
+            the origin of the poses' frame. May be None.
+        poses: (N, d).
+        chains: one name or several; of several the product of their trees is taken.
+
+    Returns:
+        poses (M, d), ordered by the pose they come from, which stands first of its leaves, and the
+        index (M,) of that pose.
+
+    Raises:
+        KeyError: a chain that the body does not have.
+        ValueError: a chain whose joints have no closed form, or that contains another's segments.
+    """
+    del camera
+    names = [chains] if isinstance(chains, str) else list(chains)
+    skeleton = body.skeleton
+    q = np.array(poses, dtype=np.float64, ndmin=2, order='C')
+    frames = forward(skeleton, q)
+    links = [chain_links(skeleton, name) for name in names]
+    segments = [s for chain in links for s in chain.segments.tolist()]
+    if len(set(segments)) < len(segments):
+        raise ValueError(f'chains {names} share segments, their trees can not be multiplied')
+    trees = [_leaves(frames, q, chain) for chain in links]
+    mask = np.ones(len(q), dtype=np.bool_)
+    for _, valid in trees:
+        mask = mask[..., None] & valid.reshape(len(q), *(1,) * (mask.ndim - 1), valid.shape[1])
+    parents, *choices = np.nonzero(mask)
+    result = q[parents]
+    for chain, (angles, _), choice in zip(links, trees, choices, strict=True):
+        result[:, chain.dofs] = angles[parents, choice]
+    return result, parents
+
+
+def rehang_chain(
+    body: Body,
+    poses: ArrayLike,
+    new_poses: ArrayLike,
+    chain: str,
+    *,
+    image_of: str | None = None,
+    slack: float = 0.1,
+) -> tuple[Array, Index]:
+    """Poses whose chain hangs on another trunk and still has the image that it had.
+
+    When a trunk turns or flips, its limbs start elsewhere. Their joints are put back onto the rays
+    through their images, in all ways that lengths and limits allow. With `image_of` they are put
+    onto the image of another chain: a left leg onto the right one's.
+
+    Args:
+        body: the body.
+        poses: (N, d) that have the image.
+        new_poses: (N, d) with the other trunk.
+        chain: name.
+        image_of: name of the chain whose image is taken; the chain itself when None.
+        slack: a ray that misses its sphere by less than this touches it, m.
+
+    Returns:
+        poses (M, d), equal to the new ones outside the chain, and the index (M,) of each.
+
+    Raises:
+        KeyError, ValueError: as `enumerate_flips`.
+    """
+    skeleton = body.skeleton
+    links = chain_links(skeleton, chain)
+    new = np.array(new_poses, dtype=np.float64, ndmin=2, order='C')
+    seen = forward(skeleton, np.array(poses, dtype=np.float64, ndmin=2))
+    ends = links if image_of is None else chain_links(skeleton, image_of)
+    if len(ends.lengths) != len(links.lengths):
+        raise ValueError(f'chains {chain} and {image_of} differ in their number of segments')
+    return _hung(body, new, links, _ends(seen, ends), slack)
+
+
+def chain_points(body: Body, poses: ArrayLike, chain: str) -> Array:
+    """Where a chain of K links starts and where its links end, (N, K + 1, 3) m.
+
+    Raises:
+        KeyError, ValueError: as `enumerate_flips`.
+    """
+    links = chain_links(body.skeleton, chain)
+    frames = forward(body.skeleton, np.array(poses, dtype=np.float64, ndmin=2))
+    root = frames.origins[links.segments[:1]]
+    points: Array = np.concatenate([root, _ends(frames, links)]).transpose(2, 0, 1)
+    return points
+
+
+def place_chain(
+    body: Body, poses: ArrayLike, chain: str, points: ArrayLike, *, slack: float = 0.1
+) -> tuple[Array, Index]:
+    """Poses whose chain is seen where it is wanted, in all ways that lengths and limits allow.
+
+    Args:
+        body: the body.
+        poses: (N, d) whose trunk the chain hangs on.
+        chain: name, of K links.
+        points: (N, K, 3) on the rays through which the ends of the links are to be seen; the first
+            way is the one whose ends lie before or behind their parents as these do.
+        slack: a ray that misses its sphere by less than this touches it, m.
+
+    Returns:
+        poses (M, d), equal to the given ones outside the chain, and the index (M,) of each.
+
+    Raises:
+        KeyError, ValueError: as `enumerate_flips`, and points of another shape.
+    """
+    links = chain_links(body.skeleton, chain)
+    q = np.array(poses, dtype=np.float64, ndmin=2, order='C')
+    wanted = np.asarray(points, dtype=np.float64)
+    shape = (len(q), len(links.lengths), 3)
+    if wanted.shape != shape:
+        raise ValueError(f'chain {chain} wants points of shape {shape}, saw {wanted.shape}')
+    targets = np.ascontiguousarray(wanted.transpose(1, 2, 0))
+    return _hung(body, q, links, targets, slack)
+
+
+def flip_counts(body: Body, poses: ArrayLike, chain: str) -> Index:
+    """Number of leaves (N,) that the tree of one chain has at each pose."""
+    q = np.array(poses, dtype=np.float64, ndmin=2, order='C')
+    _, valid = _leaves(forward(body.skeleton, q), q, chain_links(body.skeleton, chain))
+    counts: Index = valid.sum(1)
+    return counts
+
+
+def _leaves(frames: Frames, poses: Array, chain: ChainLinks) -> tuple[Array, NDArray[np.bool_]]:
+    """Angles (N, leaves, chain dofs) and validity (N, leaves); leaf 0 is the given pose."""
+    angles, valid = _grown(frames, poses, chain, _ends(frames, chain), 0.0, given_stays=True)
+    valid[:, 0] = True
+    angles[:, 0] = poses[:, chain.dofs]
+    return angles, valid
+
+
+def _ends(frames: Frames, chain: ChainLinks) -> Array:
+    """Where the links of a chain end, (K, 3, N)."""
+    lengths = chain.lengths[:, None, None]
+    ends: Array = frames.origins[chain.segments] - lengths * frames.columns[chain.segments, 2]
+    return ends
+
+
+def _hung(
+    body: Body, poses: Array, links: ChainLinks, targets: Array, slack: float
+) -> tuple[Array, Index]:
+    """Poses (M, d) whose chain is seen at targets (K, 3, N), and the index (M,) of each."""
+    angles, valid = _grown(forward(body.skeleton, poses), poses, links, targets, slack)
+    parents, choice = np.nonzero(valid)
+    result = poses[parents]
+    result[:, links.dofs] = angles[parents, choice]
+    return result, parents
+
+
+def _grown(
+    frames: Frames,
+    poses: Array,
+    chain: ChainLinks,
+    targets: Array,
+    slack: float,
+    *,
+    given_stays: bool = False,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Leaves of the trees of one chain.
+
+    Args:
+        frames: where the chain starts.
+        poses: (N, d) of the frames; the angles nearest to theirs are taken.
+        chain: the links.
+        targets: (K, 3, N) points on the rays of the joints.
+        slack: a ray that misses its sphere by less touches it, m.
+        given_stays: the targets are joints of the given pose, which comes out first.
+
+    Returns:
+        angles (N, 2^K, D), undefined where there is no leaf, and where there is one (N, 2^K).
+    """
+    count = 2 ** len(chain.lengths)
+    angles = np.empty((len(poses), count, len(chain.dofs)))
+    valid = np.zeros((len(poses), count), dtype=np.bool_)
+    grow_leaves(
+        chain, frames.columns, frames.origins, poses, targets, float(slack), given_stays, angles,
+        valid,
+    )  # fmt: skip
+    return angles, valid

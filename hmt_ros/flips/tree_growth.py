@@ -1,0 +1,237 @@
+"""Growth of the interpretation trees of a chain, compiled (KJS 3).
+
+Joint angles follow from the joint positions by descending the chain, with v the segment's z axis
+seen from the frame before its rotations:
+
+    spherical, first two   v = (sin b, -sin a cos b, cos a cos b)
+    its third, and hinge   v = (sin c sin e, -cos c sin e, cos e)
+    end effector           as the first line
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from hmt_ros.flips.chain_links import TURN
+
+# Two solutions nearer than this are one: the ray touches the sphere, m.
+TOUCHING = 1e-6
+# Sine of an elbow or knee angle below which the segments count as straight: their twist is free.
+STRAIGHT = 1e-6
+LIMIT_TOLERANCE = 1e-9  # rad
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def grow_leaves(  # type: ignore[no-untyped-def]
+    chain, columns, origins, poses, targets, slack, given_stays, angles, valid
+):
+    """Fills angles and validity, pose by pose, depth first: dead branches have no leaves to visit.
+
+    The bits of a leaf's number, highest first, say which of the two solutions each link takes.
+
+    Args:
+        chain: its `ChainLinks`, K.
+        columns, origins: of the `Frames` of N poses.
+        poses: (N, d); the angles nearest to theirs are taken.
+        targets: (K, 3, N) points on the rays of the joints.
+        slack: a ray that misses its sphere by less touches it, m.
+        given_stays: the targets are joints of the given pose, which comes out first.
+        angles: (N, 2^K, D) becomes the angles of the leaves.
+        valid: (N, 2^K) becomes true where there is one.
+    """
+    count = len(chain.lengths)
+    leaves = 1 << count
+    rays, distances, signs = np.empty((count, 3)), np.empty(count), np.empty(count)
+    # Of the branch at hand: the joints, the frames that the links turn from, and the angles.
+    joints, frames = np.empty((count + 1, 3)), np.empty((count + 1, 3, 3))
+    given, found = np.empty(len(chain.dofs)), np.empty(len(chain.dofs))
+    for n in range(len(poses)):
+        for j in range(len(given)):
+            given[j] = poses[n, chain.dofs[j]]
+        for x in range(3):
+            joints[0, x] = origins[chain.segments[0], x, n]
+            for i in range(3):
+                frames[0, i, x] = columns[chain.parent, i, x, n]
+        p0, p1, p2 = joints[0, 0], joints[0, 1], joints[0, 2]
+        for k in range(count):
+            t0, t1, t2 = targets[k, 0, n], targets[k, 1, n], targets[k, 2, n]
+            distance = np.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+            r0, r1, r2 = t0 / distance, t1 / distance, t2 / distance
+            rays[k, 0], rays[k, 1], rays[k, 2], distances[k] = r0, r1, r2, distance
+            # The given pose takes the far solution where its joint lies beyond the foot of the
+            # parent.
+            signs[k] = 1.0 if distance >= r0 * p0 + r1 * p1 + r2 * p2 else -1.0
+            p0, p1, p2 = t0, t1, t2
+        leaf = k = 0
+        while leaf < leaves:
+            while k < count:
+                branch = leaf >> (count - 1 - k)
+                stays = given_stays and branch == 0
+                if not _put_joint(chain, k, branch, stays, rays, distances, signs, slack, joints):
+                    break
+                if not _bend_joint(chain, k, joints, given, frames, found):
+                    break
+                k += 1
+            if k == count:
+                valid[n, leaf] = True
+                for j in range(len(found)):
+                    angles[n, leaf, j] = found[j]
+                k -= 1
+            # On to the second solution of the last link that has not yet had it.
+            leaf = ((leaf >> (count - 1 - k)) + 1) << (count - 1 - k)
+            k = count - 1
+            while k > 0 and not (leaf >> (count - 1 - k)) & 1:
+                k -= 1
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def _put_joint(  # type: ignore[no-untyped-def]
+    chain, k, branch, stays, rays, distances, signs, slack, joints
+):
+    """Places the end of link k onto its ray; False where it can not be there."""
+    p0, p1, p2 = joints[k, 0], joints[k, 1], joints[k, 2]
+    r0, r1, r2, length = rays[k, 0], rays[k, 1], rays[k, 2], chain.lengths[k]
+    if stays:
+        # The given pose itself stays, however the rounding of its discriminant turns out.
+        s = distances[k]
+    else:
+        along = p0 * r0 + p1 * r1 + p2 * r2
+        discriminant = along * along - (p0 * p0 + p1 * p1 + p2 * p2) + length * length
+        if not discriminant >= length * length - (length + slack) * (length + slack):
+            return False
+        root = np.sqrt(max(discriminant, 0.0))
+        s = along + signs[k] * root
+        if branch & 1:
+            if root <= 0.5 * TOUCHING:
+                return False
+            s = along - signs[k] * root
+        if not s > 0.0:
+            return False
+    x0, x1, x2 = s * r0, s * r1, s * r2
+    if slack > 0.0:
+        # A joint put on the nearest point of a ray that misses keeps the length of its link.
+        a0, a1, a2 = x0 - p0, x1 - p1, x2 - p2
+        scale = length / max(np.sqrt(a0 * a0 + a1 * a1 + a2 * a2), 1e-9)
+        x0, x1, x2 = p0 + scale * a0, p1 + scale * a1, p2 + scale * a2
+    joints[k + 1, 0], joints[k + 1, 1], joints[k + 1, 2] = x0, x1, x2
+    return True
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def _bend_joint(chain, k, joints, given, frames, found):  # type: ignore[no-untyped-def]
+    """Angles that point link k at its joint, and the frame beyond; False where no limits allow."""
+    at = chain.first_dofs[k]
+    dofs = chain.first_dofs[k + 1] - at
+    inner = k + 1 < len(chain.lengths)
+    length = chain.lengths[k]
+    z0 = (joints[k, 0] - joints[k + 1, 0]) / length
+    z1 = (joints[k, 1] - joints[k + 1, 1]) / length
+    z2 = (joints[k, 2] - joints[k + 1, 2]) / length
+    # The frame beyond the mount is built where the next link looks for its own.
+    if chain.mounted[k]:
+        for i in range(3):
+            for x in range(3):
+                total = 0.0
+                for j in range(3):
+                    total += frames[k, j, x] * chain.mounts[k, j, i]
+                frames[k + 1, i, x] = total
+    else:
+        for i in range(3):
+            for x in range(3):
+                frames[k + 1, i, x] = frames[k, i, x]
+    frame = k + 1
+    v0 = frames[frame, 0, 0] * z0 + frames[frame, 0, 1] * z1 + frames[frame, 0, 2] * z2
+    v1 = frames[frame, 1, 0] * z0 + frames[frame, 1, 1] * z1 + frames[frame, 1, 2] * z2
+    v2 = frames[frame, 2, 0] * z0 + frames[frame, 2, 1] * z1 + frames[frame, 2, 2] * z2
+    if dofs == 1:
+        c, e, fits = _hinge(chain, k, v0, v1, v2, given)
+        # Until here the twist of the spherical joint was left out of the frame.
+        found[at - 1], found[at] = c, e
+        if inner and fits:
+            _turn(frames, frame, c, 2)
+            _turn(frames, frame, e, 0)
+        return fits
+    a, b, fits = _two_angles(chain, k, v0, v1, v2, given)
+    found[at], found[at + 1] = a, b
+    if inner and fits:
+        _turn(frames, frame, a, 0)
+        _turn(frames, frame, b, 1)
+    if dofs == 3:
+        found[at + 2] = given[at + 2]
+        if inner and fits and chain.first_dofs[k + 2] - chain.first_dofs[k + 1] != 1:
+            _turn(frames, frame, given[at + 2], 2)
+    return fits
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def _two_angles(chain, k, v0, v1, v2, given):  # type: ignore[no-untyped-def]
+    """a and b of v = (sin b, -sin a cos b, cos a cos b), within limits and nearest the given."""
+    i = chain.first_dofs[k]
+    j = i + 1
+    first = np.arcsin(min(max(v0, -1.0), 1.0))
+    free = np.sqrt(v1 * v1 + v2 * v2) < STRAIGHT
+    best_a, best_b, best_cost = given[i], given[j], np.inf
+    found = False
+    for solution in range(2):
+        if not chain.sides[k, solution]:
+            continue
+        side = 1.0 - 2.0 * solution
+        b = first if solution == 0 else np.pi - first
+        b, fits = _into_limits(b, chain.lower[j], chain.upper[j], given[j])
+        if not fits:
+            continue
+        # cos b = 0: the first angle has no effect on the segment; keep it.
+        a = given[i] if free else np.arctan2(-side * v1, side * v2)
+        a, fits = _into_limits(a, chain.lower[i], chain.upper[i], given[i])
+        cost = (a - given[i]) ** 2 + (b - given[j]) ** 2
+        if fits and cost < best_cost:
+            best_a, best_b, best_cost, found = a, b, cost, True
+    return best_a, best_b, found
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def _hinge(chain, k, w0, w1, w2, given):  # type: ignore[no-untyped-def]
+    """c and e of w = (sin c sin e, -cos c sin e, cos e), within limits and nearest the given."""
+    j = chain.first_dofs[k]
+    i = j - 1
+    bent = np.arccos(min(max(w2, -1.0), 1.0))
+    free = np.sqrt(w0 * w0 + w1 * w1) < STRAIGHT
+    best_c, best_e, best_cost = given[i], given[j], np.inf
+    found = False
+    for solution in range(2):
+        if not chain.sides[k, solution]:
+            continue
+        side = 1.0 - 2.0 * solution
+        e, fits = _into_limits(side * bent, chain.lower[j], chain.upper[j], given[j])
+        if not fits:
+            continue
+        c = given[i] if free else np.arctan2(side * w0, -side * w1)
+        c, fits = _into_limits(c, chain.lower[i], chain.upper[i], given[i])
+        cost = (c - given[i]) ** 2 + (e - given[j]) ** 2
+        if fits and cost < best_cost:
+            best_c, best_e, best_cost, found = c, e, cost, True
+    return best_c, best_e, found
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _into_limits(angle, lower, upper, given):  # type: ignore[no-untyped-def]
+    """The angle plus the multiple of 2 pi that fits the limits; if several, nearest the given."""
+    shifted = angle + TURN * np.rint((given - angle) / TURN)
+    if shifted < lower - LIMIT_TOLERANCE:
+        shifted += TURN
+    if shifted > upper + LIMIT_TOLERANCE:
+        shifted -= TURN
+    fits = lower - LIMIT_TOLERANCE <= shifted <= upper + LIMIT_TOLERANCE
+    return min(max(shifted, lower), upper), fits
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def _turn(frames, k, angle, axis):  # type: ignore[no-untyped-def]
+    """Turns frame k of (K, 3, 3) about one of its own axes."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    cos, sin = np.cos(angle), np.sin(angle)
+    for x in range(3):
+        a, b = frames[k, i, x], frames[k, j, x]
+        frames[k, i, x] = cos * a + sin * b
+        frames[k, j, x] = cos * b - sin * a

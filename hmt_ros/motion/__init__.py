@@ -1,0 +1,1 @@
+"""Motions: motion capture files, retargeting to our bodies, procedural motion, viewpoints."""

@@ -1,0 +1,191 @@
+"""Poses that follow joint positions, in closed form and frame by frame: the start of retargeting.
+
+The descending solution of KJS 3, from the trunk outwards: with v the direction against a segment,
+seen from its frame before its rotations,
+
+    v = (sin b, -sin a cos b, cos a cos b)
+
+gives the first two angles, whatever the lengths. The third, the twist, shows in what hangs on the
+segment; where that is straight, in the frames around. The result lies within the limits, and is
+exact for a body of the same lengths that can take the pose; for others it is near.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.motion.rig_names import ARM, LEG, SIDES
+
+Array = NDArray[np.float64]
+
+# How much a foot says about the twist of its leg, and the frames around about that of any limb,
+# against a hinge bent by a right angle; and the time that counts as around.
+FOOT = 0.3
+AROUND = 0.2
+AROUND_TIME = 0.2  # s, standard deviation
+REST = 1e-3  # in favour of no twist
+FLEXIBLE = 0.05  # weight of neck and shoulders for the root of a body whose trunk can bend
+
+
+def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float) -> Array:
+    """Poses (T, d) that follow joints by their standard names, (T, 3) each, camera frame, m.
+
+    Args:
+        skeleton: with the limbs of KJS fig. 3, such as those of the bodies that ship.
+        place: the joints; toes and hands may be missing.
+        fps: frames a second.
+
+    Raises:
+        ValueError: a skeleton with other limbs.
+    """
+    count = len(place['pelvis'])
+    poses = np.zeros((count, skeleton.dimension))
+    turns: dict[int, Array] = {}  # segment -> rotation (T, 3, 3) to the camera frame
+    aims = _aims(skeleton)
+    for s, parent in enumerate(skeleton.parents):
+        if parent < 0:
+            turns[s] = _set_root(skeleton, place, poses)
+            continue
+        turn = turns[parent] @ skeleton.mounts[s]
+        own = [i for i in skeleton.segment_dofs[s] if skeleton.dof_is_rotation[i]]
+        axes = [int(skeleton.dof_axes[i]) for i in own]
+        if s in aims and axes:
+            start, end, next_end = aims[s]
+            if axes not in ([0, 1, 2], [0, 1], [0]):
+                raise ValueError(
+                    f'{skeleton.name}: {skeleton.segment_names[s]} turns about {axes}, wanted Rx, '
+                    f'Rx Ry or Rx Ry Rz'
+                )
+            if start in place and end in place:
+                along = _local(turn, place[start] - place[end])
+                a = np.arctan2(-along[:, 1], along[:, 2])
+                poses[:, own[0]] = a
+                if len(axes) > 1:
+                    poses[:, own[1]] = np.arcsin(np.clip(along[:, 0], -1.0, 1.0))
+            turn = _turned(skeleton, own[:2], poses, turn)
+            if len(axes) == 3:
+                poses[:, own[2]] = _twist(skeleton, s, turn, place, next_end, fps)
+                turn = _turned(skeleton, own[2:], poses, turn)
+        turns[s] = turn
+    return _within(poses, skeleton)
+
+
+Aim = tuple[str, str, str]
+
+
+def _aims(skeleton: Skeleton) -> dict[int, Aim]:
+    """For segments that aim at a joint: the joints at its start, its end, the next one's end."""
+    result: dict[int, Aim] = {}
+    try:
+        head = skeleton.chains['neck'][0]
+        for side in SIDES:
+            for limb, joints in (('arm', ARM), ('leg', LEG)):
+                first, second, third = skeleton.chains[f'{side}_{limb}']
+                a, b, c, d = (f'{side}_{joint}' for joint in joints)
+                result |= {first: (a, b, c), second: (b, c, d), third: (c, d, '')}
+    except (KeyError, ValueError):
+        raise ValueError(
+            f'{skeleton.name} has chains {dict(skeleton.chains)}, wanted a neck and four limbs of '
+            f'three segments each'
+        ) from None
+    result[head] = ('neck', 'head', '')
+    trunk = skeleton.parents[head]
+    if skeleton.parents[trunk] >= 0:
+        result[trunk] = ('pelvis', 'neck', '')
+    return result
+
+
+def _set_root(skeleton: Skeleton, place: Mapping[str, Array], poses: Array) -> Array:
+    """Sets the root's degrees of freedom from the joints of the trunk; returns its rotation."""
+    rotations = [i for i in skeleton.segment_dofs[0] if skeleton.dof_is_rotation[i]]
+    shifts = skeleton.dof_index(('root_tx', 'root_ty', 'root_tz'))
+    if [int(skeleton.dof_axes[i]) for i in rotations] != [2, 1, 0]:
+        raise ValueError(f'{skeleton.name}: wanted a root that turns by Rz Ry Rx')
+    flexible = bool(skeleton.moves[skeleton.chains['neck'][0]].sum() > 8)  # root and neck have 8
+    names = ['pelvis', 'left_hip', 'right_hip', 'neck', 'left_shoulder', 'right_shoulder']
+    weights = np.array([1.0, 1.0, 1.0, *([FLEXIBLE if flexible else 1.0] * 3)])
+    at_rest = forward(skeleton, np.zeros((1, skeleton.dimension))).joints()[..., 0]
+    rest = at_rest[skeleton.joint_index(tuple(names))]
+    seen = np.stack([place[n] for n in names], axis=1)
+    turn = _aligned(rest, seen, weights)
+    poses[:, shifts] = place['pelvis']
+    rotation: Array = turn @ skeleton.mounts[0]
+    own = skeleton.mounts[0].T @ rotation
+    poses[:, rotations[0]] = np.unwrap(np.arctan2(own[:, 1, 0], own[:, 0, 0]))
+    poses[:, rotations[1]] = np.arcsin(np.clip(-own[:, 2, 0], -1.0, 1.0))
+    poses[:, rotations[2]] = np.arctan2(own[:, 2, 1], own[:, 2, 2])
+    return rotation
+
+
+def _aligned(rest: Array, seen: Array, weights: Array) -> Array:
+    """Rotations (T, 3, 3) that best take points (P, 3) to (T, P, 3) about their weighted means."""
+    w = weights / weights.sum()
+    a, b = rest - w @ rest, seen - np.einsum('p,tpi->ti', w, seen)[:, None]
+    u, _, vt = np.linalg.svd(np.einsum('tpi,p,pj->tij', b, w, a))
+    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
+    result: Array = u @ vt
+    return result
+
+
+def _twist(
+    skeleton: Skeleton, s: int, turn: Array, place: Mapping[str, Array], next_end: str, fps: float
+) -> Array:
+    """The third angle of a spherical joint, from what hangs on the segment.
+
+    The hinge of a limb says it as far as it is bent; a foot says it where the leg is straight;
+    where nothing does, the frames around. For the trunk it is the line of the shoulders.
+    """
+    if not next_end:
+        line = _local(turn, place['right_shoulder'] - place['left_shoulder'])
+        return np.unwrap(np.arctan2(line[:, 1], line[:, 0]))
+    side, _, joint = next_end.partition('_')
+    middle_joint = f'{side}_{"knee" if joint == "ankle" else "elbow"}'
+    hinge = next(i for i, t in enumerate(skeleton.dof_segments) if skeleton.parents[t] == s)
+    sense = np.sign(skeleton.lower[hinge] + skeleton.upper[hinge])
+    w = _local(turn, place[middle_joint] - place[next_end])
+    said = sense * np.stack([-w[:, 1], w[:, 0]], axis=1)
+    toe = f'{side}_toe'
+    if joint == 'ankle' and toe in place:
+        forward_of_foot = _local(turn, place[toe] - place[next_end])
+        said += FOOT * np.stack([forward_of_foot[:, 1], -forward_of_foot[:, 0]], axis=1)
+    around = gaussian_filter1d(said, AROUND_TIME * fps, axis=0, mode='nearest')
+    said = said + AROUND * around + [REST, 0.0]
+    twist: Array = np.arctan2(said[:, 1], said[:, 0])
+    return twist
+
+
+def _local(turn: Array, direction: Array) -> Array:
+    """Unit vectors (T, 3) of directions, seen in frames (T, 3, 3)."""
+    norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+    result: Array = np.einsum('tij,ti->tj', turn, direction / norm)
+    return result
+
+
+def _turned(skeleton: Skeleton, dofs: Sequence[int], poses: Array, turn: Array) -> Array:
+    for dof in dofs:
+        axis = int(skeleton.dof_axes[dof])
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        cos, sin = np.cos(poses[:, dof])[:, None], np.sin(poses[:, dof])[:, None]
+        new = turn.copy()
+        new[:, :, i] = cos * turn[:, :, i] + sin * turn[:, :, j]
+        new[:, :, j] = cos * turn[:, :, j] - sin * turn[:, :, i]
+        turn = new
+    return turn
+
+
+def _within(poses: Array, skeleton: Skeleton) -> Array:
+    """The poses with angles brought into the limits by whole turns, else to the nearer limit."""
+    poses = poses.copy()
+    lower, upper = skeleton.lower, skeleton.upper
+    for i in np.flatnonzero(skeleton.dof_is_rotation):
+        if skeleton.dof_names[i] != 'root_z':
+            middle = 0.5 * (lower[i] + upper[i])
+            poses[:, i] -= 2 * np.pi * np.round((poses[:, i] - middle) / (2 * np.pi))
+    result: Array = np.clip(poses, lower, upper)
+    return result

@@ -1,0 +1,1 @@
+"""Images of the body model: renderer, clothes and scene, for training sets and made bags."""

@@ -1,0 +1,371 @@
+"""Pictures of a body: image, silhouette, part labels and depth of its flesh at given poses.
+
+Triangles of the flesh's mesh are cut into spans of pixels and the spans meet in a depth buffer, all
+in numpy over whole arrays. A pixel belongs to a triangle when its centre lies inside; neighbouring
+triangles share no pixel and leave none out. Colours are taken at a finer raster and averaged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.flesh import Mesh
+from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.rendering.clothes import Clothes
+from hmt_ros.rendering.scene import Scene
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Picture = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+STACKS, SLICES = 13, 18  # of the mesh of a part: its outline is right to 2 % of its radius
+SUPERSAMPLING = 2
+SMALLEST_AREA = 1e-6  # px^2, of twice a triangle: a smaller one covers the centre of no pixel
+SHADOW_BLUR = 0.004  # standard deviation of the shadow's edge as a share of the image's width
+CHUNK = 16  # poses whose silhouettes are drawn together
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """A person in a scene.
+
+    Attributes:
+        image: (H, W, 3) uint8, BGR.
+        mask: (H, W) where the person is seen.
+        parts: (H, W) int8, index into `body.flesh.parts`; -1: background.
+        depth: (H, W) float32, z of the surface in the camera frame, m; inf: background.
+    """
+
+    image: NDArray[np.uint8]
+    mask: Mask
+    parts: NDArray[np.int8]
+    depth: Picture
+
+
+def render(body: Body, pose: ArrayLike, camera: Camera, scene: Scene, frame: int = 0) -> Rendered:
+    """Picture of a body at a pose (d,) in a scene.
+
+    Args:
+        body: with flesh.
+        pose: (d,).
+        camera: with its distortion; the scene's viewpoint says where it stands.
+        scene: place, light, clothes and noise.
+        frame: number of the picture; pictures of different numbers have different noise.
+
+    Raises:
+        ValueError: a body without flesh, or a pose of wrong shape.
+    """
+    return _renderer(body, camera, scene).render(pose, frame)
+
+
+def render_frames(body: Body, poses: ArrayLike, camera: Camera, scene: Scene) -> Iterator[Rendered]:
+    """Pictures of a body at poses (T, d), one after the other, numbered from 0."""
+    renderer = _renderer(body, camera, scene)
+    for frame, pose in enumerate(np.asarray(poses, dtype=np.float64)):
+        yield renderer.render(pose, frame)
+
+
+def render_silhouettes(body: Body, poses: ArrayLike, camera: Camera) -> Mask:
+    """Silhouettes (N, H, W) of a body at poses (N, d): the masks that `render` gives, and no more.
+
+    Raises:
+        ValueError: a body without flesh, or poses of wrong shape.
+    """
+    poses = np.asarray(poses, dtype=np.float64)
+    mesh = _mesh(body)
+    result = np.zeros((len(poses), camera.height, camera.width), dtype=bool)
+    for start in range(0, len(poses), CHUNK):
+        points = _vertices(mesh, forward(body.skeleton, poses[start : start + CHUNK]))
+        pixels = _fill(_project(mesh, points, camera), camera.height, camera.width).pixels
+        result[start : start + CHUNK].reshape(-1)[pixels] = True
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Renderer:
+    """What pictures of the same body, camera and scene share.
+
+    Attributes:
+        body, camera, scene: of the pictures.
+        mesh: of the flesh.
+        places: (V, 4) of the vertices, for the clothes.
+        clothes: of the person.
+    """
+
+    body: Body
+    camera: Camera
+    scene: Scene
+    mesh: Mesh
+    places: Array
+    clothes: Clothes
+
+    @classmethod
+    def of(cls, body: Body, camera: Camera, scene: Scene) -> Renderer:
+        """The renderer of a body in a scene."""
+        mesh = _mesh(body)
+        clothes = Clothes.of_seed(body, scene.seed)
+        return cls(body, camera, scene, mesh, clothes.places(mesh.segments, mesh.vertices), clothes)
+
+    def render(self, pose: ArrayLike, frame: int = 0) -> Rendered:
+        """Picture number `frame`, of a pose (d,)."""
+        camera, scene = self.camera, self.scene
+        shape = (camera.height, camera.width)
+        frames = forward(self.body.skeleton, np.asarray(pose, dtype=np.float64)[None])
+        points = _vertices(self.mesh, frames)
+        triangles = _project(self.mesh, points, camera)
+        image = scene.background(camera).copy()
+        if scene.shadow > 0:
+            self._darken(image, points)
+        front = _front(triangles, _fill(triangles, *shape), shape)
+        parts = np.full(shape, -1, dtype=np.int8)
+        parts.reshape(-1)[front.pixels] = self.mesh.parts[triangles.corners[0, front.triangles]]
+        depth = np.full(shape, np.inf, dtype=np.float32)
+        depth.reshape(-1)[front.pixels] = 1.0 / front.inverse_depth
+        if len(front.pixels):
+            self._draw(image, triangles, frames)
+        return Rendered(scene.add_noise(image, frame), parts >= 0, parts, depth)
+
+    def _draw(self, image: Picture, triangles: _Triangles, frames: Frames) -> None:
+        """The person into the image."""
+        k = SUPERSAMPLING
+        height, width = image.shape[:2]
+        left, right = _extent(triangles.u, width)
+        top, bottom = _extent(triangles.v, height)
+        fine = triangles.magnified(k, left, top)
+        shape = (k * (bottom - top), k * (right - left))
+        front = _front(fine, _fill(fine, *shape), shape)
+        normals = frames.directions(self.mesh.segments, self.mesh.normals)[:, :, 0]
+        values = np.concatenate([self.places, normals], axis=1).astype(np.float32)
+        surface = fine.interpolated(values, front)
+        normal = surface[:, 4:]
+        cosine = normal @ self.scene.light_direction.astype(np.float32)
+        cosine /= np.sqrt(np.einsum('mx,mx->m', normal, normal))
+        parts = self.mesh.parts[fine.corners[0, front.triangles]]
+        layer = np.zeros((shape[0] * shape[1], 4), dtype=np.float32)
+        colour = self.clothes.colours(parts, surface[:, :4])
+        colour *= (255.0 * self.scene.lambert(cosine))[:, None]
+        layer[front.pixels, :3] = np.minimum(colour, 255.0)
+        layer[front.pixels, 3] = 1.0
+        size = (right - left, bottom - top)
+        seen = cv2.resize(layer.reshape(*shape, 4), size, interpolation=cv2.INTER_AREA)
+        window = image[top:bottom, left:right]
+        window *= 1.0 - seen[:, :, 3:]
+        window += seen[:, :, :3]
+
+    def _darken(self, image: Picture, points: Array) -> None:
+        """The shadow of the person's vertices (V, 3, 1) into the image."""
+        camera, scene = self.camera, self.scene
+        fallen = scene.shadow_points(points[:, :, 0])[:, :, None]
+        triangles = _project(self.mesh, fallen, camera)
+        dark = np.zeros((camera.height, camera.width), dtype=np.float32)
+        dark.reshape(-1)[_fill(triangles, camera.height, camera.width).pixels] = 1.0
+        if not dark.any():
+            return
+        sigma = max(SHADOW_BLUR * camera.width, 0.5)
+        margin = int(3 * sigma) + 1
+        left, right = _extent(triangles.u, camera.width, margin)
+        top, bottom = _extent(triangles.v, camera.height, margin)
+        soft = cv2.GaussianBlur(dark[top:bottom, left:right], (0, 0), sigma)
+        cosine = scene.light[2] / float(np.linalg.norm(scene.light))
+        lit, shaded = scene.lambert(np.array([1.0, 1.0 - scene.shadow]) * cosine)
+        soft *= (1.0 - shaded / lit) * scene.floor(camera)[top:bottom, left:right]
+        image[top:bottom, left:right] *= 1.0 - soft[:, :, None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Triangles:
+    """F triangles that face the camera.
+
+    Attributes:
+        images: (F,) index of the image.
+        corners: (3, F) vertices.
+        u, v: (3, F) corners, px.
+        inverse_depth: (3, F) 1 / z of the corners, 1/m.
+    """
+
+    images: Index
+    corners: Index
+    u: Array
+    v: Array
+    inverse_depth: Array
+
+    def magnified(self, factor: int, left: int, top: int) -> _Triangles:
+        """The triangles in a finer raster over a window of the image."""
+        u = (self.u + (0.5 - left)) * factor - 0.5
+        v = (self.v + (0.5 - top)) * factor - 0.5
+        return _Triangles(self.images, self.corners, u, v, self.inverse_depth)
+
+    def planes(self, values: NDArray[np.floating]) -> tuple[Array, Array, Array]:
+        """Value at the first corner, and slopes along u and v, of values (3, F, ...)."""
+        tail = (slice(None),) + (None,) * (values.ndim - 2)
+        u, v = self.u[1:] - self.u[0], self.v[1:] - self.v[0]
+        area = u[0] * v[1] - v[0] * u[1]
+        one, two = values[1] - values[0], values[2] - values[0]
+        along_u = one * (v[1] / area)[tail] - two * (v[0] / area)[tail]
+        along_v = two * (u[0] / area)[tail] - one * (u[1] / area)[tail]
+        return values[0], along_u, along_v
+
+    def interpolated(self, values: Picture, front: _Front) -> Picture:
+        """Values (M, k) at what is seen, of values (V, k) at the vertices; right in perspective."""
+        # Divided by the depth they are linear over the image.
+        weighted = values[self.corners] * self.inverse_depth[:, :, None].astype(np.float32)
+        which = front.triangles
+        base, along_u, along_v = (x.astype(np.float32)[which] for x in self.planes(weighted))
+        along_u *= (front.columns - self.u[0][which]).astype(np.float32)[:, None]
+        along_v *= (front.rows - self.v[0][which]).astype(np.float32)[:, None]
+        base += along_u
+        base += along_v
+        base *= (1.0 / front.inverse_depth).astype(np.float32)[:, None]
+        return base
+
+
+@dataclass(frozen=True, eq=False)
+class _Filled:
+    """M times a pixel whose centre lies in a triangle.
+
+    Attributes:
+        pixels: (M,) index into all images, row by row.
+        rows, columns: (M,).
+        triangles: (M,).
+    """
+
+    pixels: Index
+    rows: Index
+    columns: Index
+    triangles: Index
+
+
+@dataclass(frozen=True, eq=False)
+class _Front(_Filled):
+    """Every pixel that shows something, once.
+
+    Attributes:
+        inverse_depth: (M,) 1 / z, 1/m.
+    """
+
+    inverse_depth: Array
+
+
+def _mesh(body: Body) -> Mesh:
+    if not body.shapes:
+        raise ValueError(f'body {body.name} has no flesh: it can not be drawn')
+    return _mesh_of_flesh(body)
+
+
+@lru_cache(maxsize=8)
+def _mesh_of_flesh(body: Body) -> Mesh:
+    mesh = body.flesh.mesh(STACKS, SLICES)
+    # What faces the camera is told from the order of the corners: make it that of the normals.
+    a, b, c = mesh.vertices[mesh.triangles.T]
+    inwards = np.einsum('fx,fx->f', np.cross(b - a, c - a), mesh.normals[mesh.triangles[:, 0]]) < 0
+    triangles = np.where(inwards[:, None], mesh.triangles[:, ::-1], mesh.triangles)
+    return replace(mesh, triangles=triangles)
+
+
+@lru_cache(maxsize=4)
+def _renderer(body: Body, camera: Camera, scene: Scene) -> Renderer:
+    return Renderer.of(body, camera, scene)
+
+
+def _vertices(mesh: Mesh, frames: Frames) -> Array:
+    """Vertices (V, 3, N) of the mesh, camera frame, m."""
+    return frames.points(mesh.segments, mesh.vertices)
+
+
+@lru_cache(maxsize=8)
+def _field_of_view(camera: Camera) -> Array:
+    """Bounds [[low, high], [low, high]] of x / z and of y / z of what the image may show."""
+    u, v = np.linspace(-0.5, camera.width - 0.5, 33), np.linspace(-0.5, camera.height - 0.5, 33)
+    rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1))
+    slopes = (rays[..., :2] / rays[..., 2:]).reshape(-1, 2)
+    low, high = slopes.min(0), slopes.max(0)
+    margin = 0.05 * (high - low)
+    return np.stack([low - margin, high + margin], axis=1)
+
+
+def _project(mesh: Mesh, points: Array, camera: Camera) -> _Triangles:
+    """Triangles that face the camera and may be seen, of vertices (V, 3, N) of N images."""
+    p = np.ascontiguousarray(points.transpose(1, 0, 2))
+    (u, v), _ = camera.project_with_derivative(p, derivative=False)
+    a, b, c = mesh.triangles.T
+    # Counter-clockwise from outside is clockwise where the v axis points down. A corner behind the
+    # camera is NaN, and the triangle is left out.
+    area = (u[b] - u[a]) * (v[c] - v[a]) - (v[b] - v[a]) * (u[c] - u[a])
+    visible = area < -SMALLEST_AREA
+    # Far outside the image a distortion model may fold back into it.
+    (left, right), (top, bottom) = _field_of_view(camera)
+    x, y, z = p
+    sides = (x < left * z, x > right * z, y < top * z, y > bottom * z)
+    for side in sides:
+        if side.any():
+            visible &= ~(side[a] & side[b] & side[c])
+    triangle, image = np.nonzero(visible)
+    corners = np.ascontiguousarray(mesh.triangles[triangle].T)
+    return _Triangles(image, corners, u[corners, image], v[corners, image], 1.0 / z[corners, image])
+
+
+def _fill(triangles: _Triangles, height: int, width: int) -> _Filled:
+    """All pixels whose centres lie in triangles, without regard to what hides what."""
+    # Corners from top to bottom. Both triangles at an edge then compute its places alike, and every
+    # pixel goes to one of them.
+    order = np.argsort(triangles.v, axis=0, kind='stable')
+    u0, u1, u2 = np.take_along_axis(triangles.u, order, axis=0)
+    v0, v1, v2 = np.take_along_axis(triangles.v, order, axis=0)
+    rows, which = _ranges(_first(v0, height), _first(v2, height))
+    with np.errstate(divide='ignore', invalid='ignore'):  # an edge along a row is never asked
+        upper, lower, long = (u1 - u0) / (v1 - v0), (u2 - u1) / (v2 - v1), (u2 - u0) / (v2 - v0)
+    below = rows >= v1[which]
+    one = u0[which] + long[which] * (rows - v0[which])
+    two = np.where(below, u1[which], u0[which])
+    two += np.where(below, lower[which], upper[which]) * (
+        rows - np.where(below, v1[which], v0[which])
+    )
+    start, stop = _first(np.minimum(one, two), width), _first(np.maximum(one, two), width)
+    columns, span = _ranges(start, stop)
+    first = (triangles.images[which] * height + rows) * width
+    return _Filled(first[span] + columns, rows[span], columns, which[span])
+
+
+def _front(triangles: _Triangles, filled: _Filled, shape: tuple[int, int]) -> _Front:
+    """Of all that the pixels of one image may show, what is nearest to the camera."""
+    base, along_u, along_v = triangles.planes(triangles.inverse_depth)
+    base = base - along_u * triangles.u[0] - along_v * triangles.v[0]
+    which = filled.triangles
+    inverse = base[which] + along_u[which] * filled.columns + along_v[which] * filled.rows
+    buffer = np.zeros(shape[0] * shape[1])
+    np.maximum.at(buffer, filled.pixels, inverse)
+    nearest = np.flatnonzero(inverse == buffer[filled.pixels])
+    winner = np.full(len(buffer), -1, dtype=np.intp)
+    winner[filled.pixels[nearest]] = nearest  # of equals the last
+    seen = winner[winner >= 0]
+    return _Front(
+        filled.pixels[seen], filled.rows[seen], filled.columns[seen], which[seen], inverse[seen]
+    )  # fmt: skip
+
+
+def _extent(places: Array, size: int, margin: int = 0) -> tuple[int, int]:
+    """First pixel and the one after the last that places (px) touch, within an image."""
+    low, high = np.floor(places.min() + 0.5) - margin, np.floor(places.max() + 0.5) + 1 + margin
+    return int(np.clip(low, 0, size)), int(np.clip(high, 0, size))
+
+
+def _first(places: Array, size: int) -> Index:
+    """First whole number from each place on, within an image."""
+    return np.clip(np.ceil(places), 0, size).astype(np.intp)
+
+
+def _ranges(start: Index, stop: Index) -> tuple[Index, Index]:
+    """All whole numbers of the ranges [start, stop), and the range that each belongs to."""
+    count = np.maximum(stop - start, 0)
+    which = np.repeat(np.arange(len(start)), count)
+    first = start - (np.cumsum(count) - count)
+    return np.arange(len(which)) + first[which], which

@@ -1,0 +1,245 @@
+"""The still scene around a rendered person: light, floor, wall and things, and the camera's noise.
+
+A scene is a seed and a few numbers. The picture of the empty place follows from them by casting
+rays through every pixel, so that it is right for every distortion of the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.camera import Camera
+from hmt_ros.motion.viewpoint import Viewpoint
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.float32]
+Real = TypeVar('Real', np.float32, np.float64)
+
+SUPERSAMPLING = 2
+NOISE_LEVELS = 256
+# Streams of random numbers of a seed.
+OF_THINGS, OF_SURFACES, OF_NOISE = 1, 2, 3
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A still, cluttered place with a floor, seen by a still camera.
+
+    Attributes:
+        viewpoint: where the camera stands.
+        seed: of the clutter, the clothes of the person, and the noise.
+        light: direction towards the light in the world of the viewpoint, of any length.
+        ambient: share of the light that comes from everywhere.
+        shadow: how much of the other light the person takes from the floor, 0 (no shadow) to 1.
+        noise: standard deviation of the noise of a pixel, grey levels of 255.
+        clear: things stand at least this far behind the world's origin, m.
+        clutter: number of things.
+
+    Raises:
+        ValueError: a number outside its range.
+    """
+
+    viewpoint: Viewpoint = field(default_factory=Viewpoint)
+    seed: int = 0
+    light: tuple[float, float, float] = (-0.5, 0.75, 1.0)
+    ambient: float = 0.5
+    shadow: float = 0.8
+    noise: float = 2.5
+    clear: float = 1.5
+    clutter: int = 14
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ('seed', 0, 2**63), ('ambient', 0.0, 1.0), ('shadow', 0.0, 1.0),
+            ('noise', 0.0, 100.0), ('clear', 0.0, 1000.0), ('clutter', 0, 1000),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f'{name} of a scene must lie in [{low}, {high}], saw {value}')
+        if not (np.isfinite(self.light).all() and self.light[2] > 0):
+            raise ValueError(f'the light of a scene must come from above, saw {self.light}')
+
+    @property
+    def light_direction(self) -> Array:
+        """Unit vector (3,) towards the light, camera frame."""
+        result: Array = self.viewpoint.rotation @ _unit(np.array(self.light))
+        return result
+
+    def lambert(self, cosine: NDArray[Real]) -> NDArray[Real]:
+        """Light that a surface sends back, by the cosine of its normal to the light; 1 at most."""
+        lit = self.ambient + (1.0 - self.ambient) * np.maximum(cosine, 0.0)
+        return lit.astype(cosine.dtype, copy=False)
+
+    def background(self, camera: Camera) -> Picture:
+        """The empty place, BGR (H, W, 3) in grey levels 0 to 255, without noise."""
+        return _empty_place(self, camera)[0]
+
+    def floor(self, camera: Camera) -> Picture:
+        """Share (H, W) of each pixel that shows the floor and nothing in front of it."""
+        return _empty_place(self, camera)[1]
+
+    def shadow_points(self, points: Array) -> Array:
+        """Where the shadows of points (..., 3) fall on the floor; camera frame, m."""
+        world = self.viewpoint.to_world(points)
+        light = np.array(self.light)
+        return self.viewpoint.to_camera(world - world[..., 2:] / light[2] * light)
+
+    def add_noise(self, image: Picture, frame: int) -> NDArray[np.uint8]:
+        """The image (H, W, 3) as a camera would give it, with the noise of this frame."""
+        if self.noise > 0:
+            rng = np.random.default_rng([self.seed, OF_NOISE, frame])
+            index = rng.integers(0, NOISE_LEVELS, image.shape, dtype=np.uint8)
+            # Rounding: half a grey level more, then towards zero.
+            table = np.float32(self.noise) * _normal_quantiles() + np.float32(0.5)
+            image = image + cv2.LUT(index, table)
+        else:
+            image = image + np.float32(0.5)
+        return np.clip(image, 0.0, 255.0, out=image).astype(np.uint8)
+
+
+@lru_cache(maxsize=1)
+def _normal_quantiles() -> Picture:
+    """NOISE_LEVELS equally likely values, with mean and variance of a standard normal variable."""
+    grid = np.linspace(-4.0, 4.0, 8001)
+    cumulative = np.cumsum(np.exp(-0.5 * grid * grid))
+    p = (np.arange(NOISE_LEVELS) + 0.5) / NOISE_LEVELS
+    values = np.interp(p, cumulative / cumulative[-1], grid)
+    values -= values.mean()
+    result: Picture = (values / values.std()).astype(np.float32)
+    return result
+
+
+def smooth_noise(points: Array, rng: np.random.Generator) -> Array:
+    """Smooth random values in [-1, 1] at points (N, 2): random at whole numbers, cubic between."""
+    table = rng.uniform(-1.0, 1.0, (64, 64))
+    cell = np.floor(points).astype(np.intp)
+    f = points - cell
+    f = f * f * (3.0 - 2.0 * f)
+    i, j = cell[:, 0] % 64, cell[:, 1] % 64
+    k, m = (i + 1) % 64, (j + 1) % 64
+    low = table[i, j] * (1 - f[:, 0]) + table[k, j] * f[:, 0]
+    high = table[i, m] * (1 - f[:, 0]) + table[k, m] * f[:, 0]
+    result: Array = low * (1 - f[:, 1]) + high * f[:, 1]
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Things:
+    """B boxes that stand on the floor; world of the viewpoint, m."""
+
+    centre: Array  # (B, 3)
+    half: Array  # (B, 3)
+    yaw: Array  # (B,)
+    colour: Array  # (B, 3)
+    stripes: Array  # (B,) per metre, 0: plain
+
+    def hit(self, origins: Array, rays: Array) -> tuple[Array, NDArray[np.intp], Array, Array]:
+        """First box on each ray (N, 3): distance (inf: none), box, normal, place in the box."""
+        best = np.full(len(rays), np.inf)
+        which = np.zeros(len(rays), dtype=np.intp)
+        normal, place = np.zeros((len(rays), 3)), np.zeros((len(rays), 3))
+        for b in range(len(self.yaw)):
+            # Only rays that meet the sphere around the box are worth the rest.
+            offset = self.centre[b] - origins
+            along = np.einsum('ni,ni->n', offset, rays)
+            miss = np.einsum('ni,ni->n', offset, offset) - along * along
+            near = np.flatnonzero((miss < self.half[b] @ self.half[b]) & (along > 0))
+            c, s = np.cos(self.yaw[b]), np.sin(self.yaw[b])
+            turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+            o, r = -offset[near] @ turn.T, rays[near] @ turn.T
+            r = np.where(np.abs(r) > 1e-12, r, 1e-12)
+            enter = (-np.sign(r) * self.half[b] - o) / r
+            leave = (np.sign(r) * self.half[b] - o) / r
+            t, axis = enter.max(1), enter.argmax(1)
+            new = np.flatnonzero((t > 1e-6) & (t < leave.min(1)) & (t < best[near]))
+            here = near[new]
+            best[here], which[here] = t[new], b
+            place[here] = o[new] + t[new, None] * r[new]
+            face = np.zeros((len(new), 3))
+            face[np.arange(len(new)), axis[new]] = -np.sign(r[new, axis[new]])
+            normal[here] = face @ turn
+        return best, which, normal, place
+
+
+def _things(scene: Scene) -> _Things:
+    rng = np.random.default_rng([scene.seed, OF_THINGS])
+    n = scene.clutter
+    half = rng.uniform([0.2, 0.15, 0.25], [0.7, 0.5, 1.1], (n, 3))
+    depth = scene.clear + rng.uniform(0.8, 4.0, n)
+    # One thing in every slot across the view, so that some stand behind the person.
+    slots = (rng.permutation(n) + rng.uniform(0.1, 0.9, n)) / max(n, 1)
+    side = (slots - 0.5) * 1.3 * (scene.viewpoint.distance + depth)
+    hsv = rng.uniform([0, 60, 90], [180, 170, 210], (n, 3)).astype(np.uint8)
+    colour = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2BGR)[0] if n else hsv
+    stripes = np.where(rng.random(n) < 0.5, rng.uniform(2.0, 6.0, n), 0.0)
+    centre = np.stack([side, -depth, half[:, 2]], axis=1)
+    return _Things(centre, half, rng.uniform(-0.7, 0.7, n), colour / 255.0, stripes)
+
+
+@lru_cache(maxsize=8)
+def _empty_place(scene: Scene, camera: Camera) -> tuple[Picture, Picture]:
+    shape = (SUPERSAMPLING * camera.height, SUPERSAMPLING * camera.width)
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    pixels = (np.stack([u, v], axis=-1).reshape(-1, 2) + 0.5) / SUPERSAMPLING - 0.5
+    rays = camera.rays(pixels) @ scene.viewpoint.rotation
+    eye = np.array([0.0, scene.viewpoint.distance, scene.viewpoint.height])
+    light = _unit(np.array(scene.light))
+    rng = np.random.default_rng([scene.seed, OF_SURFACES])
+    base = np.array([[0.62, 0.66, 0.68], [0.30, 0.34, 0.40], [0.36, 0.42, 0.50]])
+    base = np.clip(base + rng.uniform(-0.08, 0.08, base.shape), 0.05, 0.95)
+
+    wall = -scene.clear - 5.0
+    t_wall = np.where(rays[:, 1] < -1e-6, (wall - eye[1]) / np.minimum(rays[:, 1], -1e-6), np.inf)
+    t_floor = np.where(rays[:, 2] < -1e-6, -eye[2] / np.minimum(rays[:, 2], -1e-6), np.inf)
+    things = _things(scene)
+    t_box, box, normal, place = things.hit(np.broadcast_to(eye, rays.shape), rays)
+    on_box = t_box < np.minimum(t_wall, t_floor)
+    on_floor = (t_floor < t_wall) & ~on_box
+
+    # The wall has stains and a skirting. What no ray meets has its plain colour.
+    colour = np.tile(base[0] * scene.lambert(light[1:2]), (len(rays), 1))
+    on_wall = np.flatnonzero(np.isfinite(t_wall) & ~on_floor & ~on_box)
+    at = eye + rays[on_wall] * t_wall[on_wall, None]
+    stains = 1.0 + 0.25 * smooth_noise(at[:, [0, 2]] * 0.6, rng)
+    stains *= 1.0 + 0.10 * smooth_noise(at[:, [0, 2]] * 3.0, rng)
+    colour[on_wall] *= (stains * np.where(at[:, 2] < 0.18, 0.45, 1.0))[:, None]
+
+    # The floor has tiles, stains and the shadows of the things; its colours fade with distance.
+    points = eye + rays[on_floor] * t_floor[on_floor, None]
+    tile = np.floor(points[:, 0] / 0.9 + 0.3) + np.floor(points[:, 1] / 0.9)
+    ground = np.where((tile % 2 == 0)[:, None], base[1], base[2])
+    ground *= 1.0 + 0.20 * smooth_noise(points[:, :2] * 1.3, rng)[:, None]
+    ground *= 1.0 + 0.12 * smooth_noise(points[:, :2] * 9.0, rng)[:, None]
+    dark = np.isfinite(things.hit(points, np.broadcast_to(light, points.shape))[0])
+    ground *= scene.lambert(light[2] * np.where(dark, 1.0 - scene.shadow, 1.0))[:, None]
+    fade = np.clip((t_floor[on_floor, None] - 6.0) / 20.0, 0.0, 0.6)
+    colour[on_floor] = ground + fade * (base[1:].mean() - ground)
+
+    which = box[on_box]
+    face = things.colour[which] * scene.lambert(normal[on_box] @ light)[:, None]
+    wave = np.sin(2 * np.pi * things.stripes[which] * (place[on_box] @ [0.8, 0.8, 1.0]))
+    face[(wave > 0.3) & (things.stripes[which] > 0)] *= 0.6
+    skew = np.array([[6.0, 1.2], [0.6, 6.0], [5.4, 1.8]])
+    colour[on_box] = face * (1.0 + 0.08 * smooth_noise(place[on_box] @ skew, rng))[:, None]
+
+    image = (255.0 * np.clip(colour, 0.0, 1.0)).astype(np.float32).reshape(*shape, 3)
+    floor = on_floor.astype(np.float32).reshape(shape)
+    size = (camera.width, camera.height)
+    result = [
+        np.asarray(cv2.resize(x, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+        for x in (image, floor)
+    ]
+    for picture in result:
+        picture.setflags(write=False)
+    return result[0], result[1]
+
+
+def _unit(vector: Array) -> Array:
+    result: Array = vector / np.linalg.norm(vector)
+    return result

@@ -1,0 +1,153 @@
+"""Parameter files of ROS 2: written with comments, and read without ROS."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hmt_ros.sessions.declared_parameters import (
+    EFFECTS,
+    DeclaredParameter,
+    ParameterError,
+    Value,
+    declared_parameters,
+)
+from msg_tools.files.error_line import error_line
+from msg_tools.files.plain_yaml import load_plain_yaml
+
+_KEY = 'ros__parameters'
+_WIDTH = 100
+_LARGEST_FILE = 1_000_000  # bytes
+
+
+def parameter_file_text(node: str, settings: Any) -> str:
+    """A parameter file with all parameters, each under a comment that describes it.
+
+    Args:
+        node: name of the node.
+        settings: dataclass whose values are written.
+    """
+    declared = declared_parameters(settings)
+    used = {parameter.effect for parameter in declared}
+    lines = [
+        f'# Parameters of {node}, with their defaults. A file needs only those that it changes:',
+        '#',
+        f'#     ros2 run hmt_ros {node} --ros-args --params-file FILE',
+        '#',
+        '# In square brackets: lowest and highest value, and when a new value takes effect:',
+        *(
+            f'# "{name}": {text[0].lower()}{text[1:]}'
+            for name, text in EFFECTS.items()
+            if name in used
+        ),
+        f'/**/{node}:',
+        f'  {_KEY}:',
+    ]
+    open_groups: list[str] = []
+    for parameter in declared:
+        *groups, name = parameter.name.split('.')
+        same = 0
+        while open_groups[same : same + 1] == groups[same : same + 1] != []:
+            same += 1
+        lines.extend(f'{_indent(depth)}{groups[depth]}:' for depth in range(same, len(groups)))
+        open_groups = groups
+        indent = _indent(len(groups))
+        lines.extend(
+            textwrap.wrap(
+                f'{parameter.description} [{_bounds(parameter)}{parameter.effect}]',
+                _WIDTH,
+                initial_indent=f'{indent}# ',
+                subsequent_indent=f'{indent}# ',
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+        )
+        lines.append(f'{indent}{name}: {yaml_scalar(parameter.default)}')
+    return '\n'.join(lines) + '\n'
+
+
+def yaml_scalar(value: Value) -> str:
+    """A value as YAML that the parser of ROS reads as the same type."""
+    if isinstance(value, str):
+        return "'" + value.replace("'", "''") + "'"
+    text: str = yaml.safe_dump(value)
+    return text.removesuffix('\n...\n').strip()
+
+
+def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -> dict[str, Any]:
+    """Values by name, dots between groups, of the parameters that a file gives a node.
+
+    Sections for other nodes are passed over; a file may also hold the parameters alone, without
+    sections.
+
+    Args:
+        path: of the file.
+        node: its name.
+        by_name: whether only sections count that name the node, not those for all nodes.
+
+    Raises:
+        ParameterError: not such a file; one line that says why.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise ParameterError(
+                f'{path}: {path.stat().st_size} bytes, wanted a parameter file of at most '
+                f'{_LARGEST_FILE}'
+            )
+        document = load_plain_yaml(path.read_text('utf-8'))
+    except OSError as error:
+        raise ParameterError(f'{path}: can not be read ({error.strerror})') from error
+    except ParameterError:
+        raise
+    except ValueError as error:
+        raise ParameterError(f'{path}: not YAML ({error_line(error)})') from error
+    if document is None:
+        return {}
+    if not isinstance(document, dict):
+        raise ParameterError(f'{path}: wanted parameters by name, saw {type(document).__name__}')
+    sections = {
+        str(key): value
+        for key, value in document.items()
+        if isinstance(value, dict) and _KEY in value
+    }
+    if not sections:
+        values = dict(_flattened(document, '', path))
+        return {} if by_name else values
+    result: dict[str, Any] = {}
+    for key in document:
+        if str(key) not in sections:
+            raise ParameterError(f'{path}: section {key!r} has no {_KEY}')
+    # As in ROS, what stands for one node goes before what stands for all.
+    for key in sorted(sections, key=lambda key: '*' not in key):
+        if key.rpartition('/')[2] in ((node,) if by_name else (node, '*', '**')):
+            result.update(_flattened(sections[key][_KEY] or {}, '', path))
+    return result
+
+
+def _flattened(values: Any, prefix: str, path: Path) -> Iterator[tuple[str, Any]]:
+    if not isinstance(values, Mapping):
+        raise ParameterError(f'{path}: wanted parameters by name, saw {values!r}')
+    for key, value in values.items():
+        name = f'{prefix}{key}'
+        if isinstance(value, Mapping):
+            yield from _flattened(value, f'{name}.', path)
+        else:
+            yield name, value
+
+
+def _indent(depth: int) -> str:
+    return '  ' * (depth + 2)
+
+
+def _bounds(parameter: DeclaredParameter) -> str:
+    if parameter.limits is None:
+        return ''
+    low, high = parameter.limits
+    if isinstance(parameter.default, int):
+        return f'{low:.0f} to {high:.0f}; '
+    return f'{low:g} to {high:g}; '

@@ -1,0 +1,172 @@
+"""What is published of a smoothed window, as messages; as `track_messages` for tracked images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body import Body
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.sessions.published_topic import PublishedTopic
+from hmt_ros.smoothing import FinalPose, TrajectoryMixture
+from msg_tools import MessageFactory
+from msg_tools.messages.joint_states import heaviest_joint_state
+from msg_tools.messages.markers import trajectory_markers
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.trajectory_mixtures import TrajectoryMixture as TrajectoryContent
+from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
+
+Array = NDArray[np.float64]
+
+# In the order in which they are published.
+TOPICS = {
+    'trajectory_mixture': PublishedTopic('hmt_msgs/msg/TrajectoryMixture'),
+    'trajectory_markers': PublishedTopic('visualization_msgs/msg/MarkerArray'),
+    'smoothed_pose_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
+    'smoothed_joint_states': PublishedTopic('sensor_msgs/msg/JointState'),
+}
+TRACED = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
+# The heaviest trajectories that are drawn.
+DRAWN = 8
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedBody:
+    """Whose poses they are.
+
+    Attributes:
+        body: at its present lengths.
+        frame_id: optical frame of the camera.
+    """
+
+    body: Body
+    frame_id: str
+
+
+def trajectory_content(
+    found: TrajectoryMixture, of: SmoothedBody, *, covariances: bool
+) -> TrajectoryContent:
+    """The content of a message on a mixture over trajectories."""
+    content = found.message_content() if covariances else _without_covariances(found)
+    if covariances:
+        content['marginal_covariances'] = _symmetric(content['marginal_covariances'])
+    return TrajectoryContent(
+        **content,
+        body_model=of.body.name,
+        dof_names=of.body.dof_names,
+        frame_id=of.frame_id,
+    )
+
+
+def window_messages(
+    messages: MessageFactory,
+    found: TrajectoryMixture,
+    of: SmoothedBody,
+    *,
+    covariances: bool,
+    wanted: Callable[[str], bool],
+    publish: Callable[[str, Any], None],
+) -> None:
+    """Makes the messages of a window.
+
+    Args:
+        messages: factory.
+        found: trajectories, with stamps.
+        of: whose poses they are.
+        covariances: whether they are part of the message.
+        wanted: whether a topic is to be made.
+        publish: takes the topic and the message, one after the other.
+    """
+    if wanted('trajectory_mixture'):
+        content = trajectory_content(found, of, covariances=covariances)
+        publish('trajectory_mixture', trajectory_mixture_message(messages, content))
+    if wanted('trajectory_markers'):
+        assert found.stamps_ns is not None
+        body = of.body
+        chosen = np.argsort(-found.weights, kind='stable')[:DRAWN]
+        means = found.means[chosen]
+        joints = body.joint_positions(means.reshape(-1, body.dimension))
+        names = body.joint_names
+        publish(
+            'trajectory_markers',
+            trajectory_markers(
+                messages,
+                joints.reshape(*means.shape[:2], len(names), 3),
+                names,
+                TRACED,
+                [(names[a], names[b]) for a, b in body.skeleton.bones],
+                found.weights[chosen],
+                found.stamps_ns[-1],
+                of.frame_id,
+                ranks=DRAWN,
+            ),
+        )
+
+
+def final_messages(
+    messages: MessageFactory,
+    pose: FinalPose,
+    of: SmoothedBody,
+    *,
+    components: int,
+    wanted: Callable[[str], bool],
+    publish: Callable[[str, Any], None],
+) -> None:
+    """Makes the messages of a pose that will not be revised.
+
+    Args:
+        messages: factory.
+        pose: its density.
+        of: whose pose it is.
+        components: of the message at most.
+        wanted: whether a topic is to be made.
+        publish: takes the topic and the message, one after the other.
+
+    Raises:
+        MessageError: a mixture that a message must not have.
+    """
+    if not wanted('smoothed_pose_mixture') and not wanted('smoothed_joint_states'):
+        return
+    mixture = pose.mixture.reduce(components).normalised()
+    content = PoseMixture(
+        mixture=GaussianMixture(
+            mixture.weights, mixture.means, _symmetric(np.array(mixture.covariances))
+        ),
+        body_model=of.body.name,
+        dof_names=of.body.dof_names,
+        joint_names=of.body.joint_names,
+        joint_positions=of.body.joint_positions(mixture.means),
+        kind=MixtureKind.SMOOTHED,
+        stamp_ns=pose.stamp_ns,
+        frame_id=of.frame_id,
+    )
+    if wanted('smoothed_pose_mixture'):
+        publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
+    if wanted('smoothed_joint_states'):
+        publish('smoothed_joint_states', heaviest_joint_state(messages, content))
+
+
+def _without_covariances(found: TrajectoryMixture) -> dict[str, Any]:
+    """As `TrajectoryMixture.message_content`, which would compute them."""
+    assert found.stamps_ns is not None
+    before = found.stamps_ns[0] - 1
+    return {
+        'weights': found.weights,
+        'means': found.means,
+        'marginal_covariances': None,
+        'log_joint': found.log_joint,
+        'inflation': found.inflation,
+        'stamps_ns': found.stamps_ns,
+        'final_until_ns': before if found.final_until_ns is None else found.final_until_ns,
+        'free_energy': found.free_energy,
+    }
+
+
+def _symmetric(covariances: Array) -> Array:
+    """What rounding has left of it is taken away."""
+    result: Array = 0.5 * (covariances + np.swapaxes(covariances, -1, -2))
+    return result

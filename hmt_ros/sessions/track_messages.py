@@ -1,0 +1,203 @@
+"""What is published of a tracked image, as messages.
+
+`TOPICS` says the names and types; the functions here make the messages from arrays. Nothing in a
+message depends on anything but the track and the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body import Body, Camera
+from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.sessions.overlay import draw_modes
+from hmt_ros.sessions.published_topic import PublishedTopic
+from msg_tools import MessageFactory
+from msg_tools.messages.bodies import description_message, message_of_body
+from msg_tools.messages.images import compressed_image_message
+from msg_tools.messages.joint_states import heaviest_joint_state
+from msg_tools.messages.markers import skeleton_markers
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.transforms import transforms_message
+from msg_tools.messages.urdf import link_frames
+
+Array = NDArray[np.float64]
+
+
+# In the order in which they are published.
+TOPICS = {
+    'body': PublishedTopic('hmt_msgs/msg/Body', latched=True),
+    # Never robot_description: without a namespace that would be the robot's own.
+    'human_description': PublishedTopic('std_msgs/msg/String', latched=True),
+    'pose_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
+    'likelihood_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
+    'joint_states': PublishedTopic('sensor_msgs/msg/JointState'),
+    '/tf': PublishedTopic('tf2_msgs/msg/TFMessage'),
+    'markers': PublishedTopic('visualization_msgs/msg/MarkerArray'),
+    'overlay/compressed': PublishedTopic('sensor_msgs/msg/CompressedImage'),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedImage:
+    """An image, and the track in it.
+
+    Attributes:
+        image: (H, W, 3) BGR.
+        stamp_ns, frame_id: of the image.
+        body, camera: of the track.
+        posterior, likelihood: mixtures over poses, heaviest first.
+        log_likelihoods: (K,) of the image at the means of the posterior.
+        starts: whether the body is a new one, with other lengths than the image before.
+    """
+
+    image: NDArray[np.uint8]
+    stamp_ns: int
+    frame_id: str
+    body: Body
+    camera: Camera
+    posterior: GaussianMixture
+    likelihood: GaussianMixture
+    log_likelihoods: Array
+    starts: bool
+
+
+@dataclass(frozen=True)
+class Presentation:
+    """How a track is shown.
+
+    Attributes:
+        max_hypotheses: modes that a track has at most.
+        overlay_modes: heaviest modes that are drawn on the image; 0: no overlay.
+        overlay_quality: of the JPEG, 1 to 100.
+        publish_tf: whether there are transforms.
+        frame_prefix: of the names of the frames of the links.
+        describe: whether the URDF is due: a new body, or other names of its frames.
+    """
+
+    max_hypotheses: int
+    overlay_modes: int
+    overlay_quality: int
+    publish_tf: bool
+    frame_prefix: str
+    describe: bool
+
+
+def track_messages(
+    messages: MessageFactory,
+    track: TrackedImage,
+    presentation: Presentation,
+    wanted: Callable[[str], bool],
+    publish: Callable[[str, Any], None],
+) -> None:
+    """Makes the messages of a tracked image.
+
+    Args:
+        messages: factory.
+        track: the image and its track.
+        presentation: how it is shown.
+        wanted: whether a topic is to be made; mixtures come first, pictures last.
+        publish: takes the topic and the message, one after the other.
+
+    Raises:
+        MessageError: a mixture that a message must not have.
+    """
+    stamp, frame = track.stamp_ns, track.frame_id
+    skeleton = track.body.skeleton
+    frames = forward(skeleton, track.posterior.means)
+    joints = frames.joints().transpose(2, 0, 1)
+    posterior = _content(
+        track, track.posterior, joints, MixtureKind.POSTERIOR, track.log_likelihoods
+    )
+    likelihood = _content(
+        track,
+        track.likelihood,
+        track.body.joint_positions(track.likelihood.means),
+        MixtureKind.LIKELIHOOD,
+        None,
+    )
+    if track.starts:
+        publish('body', message_of_body(messages, track.body, stamp, frame))
+    if presentation.describe:
+        prefix = presentation.frame_prefix
+        publish('human_description', description_message(messages, track.body, frame, prefix))
+    if wanted('pose_mixture'):
+        publish('pose_mixture', pose_mixture_message(messages, posterior))
+    if wanted('likelihood_mixture'):
+        publish('likelihood_mixture', pose_mixture_message(messages, likelihood))
+    if wanted('joint_states'):
+        publish('joint_states', heaviest_joint_state(messages, posterior))
+    if presentation.publish_tf and wanted('/tf'):
+        publish('/tf', _link_transforms(messages, track, frames, presentation.frame_prefix))
+    if wanted('markers'):
+        names = track.body.joint_names
+        publish(
+            'markers',
+            skeleton_markers(
+                messages,
+                joints,
+                names,
+                [(names[a], names[b]) for a, b in skeleton.bones],
+                track.posterior.weights,
+                stamp,
+                frame,
+                ranks=max(presentation.max_hypotheses, len(track.posterior)),
+            ),
+        )
+    if presentation.overlay_modes and wanted('overlay/compressed'):
+        drawn = draw_modes(
+            track.image,
+            track.camera,
+            joints,
+            skeleton.bones,
+            track.posterior.weights,
+            presentation.overlay_modes,
+        )
+        quality = presentation.overlay_quality
+        publish(
+            'overlay/compressed', compressed_image_message(messages, drawn, stamp, frame, quality)
+        )
+
+
+def _content(
+    track: TrackedImage,
+    mixture: GaussianMixture,
+    joints: Array,
+    kind: MixtureKind,
+    log_likelihoods: Array | None,
+) -> PoseMixture:
+    return PoseMixture(
+        mixture=mixture,
+        body_model=track.body.name,
+        dof_names=track.body.dof_names,
+        joint_names=track.body.joint_names,
+        joint_positions=joints,
+        kind=kind,
+        stamp_ns=track.stamp_ns,
+        frame_id=track.frame_id,
+        log_likelihoods=log_likelihoods,
+    )
+
+
+def _link_transforms(
+    messages: MessageFactory, track: TrackedImage, frames: Frames, prefix: str
+) -> Any:
+    """Every link of the URDF in the heaviest mode, seen from the camera."""
+    heaviest = int(np.argmax(track.posterior.weights))
+    names, rotations, origins = link_frames(
+        track.body.skeleton, frames, track.posterior.means[heaviest], heaviest
+    )
+    return transforms_message(
+        messages,
+        [track.frame_id] * len(names),
+        [f'{prefix}{name}' for name in names],
+        rotations,
+        origins,
+        track.stamp_ns,
+    )

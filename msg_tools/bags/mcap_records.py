@@ -1,0 +1,199 @@
+"""Records of an MCAP file: lengths that are checked, fields that end with their record."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from typing import BinaryIO
+
+from msg_tools.bags.decompression import MAX_BYTES, PIECE_BYTES, DecompressionError, decompress
+
+MAGIC = b'\x89MCAP0\r\n'
+
+# Type and length; the fixed fields of a message and of a chunk.
+RECORD = struct.Struct('<BQ')
+MESSAGE_HEAD = struct.Struct('<HIQQ')
+CHUNK_HEAD = struct.Struct('<QQQI')
+
+HEADER = 1
+FOOTER = 2
+SCHEMA = 3
+CHANNEL = 4
+MESSAGE = 5
+CHUNK = 6
+MESSAGE_INDEX = 7
+ATTACHMENT = 9
+STATISTICS = 11
+METADATA = 12
+DATA_END = 15
+
+FOOTER_BYTES = RECORD.size + 20
+
+# These are read whole, and small; a larger one is damage.
+_READ_WHOLE = (HEADER, FOOTER, SCHEMA, CHANNEL, STATISTICS, DATA_END)
+_SMALL_RECORD_BYTES = 2**24
+
+_U16 = struct.Struct('<H')
+_U32 = struct.Struct('<I')
+_U64 = struct.Struct('<Q')
+
+
+class DamageError(Exception):
+    """What is wrong with a file, as the end of a sentence that starts with its name."""
+
+
+class Fields:
+    """Fields of a record, in turn; nothing is read beyond its end."""
+
+    def __init__(self, body: bytes | memoryview, offset: int) -> None:
+        self._body = memoryview(body)
+        self._at = 0
+        self._offset = offset
+
+    def take(self, count: int) -> memoryview:
+        """The next bytes."""
+        result = self._body[self._at : self._at + count]
+        if len(result) != count:
+            raise DamageError(f'is damaged at byte {self._offset}: a record breaks off')
+        self._at += count
+        return result
+
+    def skip(self, count: int) -> None:
+        """Passes over the next bytes."""
+        self.take(count)
+
+    def u16(self) -> int:
+        """The next two bytes as a number."""
+        value: int = _U16.unpack(self.take(2))[0]
+        return value
+
+    def u32(self) -> int:
+        """The next four bytes as a number."""
+        value: int = _U32.unpack(self.take(4))[0]
+        return value
+
+    def u64(self) -> int:
+        """The next eight bytes as a number."""
+        value: int = _U64.unpack(self.take(8))[0]
+        return value
+
+    def block(self) -> bytes:
+        """Bytes after their length."""
+        return bytes(self.take(self.u32()))
+
+    def text(self) -> str:
+        """Text after its length."""
+        try:
+            return self.block().decode()
+        except UnicodeDecodeError:
+            raise DamageError(f'is damaged at byte {self._offset}: a name is not UTF-8') from None
+
+    def texts(self) -> dict[str, str]:
+        """Texts by name."""
+        entries = Fields(self.block(), self._offset)
+        found: dict[str, str] = {}
+        while entries._at < len(entries._body):
+            name = entries.text()
+            found[name] = entries.text()
+        return found
+
+    def statistics(self) -> Counter[int] | None:
+        """Messages of each channel; None where the writer gave only their total."""
+        total = self.u64()
+        self.skip(34)
+        entries = Fields(self.block(), self._offset)
+        counts: Counter[int] = Counter()
+        while entries._at < len(entries._body):
+            key = entries.u16()
+            counts[key] += entries.u64()
+        return counts if counts.total() == total else None
+
+
+def record_head(file: BinaryIO, offset: int, size: int) -> tuple[int, int]:
+    """Type and length of the record at `offset`, which lies in the file whole."""
+    if offset == size:
+        raise DamageError(f'breaks off after {size} bytes: its end is missing')
+    if offset + RECORD.size > size:
+        raise DamageError(f'breaks off after {size} bytes, inside a record')
+    opcode: int
+    length: int
+    opcode, length = RECORD.unpack(read_exactly(file, RECORD.size))
+    if opcode == 0:
+        raise DamageError(f'is damaged at byte {offset}: record of type 0')
+    if opcode in (MESSAGE, CHUNK):
+        smallest = MESSAGE_HEAD.size if opcode == MESSAGE else CHUNK_HEAD.size
+        largest = MAX_BYTES
+    else:
+        smallest = 0
+        largest = _SMALL_RECORD_BYTES if opcode in _READ_WHOLE else size
+    if not smallest <= length <= largest:
+        raise DamageError(
+            f'is damaged at byte {offset}: record of type {opcode} with {length} bytes'
+        )
+    if offset + RECORD.size + length > size:
+        raise DamageError(
+            f'breaks off after {size} bytes: the record at byte {offset} has {length} bytes'
+        )
+    return opcode, length
+
+
+def read_exactly(file: BinaryIO, count: int) -> bytes:
+    """Bytes that are known to be there."""
+    data = file.read(count)
+    if len(data) != count:
+        raise DamageError('became shorter while it was read')
+    return data
+
+
+def chunk_records(body: bytes, offset: int) -> memoryview:
+    """The records of a chunk, decompressed and compared with its checksum.
+
+    Args:
+        body: of the record of the chunk.
+        offset: by which texts of errors name the chunk.
+    """
+    fields = Fields(body, offset)
+    _, _, size, checksum = CHUNK_HEAD.unpack(fields.take(CHUNK_HEAD.size))
+    compression = fields.text()
+    try:
+        data = decompress(fields.take(fields.u64()), compression, size)
+    except DecompressionError as error:
+        raise DamageError(f'is damaged in the chunk at byte {offset}: {error}') from None
+    if checksum and zlib.crc32(data) != checksum:
+        raise DamageError(f'is damaged in the chunk at byte {offset}: its checksum differs')
+    return memoryview(data)
+
+
+def records_in(data: memoryview, offset: int) -> Iterator[tuple[int, int, int]]:
+    """Type, start and end of the body of records that follow each other, those of a chunk say.
+
+    Args:
+        data: the records.
+        offset: by which texts of errors name the chunk.
+    """
+    place = f'the chunk at byte {offset}'
+    at = 0
+    while at < len(data):
+        body = at + RECORD.size
+        if body > len(data):
+            raise DamageError(f'is damaged in {place}: a record breaks off')
+        opcode, length = RECORD.unpack_from(data, at)
+        at = body + length
+        if at > len(data):
+            raise DamageError(f'is damaged in {place}: a record breaks off')
+        if opcode == MESSAGE and length < MESSAGE_HEAD.size:
+            raise DamageError(f'is damaged in {place}: a message has {length} bytes')
+        yield opcode, body, at
+
+
+def checksum_of(file: BinaryIO, start: int, end: int) -> int:
+    """CRC-32 of a stretch of the file."""
+    file.seek(start)
+    checksum = 0
+    while start < end:
+        piece = read_exactly(file, min(PIECE_BYTES, end - start))
+        checksum = zlib.crc32(piece, checksum)
+        start += len(piece)
+    return checksum

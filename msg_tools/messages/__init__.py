@@ -1,0 +1,1 @@
+"""Numpy arrays to ROS messages and back, markers and URDF for viewers."""

@@ -1,0 +1,155 @@
+"""sensor_msgs/CameraInfo to a camera and back.
+
+The calibration in the message is that of the full sensor. The picture may be a part of it (roi),
+and that part may be binned: a pixel u of the sensor lies at (u - roi.x_offset) / binning_x in the
+picture, the convention of image_geometry.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from hmt_ros.body import Camera
+from msg_tools.messages.headers import header_message
+from msg_tools.messages.message_factory import MessageFactory
+
+# Number of coefficients that stand for no distortion.
+_COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
+
+# A calibration beyond these is damage: focal lengths and the principal point in sizes of the
+# picture, and coefficients of the distortion.
+_FARTHEST = 1000.0
+_LARGEST_COEFFICIENT = 1e6
+
+
+class CameraInfoError(ValueError):
+    """A camera info that gives no camera, in one line: what was seen and what was wanted."""
+
+
+def camera_from_info(message: Any, image_size: tuple[int, int] | None = None) -> Camera:
+    """The camera that took the pictures.
+
+    Args:
+        message: sensor_msgs/CameraInfo, of `rosbags` or of ROS.
+        image_size: (width, height) of a picture that it has to fit, px.
+
+    Raises:
+        CameraInfoError: not calibrated, values that are not finite or do not fit each other, an
+            unknown distortion model.
+    """
+    k = [float(value) for value in message.k]
+    d = [float(value) for value in message.d]
+    if len(k) != 9:
+        raise CameraInfoError(f'camera info: K has {len(k)} values, wanted 9')
+    if k[0] == 0.0:
+        raise CameraInfoError('camera info: the camera is not calibrated (K is zero)')
+    if not all(math.isfinite(value) for value in (*k, *d)):
+        raise CameraInfoError('camera info: K or D has values that are not finite')
+    if k[0] < 0.0 or k[4] <= 0.0:
+        raise CameraInfoError(f'camera info: focal lengths are {k[0]} and {k[4]}, wanted positive')
+    if k[1] != 0.0 or k[3] != 0.0 or k[6:] != [0.0, 0.0, 1.0]:
+        raise CameraInfoError(
+            f'camera info: K is {k}, wanted [fx, 0, cx, 0, fy, cy, 0, 0, 1] without skew'
+        )
+    model, coefficients = _distortion(str(message.distortion_model), d)
+    x, y, width, height = _region(message)
+    _check_plausible(k, coefficients, max(width, height))
+    binning_x, binning_y = max(int(message.binning_x), 1), max(int(message.binning_y), 1)
+    width, height = width // binning_x, height // binning_y
+    if width < 1 or height < 1:
+        raise CameraInfoError(
+            f'camera info: binning of {binning_x} and {binning_y} leaves {width}x{height} pixels'
+        )
+    if image_size is not None and tuple(image_size) != (width, height):
+        raise CameraInfoError(
+            f'camera info is for pictures of {width}x{height}, saw {image_size[0]}x{image_size[1]}'
+        )
+    try:
+        return Camera(
+            fx=k[0] / binning_x,
+            fy=k[4] / binning_y,
+            cx=(k[2] - x) / binning_x,
+            cy=(k[5] - y) / binning_y,
+            width=width,
+            height=height,
+            distortion=coefficients,
+            distortion_model=model,
+        )
+    except ValueError as error:
+        raise CameraInfoError(f'camera info: {error}') from error
+
+
+def _check_plausible(k: list[float], coefficients: tuple[float, ...], size: int) -> None:
+    """Raises CameraInfoError for numbers that no camera has, and that overflow when squared."""
+    low, high = size / _FARTHEST, size * _FARTHEST
+    if not (low < k[0] < high and low < k[4] < high):
+        raise CameraInfoError(
+            f'camera info: focal lengths are {k[0]:g} and {k[4]:g}, wanted {low:g} to {high:g} '
+            f'for {size} pixels'
+        )
+    if max(abs(k[2]), abs(k[5])) > high:
+        raise CameraInfoError(
+            f'camera info: principal point is ({k[2]:g}, {k[5]:g}), wanted at most {high:g}'
+        )
+    if any(abs(value) > _LARGEST_COEFFICIENT for value in coefficients):
+        raise CameraInfoError(
+            f'camera info: D has a coefficient of {max(coefficients, key=abs):g}, wanted at most '
+            f'{_LARGEST_COEFFICIENT:g}'
+        )
+
+
+def _distortion(model: str, coefficients: list[float]) -> tuple[str, tuple[float, ...]]:
+    if not any(coefficients):
+        if model not in ('', 'plumb_bob', 'rational_polynomial', 'equidistant'):
+            raise CameraInfoError(f'camera info: unknown distortion model {model!r}')
+        if model == 'equidistant':
+            # Without coefficients it is a perfect fisheye, not a pinhole.
+            raise CameraInfoError('camera info: equidistant without coefficients is not supported')
+        return 'plumb_bob', ()
+    if model == '':
+        raise CameraInfoError(
+            f'camera info: D has {len(coefficients)} coefficients, but no distortion model'
+        )
+    if model == 'rational_polynomial' and not any(coefficients[8:]):
+        # Thin prism and tilt, which OpenCV appends.
+        coefficients = coefficients[:8]
+    return model, tuple(coefficients)
+
+
+def _region(message: Any) -> tuple[int, int, int, int]:
+    """Offset and size of the part of the sensor that the picture shows, px."""
+    width, height = int(message.width), int(message.height)
+    if width < 1 or height < 1:
+        raise CameraInfoError(f'camera info: size is {width}x{height}, wanted that of the picture')
+    roi = message.roi
+    x, y = int(roi.x_offset), int(roi.y_offset)
+    roi_width, roi_height = int(roi.width), int(roi.height)
+    if roi_width == 0 and roi_height == 0 and x == 0 and y == 0:
+        return 0, 0, width, height
+    if roi_width < 1 or roi_height < 1 or x + roi_width > width or y + roi_height > height:
+        raise CameraInfoError(
+            f'camera info: roi of {roi_width}x{roi_height} at ({x}, {y}) does not lie in the '
+            f'{width}x{height} of the sensor'
+        )
+    return x, y, roi_width, roi_height
+
+
+def camera_info_message(
+    messages: MessageFactory, camera: Camera, stamp_ns: int, frame_id: str
+) -> Any:
+    """sensor_msgs/CameraInfo of a camera, without roi and binning."""
+    k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+    return messages.create(
+        'sensor_msgs/msg/CameraInfo',
+        header=header_message(messages, stamp_ns, frame_id),
+        height=camera.height,
+        width=camera.width,
+        distortion_model=camera.distortion_model,
+        d=np.array(camera.distortion or (0.0,) * _COEFFICIENTS[camera.distortion_model]),
+        k=np.array(k),
+        r=np.eye(3).reshape(-1),
+        p=np.hstack([np.reshape(k, (3, 3)), np.zeros((3, 1))]).reshape(-1),
+    )

@@ -1,0 +1,57 @@
+"""Messages to CDR bytes and back, without ROS.
+
+CDR leaves the bytes that pad a field to its alignment undefined, and the middleware of ROS 2 fills
+them with whatever its buffer held before; `rclpy.serialization.serialize_message` even appends some
+where a sequence is empty. `serialise` writes zeros into the padding and nothing behind the message:
+equal messages have equal bytes. A node that publishes these bytes (`Publisher.publish` takes them)
+puts the same bytes on the wire, and so into a recorded bag, as an offline run writes; only at the
+end the middleware may append some, up to a multiple of four, which `canonical` takes away again.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rosbags.typesys.store import Typestore
+
+from msg_tools.messages.typestore import typestore
+
+_HEADER_BYTES = 4
+
+
+def serialise(message: Any) -> bytes:
+    """Little-endian CDR bytes, with their encapsulation header, of a message of `typestore()`."""
+    return bytes(typestore().serialize_cdr(message, message.__msgtype__, little_endian=True))
+
+
+def deserialise(data: bytes | memoryview, msgtype: str, types: Typestore | None = None) -> Any:
+    """Message of CDR bytes; its arrays are read-only views of `data`.
+
+    Bytes behind the message are ignored, as ROS does: recorders that use `serialize_message` leave
+    some.
+
+    Args:
+        data: with encapsulation header, of either byte order.
+        msgtype: for example 'hmt_msgs/msg/Body'.
+        types: where the type is looked up; None: `typestore()`.
+
+    Raises:
+        Exception: of many kinds, where the bytes are not a message of this type.
+    """
+    store = typestore() if types is None else types
+    view = memoryview(data).toreadonly()
+    if len(view) < _HEADER_BYTES or view[0] != 0 or view[1] > 1:
+        raise ValueError(f'its encapsulation is {bytes(view[:_HEADER_BYTES])!r}, wanted plain CDR')
+    definition = store.get_msgdef(msgtype)
+    read = definition.deserialize_cdr_le if view[1] else definition.deserialize_cdr_be
+    body = view[_HEADER_BYTES:]
+    message, end = read(body, 0, definition.cls, store)
+    if end > len(body):
+        # rosbags before 0.11 takes what is there for the whole of a string.
+        raise ValueError(f'it breaks off after {len(view)} bytes')
+    return message
+
+
+def canonical(data: bytes | memoryview, msgtype: str) -> bytes:
+    """The same message as CDR bytes whose padding is zero, as `serialise` writes them."""
+    return serialise(deserialise(data, msgtype))

@@ -1,0 +1,28 @@
+"""Times in nanoseconds and headers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from msg_tools.messages.message_factory import MessageFactory
+
+SECOND_NS = 1_000_000_000
+EARLIEST_NS = -(2**31) * SECOND_NS  # that a message can tell
+
+
+def time_message(messages: MessageFactory, stamp_ns: int) -> Any:
+    """builtin_interfaces/Time of a time in ns since 1970."""
+    seconds, nanoseconds = divmod(int(stamp_ns), SECOND_NS)
+    return messages.create('builtin_interfaces/msg/Time', sec=seconds, nanosec=nanoseconds)
+
+
+def time_ns(time: Any) -> int:
+    """Time in ns of a builtin_interfaces/Time, `message.header.stamp` for example."""
+    return int(time.sec) * SECOND_NS + int(time.nanosec)
+
+
+def header_message(messages: MessageFactory, stamp_ns: int, frame_id: str) -> Any:
+    """std_msgs/Header."""
+    return messages.create(
+        'std_msgs/msg/Header', stamp=time_message(messages, stamp_ns), frame_id=frame_id
+    )

@@ -1,0 +1,283 @@
+"""Pictures of sensor_msgs/Image and sensor_msgs/CompressedImage as arrays, and back.
+
+A decoded picture is always BGR, uint8, (H, W, 3), contiguous and writable. Messages of `rosbags`
+and of ROS will both do: the data may be any buffer of bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from msg_tools.messages.headers import header_message
+from msg_tools.messages.message_factory import MessageFactory
+
+Picture = NDArray[np.uint8]
+
+# Larger pictures are taken for damage, before memory is spent on them.
+MAX_PIXELS = 2**26
+
+_PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
+
+# A progressive JPEG has a dozen; each costs the decoder a pass over the whole picture.
+MAX_JPEG_SCANS = 100
+
+# What compression can do at its best: JPEG spends one bit on each block of 8x8 pixels, deflate one
+# byte on 1032, which in PNG may be 8 pixels each.
+_JPEG_PIXELS_PER_BYTE = 512
+_PNG_PIXELS_PER_BYTE = 8 * 1032
+
+
+class ImageError(ValueError):
+    """A picture that can not be decoded, in one line: what was seen and what was wanted."""
+
+
+# Encoding: (dtype, channels, conversion to BGR or None). The names of OpenCV for Bayer patterns are
+# those of the second row, second column: its BG is rggb.
+_ENCODINGS: dict[str, tuple[str, int, int | None]] = {
+    'mono8': ('u1', 1, cv2.COLOR_GRAY2BGR),
+    '8UC1': ('u1', 1, cv2.COLOR_GRAY2BGR),
+    'mono16': ('u2', 1, cv2.COLOR_GRAY2BGR),
+    '16UC1': ('u2', 1, cv2.COLOR_GRAY2BGR),
+    'bgr8': ('u1', 3, None),
+    '8UC3': ('u1', 3, None),
+    'rgb8': ('u1', 3, cv2.COLOR_RGB2BGR),
+    'bgra8': ('u1', 4, cv2.COLOR_BGRA2BGR),
+    '8UC4': ('u1', 4, cv2.COLOR_BGRA2BGR),
+    'rgba8': ('u1', 4, cv2.COLOR_RGBA2BGR),
+    'bgr16': ('u2', 3, None),
+    'rgb16': ('u2', 3, cv2.COLOR_RGB2BGR),
+    'bgra16': ('u2', 4, cv2.COLOR_BGRA2BGR),
+    'rgba16': ('u2', 4, cv2.COLOR_RGBA2BGR),
+    'bayer_rggb8': ('u1', 1, cv2.COLOR_BayerBG2BGR),
+    'bayer_bggr8': ('u1', 1, cv2.COLOR_BayerRG2BGR),
+    'bayer_gbrg8': ('u1', 1, cv2.COLOR_BayerGR2BGR),
+    'bayer_grbg8': ('u1', 1, cv2.COLOR_BayerGB2BGR),
+    'bayer_rggb16': ('u2', 1, cv2.COLOR_BayerBG2BGR),
+    'bayer_bggr16': ('u2', 1, cv2.COLOR_BayerRG2BGR),
+    'bayer_gbrg16': ('u2', 1, cv2.COLOR_BayerGR2BGR),
+    'bayer_grbg16': ('u2', 1, cv2.COLOR_BayerGB2BGR),
+    'yuv422': ('u1', 2, cv2.COLOR_YUV2BGR_UYVY),
+    'uyvy': ('u1', 2, cv2.COLOR_YUV2BGR_UYVY),
+    'yuv422_yuy2': ('u1', 2, cv2.COLOR_YUV2BGR_YUY2),
+    'yuyv': ('u1', 2, cv2.COLOR_YUV2BGR_YUY2),
+    'nv12': ('u1', 1, cv2.COLOR_YUV2BGR_NV12),
+    'nv21': ('u1', 1, cv2.COLOR_YUV2BGR_NV21),
+}
+# Chroma rows of half the height follow the picture.
+_PLANAR = ('nv12', 'nv21')
+# Two neighbours share their chroma, or a colour pattern repeats.
+_EVEN_WIDTH = ('yuv422', 'uyvy', 'yuv422_yuy2', 'yuyv', *_PLANAR)
+
+
+def decode_image(message: Any) -> Picture:
+    """The picture of an Image or a CompressedImage, BGR (H, W, 3).
+
+    16-bit pictures are scaled to 8 bits, grey ones get three equal channels, alpha is dropped; an
+    orientation that a camera wrote into a JPEG is ignored, as the calibration knows nothing of it.
+
+    Raises:
+        ImageError: unknown encoding, sizes that contradict each other, bytes that are no picture.
+    """
+    if hasattr(message, 'encoding'):
+        return _decode_raw(message)
+    return _decode_compressed(message)
+
+
+def _decode_raw(message: Any) -> Picture:
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    encoding = str(message.encoding)
+    if encoding not in _ENCODINGS:
+        raise ImageError(
+            f'image encoding {encoding!r} is not known, wanted one of {", ".join(_ENCODINGS)}'
+        )
+    dtype, channels, conversion = _ENCODINGS[encoding]
+    _check_size(width, height)
+    if (encoding in _EVEN_WIDTH and width % 2) or (encoding in _PLANAR and height % 2):
+        raise ImageError(f'image of {width}x{height} can not be {encoding}, wanted even sizes')
+    row_bytes = width * channels * np.dtype(dtype).itemsize
+    if step < row_bytes:
+        raise ImageError(
+            f'image step is {step}, wanted at least {row_bytes} for {width} {encoding}'
+        )
+    rows = height * 3 // 2 if encoding in _PLANAR else height
+    data = _bytes_of(message.data)
+    if len(data) != rows * step:
+        raise ImageError(
+            f'image has {len(data)} bytes, wanted {rows * step}: {rows} rows with a step of {step}'
+        )
+    image: NDArray[Any]
+    image = pixels = np.ascontiguousarray(data.reshape(rows, step)[:, :row_bytes])
+    if dtype == 'u2':
+        image = pixels.view('>u2' if message.is_bigendian else '<u2').astype(np.uint16)
+    image = image.reshape((rows, width, channels) if channels > 1 else (rows, width))
+    try:
+        if conversion is not None:
+            image = cv2.cvtColor(image, conversion)
+    except cv2.error as error:
+        raise ImageError(f'image of {width}x{height} can not be {encoding}: {error.err}') from error
+    if image.dtype == np.uint16:
+        image = cv2.convertScaleAbs(image, alpha=255.0 / 65535.0)
+    return np.array(image, dtype=np.uint8, order='C')
+
+
+def _decode_compressed(message: Any) -> Picture:
+    form = str(message.format)
+    if 'compressedDepth' in form:
+        raise ImageError(f'compressed image has format {form!r}: depth, wanted a picture')
+    return decode_picture(_bytes_of(message.data).tobytes(), f'format {form!r}')
+
+
+def decode_picture(content: bytes, form: str = 'unknown format') -> Picture:
+    """The picture of a PNG or JPEG file, BGR (H, W, 3).
+
+    The size that the file tells is looked at before anything is decoded.
+
+    Args:
+        content: of the file.
+        form: what it is said to be, for messages.
+
+    Raises:
+        ImageError: another format, a damaged file, more pixels than `MAX_PIXELS`, more pixels than
+            so many bytes can hold.
+    """
+    if content.startswith(b'\xff\xd8\xff'):
+        width, height = _jpeg_size(content)
+        densest = _JPEG_PIXELS_PER_BYTE
+    elif content.startswith(_PNG_SIGNATURE):
+        width, height = _png_size(content)
+        densest = _PNG_PIXELS_PER_BYTE
+    else:
+        raise ImageError(
+            f'compressed image of {form} starts with {content[:4]!r}, wanted jpeg or png'
+        )
+    _check_size(width, height)
+    if width * height > densest * len(content):
+        raise ImageError(
+            f'compressed image of {len(content)} bytes can not have a size of {width}x{height}'
+        )
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
+    except cv2.error as error:
+        raise ImageError(f'compressed image can not be decoded: {error.err}') from error
+    if image is None or image.shape != (height, width, 3):
+        raise ImageError(f'compressed image of {len(content)} bytes and {form} is damaged')
+    return np.array(image, dtype=np.uint8, order='C')
+
+
+def _check_size(width: int, height: int) -> None:
+    if width < 1 or height < 1:
+        raise ImageError(f'image has size {width}x{height}, wanted at least one pixel')
+    if width * height > MAX_PIXELS:
+        raise ImageError(f'image has size {width}x{height}, the limit is {MAX_PIXELS} pixels')
+
+
+def _bytes_of(data: Any) -> Picture:
+    try:
+        # numpy takes no empty buffer.
+        return np.frombuffer(data, dtype=np.uint8) if len(data) else np.zeros(0, dtype=np.uint8)
+    except (TypeError, ValueError) as error:
+        raise ImageError(f'image data is a {type(data).__name__}, wanted bytes') from error
+
+
+def _png_size(content: bytes) -> tuple[int, int]:
+    """Width and height of a file whose chunks are whole; OpenCV believes any length of a chunk."""
+    at = len(_PNG_SIGNATURE)
+    kind = b''
+    while kind != b'IEND':
+        length = int.from_bytes(content[at : at + 4], 'big')
+        kind = content[at + 4 : at + 8]
+        end = at + 12 + length
+        first = at == len(_PNG_SIGNATURE)
+        if end > len(content) or (first and (kind, length) != (b'IHDR', 13)):
+            raise ImageError(f'png of {len(content)} bytes breaks off or is damaged')
+        if zlib.crc32(content[at + 4 : end - 4]) != int.from_bytes(content[end - 4 : end], 'big'):
+            raise ImageError(f'png of {len(content)} bytes is damaged: a checksum differs')
+        at = end
+    width, height = struct.unpack_from('>II', content, len(_PNG_SIGNATURE) + 8)
+    return int(width), int(height)
+
+
+# Start-of-frame markers; C4, C8 and CC between them are something else.
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def _jpeg_size(content: bytes) -> tuple[int, int]:
+    """Width and height of a file that has its end; a decoder would make up what is missing."""
+    size: tuple[int, int] | None = None
+    at = 2
+    while at + 4 <= len(content) and content[at] == 0xFF:
+        marker = content[at + 1]
+        if marker == 0xFF or 0xD0 <= marker <= 0xD7 or marker == 0x01:
+            at += 1 if marker == 0xFF else 2
+            continue
+        if marker in _JPEG_FRAMES and at + 9 <= len(content):
+            height, width = struct.unpack('>HH', content[at + 5 : at + 9])
+            size = width, height
+        if marker == 0xDA:
+            if size is None or content.find(b'\xff\xd9', at) < 0:
+                break
+            # Within a scan a byte ff is never followed by the number of a marker like this.
+            scans = content.count(b'\xff\xda', at)
+            if scans > MAX_JPEG_SCANS:
+                raise ImageError(f'jpeg has {scans} scans, the limit is {MAX_JPEG_SCANS}')
+            return size
+        at += 2 + int.from_bytes(content[at + 2 : at + 4], 'big')
+    raise ImageError(f'jpeg of {len(content)} bytes breaks off or is damaged')
+
+
+def encode_jpeg(image: NDArray[np.uint8], quality: int = 90) -> bytes:
+    """JPEG file of a picture, BGR (H, W, 3) or grey (H, W); the same bytes for the same picture.
+
+    Raises:
+        ImageError: not a picture.
+    """
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
+        raise ImageError(f'image is {image.dtype} {image.shape}, wanted uint8 (H, W, 3) or (H, W)')
+    _check_size(image.shape[1], image.shape[0])
+    done, encoded = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise ImageError(f'image of {image.shape[1]}x{image.shape[0]} can not be encoded as jpeg')
+    return bytes(encoded)
+
+
+def compressed_image_message(
+    messages: MessageFactory,
+    image: NDArray[np.uint8],
+    stamp_ns: int,
+    frame_id: str,
+    quality: int = 90,
+) -> Any:
+    """sensor_msgs/CompressedImage with a JPEG of a picture, BGR (H, W, 3) or grey (H, W)."""
+    return messages.create(
+        'sensor_msgs/msg/CompressedImage',
+        header=header_message(messages, stamp_ns, frame_id),
+        format='jpeg',
+        data=np.frombuffer(encode_jpeg(image, quality), dtype=np.uint8),
+    )
+
+
+def image_message(
+    messages: MessageFactory, image: NDArray[np.uint8], stamp_ns: int, frame_id: str
+) -> Any:
+    """sensor_msgs/Image of a picture, bgr8 for (H, W, 3) or mono8 for (H, W)."""
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
+        raise ImageError(f'image is {image.dtype} {image.shape}, wanted uint8 (H, W, 3) or (H, W)')
+    height, width = image.shape[:2]
+    _check_size(width, height)
+    return messages.create(
+        'sensor_msgs/msg/Image',
+        header=header_message(messages, stamp_ns, frame_id),
+        height=height,
+        width=width,
+        encoding='bgr8' if image.ndim == 3 else 'mono8',
+        is_bigendian=0,
+        step=width * (3 if image.ndim == 3 else 1),
+        data=np.ascontiguousarray(image).reshape(-1),
+    )

@@ -1,0 +1,169 @@
+"""hmt_msgs/TrajectoryMixture: a mixture over a window of poses, as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from msg_tools.messages.headers import EARLIEST_NS, header_message, time_message, time_ns
+from msg_tools.messages.message_error import (
+    MessageError,
+    check_covariances,
+    check_finite,
+    check_names,
+    check_weights,
+    names_of,
+    numbers,
+)
+from msg_tools.messages.message_factory import MessageFactory
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryMixture:
+    """The content of the message: M trajectories of T poses with d degrees of freedom.
+
+    Attributes:
+        weights: (M,) sum to 1.
+        means: (M, T, d).
+        marginal_covariances: (M, T, d, d), inflation included; None: not computed.
+        log_joint: (M,) log p(trajectory, images) at the mean.
+        inflation: (M,) factor on the standard deviations.
+        stamps_ns: (T,) times of the poses, increasing.
+        final_until_ns: poses at or before this time will not be revised.
+        free_energy: (I,) per iteration, nats.
+        body_model: name of the body.
+        dof_names: (d,) order of the variables.
+        frame_id: optical frame of the camera.
+
+    Raises:
+        MessageError: shapes or values that a message must not have.
+    """
+
+    weights: Array
+    means: Array
+    marginal_covariances: Array | None
+    log_joint: Array
+    inflation: Array
+    stamps_ns: tuple[int, ...]
+    final_until_ns: int
+    free_energy: Array
+    body_model: str
+    dof_names: tuple[str, ...]
+    frame_id: str
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, 'stamps_ns', tuple(int(stamp) for stamp in self.stamps_ns))
+        object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'trajectories: dof_names'))
+        m, t, d = len(self.weights), len(self.stamps_ns), len(self.dof_names)
+        if m == 0 or t == 0:
+            raise MessageError(f'trajectories: {m} components of {t} poses, wanted one at least')
+        shapes: dict[str, tuple[int, ...]] = {
+            'weights': (m,),
+            'means': (m, t, d),
+            'marginal_covariances': (m, t, d, d),
+            'log_joint': (m,),
+            'inflation': (m,),
+            'free_energy': (len(self.free_energy),),
+        }
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            array = np.array(value, dtype=np.float64)
+            if array.shape != shape:
+                raise MessageError(f'trajectories: {name} has shape {array.shape}, wanted {shape}')
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if any(b <= a for a, b in zip(self.stamps_ns, self.stamps_ns[1:], strict=False)):
+            raise MessageError('trajectories: stamps do not increase')
+        check_weights(self.weights, 'trajectories')
+        check_finite(self.means, 'trajectories: means')
+        if self.marginal_covariances is not None:
+            check_covariances(self.marginal_covariances, 'trajectories')
+
+
+def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixture) -> Any:
+    """hmt_msgs/TrajectoryMixture; components heaviest first, of equal weights in their order."""
+    covariances = content.marginal_covariances
+    components = [
+        messages.create(
+            'hmt_msgs/msg/TrajectoryComponent',
+            weight=float(content.weights[m]),
+            log_joint=float(content.log_joint[m]),
+            inflation=float(content.inflation[m]),
+            means=content.means[m].reshape(-1),
+            marginal_covariances=np.empty(0) if covariances is None else covariances[m].reshape(-1),
+        )
+        for m in np.argsort(-content.weights, kind='stable')
+    ]
+    return messages.create(
+        'hmt_msgs/msg/TrajectoryMixture',
+        header=header_message(messages, content.stamps_ns[-1], content.frame_id),
+        body_model=content.body_model,
+        dof_names=list(content.dof_names),
+        stamps=[time_message(messages, stamp) for stamp in content.stamps_ns],
+        # Before the first of all stamps there is none.
+        final_until=time_message(messages, max(content.final_until_ns, EARLIEST_NS)),
+        free_energy=content.free_energy,
+        components=components,
+    )
+
+
+def trajectory_mixture_of(
+    message: Any, dof_names: Sequence[str] | None = None
+) -> TrajectoryMixture:
+    """The content of an hmt_msgs/TrajectoryMixture, of `rosbags` or of ROS.
+
+    Args:
+        message: the message.
+        dof_names: what it has to be about, in this order; None: anything.
+
+    Raises:
+        MessageError: names that differ, arrays whose lengths contradict each other, weights that
+            are no probabilities, covariances that are not positive definite, stamps that do not
+            increase.
+    """
+    names = names_of(message.dof_names, 'trajectories: dof_names')
+    check_names(names, dof_names, 'trajectories: dof_names')
+    components = message.components
+    if not components:
+        raise MessageError('trajectories: no components')
+    t, d = len(message.stamps), len(names)
+    known = {bool(len(component.marginal_covariances)) for component in components}
+    if len(known) > 1:
+        raise MessageError('trajectories: some components have covariances, others have none')
+    return TrajectoryMixture(
+        weights=np.array([component.weight for component in components]),
+        means=np.array(
+            [
+                numbers(component.means, (t, d), f'trajectories: component {m}: means')
+                for m, component in enumerate(components)
+            ]
+        ),
+        marginal_covariances=np.array(
+            [
+                numbers(
+                    component.marginal_covariances,
+                    (t, d, d),
+                    f'trajectories: component {m}: marginal_covariances',
+                )
+                for m, component in enumerate(components)
+            ]
+        )
+        if known == {True}
+        else None,
+        log_joint=np.array([component.log_joint for component in components]),
+        inflation=np.array([component.inflation for component in components]),
+        stamps_ns=tuple(time_ns(stamp) for stamp in message.stamps),
+        final_until_ns=time_ns(message.final_until),
+        free_energy=np.array(message.free_energy, dtype=np.float64),
+        body_model=str(message.body_model),
+        dof_names=names,
+        frame_id=str(message.header.frame_id),
+    )
