@@ -1,0 +1,203 @@
+"""Energies: minus the logarithm of the factors of a posterior, which add.
+
+    E(x) = - sum_i log p_i(x),     g = dE/dx,     H ~ d2E/dx2
+
+Everything that says something about x is an `EnergyTerm`. A posterior is the sum of its terms, and
+every optimiser takes such a sum (KJS 2 and 3.2, VMS 5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+class Derivatives(IntEnum):
+    """Which derivatives an energy is asked for."""
+
+    NONE = 0
+    POSITIVE = 1  # gradient and a positive semi-definite Hessian: Gauss-Newton, or a majorising one
+    EXACT = 2  # gradient and the exact Hessian, where the term knows it; else as POSITIVE
+
+
+class Energy(NamedTuple):
+    """Energies of N points; they add.
+
+    Attributes:
+        value: (N,) nats.
+        gradient: (N, d); None: not asked for.
+        hessian: (N, d, d); None: not asked for.
+    """
+
+    value: Array
+    gradient: Array | None = None
+    hessian: Array | None = None
+
+    def plus(self, other: Energy) -> Energy:
+        """The sum of both."""
+        if self.gradient is None or other.gradient is None:
+            return Energy(self.value + other.value)
+        assert self.hessian is not None
+        assert other.hessian is not None
+        return Energy(
+            self.value + other.value,
+            self.gradient + other.gradient,
+            self.hessian + other.hessian,
+        )
+
+    def derivatives(self) -> tuple[Array, Array]:
+        """Gradient and Hessian.
+
+        Raises:
+            ValueError: they were not asked for.
+        """
+        if self.gradient is None or self.hessian is None:
+            raise ValueError('the energy was computed without derivatives')
+        return self.gradient, self.hessian
+
+
+class EnergyTerm(Protocol):
+    """Minus the logarithm of one factor of a posterior."""
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """The energy at points x (n, d).
+
+        Args:
+            x: (n, d).
+            rows: (n,) the problem that each point belongs to: a term that differs from problem to
+                problem (another centre, texture or time) looks up its own data there.
+            derivatives: which are wanted.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Sum:
+    """The product of factors: the sum of their energies, in the order in which they are given."""
+
+    terms: tuple[EnergyTerm, ...]
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`."""
+        first, *others = self.terms
+        total = first.energy(x, rows, derivatives=derivatives)
+        for term in others:
+            total = total.plus(term.energy(x, rows, derivatives=derivatives))
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """Minus the logarithm of a Gaussian, up to a constant.
+
+        E(x) = 1/2 (x - m)' P (x - m)
+
+    Attributes:
+        centres: m, (d,) for all problems or (N, d).
+        precisions: P, (d,) of a diagonal, (d, d) for all problems, or (N, d, d).
+    """
+
+    centres: Array
+    precisions: Array
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`."""
+        if self.precisions.ndim == 1:
+            offset = x - _of_rows(self.centres, rows, 2)
+            value = 0.5 * (offset * offset) @ self.precisions
+            if not derivatives:
+                return Energy(value)
+            shape = (*x.shape, x.shape[1])
+            hessian = np.broadcast_to(np.diag(self.precisions), shape)
+            return Energy(value, offset * self.precisions, hessian)
+        offset, pulled, precisions = _pulls(self, x, rows)
+        value = 0.5 * (offset * pulled).sum(1)
+        return Energy(value, pulled, precisions) if derivatives else Energy(value)
+
+
+@dataclass(frozen=True, eq=False)
+class Student:
+    """Minus the logarithm of a Student density, up to a constant: a Gaussian with heavy tails.
+
+        E(x) = (nu + d)/2 log(1 + D/nu),     D = (x - m)' P (x - m)
+
+    Its Gauss-Newton Hessian is s P with the shrinkage s = (nu + d) / (nu + D), positive everywhere.
+
+    Attributes:
+        centres: m, (d,) for all problems or (N, d).
+        precisions: P, (d, d) for all problems, or (N, d, d).
+        degrees_of_freedom: nu.
+    """
+
+    centres: Array
+    precisions: Array
+    degrees_of_freedom: float
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`."""
+        nu, d = self.degrees_of_freedom, x.shape[1]
+        offset, pulled, precisions = _pulls(self, x, rows)
+        distance = (offset * pulled).sum(1)
+        value = 0.5 * (nu + d) * np.log1p(distance / nu)
+        if not derivatives:
+            return Energy(value)
+        shrinkage = (nu + d) / (nu + distance)
+        return Energy(value, shrinkage[:, None] * pulled, shrinkage[:, None, None] * precisions)
+
+
+def _pulls(term: Quadratic | Student, x: Array, rows: Index) -> tuple[Array, Array, Array]:
+    """x - m, P (x - m) and P of each point."""
+    offset = x - _of_rows(term.centres, rows, 2)
+    if term.precisions.ndim == 2:
+        return offset, offset @ term.precisions, term.precisions
+    precisions = term.precisions[rows]
+    return offset, np.einsum('nij,nj->ni', precisions, offset), precisions
+
+
+def _of_rows(value: Array, rows: Index, axes: int) -> Array:
+    return value[rows] if value.ndim == axes else value
+
+
+@dataclass(frozen=True, eq=False)
+class Restricted:
+    """A term over some of the variables; the others stay where they are.
+
+    Attributes:
+        term: over all d variables.
+        point: (d,) values of all variables.
+        free: (f,) the variables that may move.
+    """
+
+    term: EnergyTerm
+    point: Array
+    free: Index
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """The energy at values x (n, f) of the free variables; see `EnergyTerm`."""
+        whole = np.repeat(self.point[None], len(x), axis=0)
+        whole[:, self.free] = x
+        found = self.term.energy(whole, rows, derivatives=derivatives)
+        if found.gradient is None or found.hessian is None:
+            return found
+        return Energy(
+            found.value,
+            found.gradient[:, self.free],
+            found.hessian[:, self.free[:, None], self.free],
+        )
