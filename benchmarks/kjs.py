@@ -22,7 +22,8 @@ from hmt_ros.flips.distinct_poses import distinct_poses
 from hmt_ros.flips.interpretation_tree import flip_counts
 from hmt_ros.flips.whole_body_flips import full_body_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
-from hmt_ros.image.observation import Keypoints, Observation
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import Minimum, Status, minimise
 from hmt_ros.tracking.proposals import covariance_scaled_samples, spherical_samples
 

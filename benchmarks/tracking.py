@@ -30,7 +30,7 @@ from hmt_ros.body.inverse_kinematics import solve_joint_positions
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, Scores, joint_mixtures, score
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import TermSettings
-from hmt_ros.image.observation import Keypoints
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings, read_subject
 from hmt_ros.tracking.initialisation import start_from_keypoints

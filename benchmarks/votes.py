@@ -30,7 +30,8 @@ from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, joint_mixtu
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood
-from hmt_ros.image.observation import Keypoints, Observation
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
 from hmt_ros.motion.viewpoint import Viewpoint

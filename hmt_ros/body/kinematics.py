@@ -35,6 +35,7 @@ class Frames:
     """Where the segments of N poses are; camera frame, m.
 
     Attributes:
+        poses: (N, d) whose frames they are.
         columns: (S, 3, 3, N): columns[s, i, :, n] is the i-th axis of segment s.
         origins: (S, 3, N) of the segments.
         axes: (d, 3, N) unit vector of each degree of freedom.
@@ -42,6 +43,7 @@ class Frames:
     """
 
     skeleton: Skeleton
+    poses: Array
     columns: Array
     origins: Array
     axes: Array
@@ -129,7 +131,7 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
     _place_segments(
         _plan(skeleton), skeleton.mounts, skeleton.offsets, q, columns, origins, axes, dof_origins
     )
-    return Frames(skeleton, columns, origins, axes, dof_origins)
+    return Frames(skeleton, q, columns, origins, axes, dof_origins)
 
 
 def joint_positions(skeleton: Skeleton, poses: ArrayLike) -> Array:

@@ -12,7 +12,7 @@ Each problem has its own lambda and its own active set, and leaves the batch whe
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import numpy as np
@@ -57,6 +57,15 @@ class Minimum:
     status: NDArray[np.int8]
     iterations: NDArray[np.int32]
 
+    def __getitem__(self, rows: Index) -> Minimum:
+        """Some of them."""
+        return Minimum(*(getattr(self, f.name)[rows] for f in fields(Minimum)))
+
+    def joined(self, other: Minimum) -> Minimum:
+        """These and others."""
+        parts = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(Minimum))
+        return Minimum(*(np.concatenate(pair) for pair in parts))
+
 
 def minimise(
     objective: Objective,
@@ -81,6 +90,7 @@ def minimise(
         max_iterations: evaluations per problem after the first one.
         tolerance: converged when a step is predicted to gain less than this, in units of energy.
     """
+    objective = getattr(objective, 'energy', objective)
     lower, upper = (np.asarray(limit, dtype=np.float64) for limit in (lower, upper))
     x = np.clip(np.array(x, dtype=np.float64, ndmin=2), lower, upper)
     n, d = x.shape

@@ -8,6 +8,7 @@ every optimiser takes such a sum (KJS 2 and 3.2, VMS 5).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, Protocol
@@ -40,18 +41,6 @@ class Energy(NamedTuple):
     gradient: Array | None = None
     hessian: Array | None = None
 
-    def plus(self, other: Energy) -> Energy:
-        """The sum of both."""
-        if self.gradient is None or other.gradient is None:
-            return Energy(self.value + other.value)
-        assert self.hessian is not None
-        assert other.hessian is not None
-        return Energy(
-            self.value + other.value,
-            self.gradient + other.gradient,
-            self.hessian + other.hessian,
-        )
-
     def derivatives(self) -> tuple[Array, Array]:
         """Gradient and Hessian.
 
@@ -80,6 +69,24 @@ class EnergyTerm(Protocol):
         ...
 
 
+def add_energies(energies: Iterable[Energy]) -> Energy:
+    """The sum of energies of the same points, in their order."""
+    first, *others = energies
+    value, gradient, hessian = first
+    if not others:
+        return first
+    value = value.copy()
+    if gradient is not None and hessian is not None:
+        gradient, hessian = gradient.copy(), hessian.copy()
+    for other in others:
+        value += other.value
+        if gradient is not None and hessian is not None:
+            own = other.derivatives()
+            gradient += own[0]
+            hessian += own[1]
+    return Energy(value, gradient, hessian)
+
+
 @dataclass(frozen=True, eq=False)
 class Sum:
     """The product of factors: the sum of their energies, in the order in which they are given."""
@@ -90,11 +97,7 @@ class Sum:
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
         """See `EnergyTerm`."""
-        first, *others = self.terms
-        total = first.energy(x, rows, derivatives=derivatives)
-        for term in others:
-            total = total.plus(term.energy(x, rows, derivatives=derivatives))
-        return total
+        return add_energies(term.energy(x, rows, derivatives=derivatives) for term in self.terms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +159,14 @@ class Student:
         value = 0.5 * (nu + d) * np.log1p(distance / nu)
         if not derivatives:
             return Energy(value)
-        shrinkage = (nu + d) / (nu + distance)
+        shrinkage = self.shrinkage(distance, d)
         return Energy(value, shrinkage[:, None] * pulled, shrinkage[:, None, None] * precisions)
+
+
+    def shrinkage(self, distance: Array, dimension: int) -> Array:
+        """Curvature over that of the Gaussian with the same precision, at distances D (N,)."""
+        nu = self.degrees_of_freedom
+        return (nu + dimension) / (nu + distance)
 
 
 def _pulls(term: Quadratic | Student, x: Array, rows: Index) -> tuple[Array, Array, Array]:

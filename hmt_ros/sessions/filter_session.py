@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body, Camera
-from hmt_ros.image.observation import Keypoints
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE, CameraInput, InTime, WaitingImage
 from hmt_ros.sessions.filter_parameters import FilterParameters

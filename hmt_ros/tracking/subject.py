@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.image.observation import Keypoints
+from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools.files.plain_yaml import load_plain_yaml
 
 Array = NDArray[np.float64]

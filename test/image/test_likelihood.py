@@ -12,7 +12,8 @@ from hmt_ros.body.flesh import occluding_contour
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image import likelihood as likelihood_module
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
-from hmt_ros.image.observation import Keypoints, Observation, observe
+from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.surface import COVER, HIDDEN
 from hmt_ros.image.texture import capture_textures
 

@@ -10,7 +10,8 @@ import pytest
 from hmt_ros.body import Body, load_body
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
-from hmt_ros.image.observation import Keypoints, Observation
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.dynamics import DynamicsSettings

@@ -1,4 +1,9 @@
-"""Poses that something else than the tracker expects by an image alone, such as a regression."""
+"""Pose hypotheses from an external single-image predictor, such as a mixture of experts.
+
+    log p(jump) = log epsilon + log w_m        of component m of the prediction
+
+They are proposals, no evidence, which would count the image twice.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,10 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import reverse_depth
+from hmt_ros.image.observation import Observation
+from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.hypotheses import Array, Hypotheses, relative_joints
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,4 +68,42 @@ class PosePrediction:
             np.tile(0.5 * seen.weights, 2),
             np.concatenate([seen.means, reverse_depth(body, seen.means)]),
             np.tile(seen.covariances, (2, 1, 1)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedPoses:
+    """Proposes the means of a prediction, each as a jump from the nearest mode.
+
+    Attributes:
+        body: of the person.
+        prediction: over poses of the body, weights that sum to 1.
+        probability: epsilon, prior probability of a pose that comes from the image alone.
+    """
+
+    body: Body
+    prediction: GaussianMixture
+    probability: float
+
+    def propose(
+        self,
+        _base: Minimum,
+        sources: Hypotheses,
+        _covariances: Array,
+        _observation: Observation,
+        _rng: np.random.Generator,
+    ) -> Hypotheses:
+        """See `Proposal`."""
+        poses = self.prediction.means
+        joints = (relative_joints(self.body, x) for x in (poses, sources.expected))
+        apart = next(joints)[:, None] - next(joints)[None]
+        nearest = np.linalg.norm(apart, axis=3).mean(2).argmin(1)
+        return Hypotheses(
+            poses,
+            sources.log_weights[nearest] + np.log(self.probability * self.prediction.weights),
+            sources.ancestors[nearest],
+            poses,
+            np.ones(poses.shape, dtype=np.bool_),
+            sources.textures,
+            sources.texture_rows[nearest],
         )

@@ -1,4 +1,9 @@
-"""How much of an image no mode explains: whether a track is lost."""
+"""How much of an image no mode explains: whether a track is lost.
+
+    misfit = max(share of the outline's samples, share of the keypoints)
+
+A sample or keypoint is unexplained when it is further than 4 sigmas from where it should be.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +12,41 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.image.likelihood import TermSettings
-from hmt_ros.image.observation import Keypoints
+from hmt_ros.image.likelihood import LikelihoodSettings
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.keypoints import Keypoints
 
 Array = NDArray[np.float64]
 
 # A sample of the outline or a keypoint further away than this from where it should be is
 # unexplained, in sigmas.
 UNEXPLAINED = 4.0
+
+
+def unexplained_share(
+    body: Body,
+    camera: Camera,
+    poses: Array,
+    observation: Observation,
+    outline_costs: Array,
+    settings: LikelihoodSettings,
+) -> float:
+    """Share of an image that the best of poses (K, d) does not explain.
+
+    Args:
+        body, camera: who is seen by what.
+        poses: (K, d).
+        observation: of the image.
+        outline_costs: (K, M) what each sample of the outline costs each pose.
+        settings: of the terms.
+    """
+    share = unexplained_outline(outline_costs, settings.coverage)
+    keypoints = observation.keypoints
+    if keypoints is None:
+        return share
+    sigma = settings.keypoints.sigma
+    return max(share, unexplained_keypoints(body, camera, poses, keypoints, sigma))
 
 
 def unexplained_outline(costs: Array, term: TermSettings) -> float:

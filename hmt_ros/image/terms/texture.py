@@ -1,42 +1,78 @@
-"""Likelihood of intensities and of motion along the surface (KJS 2).
+"""Intensities and motion along the surface (KJS 2).
 
-The model carries the texture of the last accepted image. The intensity term compares it with the
-present image; the motion term compares where the texture has moved with the optical flow, which
-says the same to first order but reaches further.
+    intensity     E(x) = w / Q sum_q rho(|I(u_q(x)) - c_q| / sigma)
+    motion        E(x) = w / Q sum_q rho(|u_q(x) - p_q - f(p_q)| / (sigma + 0.15 |f(p_q)|))
+
+The model carries the texture of the last accepted image: Q points of its surface, seen at pixels
+p_q with colours c_q, that the pose x moves to u_q(x). The intensity term compares the colours with
+the present image I; the motion term compares where the texture has moved with the optical flow f,
+which says the same to first order but reaches further.
 """
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
+import cv2
 import numpy as np
 from numba import njit
 
-from hmt_ros.image.sampling import sample
+from hmt_ros.image.sampling import ImageMap, sample
 from hmt_ros.image.surface import project
-from hmt_ros.image.terms.accumulation import add_residual
-from hmt_ros.image.terms.robust_kernel import geman_mcclure
+from hmt_ros.image.terms.image_term import (
+    NO_MAP,
+    ImageTerm,
+    ImageWindow,
+    Request,
+    TermSettings,
+    Weighting,
+)
+from hmt_ros.image.terms.residuals import add_residual, geman_mcclure
 
 # Fewer texture points than this do not make each of them count more.
 FEWEST = 20
 # Optical flow errs by this share of the displacement on top of the term's sigma.
 FLOW_ERROR = 0.15
+# Standard deviation of the blur before intensities are compared, px.
+BLUR = 1.5
+
+
+class TextureInputs(NamedTuple):
+    """Weighting, and the blurred colours (3 channels) or the optical flow (2 channels, px)."""
+
+    term: Weighting
+    image_map: ImageMap
+
+
+def blurred_colours(window: ImageWindow) -> ImageMap:
+    """The blurred image, three channels."""
+    blurred = cv2.GaussianBlur(window.image, (0, 0), BLUR).astype(np.float32)
+    return window.as_map(np.ascontiguousarray(blurred.transpose(2, 0, 1)))
+
+
+def optical_flow(window: ImageWindow) -> ImageMap | None:
+    """Dense flow from the last image to this one, two channels, px [Kroeger et al., ECCV 2016]."""
+    if window.last_image is None:
+        return None
+    grey = [cv2.cvtColor(x, cv2.COLOR_BGR2GRAY) for x in (window.last_image, window.image)]
+    if min(grey[0].shape) < 32:
+        return window.as_map(np.zeros((2, *grey[0].shape), np.float32))
+    # The stubs do not know that there may be no flow to start from.
+    method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    flow = method.calc(grey[0], grey[1], None)
+    return window.as_map(np.ascontiguousarray(flow.transpose(2, 0, 1)))
+
+
+def _inputs(term: Weighting, evidence: Any, _request: Request) -> TextureInputs:
+    return TextureInputs(term, evidence or NO_MAP)
 
 
 @njit(cache=True, nogil=True)
-def add_intensity(  # type: ignore[no-untyped-def]
-    intensity, texture, t, wanted, lens, columns, origins, term, wrenches, stiffnesses
-):
-    """Differences in colour between the texture and the image under it; returns the energy.
-
-    Args:
-        intensity: the blurred image, three channels.
-        texture: of several poses.
-        t: which of them this pose carries.
-        wanted: (S,) segments whose texture counts.
-        lens: the camera.
-        columns, origins: frames of the segments.
-        term: weight, sigma (grey levels) and scale (sigmas) of the term.
-        wrenches, stiffnesses: sums of the segments, added to.
-    """
+def add_intensity(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
+    """Colours of the texture against the image under it; see `ImageTerm.kernel`."""
+    intensity, term = inputs.image_map, inputs.term
+    texture, t, wanted = view.textures, view.texture_row, view.textured
+    lens, columns, origins = view.lens, view.columns, view.origins
     count = texture.counts[t]
     each = term.weight / max(count, FEWEST)
     pixel, projection = np.empty((1, 2)), np.empty((1, 2, 3))
@@ -71,16 +107,11 @@ def add_intensity(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def add_motion(  # type: ignore[no-untyped-def]
-    flow, texture, t, wanted, lens, columns, origins, term, wrenches, stiffnesses
-):
-    """Differences between the motion of the texture and the optical flow; returns the energy.
-
-    Args:
-        flow: from the last image to this one, two channels, px.
-        texture, t, wanted, lens, columns, origins, wrenches, stiffnesses: as for `add_intensity`.
-        term: weight, sigma (px) and scale (sigmas) of the term.
-    """
+def add_motion(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
+    """Motion of the texture against the optical flow; see `ImageTerm.kernel`."""
+    flow, term = inputs.image_map, inputs.term
+    texture, t, wanted = view.textures, view.texture_row, view.textured
+    lens, columns, origins = view.lens, view.columns, view.origins
     count = texture.counts[t]
     each = term.weight / max(count, FEWEST)
     pixel, projection = np.empty((1, 2)), np.empty((1, 2, 3))
@@ -143,3 +174,23 @@ def _add_pixel_energy(  # type: ignore[no-untyped-def]
         wrenches, stiffnesses, segment, p0, p1, p2,
         l11 * j[0, 1, 0], l11 * j[0, 1, 1], l11 * j[0, 1, 2], curvature * second, curvature,
     )  # fmt: skip
+
+
+INTENSITY = ImageTerm(
+    'intensity',
+    'The surface of the body keeps the colours that it had in the last image.',
+    TermSettings(4.0, 20.0, 2.0),
+    blurred_colours,
+    _inputs,
+    add_intensity,
+    needs_texture=True,
+)
+MOTION = ImageTerm(
+    'motion',
+    'The surface of the body moves with the optical flow.',
+    TermSettings(5.0, 1.5, 2.0),
+    optical_flow,
+    _inputs,
+    add_motion,
+    needs_texture=True,
+)

@@ -1,12 +1,11 @@
-"""Which of many hypotheses to keep: few that stand for all.
+"""Select: which of many hypotheses to keep, few that stand for all (KJS figure 4, step 5).
+
+    min over S, |S| = K:   sum_i w_i min_{s in S} d(i, s)
 
 Keeping the K heaviest modes keeps near copies of the heaviest one. Here the K are chosen that leave
-the least expected distance from a hypothesis to the nearest kept one,
-
-    min over S, |S| = K:   sum_i w_i min_{s in S} d(i, s),
-
-greedily, heaviest first; d is the mean distance of the joints, each capped, below which two
-hypotheses count as the same. What is not kept gives its weight to the nearest that is.
+the least expected distance from a hypothesis to the nearest kept one, greedily, heaviest first; d
+is the mean distance of the joints, each capped, below which two hypotheses count as the same. What
+is not kept gives its weight to the nearest that is.
 """
 
 from __future__ import annotations
@@ -16,8 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-
-from hmt_ros.inference.mixture import GaussianMixture, bhattacharyya_distances
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -54,30 +51,6 @@ def choose_hypotheses(
     chosen, owner = _choose(np.ascontiguousarray(joints), weights / weights.sum(), count, same, cap)
     groups = np.array([np.logaddexp.reduce(log_weights[owner == k]) for k in range(len(chosen))])
     return Kept(chosen, owner, groups)
-
-
-def inherited_log_weights(
-    means: Array, covariances: Array, order: Index, before: GaussianMixture
-) -> Array:
-    """Log weights (K,) that new modes take over from a mixture before (KJS fig. 4, step 5).
-
-    Each takes the weight of the nearest component by the Bhattacharyya distance, which is then
-    taken out; modes that none is left for get the smallest weight. So a track keeps the modes that
-    it had, while new ones may emerge.
-
-    Args:
-        means, covariances: (K, d), (K, d, d).
-        order: (K,) in which they choose.
-        before: the mixture.
-    """
-    distances = bhattacharyya_distances(means, covariances, before.means, before.covariances)
-    log_weights = np.log(np.maximum(before.normalised().weights, np.finfo(np.float64).tiny))
-    result = np.full(len(means), log_weights.min())
-    for k in order[: len(before)]:
-        nearest = int(np.argmin(distances[k]))
-        result[k] = log_weights[nearest]
-        distances[:, nearest] = np.inf
-    return result
 
 
 @njit(cache=True, nogil=True)

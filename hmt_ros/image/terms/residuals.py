@@ -1,12 +1,17 @@
-"""From residuals at points of the body to a gradient and a Gauss-Newton Hessian over the pose.
+"""Robust residuals at points of the body, and their gradient and Hessian over the pose.
 
-The compiled counterpart of `body.kinematics.segment_sums` and `assemble`, one pose at a time: a
-residual at the point p with derivative a adds `g b` and `k b b^T` to its segment, b = (a, p x a);
-sums over what a degree of freedom moves give its row of the gradient and of the Hessian.
+    rho(r) = 1/2 w r^2 / (1 + r^2 / c^2)                                       Geman-McClure (KJS 2)
+
+A residual at the point p of a segment has a derivative a with respect to the point. A small motion
+of the segment is a twist (v, w) that moves p by v + w x p, so the residual adds `g b` and
+`k b b^T` to its segment, b = (a, p x a), g the derivative and k the curvature of rho. Sums over
+what a degree of freedom moves give its row of the gradient and of the Hessian. It is the compiled
+counterpart of `body.kinematics.segment_sums` and `assemble`, one pose at a time.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +39,7 @@ class Tree(NamedTuple):
     dof_is_rotation: NDArray[np.bool_]
 
 
+@lru_cache(maxsize=64)
 def tree_of(skeleton: Skeleton) -> Tree:
     """The compiled code's view of a skeleton."""
     last_of: list[int] = []  # the last degree of freedom on the path to each segment
@@ -50,6 +56,26 @@ def tree_of(skeleton: Skeleton) -> Tree:
         before.astype(np.int64),
         np.array(skeleton.dof_is_rotation),
     )
+
+
+@njit(cache=True, nogil=True, inline='always')
+def geman_mcclure(residual, scale, weight):  # type: ignore[no-untyped-def]
+    """Geman-McClure kernel: value, derivative and Gauss-Newton curvature.
+
+        rho(r) = 1/2 w r^2 / (1 + r^2 / c^2)
+
+    Quadratic near zero, at most w c^2 / 2. The curvature is the weight rho'(r) / r of iteratively
+    reweighted least squares, which is positive everywhere.
+
+    Args:
+        residual: r, in standard deviations.
+        scale: c, in standard deviations.
+        weight: w, factor on the energy.
+    """
+    square = residual * residual
+    shrink = 1.0 / (1.0 + square / (scale * scale))
+    curvature = weight * shrink * shrink
+    return 0.5 * weight * square * shrink, curvature * residual, curvature
 
 
 @njit(cache=True, nogil=True, inline='always')
