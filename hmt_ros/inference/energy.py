@@ -8,6 +8,7 @@ every optimiser takes such a sum (KJS 2 and 3.2, VMS 5).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, Protocol
@@ -23,8 +24,9 @@ class Derivatives(IntEnum):
     """Which derivatives an energy is asked for."""
 
     NONE = 0
-    POSITIVE = 1  # gradient and a positive semi-definite Hessian: Gauss-Newton, or a majorising one
-    EXACT = 2  # gradient and the exact Hessian, where the term knows it; else as POSITIVE
+    GRADIENT = 1  # the gradient; a term may return a Hessian with it
+    POSITIVE = 2  # gradient and a positive semi-definite Hessian: Gauss-Newton, or a majorising one
+    EXACT = 3  # gradient and the exact Hessian, where the term knows it; else as POSITIVE
 
 
 class Energy(NamedTuple):
@@ -41,15 +43,11 @@ class Energy(NamedTuple):
     hessian: Array | None = None
 
     def plus(self, other: Energy) -> Energy:
-        """The sum of both."""
-        if self.gradient is None or other.gradient is None:
-            return Energy(self.value + other.value)
-        assert self.hessian is not None
-        assert other.hessian is not None
+        """The sum of both; it has the derivatives that both have."""
         return Energy(
             self.value + other.value,
-            self.gradient + other.gradient,
-            self.hessian + other.hessian,
+            _plus(self.gradient, other.gradient),
+            _plus(self.hessian, other.hessian),
         )
 
     def derivatives(self) -> tuple[Array, Array]:
@@ -61,6 +59,10 @@ class Energy(NamedTuple):
         if self.gradient is None or self.hessian is None:
             raise ValueError('the energy was computed without derivatives')
         return self.gradient, self.hessian
+
+
+def _plus(one: Array | None, other: Array | None) -> Array | None:
+    return None if one is None or other is None else one + other
 
 
 class EnergyTerm(Protocol):
@@ -78,6 +80,23 @@ class EnergyTerm(Protocol):
             derivatives: which are wanted.
         """
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyFunction:
+    """A term that is written as a function.
+
+    Attributes:
+        function: maps points (n, d) and rows (n,) to value, gradient and Hessian, of any kind.
+    """
+
+    function: Callable[[Array, Index], tuple[Array, Array, Array]]
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`; the derivatives are always there."""
+        return Energy(*self.function(x, rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,10 +180,11 @@ class Student:
 
 
 def _pulls(term: Quadratic | Student, x: Array, rows: Index) -> tuple[Array, Array, Array]:
-    """x - m, P (x - m) and P of each point."""
+    """x - m (n, d), P (x - m) (n, d) and P (n, d, d) of each point."""
     offset = x - _of_rows(term.centres, rows, 2)
     if term.precisions.ndim == 2:
-        return offset, offset @ term.precisions, term.precisions
+        shape = (*x.shape, x.shape[1])
+        return offset, offset @ term.precisions, np.broadcast_to(term.precisions, shape)
     precisions = term.precisions[rows]
     return offset, np.einsum('nij,nj->ni', precisions, offset), precisions
 
@@ -193,11 +213,9 @@ class Restricted:
         """The energy at values x (n, f) of the free variables; see `EnergyTerm`."""
         whole = np.repeat(self.point[None], len(x), axis=0)
         whole[:, self.free] = x
-        found = self.term.energy(whole, rows, derivatives=derivatives)
-        if found.gradient is None or found.hessian is None:
-            return found
-        return Energy(
-            found.value,
-            found.gradient[:, self.free],
-            found.hessian[:, self.free[:, None], self.free],
-        )
+        value, gradient, hessian = self.term.energy(whole, rows, derivatives=derivatives)
+        if gradient is not None:
+            gradient = gradient[:, self.free]
+        if hessian is not None:
+            hessian = hessian[:, self.free[:, None], self.free]
+        return Energy(value, gradient, hessian)
