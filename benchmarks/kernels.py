@@ -31,13 +31,13 @@ from hmt_ros.image.likelihood import ImageLikelihood, TermSettings
 from hmt_ros.image.observation import observe
 from hmt_ros.image.texture import capture_textures
 from hmt_ros.inference.block_tridiagonal import add_band_product
+from hmt_ros.inference.energy import Derivatives
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.smoothing import embedded_network as network_module
 from hmt_ros.smoothing.component_overlaps import add_overlaps
-from hmt_ros.smoothing.likelihood import Curvature
 from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.tracking.pruning import choose_hypotheses
 
@@ -200,7 +200,7 @@ def _smoothing(seconds: float) -> Iterator[dict[str, Any]]:
     ends = likelihood.first[1:-1]  # type: ignore[union-attr]
     yield _smoothing_case(
         'mixtures, gradient, Hessian', len(poses), seconds,
-        partial(likelihood.energy, poses, times, Curvature.EXACT),
+        partial(likelihood.energy, poses, times, derivatives=Derivatives.EXACT),
         partial(
             numpy_smoothing.mixture_energy, list(layers.mixtures),
             np.split(likelihood.whiteners, ends),  # type: ignore[union-attr]

@@ -25,6 +25,7 @@ from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSe
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import Minimum, Status, minimise
+from hmt_ros.inference.energy import EnergyFunction
 from hmt_ros.tracking.proposals import covariance_scaled_samples, spherical_samples
 
 Array = NDArray[np.float64]
@@ -323,7 +324,7 @@ def setting_of(body: Body, pose: Array) -> Setting:
 def optimise(body: Body, energy: Any, poses: Array) -> Minimum:
     """Minima next to poses (N, d), within the limits."""
     return minimise(
-        energy, poses, body.lower, body.upper,
+        EnergyFunction(energy), poses, body.lower, body.upper,
         step_scale=np.where(body.skeleton.dof_is_rotation, 0.4, 0.3),
         damping=1e-3, max_iterations=ITERATIONS, tolerance=1e-8,
     )  # fmt: skip

@@ -33,6 +33,7 @@ from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import Minimum, minimise
+from hmt_ros.inference.energy import EnergyFunction
 from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
 from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.rendering.renderer import render_frames
@@ -205,7 +206,7 @@ def new_minima(name: str, vote: str, seed: int, count: int, budget: int) -> dict
 def _optimised(likelihood: ImageLikelihood, poses: Array, observation: Observation) -> Minimum:
     body = likelihood.body
     return minimise(
-        lambda x, _: likelihood.energy(x, observation),
+        EnergyFunction(lambda x, _: likelihood.energy(x, observation)),
         poses, body.lower, body.upper, step_scale=0.3, max_iterations=40, tolerance=1e-3,
     )  # fmt: skip
 

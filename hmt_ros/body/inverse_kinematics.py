@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import assemble, forward, segment_sums
 from hmt_ros.inference.bounded_newton import Minimum, minimise
+from hmt_ros.inference.energy import EnergyFunction, Quadratic, Sum
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -77,7 +78,7 @@ def solve_joint_positions(
         rays = goal / np.maximum(np.linalg.norm(goal, axis=2, keepdims=True), 1e-12)
         axes -= rays[..., :, None] * rays[..., None, :]
 
-    def energy(x: Array, problem: Index) -> tuple[Array, Array, Array]:
+    def distances(x: Array, problem: Index) -> tuple[Array, Array, Array]:
         frames = forward(skeleton, x)
         joints = frames.points(skeleton.joint_segments[which], offsets)
         w = weight[problem].T
@@ -96,12 +97,9 @@ def solve_joint_positions(
                 len(skeleton.parents),
             ),
         )
-        offset = x - body.prior_mean
-        value += 0.5 * (offset * offset) @ precision
-        gradient += offset * precision
-        hessian += np.diag(precision)
         return value, gradient, hessian
 
+    energy = Sum((EnergyFunction(distances), Quadratic(body.prior_mean, precision)))
     return minimise(
         energy, start, limits_low, limits_high,
         step_scale=np.where(skeleton.dof_is_rotation, 0.5, 0.3),

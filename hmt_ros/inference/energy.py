@@ -8,7 +8,7 @@ every optimiser takes such a sum (KJS 2 and 3.2, VMS 5).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, Protocol
@@ -24,8 +24,9 @@ class Derivatives(IntEnum):
     """Which derivatives an energy is asked for."""
 
     NONE = 0
-    POSITIVE = 1  # gradient and a positive semi-definite Hessian: Gauss-Newton, or a majorising one
-    EXACT = 2  # gradient and the exact Hessian, where the term knows it; else as POSITIVE
+    GRADIENT = 1  # the gradient; a term may return a Hessian with it
+    POSITIVE = 2  # gradient and a positive semi-definite Hessian: Gauss-Newton, or a majorising one
+    EXACT = 3  # gradient and the exact Hessian, where the term knows it; else as POSITIVE
 
 
 class Energy(NamedTuple):
@@ -50,6 +51,10 @@ class Energy(NamedTuple):
         if self.gradient is None or self.hessian is None:
             raise ValueError('the energy was computed without derivatives')
         return self.gradient, self.hessian
+
+
+def _plus(one: Array | None, other: Array | None) -> Array | None:
+    return None if one is None or other is None else one + other
 
 
 class EnergyTerm(Protocol):
@@ -85,6 +90,23 @@ def add_energies(energies: Iterable[Energy]) -> Energy:
             gradient += own[0]
             hessian += own[1]
     return Energy(value, gradient, hessian)
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyFunction:
+    """A term that is written as a function.
+
+    Attributes:
+        function: maps points (n, d) and rows (n,) to value, gradient and Hessian, of any kind.
+    """
+
+    function: Callable[[Array, Index], tuple[Array, Array, Array]]
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`; the derivatives are always there."""
+        return Energy(*self.function(x, rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,10 +192,11 @@ class Student:
 
 
 def _pulls(term: Quadratic | Student, x: Array, rows: Index) -> tuple[Array, Array, Array]:
-    """x - m, P (x - m) and P of each point."""
+    """x - m (n, d), P (x - m) (n, d) and P (n, d, d) of each point."""
     offset = x - _of_rows(term.centres, rows, 2)
     if term.precisions.ndim == 2:
-        return offset, offset @ term.precisions, term.precisions
+        shape = (*x.shape, x.shape[1])
+        return offset, offset @ term.precisions, np.broadcast_to(term.precisions, shape)
     precisions = term.precisions[rows]
     return offset, np.einsum('nij,nj->ni', precisions, offset), precisions
 
@@ -202,11 +225,9 @@ class Restricted:
         """The energy at values x (n, f) of the free variables; see `EnergyTerm`."""
         whole = np.repeat(self.point[None], len(x), axis=0)
         whole[:, self.free] = x
-        found = self.term.energy(whole, rows, derivatives=derivatives)
-        if found.gradient is None or found.hessian is None:
-            return found
-        return Energy(
-            found.value,
-            found.gradient[:, self.free],
-            found.hessian[:, self.free[:, None], self.free],
-        )
+        value, gradient, hessian = self.term.energy(whole, rows, derivatives=derivatives)
+        if gradient is not None:
+            gradient = gradient[:, self.free]
+        if hessian is not None:
+            hessian = hessian[:, self.free[:, None], self.free]
+        return Energy(value, gradient, hessian)

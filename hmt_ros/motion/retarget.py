@@ -18,6 +18,7 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import assemble, forward, segment_sums
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference import minimise
+from hmt_ros.inference.energy import EnergyFunction
 from hmt_ros.motion.limb_angles import limb_angles
 from hmt_ros.motion.motion_file import Motion
 from hmt_ros.motion.rig_names import SIDES
@@ -228,7 +229,7 @@ def _refined(body: Body, markers: _Markers, start: Array, fps: float, sweeps: in
             return value + 0.5 * (pull * off * off).sum(1), gradient + pull * off, hessian
 
         best = minimise(
-            objective, poses, skeleton.lower, skeleton.upper,
+            EnergyFunction(objective), poses, skeleton.lower, skeleton.upper,
             step_scale=step_scale, max_iterations=iterations, tolerance=1e-4,
         )  # fmt: skip
         return best.x, best.value

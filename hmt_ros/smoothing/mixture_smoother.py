@@ -12,8 +12,9 @@ from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.block_tridiagonal import BlockCholesky
+from hmt_ros.inference.energy import Derivatives
 from hmt_ros.smoothing.dynamics import LinearGaussianDynamics, TrajectoryPrior
-from hmt_ros.smoothing.likelihood import Curvature, SequenceLikelihood, check_mixtures
+from hmt_ros.smoothing.likelihood import SequenceLikelihood, check_mixtures
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.path_gaussians import path_gaussians
 from hmt_ros.smoothing.paths import Paths
@@ -275,7 +276,8 @@ class MixtureSmoother:
         energies, _ = prior.energy(found.states)
         at = np.tile(np.arange(times), count)
         poses = found.states[:, :, : prior.dimension].reshape(-1, prior.dimension)
-        observed = likelihood.energy(poses, at, Curvature.NONE)[0].reshape(count, times).sum(1)
+        energy = likelihood.energy(poses, at, derivatives=Derivatives.NONE)
+        observed = energy.value.reshape(count, times).sum(1)
         d = self.dynamics.dimension
         return TrajectoryMixture(
             weights=found.weights[order],

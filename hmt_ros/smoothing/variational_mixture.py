@@ -25,9 +25,10 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, add_band_product
+from hmt_ros.inference.energy import Derivatives
 from hmt_ros.smoothing.component_overlaps import NEGLIGIBLE, add_overlaps, pair_distances
 from hmt_ros.smoothing.dynamics import TrajectoryPrior
-from hmt_ros.smoothing.likelihood import Curvature, SequenceLikelihood
+from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 Array = NDArray[np.float64]
 
@@ -413,9 +414,10 @@ class FreeEnergy:
         gradient -= information
         poses = points.reshape(s * self.times, self.size)[:, :d]
         at = np.tile(np.arange(self.times), s)
-        observed, slope, _ = self.likelihood.energy(poses, at, Curvature.NONE)
-        gradient.reshape(s * self.times, self.size)[:, :d] += slope
-        return value + observed.reshape(s, self.times).sum(1), gradient
+        found = self.likelihood.energy(poses, at, derivatives=Derivatives.GRADIENT)
+        assert found.gradient is not None
+        gradient.reshape(s * self.times, self.size)[:, :d] += found.gradient
+        return value + found.value.reshape(s, self.times).sum(1), gradient
 
     def _near(self, means: Array, inflation: Array) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
         """(M, M) which components may overlap, by their marginals where they are farthest apart.
