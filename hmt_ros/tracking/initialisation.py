@@ -85,10 +85,8 @@ def start_from_keypoints(
     chains = [
         c for c in ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck') if c in body.chains
     ]
-    flips = np.concatenate(
-        [heads.x] + [enumerate_flips(body, camera, heads.x, c)[0] for c in chains]
-    )
-    flips = np.concatenate([flips, *_pairs_of_flips(body, camera, heads.x, chains)])
+    flips = np.concatenate([heads.x] + [enumerate_flips(body, heads.x, c)[0] for c in chains])
+    flips = np.concatenate([flips, *_pairs_of_flips(body, heads.x, chains)])
     raw = likelihood.energy(flips, observation)[0]
     keep = np.argsort(raw, kind='stable')[:192]
     solved = _distinct(_solve(energy, flips[keep], body), body, 96)
@@ -234,13 +232,11 @@ def _first_guesses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
     return result
 
 
-def _pairs_of_flips(body: Body, camera: Camera, poses: Array, chains: list[str]) -> list[Array]:
+def _pairs_of_flips(body: Body, poses: Array, chains: list[str]) -> list[Array]:
     """Products of the trees of both arms and of both legs."""
     pairs = [('left_arm', 'right_arm'), ('left_leg', 'right_leg')]
     return [
-        enumerate_flips(body, camera, poses, pair)[0]
-        for pair in pairs
-        if all(c in chains for c in pair)
+        enumerate_flips(body, poses, pair)[0] for pair in pairs if all(c in chains for c in pair)
     ]
 
 

@@ -355,7 +355,7 @@ class KinematicJumps:
         sources = np.concatenate(angles)
         poses = np.repeat(modes[:1], len(sources), axis=0)
         poses[:, own] = sources
-        flips, parents = enumerate_flips(self.body, self.camera, poses, chain)
+        flips, parents = enumerate_flips(self.body, poses, chain)
         first = np.concatenate([[True], parents[1:] != parents[:-1]])
         flips, parents = flips[~first], parents[~first]
         angles.append(flips[:, own])
