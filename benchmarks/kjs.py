@@ -197,7 +197,7 @@ def kinematic_jumps(setting: Setting, name: str) -> Samples:
 
     def draw() -> Array:
         if chains is not None:
-            return enumerate_flips(setting.body, CAMERA, setting.pose, chains)[0]
+            return enumerate_flips(setting.body, setting.pose, chains)[0]
         product = full_body_flips(setting.body, setting.pose, most_overlap=np.inf)
         return product.most_probable(MOST_LEAVES).poses
 

@@ -234,7 +234,7 @@ def full_body_flips(
     """
     given = np.array(poses, dtype=np.float64, ndmin=2)
     names = tuple(body.chains) if chains is None else tuple(chains)
-    enumerate_flips(body, None, given[:0], names)  # raises where chains do not go together
+    enumerate_flips(body, given[:0], names)  # raises where chains do not go together
     trunks, parents = given, np.arange(len(given))
     if torso:
         flips, roots = _torso_flips(body, given, slack)
@@ -304,7 +304,7 @@ def _hung(
     The first trunks are those of the poses; each has the given leaf first.
     """
     dofs, count = body.skeleton.chain_dofs[chain], len(poses)
-    leaves, roots = enumerate_flips(body, None, poses, chain)
+    leaves, roots = enumerate_flips(body, poses, chain)
     seen, others = poses[parents[count:]], trunks[count:]
     hung, owners = rehang_chain(body, seen, others, chain, slack=slack)
     missing = np.setdiff1d(np.arange(len(others)), owners)

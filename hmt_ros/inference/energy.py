@@ -53,10 +53,6 @@ class Energy(NamedTuple):
         return self.gradient, self.hessian
 
 
-def _plus(one: Array | None, other: Array | None) -> Array | None:
-    return None if one is None or other is None else one + other
-
-
 class EnergyTerm(Protocol):
     """Minus the logarithm of one factor of a posterior."""
 

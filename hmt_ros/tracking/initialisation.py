@@ -21,7 +21,10 @@ from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.silhouette import Outline
 from hmt_ros.inference.bounded_newton import Minimum, minimise
+from hmt_ros.inference.energy import Derivatives, EnergyTerm
 from hmt_ros.tracking.subject import Subject
 
 Array = NDArray[np.float64]
@@ -79,10 +82,8 @@ def start_from_keypoints(
     chains = [
         c for c in ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck') if c in body.chains
     ]
-    flips = np.concatenate(
-        [heads.x] + [enumerate_flips(body, camera, heads.x, c)[0] for c in chains]
-    )
-    flips = np.concatenate([flips, *_pairs_of_flips(body, camera, heads.x, chains)])
+    flips = np.concatenate([heads.x] + [enumerate_flips(body, heads.x, c)[0] for c in chains])
+    flips = np.concatenate([flips, *_pairs_of_flips(body, heads.x, chains)])
     raw = energy.energy(flips, derivatives=Derivatives.NONE).value
     keep = np.argsort(raw, kind='stable')[:192]
     solved = _distinct(_solve(energy, flips[keep], body), body, 96)
@@ -228,13 +229,11 @@ def _first_guesses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
     return result
 
 
-def _pairs_of_flips(body: Body, camera: Camera, poses: Array, chains: list[str]) -> list[Array]:
+def _pairs_of_flips(body: Body, poses: Array, chains: list[str]) -> list[Array]:
     """Products of the trees of both arms and of both legs."""
     pairs = [('left_arm', 'right_arm'), ('left_leg', 'right_leg')]
     return [
-        enumerate_flips(body, camera, poses, pair)[0]
-        for pair in pairs
-        if all(c in chains for c in pair)
+        enumerate_flips(body, poses, pair)[0] for pair in pairs if all(c in chains for c in pair)
     ]
 
 

@@ -91,7 +91,7 @@ def test_depth_variances_are_those_of_samples(human32, motion):
 def test_shares_of_new_minima(human32, motion):
     """Leaves that are not the pose; none is left when all leaves are known."""
     for chain in CHAINS[:4]:
-        leaves, parents = enumerate_flips(human32, None, motion, chain)
+        leaves, parents = enumerate_flips(human32, motion, chain)
         joints = human32.joint_positions(leaves)
         joints -= joints[:, :1]
         first = np.array([joints[parents == k][0] for k in range(len(motion))])
@@ -110,7 +110,7 @@ def test_known_minima_get_no_votes(human32, motion):
     shares = [[shares_of_new_minima(human32, p[None], c)[0] for c in CHAINS] for p in motion]
     k, i = np.unravel_index(np.argmax(shares), np.shape(shares))
     pose = motion[k : k + 1]
-    leaves, _ = enumerate_flips(human32, None, pose, CHAINS[i])
+    leaves, _ = enumerate_flips(human32, pose, CHAINS[i])
     before = chain_votes(human32, covariance, CHAINS, 'minima', pose)[0]
     after = chain_votes(human32, covariance, CHAINS, 'minima', pose, leaves)[0]
     assert before[i] == max(before)

@@ -111,7 +111,7 @@ def shares_of_new_minima(body: Body, poses: Array, chain: str, known: Array | No
         chain: name.
         known: (M, d); None: none but the pose itself.
     """
-    leaves, parents = enumerate_flips(body, None, poses, chain)
+    leaves, parents = enumerate_flips(body, poses, chain)
     joints, before = (relative_joints(body, x) for x in (leaves, poses))
     new = np.linalg.norm(joints - before[parents], axis=2).max(1) > APART
     if known is not None and len(known):

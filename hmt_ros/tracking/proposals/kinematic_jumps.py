@@ -258,7 +258,7 @@ class KinematicJumps:
         sources = np.concatenate(angles)
         poses = np.repeat(modes[:1], len(sources), axis=0)
         poses[:, own] = sources
-        flips, parents = enumerate_flips(body, self.posterior.camera, poses, chain)
+        flips, parents = enumerate_flips(body, poses, chain)
         first = np.concatenate([[True], parents[1:] != parents[:-1]])
         angles = np.concatenate([sources, flips[~first][:, own]])
         penalties.append(np.full((len(modes), len(angles) - len(modes)), jump))
