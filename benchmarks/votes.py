@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from hmt_ros.tracking.chain_votes import VOTES, chain_votes
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -39,7 +40,6 @@ from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.chain_votes import VOTES, chain_votes
 from hmt_ros.tracking.proposals import covariance_scaled_samples
 
 Array = NDArray[np.float64]

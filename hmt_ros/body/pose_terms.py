@@ -57,7 +57,9 @@ class Posed:
         """The energy of poses x (N, d); without rows, pose i belongs to problem i."""
         frames = forward(self.skeleton, x)
         rows = np.arange(len(x)) if rows is None else rows
-        return add_energies(term.energy(frames, rows, derivatives=derivatives) for term in self.terms)
+        return add_energies(
+            term.energy(frames, rows, derivatives=derivatives) for term in self.terms
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames
-from hmt_ros.body.pose_terms import AnglePrior, FrameTerm, Posed
-from hmt_ros.body.self_intersection import SelfIntersection
+from hmt_ros.body.pose_terms import AnglePrior, FrameTerm, Posed, SelfIntersection
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.surface import flesh_table_of, lens_of
 from hmt_ros.image.terms.image_term import Request, TermSettings, Weighting
@@ -57,7 +56,8 @@ class LikelihoodSettings(_ImageTerms):  # type: ignore[misc]
     def of_terms(cls, **settings: TermSettings) -> LikelihoodSettings:
         """Settings with the image terms and keypoints that are named, all others switched off."""
         names = [*(term.name for term in TERMS), 'keypoints']
-        return cls(**{name: settings.get(name, OFF) for name in names})
+        chosen: dict[str, Any] = {name: settings.get(name, OFF) for name in names}
+        return cls(**chosen)
 
 
 LikelihoodSettings.__doc__ = '\n'.join(
@@ -68,8 +68,8 @@ LikelihoodSettings.__doc__ = '\n'.join(
         *(f'    {term.name}: {term.meaning}' for term in TERMS),
         '    keypoints: Projected joints lie on the keypoints.',
         '    prior_weight: Factor on the prior of the joint angles.',
-        '    self_intersection_sigma: Overlap of body parts that costs 1/2 nat, m; inf switches the',
-        '        term off.',
+        '    self_intersection_sigma: Overlap of body parts that costs 1/2 nat, m; inf switches',
+        '        the term off.',
     ]
 )
 
@@ -199,9 +199,9 @@ class ImageLikelihood:
                 )  # fmt: skip
 
             _in_threads(work, n)
-        result = {
-            term.name: energies[:, i] for i, term in enumerate(TERMS) if running[i]
-        } or {'nothing': np.zeros(n)}
+        result = {term.name: energies[:, i] for i, term in enumerate(TERMS) if running[i]} or {
+            'nothing': np.zeros(n)
+        }
         costs = next((x.costs for x in inputs if hasattr(x, 'costs')), np.zeros((n, 0)))
         if not derivatives:
             return ImageEnergy(result, costs, None, None)

@@ -1,4 +1,4 @@
-"""What one image says: the evidence of every term of the likelihood, computed once for all poses."""
+"""What one image says: the evidence of every term of the likelihood, once for all poses."""
 
 from __future__ import annotations
 

@@ -180,7 +180,6 @@ class Student:
         shrinkage = self.shrinkage(distance, d)
         return Energy(value, shrinkage[:, None] * pulled, shrinkage[:, None, None] * precisions)
 
-
     def shrinkage(self, distance: Array, dimension: int) -> Array:
         """Curvature over that of the Gaussian with the same precision, at distances D (N,)."""
         nu = self.degrees_of_freedom

@@ -41,6 +41,6 @@ class ImageSequence:
         value, gradient, hessian = np.empty(n), np.empty((n, d)), np.empty((n, d, d))
         for t in np.unique(rows):
             at = rows == t
-            found = self.likelihood.energy(x[at], self.observations[t])
-            value[at], gradient[at], hessian[at] = found
+            found = self.likelihood.given(self.observations[t]).energy(x[at])
+            value[at], gradient[at], hessian[at] = found.value, *found.derivatives()
         return Energy(value, gradient, hessian)

@@ -22,7 +22,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.filter import MixtureFilter
-from hmt_ros.tracking.hypotheses import Hypotheses
+from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.weighting import log_shares, normalised, weigh
@@ -76,7 +76,7 @@ class Track:
         return sum(one.evaluations for one in self._filters)
 
     @property
-    def modes(self) -> Hypotheses:
+    def modes(self) -> Modes:
         """The present modes; those of both ways to face while that is not decided.
 
         Raises:
@@ -127,7 +127,7 @@ class Track:
     def begin_anew(
         self, poses: Array, observation: Observation, stamp: int, *, both_ways: bool
     ) -> None:
-        """Starts a lost track anew from poses (N, d) and the present modes; `begin` for the rest."""
+        """Starts a lost track anew from poses (N, d) and the present modes; see `begin`."""
         self._forget_evaluations()
         poses = np.concatenate([self._first.modes.poses, poses])
         del self._filters[1:]
@@ -208,7 +208,7 @@ class Track:
         self._filters = [better]
 
 
-def _joined(a: MixtureFilter, b: MixtureFilter) -> Hypotheses:
+def _joined(a: MixtureFilter, b: MixtureFilter) -> Modes:
     """The heaviest modes of two filters, without textures."""
     shares = log_shares([a.log_evidence, b.log_evidence])
     first, second = (

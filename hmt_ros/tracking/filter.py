@@ -1,10 +1,10 @@
 """Mixture density propagation: the five steps from image to image (KJS figure 4).
 
-    predict     x_k | ancestor       motion prior, optical flow                       prediction
-    propose     x_k^0                jumps, samples, predictions of others            proposals
-    optimise    x_k = argmin E(x)    bounded Newton from x_k^0                        posterior
-    weigh       log w_k = log p(ancestor) + log p(jumps) - beta E(x_k)                weighting
-    select      K of N hypotheses    the least expected distance to one that is kept  selection
+predict     x_k | ancestor       motion prior, optical flow                       prediction
+propose     x_k^0                jumps, samples, predictions of others            proposals
+optimise    x_k = argmin E(x)    bounded Newton from x_k^0                        posterior
+weigh       log w_k = log p(ancestor) + log p(jumps) - beta E(x_k)                weighting
+select      K of N hypotheses    the least expected distance to one that is kept  selection
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.inference.bounded_newton import Minimum, resting
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.flesh_fitting import FleshFit
-from hmt_ros.tracking.hypotheses import Hypotheses, new_hypotheses, relative_joints
+from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses, relative_joints
 from hmt_ros.tracking.loss import unexplained_share
 from hmt_ros.tracking.posterior import Posterior, free_covariances
 from hmt_ros.tracking.prediction import follow_flow, predict, updated_velocities
@@ -55,9 +55,7 @@ class Optimised:
 
     def joined(self, other: Optimised) -> Optimised:
         """These and others."""
-        return Optimised(
-            self.hypotheses.joined(other.hypotheses), self.minima.joined(other.minima)
-        )
+        return Optimised(self.hypotheses.joined(other.hypotheses), self.minima.joined(other.minima))
 
 
 class MixtureFilter:
@@ -84,7 +82,7 @@ class MixtureFilter:
         self.log_evidence = 0.0
         self._seed = seed
         self._rng = np.random.default_rng(seed)
-        self._modes: Hypotheses | None = None
+        self._modes: Modes | None = None
         self._flesh = FleshFit(body)
         self._usual_energy = np.inf
         self._outline_costs = np.empty((0, 0))
@@ -102,7 +100,7 @@ class MixtureFilter:
         self._posterior.evaluations = count
 
     @property
-    def modes(self) -> Hypotheses:
+    def modes(self) -> Modes:
         """The present modes, heaviest first.
 
         Raises:
@@ -125,7 +123,12 @@ class MixtureFilter:
     # The start.
 
     def begin(
-        self, body: Body, poses: Array, log_weights: Array, precisions: Array, observation: Observation
+        self,
+        body: Body,
+        poses: Array,
+        log_weights: Array,
+        precisions: Array,
+        observation: Observation,
     ) -> Minimum:
         """Starts from expected poses (N, d); returns the minimum that each of them led to.
 
@@ -162,10 +165,8 @@ class MixtureFilter:
 
     def hold(self, solved: Minimum, log_weights: Array, observation: Observation) -> None:
         """Makes modes at rest from minima and their log prior weights (N,)."""
-        still = replace(
-            new_hypotheses(solved.x, log_weights), velocities=np.zeros_like(solved.x)
-        )
-        least = self._weigh_and_select(Optimised(still, solved), observation)
+        optimised = Optimised(new_hypotheses(solved.x, log_weights), solved)
+        least = self._weigh_and_select(optimised, np.zeros_like(solved.x), observation)
         self.log_evidence = -self.settings.inverse_temperature * least
 
     def twin(self) -> MixtureFilter:
@@ -174,7 +175,7 @@ class MixtureFilter:
         other._flesh = deepcopy(self._flesh)
         return other
 
-    def absorb(self, modes: Hypotheses, observation: Observation) -> None:
+    def absorb(self, modes: Modes, observation: Observation) -> None:
         """Takes over modes; their textures are taken from the image anew."""
         textures = self._posterior.textures(modes.poses, observation)
         self._modes = replace(modes, textures=textures, texture_rows=np.arange(len(modes)))
@@ -192,9 +193,8 @@ class MixtureFilter:
             expected: pose hypotheses from an external predictor, if any.
         """
         s, modes, posterior = self.settings, self.modes, self._posterior
-        predicted = predict(modes, self.body, dt, s.velocity_kept)
-        assert predicted.covariances is not None
-        covariances, precisions = predicted.covariances, _inverses(predicted.covariances)
+        predicted, covariances = predict(modes, self.body, dt, s.velocity_kept)
+        precisions = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
         predicted = follow_flow(predicted, precisions, observation, posterior)
         base = posterior.minimise(
             posterior.given(observation, predicted, precisions), predicted.poses, s.base_iterations
@@ -211,18 +211,18 @@ class MixtureFilter:
         self._learn_usual_energy(float(optimised.minima.value.min()))
         hypotheses, solved = optimised.hypotheses, optimised.minima
         ancestors = hypotheses.ancestors
-        assert modes.velocities is not None
         velocities = updated_velocities(
             modes.velocities[ancestors], modes.poses[ancestors], solved.x, dt, s.velocity_gain
         )
         # Where a limb has jumped, its displacement is no motion.
         velocities = np.where(hypotheses.jumped, 0.0, velocities)
-        hypotheses = replace(hypotheses, velocities=velocities)
         before = None
         if s.reweighting == 'bhattacharyya':
             hypotheses = replace(hypotheses, log_weights=np.zeros(len(hypotheses)))
             before = GaussianMixture(np.exp(modes.log_weights), predicted.poses, covariances)
-        least = self._weigh_and_select(Optimised(hypotheses, solved), observation, before)
+        least = self._weigh_and_select(
+            Optimised(hypotheses, solved), velocities, observation, before
+        )
         self.log_evidence -= s.inverse_temperature * least
         self._fit_flesh(observation)
 
@@ -234,7 +234,7 @@ class MixtureFilter:
         )  # fmt: skip
         self._bad_images = self._bad_images + 1 if self.misfit > self.settings.lost_misfit else 0
 
-    def likelihood_mixture(self, modes: Hypotheses, observation: Observation) -> GaussianMixture:
+    def likelihood_mixture(self, modes: Modes, observation: Observation) -> GaussianMixture:
         """The modes of the likelihood alone, without what was known from the images before.
 
         Around each mode of the posterior the energy of the image and of the body's prior is a
@@ -246,7 +246,6 @@ class MixtureFilter:
         free = ~resting(poses, gradient, body.lower, body.upper)
         covariances = free_covariances(hessian, free)
         step = -np.einsum('kij,kj->ki', covariances, np.where(free, gradient, 0.0))
-        assert modes.covariances is not None
         limit = 3.0 * np.sqrt(np.einsum('kii->ki', modes.covariances))
         step = np.clip(step, -limit, limit)
         means = np.clip(poses + step, body.lower, body.upper)
@@ -321,14 +320,19 @@ class MixtureFilter:
         return optimised[best].joined(self._optimise(sampled, precisions, observation))
 
     def _weigh_and_select(
-        self, optimised: Optimised, observation: Observation, before: GaussianMixture | None = None
+        self,
+        optimised: Optimised,
+        velocities: Array,
+        observation: Observation,
+        before: GaussianMixture | None = None,
     ) -> float:
         """Makes the modes of this image; returns the least energy.
 
         Args:
-            optimised: hypotheses with velocities, at their optima.
+            optimised: hypotheses at their optima.
+            velocities: (N, d) of them, per second.
             observation: of the image.
-            before: the prediction, of which modes inherit their weights; None: from their ancestors.
+            before: the prediction that modes inherit their weights from; None: from ancestors.
         """
         s, solved = self.settings, optimised.minima
         usable = np.flatnonzero(np.isfinite(solved.value))
@@ -359,12 +363,16 @@ class MixtureFilter:
         covariances = filtered
         if observation.evidence:
             covariances = self._posterior.covariances(fit, solved.free[rows])
-        self._modes = replace(
-            optimised.hypotheses[rows],
+        h = optimised.hypotheses[rows]
+        self._modes = Modes(
             poses=poses,
             log_weights=weights[order],
+            ancestors=h.ancestors,
+            expected=h.expected,
+            jumped=h.jumped,
             textures=self._posterior.textures(poses, observation),
             texture_rows=np.arange(len(rows)),
+            velocities=velocities[rows],
             covariances=covariances,
             filtered=filtered,
             log_likelihoods=-fit.image_energy,
@@ -403,7 +411,3 @@ class MixtureFilter:
         self._posterior = Posterior(body, self.camera, self.settings)
         self._posterior.evaluations = evaluations
         self._proposal = proposal_of(self._posterior)
-
-
-def _inverses(matrices: Array) -> Array:
-    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)

@@ -2,13 +2,14 @@
 
     predict -> propose -> optimise -> weigh -> select
 
-A hypothesis is born with a prior (its ancestor, its jumps and where it is expected), gets a pose
-that is locally optimal and a weight, and, if it is selected, covariances and a texture.
+A hypothesis is born with a prior: its ancestor, its jumps, and where it is expected. It gets a pose
+that is locally optimal and a weight; if it is selected it is a mode, with covariances and texture.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.image.texture import Textures
 from hmt_ros.inference.mixture import GaussianMixture
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -27,17 +31,12 @@ class Hypotheses:
 
     Attributes:
         poses: (N, d).
-        log_weights: (N,) log prior probabilities; once weighed, log posterior probabilities.
+        log_weights: (N,) log prior probabilities; of modes log posterior probabilities.
         ancestors: (N,) mode of the image before that each comes from.
         expected: (N, d) pose that the motion prior is centred at.
         jumped: (N, d) degrees of freedom that did not move there, but jumped.
-        textures: of the last image, or, once selected, of this one; None: there are none.
+        textures: of the last image, of modes of the present one; None: there are none.
         texture_rows: (N,) row of the textures that each carries.
-        velocities: (N, d) per second; None before the poses are optimal.
-        covariances: (N, d, d) of the posterior; None before selection.
-        filtered: (N, d, d) covariances that are propagated, as if errors were independent from
-            image to image; None before selection.
-        log_likelihoods: (N,) of the image; None before selection.
     """
 
     poses: Array
@@ -47,40 +46,49 @@ class Hypotheses:
     jumped: NDArray[np.bool_]
     textures: Textures | None
     texture_rows: Index
-    velocities: Array | None = None
-    covariances: Array | None = None
-    filtered: Array | None = None
-    log_likelihoods: Array | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
 
-    def __getitem__(self, rows: Index) -> Hypotheses:
+    def __getitem__(self, rows: Index) -> Self:
         """Some of them; all keep their textures."""
-        parts = {name: getattr(self, name) for name in _ROWS}
-        return replace(self, **{k: None if v is None else v[rows] for k, v in parts.items()})
+        parts: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._by_row()}
+        return replace(self, **parts)
 
-    def joined(self, other: Hypotheses) -> Hypotheses:
+    def joined(self, other: Self) -> Self:
         """These and others, whose textures contain those of these."""
-        parts = {}
-        for name in _ROWS:
-            a, b = getattr(self, name), getattr(other, name)
-            parts[name] = None if a is None or b is None else np.concatenate([a, b])
+        parts: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), getattr(other, name)])
+            for name in self._by_row()
+        }
         return replace(other, **parts)
+
+    @classmethod
+    def _by_row(cls) -> list[str]:
+        return [field.name for field in fields(cls) if field.name != 'textures']
+
+
+@dataclass(frozen=True, eq=False)
+class Modes(Hypotheses):
+    """Hypotheses that were optimised, weighed and selected: the mixture that is carried on.
+
+    Attributes:
+        velocities: (N, d) per second.
+        covariances: (N, d, d) of the posterior.
+        filtered: (N, d, d) covariances that are propagated, as if errors were independent from
+            image to image.
+        log_likelihoods: (N,) of the image.
+    """
+
+    velocities: Array
+    covariances: Array
+    filtered: Array
+    log_likelihoods: Array
 
     @property
     def mixture(self) -> GaussianMixture:
-        """The hypotheses as a mixture over poses.
-
-        Raises:
-            ValueError: they have no covariances yet.
-        """
-        if self.covariances is None:
-            raise ValueError('hypotheses that were not selected have no covariances')
+        """The modes as a mixture over poses."""
         return GaussianMixture(np.exp(self.log_weights), self.poses, self.covariances)
-
-
-_ROWS = tuple(f.name for f in fields(Hypotheses) if f.name != 'textures')
 
 
 def new_hypotheses(poses: Array, log_weights: Array) -> Hypotheses:

@@ -20,8 +20,8 @@ from hmt_ros.flips.distinct_poses import distinct_poses
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.silhouette import Outline
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import Derivatives, EnergyTerm

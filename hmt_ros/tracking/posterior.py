@@ -158,7 +158,7 @@ class Posterior:
         return fit
 
     def covariances(self, fit: ImageFit, free: Mask) -> Array:
-        """Covariances (K, d, d) that the Hessian of an image alone leaves, on free variables (K, d).
+        """Covariances (K, d, d) that an image alone leaves, on the free variables (K, d).
 
         Of the image only a share is believed: shapes, shadows and clothes differ from the model's
         in much the same way in image after image, and such errors do not average out, over pixels

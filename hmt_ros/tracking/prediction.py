@@ -18,8 +18,8 @@ from hmt_ros.body.pose_terms import AnglePrior, Posed
 from hmt_ros.image.likelihood import ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.energy import Quadratic, Sum
-from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
-from hmt_ros.tracking.hypotheses import Hypotheses
+from hmt_ros.tracking.dynamics import PoseRates
+from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses
 from hmt_ros.tracking.posterior import Posterior
 
 Array = NDArray[np.float64]
@@ -28,8 +28,8 @@ Array = NDArray[np.float64]
 FLOW_ITERATIONS = 5
 
 
-def predict(modes: Hypotheses, body: Body, dt: float, velocity_kept: float) -> Hypotheses:
-    """The modes after dt seconds: expected poses within the limits, and their covariances.
+def predict(modes: Modes, body: Body, dt: float, velocity_kept: float) -> tuple[Hypotheses, Array]:
+    """Hypotheses that the modes predict, within the limits, and their covariances (K, d, d).
 
     Args:
         modes: that were selected in the last image.
@@ -37,19 +37,17 @@ def predict(modes: Hypotheses, body: Body, dt: float, velocity_kept: float) -> H
         dt: time since the last image, s.
         velocity_kept: share kappa of the velocity that lasts.
     """
-    assert modes.velocities is not None
-    assert modes.filtered is not None
-    dynamics = LinearGaussianDynamics.random_walk(body.rates)
-    means, covariances = dynamics.predict(modes.poses, modes.filtered, dt)
-    moved = np.clip(means + velocity_kept * dt * modes.velocities, body.lower, body.upper)
-    return replace(
-        modes,
-        poses=moved,
-        ancestors=np.arange(len(modes)),
-        expected=moved,
-        jumped=np.zeros(moved.shape, dtype=np.bool_),
-        covariances=covariances,
+    means, covariances = (
+        modes.poses,
+        modes.filtered + np.diag(PoseRates().rates(body.skeleton) * dt),
     )
+    moved = np.clip(means + velocity_kept * dt * modes.velocities, body.lower, body.upper)
+    predicted = replace(
+        new_hypotheses(moved, modes.log_weights),
+        textures=modes.textures,
+        texture_rows=modes.texture_rows,
+    )
+    return predicted, covariances
 
 
 def follow_flow(
@@ -79,7 +77,9 @@ def follow_flow(
     return replace(predicted, poses=moved, expected=moved)
 
 
-def updated_velocities(velocities: Array, before: Array, after: Array, dt: float, gain: float) -> Array:
+def updated_velocities(
+    velocities: Array, before: Array, after: Array, dt: float, gain: float
+) -> Array:
     """Velocities (N, d) of modes that moved from `before` to `after` (N, d) in dt seconds.
 
     Args:

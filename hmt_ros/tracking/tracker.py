@@ -21,7 +21,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.facing import Track
-from hmt_ros.tracking.hypotheses import Hypotheses
+from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.initialisation import (
     poses_from_keypoints,
     poses_from_outline,
@@ -164,7 +164,7 @@ class Tracker:
         return self._track.misfit
 
     @property
-    def modes(self) -> Hypotheses:
+    def modes(self) -> Modes:
         """The present modes, heaviest first.
 
         Raises:
@@ -248,9 +248,7 @@ class Tracker:
         silhouette = None
         if shape and self.background.frames:
             silhouette = self.background.silhouette(image, self._region())
-        return observe(
-            image, silhouette, keypoints, last_image=self._last_image, wanted=wanted
-        )
+        return observe(image, silhouette, keypoints, last_image=self._last_image, wanted=wanted)
 
     def _region(self) -> Box | None:
         """Where the person can be in the next image; None: anywhere."""

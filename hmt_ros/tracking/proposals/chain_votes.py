@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.flips.interpretation_tree import enumerate_flips
-from hmt_ros.tracking.candidates import relative_joints
+from hmt_ros.tracking.hypotheses import relative_joints
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -260,10 +260,10 @@ class KinematicJumps:
         poses[:, own] = sources
         flips, parents = enumerate_flips(body, poses, chain)
         first = np.concatenate([[True], parents[1:] != parents[:-1]])
-        angles = np.concatenate([sources, flips[~first][:, own]])
-        penalties.append(np.full((len(modes), len(angles) - len(modes)), jump))
+        every = np.concatenate([sources, flips[~first][:, own]])
+        penalties.append(np.full((len(modes), len(every) - len(modes)), jump))
         return distinct_alternatives(
-            body, modes[0], chain, angles, np.concatenate(penalties, axis=1),
+            body, modes[0], chain, every, np.concatenate(penalties, axis=1),
             apart=DISTINCT, most=s.alternatives,
         )  # fmt: skip
 
@@ -297,7 +297,9 @@ class KinematicJumps:
         base, alternatives = pose.copy(), []
         for chain, sibling in (pair, pair[::-1]):
             own = self.posterior.body.skeleton.chain_dofs[chain]
-            hung, _ = rehang_chain(self.posterior.body, pose[None], pose[None], chain, image_of=sibling)
+            hung, _ = rehang_chain(
+                self.posterior.body, pose[None], pose[None], chain, image_of=sibling
+            )
             if len(hung) == 0:
                 return None
             base[own] = hung[0, own]

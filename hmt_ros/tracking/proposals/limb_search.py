@@ -51,9 +51,7 @@ class LimbSearch:
         own = tuple(i for i in parts if p.body.flesh.parts[i].segment in segments)
         rest = tuple(i for i in parts if i not in own)
         for name, traced, occluders in (('_own', own, None), ('_rest', rest, rest)):
-            likelihood = ImageLikelihood(
-                p.body, p.camera, p.settings.likelihood, traced, occluders
-            )
+            likelihood = ImageLikelihood(p.body, p.camera, p.settings.likelihood, traced, occluders)
             object.__setattr__(self, name, likelihood)
         object.__setattr__(self, 'dofs', p.body.skeleton.chain_dofs[self.chain])
 
@@ -92,7 +90,7 @@ class LimbSearch:
             (
                 Restricted(Posed(body.skeleton, seen), pose, own),
                 Quadratic(body.prior_mean[own], weight * body.prior_sigma[own] ** -2.0),
-                Student(pose[own], np.linalg.inv(block), TAILS),
+                Student(pose[own], np.asarray(np.linalg.inv(block)), TAILS),
             )
         )
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value

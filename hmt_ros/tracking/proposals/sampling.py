@@ -1,7 +1,7 @@
 """Spherical and covariance-scaled sampling (KJS 3 and 5).
 
-    SS      x ~ N(m, s^2 r^2 I),  r = |S|^(1/2d)
-    CSS     x ~ N(m, s^2 S)
+SS      x ~ N(m, s^2 r^2 I),  r = |S|^(1/2d)
+CSS     x ~ N(m, s^2 S)
 """
 
 from __future__ import annotations
