@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.model_file import read_body
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.motion.rig_names import ARM, LEG, SIDES, standard_names
 
@@ -184,11 +185,36 @@ def rig_body(rig: Rig, name: str, unit_to_m: float) -> Body:
         shapes=(),
         prior_mean=np.zeros(len(channels)),
         prior_sigma=np.full(len(channels), np.inf),
+        rates=_rates(rig, names),
         length_sigma=0.05 * values,
         stature_lengths=tuple(upright),
         stature_extra=SKULL_AND_HEEL * sum(lengths[k] for k in upright),
         default_lengths=values,
     )
+
+
+def _rates(rig: Rig, names: Sequence[str]) -> Array:
+    """Variances (d,) per second, as of human37; a segment that it lacks has those of its parent."""
+    person = read_body('human37')
+    known = person.skeleton
+    turns = {
+        int(s): float(rate)
+        for s, rate, turn in zip(known.dof_segments, person.rates, known.dof_is_rotation)
+        if turn
+    }
+    by_joint = {
+        joint: turns[int(s)]
+        for joint, s, offset in zip(known.joint_names, known.joint_segments, known.joint_offsets)
+        if not np.any(offset)
+    }
+    trunk = turns[known.segment_names.index('trunk')]
+    own: list[float] = []
+    result = []
+    for segment, name in zip(rig.segments, names):
+        above = turns[0] if segment.parent < 0 else trunk if segment.parent == 0 else None
+        own.append(by_joint.get(name, own[segment.parent] if above is None else above))
+        result += [own[-1] if c.is_rotation else float(person.rates[0]) for c in segment.channels]
+    return np.array(result)
 
 
 def _unique(names: Sequence[str]) -> list[str]:

@@ -29,8 +29,6 @@ from hmt_ros.tracking.weighting import log_shares, normalised, weigh
 
 Array = NDArray[np.float64]
 
-# Pairs of joints from a person's right to the left.
-ACROSS = (('left_shoulder', 'right_shoulder'), ('left_hip', 'right_hip'))
 # One of two ways to face is given up when it is less probable by this, nats.
 DECIDED = 25.0
 
@@ -226,11 +224,10 @@ def left_directions(body: Body, poses: Array) -> Array:
     Raises:
         ValueError: a body without shoulders and hips.
     """
-    names = [pair for pair in ACROSS if set(pair) <= set(body.joint_names)]
-    if not names:
+    if not body.trunk_pairs:
         raise ValueError(f'body {body.name} has neither shoulders nor hips: it faces nowhere')
     joints = body.joint_positions(poses)
-    ends = [body.skeleton.joint_index(side) for side in zip(*names, strict=True)]
+    ends = [body.skeleton.joint_index(side) for side in zip(*body.trunk_pairs, strict=True)]
     left = joints[:, ends[0]].sum(1) - joints[:, ends[1]].sum(1)
     result: Array = left / np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-12)
     return result

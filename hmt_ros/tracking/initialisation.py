@@ -79,11 +79,8 @@ def start_from_keypoints(
     energy = ImageLikelihood(body, camera, settings).given(Observation(keypoints=keypoints))
 
     heads = _distinct(_solve(energy, fits.x[:, :d], body), body, 4)
-    chains = [
-        c for c in ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck') if c in body.chains
-    ]
-    flips = np.concatenate([heads.x] + [enumerate_flips(body, heads.x, c)[0] for c in chains])
-    flips = np.concatenate([flips, *_pairs_of_flips(body, heads.x, chains)])
+    trees = [enumerate_flips(body, heads.x, c)[0] for c in (*body.chains, *body.chain_pairs)]
+    flips = np.concatenate([heads.x, *trees])
     raw = energy.energy(flips, derivatives=Derivatives.NONE).value
     keep = np.argsort(raw, kind='stable')[:192]
     solved = _distinct(_solve(energy, flips[keep], body), body, 96)
@@ -227,14 +224,6 @@ def _first_guesses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
     turned = body.joint_positions(result)[:, body.skeleton.joint_index(names)]
     result[:, :3] = middle - turned.mean(1)
     return result
-
-
-def _pairs_of_flips(body: Body, poses: Array, chains: list[str]) -> list[Array]:
-    """Products of the trees of both arms and of both legs."""
-    pairs = [('left_arm', 'right_arm'), ('left_leg', 'right_leg')]
-    return [
-        enumerate_flips(body, poses, pair)[0] for pair in pairs if all(c in chains for c in pair)
-    ]
 
 
 def _solve(energy: EnergyTerm, poses: Array, body: Body) -> Minimum:

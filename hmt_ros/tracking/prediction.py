@@ -18,7 +18,6 @@ from hmt_ros.body.pose_terms import AnglePrior, Posed
 from hmt_ros.image.likelihood import ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.energy import Quadratic, Sum
-from hmt_ros.tracking.dynamics import PoseRates
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses
 from hmt_ros.tracking.posterior import Posterior
 
@@ -39,7 +38,7 @@ def predict(modes: Modes, body: Body, dt: float, velocity_kept: float) -> tuple[
     """
     means, covariances = (
         modes.poses,
-        modes.filtered + np.diag(PoseRates().rates(body.skeleton) * dt),
+        modes.filtered + np.diag(body.rates * dt),
     )
     moved = np.clip(means + velocity_kept * dt * modes.velocities, body.lower, body.upper)
     predicted = replace(

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.body.skeleton import other_side
 from hmt_ros.flips.interpretation_tree import enumerate_flips, rehang_chain
 from hmt_ros.flips.torso_flips import flip_torso
 from hmt_ros.image.observation import Observation
@@ -37,10 +38,6 @@ MOST_GROUPS = 3
 SAME_TRUNK = 0.06
 # Configurations of a limb are distinct when some joint is further apart, m.
 DISTINCT = 0.08
-TRUNK = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
-CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
-PAIRS = (('left_arm', 'right_arm'), ('left_leg', 'right_leg'))
-SIBLINGS = {a: b for pair in PAIRS for a, b in (pair, pair[::-1])}
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +108,7 @@ class KinematicJumps:
             )  # fmt: skip
             found = self._search(lead, base.x, rng)
             alternatives = [
-                self._alternatives(base.x[group], chain, found.get(chain)) for chain in self._chains
+                self._alternatives(base.x[group], chain, found.get(chain)) for chain in self.posterior.body.chains
             ]
             products, textures = self._products(
                 lead, base.x[group], group, sources.log_weights[group], alternatives
@@ -151,18 +148,13 @@ class KinematicJumps:
         )
 
     @cached_property
-    def _chains(self) -> list[str]:
-        return [chain for chain in CHAINS if chain in self.posterior.body.chains]
-
-    @cached_property
     def _searches(self) -> dict[str, LimbSearch]:
-        limbs = [chain for pair in PAIRS for chain in pair if chain in self._chains]
-        return {chain: LimbSearch(self.posterior, chain) for chain in limbs}
+        pairs = self.posterior.body.chain_pairs
+        return {chain: LimbSearch(self.posterior, chain) for pair in pairs for chain in pair}
 
     def _groups(self, base: Minimum) -> list[Index]:
         """Modes with nearly the same trunk, each group with its best mode first."""
-        names = [name for name in TRUNK if name in self.posterior.body.joint_names]
-        which = self.posterior.body.skeleton.joint_index(names)
+        which = self.posterior.body.skeleton.joint_index(self.posterior.body.trunk_joints)
         trunk = self.posterior.body.joint_positions(base.x)[:, which]
         left = list(np.argsort(base.value, kind='stable'))
         groups = []
@@ -196,9 +188,7 @@ class KinematicJumps:
         weight = np.array(
             [np.logaddexp.reduce(log_weights) + np.log(self.posterior.settings.jump_probability)]
         )
-        for pair in PAIRS:
-            if not set(pair) <= set(self.posterior.body.chains):
-                continue
+        for pair in self.posterior.body.chain_pairs:
             swapped = self._swap(lead, pair)
             if swapped is None:
                 continue
@@ -251,9 +241,10 @@ class KinematicJumps:
         angles, penalties = [modes[:, own]], [np.where(np.eye(len(modes)) > 0, 0.0, jump)]
         if found is not None:
             angles.append(found)
-        if chain in SIBLINGS:
+        if chain in self._searches:
             # Limbs that cross in the image are easily taken for each other.
-            swapped, _ = rehang_chain(body, modes[:1], modes[:1], chain, image_of=SIBLINGS[chain])
+            sibling = other_side(chain)
+            swapped, _ = rehang_chain(body, modes[:1], modes[:1], chain, image_of=sibling)
             angles.append(swapped[:, own])
         sources = np.concatenate(angles)
         poses = np.repeat(modes[:1], len(sources), axis=0)

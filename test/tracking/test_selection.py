@@ -9,7 +9,8 @@ import pytest
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking.pruning import choose_hypotheses, inherited_log_weights
+from hmt_ros.tracking.selection import choose_hypotheses
+from hmt_ros.tracking.weighting import inherited_log_weights
 
 SAME, CAP = 0.02, 0.3
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hmt_ros.tracking.proposals import (
+from hmt_ros.tracking.proposals.sampling import (
     covariance_scaled_samples,
     spherical_samples,
 )

@@ -11,7 +11,8 @@ from hmt_ros.body.mirror import reverse_depth
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings
-from hmt_ros.tracking.facing_trial import faces_like, left_directions, log_shares
+from hmt_ros.tracking.facing import faces_like, left_directions
+from hmt_ros.tracking.weighting import log_shares
 
 FRAME = 100_000_000  # ns
 SMALL = TrackerSettings(
@@ -96,7 +97,7 @@ def test_both_ways_are_followed_and_become_one_mixture(film, followed, human32):
 
 def test_the_images_decide(film, followed, human32, monkeypatch):
     poses, _, _ = film
-    monkeypatch.setattr('hmt_ros.tracking.tracker.DECIDED', 0.1)
+    monkeypatch.setattr('hmt_ros.tracking.facing.DECIDED', 0.1)
     _, posteriors = followed(0.5)
     right = ways(human32, posteriors, poses[0])
     decided = next(i for i, share in enumerate(right) if share in (0.0, 1.0))
