@@ -66,10 +66,10 @@ LikelihoodSettings.__doc__ = '\n'.join(
         '',
         'Attributes:',
         *(f'    {term.name}: {term.meaning}' for term in TERMS),
-        '    keypoints: Projected joints lie on the keypoints.',
-        '    prior_weight: Factor on the prior of the joint angles.',
-        '    self_intersection_sigma: Overlap of body parts that costs 1/2 nat, m; inf switches',
-        '        the term off.',
+        '    keypoints: Distance of the joints from the keypoints.',
+        '    prior_weight: Factor on the soft prior of the joint angles.',
+        '    self_intersection_sigma: Overlap of two body parts that costs an energy of 1/2, m; inf',
+        '        switches the term off.',
     ]
 )
 

@@ -35,44 +35,46 @@ class TrackerSettings:
 
     Attributes:
         max_hypotheses: Maximum number of modes that are kept, K.
-        hypothesis_merge_distance: Mean distance of the joints below which two modes are one, m.
-        proposals: Source of hypotheses: 'kjs' (kinematic jump sampling), 'css' (covariance-scaled
-            samples) or 'ss' (spherical samples).
-        candidates: Number of hypotheses that are optimised fully in each image.
+        hypothesis_merge_distance: Mean distance of the joints below which two modes are merged, m.
+        proposals: Proposal distribution: 'kjs' (kinematic jumps and covariance-scaled samples),
+            'css' (covariance-scaled samples alone) or 'ss' (spherical samples alone).
+        candidates: Maximum number of hypotheses that are fully optimised in an image.
         combinations: Number of combinations of limb configurations that are rated for each trunk.
         alternatives: Maximum number of configurations of a limb that are rated.
-        samples: Number of samples that 'css' and 'ss' draw in each image.
-        sample_scale: Scale of the proposal covariance of 'css' and 'ss'; 0 selects Cauchy tails.
+        samples: Number of samples drawn in an image by the proposals 'css' and 'ss'.
+        sample_scale: Scale of the proposal covariance; 0 selects Cauchy tails.
         reweighting: Prior weight of a new mode: 'ancestry', that of the mode it comes from and of
             its jumps, or 'bhattacharyya', that of the nearest predicted mode (KJS figure 4, step
             5).
         exploration: Exponent of the weights when candidates are chosen; below 1 it favours unlikely
             ones.
         vote: Rule that chooses limbs for search: 'trace', 'minima' or 'uniform'.
-        searched_chains: Number of limbs that are searched in each image.
+        searched_chains: Number of chains searched in an image.
         energy_rise: Rise of the least energy over the usual one, nats, above which an image is
             searched again.
         rounds: Maximum number of search rounds in an image.
         jump_probability: Prior probability that a limb flips between two images.
         prediction_probability: Prior probability that a pose comes from a single-image prediction
             and not from the image before.
-        facing_trial: Longest time that both ways to face are followed, s, where a track starts from
-            silhouettes or predictions alone; 0 takes the better one at once. It doubles the cost.
+        facing_trial: Maximum time for which both facing directions are followed after a start from
+            silhouettes or predictions alone, s; 0 keeps the better one at once. The trial doubles
+            the cost of an image.
         base_iterations: Number of Newton steps on the predictions.
         iterations: Number of Newton steps on the candidates.
-        inverse_temperature: Factor beta on the energy in the weight of a mode; below 1 because
-            neighbouring measurements err together.
-        image_information: Factor on the curvature of the image's energy, keypoints apart, in the
-            covariance of a mode; below 1 because shapes, shadows and clothes are not the model's.
+        inverse_temperature: Factor beta on the energy in the weight of a mode; values below 1 allow
+            for correlated errors of neighbouring measurements.
+        image_information: Factor on the curvature of the image energy, without keypoints, in the
+            covariance of a mode; values below 1 allow for shapes, shadows and clothes that the
+            model lacks.
         tails: Degrees of freedom of the Student motion prior; small numbers give heavy tails.
         least_log_weight: Smallest log weight of a mode that is kept, nats.
         velocity_kept: Share of a mode's velocity that lasts to the next image; 0 is a random walk.
         velocity_gain: Share of the newest displacement in a mode's velocity.
-        flesh_images: Number of images from which the widths of the flesh are estimated; 0 keeps the
-            model's.
-        lost_misfit: Share of the outline, or of the keypoints, that no mode explains, above which
-            an image counts as lost.
-        lost_images: Number of lost images in a row that start the track anew.
+        flesh_images: Number of images from which the widths of the body parts are estimated; 0
+            keeps those of the model.
+        lost_misfit: Fraction of the outline, or of the keypoints, left unexplained by every mode
+            above which an image counts as lost.
+        lost_images: Number of consecutive lost images after which the track starts anew.
         likelihood: settings of the likelihood.
         search: settings of the search of limbs.
     """

@@ -108,7 +108,7 @@ def add_edges(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
 
 EDGES = ImageTerm(
     'edges',
-    'Visible contours of the body lie on image edges.',
+    'Distance of the visible contours from image edges.',
     TermSettings(20.0, 2.5, 3.0),
     edge_distances,
     _inputs,

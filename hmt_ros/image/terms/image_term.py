@@ -31,11 +31,11 @@ class TermSettings:
     """Settings of one term of the likelihood.
 
     Attributes:
-        weight: Number of independent measurements that the term counts for; 0 switches it off. For
-            keypoints it is a factor.
-        sigma: Standard deviation of one measurement, px; for intensity in grey levels, for
-            keypoints a factor on their own standard deviations.
-        scale: Scale of the Geman-McClure kernel, in standard deviations.
+        weight: Number of independent measurements that the term counts for (a plain factor for
+            keypoints); 0 switches the term off.
+        sigma: Standard deviation of one measurement, px (grey levels for the intensity, a factor on
+            the detector's own deviation for keypoints).
+        scale: Width of the Geman-McClure kernel, in standard deviations.
     """
 
     weight: float
@@ -135,7 +135,7 @@ class ImageTerm:
 
     Attributes:
         name: of the term, of its settings and of its evidence.
-        meaning: one sentence for the description of its parameters.
+        meaning: what it compares, which opens the descriptions of its parameters.
         settings: defaults.
         evidence: takes from an image what the term compares poses with; None: the image lacks it.
         inputs: what the kernel reads: a NamedTuple whose first field is the `Weighting`. Without

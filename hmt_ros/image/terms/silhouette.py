@@ -248,7 +248,7 @@ def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untype
 
 CONTAINMENT = ImageTerm(
     'containment',
-    'The contour of the body lies inside the silhouette.',
+    "Distance of the model's contour from the inside of the silhouette.",
     TermSettings(30.0, 3.0, 8.0),
     distance_map,
     _containment_inputs,
@@ -257,7 +257,7 @@ CONTAINMENT = ImageTerm(
 )
 COVERAGE = ImageTerm(
     'coverage',
-    'The outline of the silhouette lies on the contour of the body.',
+    "Distance of the silhouette's outline from the model's contour.",
     TermSettings(30.0, 3.0, 8.0),
     outline,
     _coverage_inputs,

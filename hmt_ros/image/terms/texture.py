@@ -178,7 +178,7 @@ def _add_pixel_energy(  # type: ignore[no-untyped-def]
 
 INTENSITY = ImageTerm(
     'intensity',
-    'The surface of the body keeps the colours that it had in the last image.',
+    'Difference of the texture from that of the last image.',
     TermSettings(4.0, 20.0, 2.0),
     blurred_colours,
     _inputs,
@@ -187,7 +187,7 @@ INTENSITY = ImageTerm(
 )
 MOTION = ImageTerm(
     'motion',
-    'The surface of the body moves with the optical flow.',
+    "Difference of the texture's motion from the optical flow.",
     TermSettings(5.0, 1.5, 2.0),
     optical_flow,
     _inputs,
