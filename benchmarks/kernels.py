@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
-from hmt_ros.tracking.pruning import choose_hypotheses
+from hmt_ros.tracking.selection import choose_hypotheses
 
 from benchmarks import (
     numpy_flips,
@@ -28,7 +27,7 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image import likelihood as likelihood_module
-from hmt_ros.image.likelihood import ImageLikelihood, TermSettings
+from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import observe
 from hmt_ros.image.texture import capture_textures
 from hmt_ros.inference.block_tridiagonal import add_band_product
@@ -40,8 +39,6 @@ from hmt_ros.rendering.scene import Scene
 from hmt_ros.smoothing import embedded_network as network_module
 from hmt_ros.smoothing.component_overlaps import add_overlaps
 from hmt_ros.smoothing.trajectory_refinement import refine
-
-OFF = TermSettings(0.0, 1.0, 1.0)
 
 
 def main(argv: list[str]) -> int:
@@ -96,7 +93,6 @@ def _likelihoods(seconds: float) -> Iterator[dict[str, Any]]:
     assert intensity is not None
     textures = capture_textures(body, camera, forward(body.skeleton, shown[:1]), intensity)
     likelihood = ImageLikelihood(body, camera)
-    likelihood = replace(likelihood, settings=replace(likelihood.settings, joints=OFF))
     rng = np.random.default_rng(0)
     for batch in (8, 32, 128):
         poses = shown[1] + 0.1 * rng.normal(size=(batch, body.dimension))
@@ -105,7 +101,7 @@ def _likelihoods(seconds: float) -> Iterator[dict[str, Any]]:
         which = np.zeros(batch, dtype=np.intp)
 
         def compiled(x: Any = poses, w: Any = which) -> Any:
-            return likelihood.image_energy(forward(body.skeleton, x), observation, textures, w)
+            return likelihood.energies(forward(body.skeleton, x), observation, textures, w)
 
         def vectorised(x: Any = poses, w: Any = which) -> Any:
             return numpy_likelihood.image_energy(likelihood, x, observation, textures, w)

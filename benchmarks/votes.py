@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from hmt_ros.tracking.chain_votes import VOTES, chain_votes
+from hmt_ros.tracking.proposals.chain_votes import VOTES, chain_votes
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -34,13 +34,12 @@ from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import Minimum, minimise
-from hmt_ros.inference.energy import EnergyFunction
 from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
 from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.proposals import covariance_scaled_samples
+from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples
 
 Array = NDArray[np.float64]
 
@@ -206,7 +205,7 @@ def new_minima(name: str, vote: str, seed: int, count: int, budget: int) -> dict
 def _optimised(likelihood: ImageLikelihood, poses: Array, observation: Observation) -> Minimum:
     body = likelihood.body
     return minimise(
-        EnergyFunction(lambda x, _: likelihood.energy(x, observation)),
+        likelihood.given(observation),
         poses, body.lower, body.upper, step_scale=0.3, max_iterations=40, tolerance=1e-3,
     )  # fmt: skip
 

@@ -68,8 +68,8 @@ LikelihoodSettings.__doc__ = '\n'.join(
         *(f'    {term.name}: {term.meaning}' for term in TERMS),
         '    keypoints: Distance of the joints from the keypoints.',
         '    prior_weight: Factor on the soft prior of the joint angles.',
-        '    self_intersection_sigma: Overlap of two body parts that costs an energy of 1/2, m; inf',
-        '        switches the term off.',
+        '    self_intersection_sigma: Overlap of two body parts that costs an energy of 1/2, m;',
+        '        inf switches the term off.',
     ]
 )
 

@@ -7,7 +7,6 @@ import pytest
 
 from hmt_ros.inference.energy import (
     Derivatives,
-    Energy,
     EnergyFunction,
     Quadratic,
     Restricted,
@@ -98,7 +97,9 @@ def test_a_sum_adds_what_its_terms_know():
     total = Sum((TERMS['full'], TERMS['student'])).energy(POINTS, ROWS)
     for one, two, both in zip(*parts, total):
         np.testing.assert_array_equal(one + two, both)
-    values = Sum((TERMS['full'], TERMS['student'])).energy(POINTS, ROWS, derivatives=Derivatives.NONE)
+    values = Sum((TERMS['full'], TERMS['student'])).energy(
+        POINTS, ROWS, derivatives=Derivatives.NONE
+    )
     assert values.gradient is None
     np.testing.assert_array_equal(values.value, total.value)
 

@@ -108,7 +108,8 @@ class KinematicJumps:
             )  # fmt: skip
             found = self._search(lead, base.x, rng)
             alternatives = [
-                self._alternatives(base.x[group], chain, found.get(chain)) for chain in self.posterior.body.chains
+                self._alternatives(base.x[group], chain, found.get(chain))
+                for chain in self.posterior.body.chains
             ]
             products, textures = self._products(
                 lead, base.x[group], group, sources.log_weights[group], alternatives
