@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.skeleton import other_side
+from hmt_ros.flips.best_combinations import Alternatives, best_combinations, distinct_alternatives
 from hmt_ros.flips.interpretation_tree import chain_points, enumerate_flips, rehang_chain
 from hmt_ros.flips.torso_flips import flip_torso
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures, with_swapped_sides
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.tracking.candidates import Candidates, relative_joints
-from hmt_ros.tracking.chain_product import Alternatives, best_combinations, distinct_alternatives
 from hmt_ros.tracking.chain_search import ChainSearch
 from hmt_ros.tracking.chain_votes import chain_votes
 from hmt_ros.tracking.edge_jumps import EdgeJumps
