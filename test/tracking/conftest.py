@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body import Body, Camera
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.motion.viewpoint import Viewpoint

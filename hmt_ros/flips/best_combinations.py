@@ -1,14 +1,19 @@
-"""Products of chain alternatives: whole poses from one configuration of each limb.
+"""The best combinations of one alternative per chain, best first (KJS 3).
 
-Modes with nearly the same trunk form a group. For each chain the group has alternatives: the
-configurations of its modes, their flips, and what a search of the image found. Because limbs are
-nearly independent given the trunk, the energy of a combination is the energy of the group's leading
-mode plus the change that each alternative makes alone: a few dozen evaluations rate thousands of
-poses.
+Given the trunk, the cost of a combination is a sum with one term per chain: of log priors for the
+flips of whole bodies (`whole_body_flips`), of changes in energy for the tracker. `least_sums` takes
+the best of them.
+
+In the tracker, modes with nearly the same trunk form a group. For each chain the group has
+alternatives: the configurations of its modes, their flips, and what a search of the image found.
+Because limbs are nearly independent given the trunk, the energy of a combination is the energy of
+the group's leading mode plus the change that each alternative makes alone: a few dozen evaluations
+rate thousands of poses.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +25,39 @@ from hmt_ros.flips.distinct_poses import distinct_poses
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+
+
+def least_sums(
+    costs: Sequence[Array],
+    count: int,
+    allowed: Mapping[tuple[int, int], NDArray[np.bool_]] | None = None,
+) -> tuple[Array, Index]:
+    """The `count` choices of one entry per list with the least sums, least first.
+
+    List by list, only the `count` best sums so far go on: what is among the best of all lists is
+    among the best of the first few. Where pairs are ruled out this does not hold, and all sums go
+    on that they allow. Equal sums stand in the order of the lists.
+
+    Args:
+        costs: C lists of costs, (A,) each.
+        count: maximum number of choices.
+        allowed: (A, A') for pairs i < j of lists, which entries go together; all, where missing.
+
+    Returns:
+        sums (n,) and choices (n, C).
+    """
+    tables = dict(allowed or {})
+    sums, picks = np.zeros(1), np.zeros((1, 0), dtype=np.intp)
+    for c, cost in enumerate(costs):
+        total = (sums[:, None] + cost).ravel()
+        order = np.argsort(total, kind='stable')[: None if tables else count]
+        before, last = np.divmod(order, len(cost))
+        for (i, j), table in tables.items():
+            if j == c:
+                fits = table[picks[before, i], last]
+                order, before, last = order[fits], before[fits], last[fits]
+        sums, picks = total[order], np.column_stack([picks[before], last])
+    return sums[:count], picks[:count]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +148,7 @@ def best_combinations(
     keys, costs, parents, priors = [], [], [], []
     for g in range(len(modes)):
         tempered = [temperature * e + a.penalties[g] for e, a in zip(changes, alternatives)]
-        sums, picks = _least_sums(tempered, count)
+        sums, picks = least_sums(tempered, count)
         penalty = sum(a.penalties[g][picks[:, c]] for c, a in enumerate(alternatives))
         keys.append(np.ravel_multi_index(tuple(picks.T), sizes))
         costs.append(sums - log_weights[g])
@@ -131,20 +169,3 @@ def best_combinations(
         poses[:, body.skeleton.chain_dofs[own.chain]] = own.angles[picks[:, c]]
         energies = energies + change[picks[:, c]]
     return Combinations(poses, parent, energies, total[best])
-
-
-def _least_sums(costs: list[Array], count: int) -> tuple[Array, Index]:
-    """The `count` choices of one entry per list with the least sums, least first.
-
-    Whatever is among the best of all lists is among the best of the first few.
-
-    Returns:
-        sums (n,) and choices (n, C).
-    """
-    sums, picks = np.zeros(1), np.zeros((1, 0), dtype=np.intp)
-    for cost in costs:
-        total = (sums[:, None] + cost).ravel()
-        best = np.argsort(total, kind='stable')[:count]
-        before, last = np.divmod(best, len(cost))
-        sums, picks = total[best], np.column_stack([picks[before], last])
-    return sums, picks
