@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from hmt_ros.tracking.selection import choose_hypotheses
 
 from benchmarks import (
     numpy_flips,
@@ -39,6 +38,7 @@ from hmt_ros.rendering.scene import Scene
 from hmt_ros.smoothing import embedded_network as network_module
 from hmt_ros.smoothing.component_overlaps import add_overlaps
 from hmt_ros.smoothing.trajectory_refinement import refine
+from hmt_ros.tracking.selection import choose_hypotheses
 
 
 def main(argv: list[str]) -> int:

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from hmt_ros.tracking.proposals.chain_votes import VOTES, chain_votes
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -39,6 +38,7 @@ from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
+from hmt_ros.tracking.proposals.chain_votes import VOTES, chain_votes
 from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples
 
 Array = NDArray[np.float64]

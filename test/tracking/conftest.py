@@ -19,11 +19,6 @@ Filmed = Callable[..., tuple[np.ndarray, list[np.ndarray], np.ndarray]]
 
 
 @pytest.fixture(scope='session')
-def human32() -> Body:
-    return load_body('human32')
-
-
-@pytest.fixture(scope='session')
 def camera() -> Camera:
     return Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
 

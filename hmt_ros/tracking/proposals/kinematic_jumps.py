@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.skeleton import other_side
+from hmt_ros.flips.best_combinations import Alternatives, best_combinations, distinct_alternatives
 from hmt_ros.flips.interpretation_tree import enumerate_flips, rehang_chain
 from hmt_ros.flips.torso_flips import flip_torso
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures, with_swapped_sides
 from hmt_ros.inference.bounded_newton import Minimum
-from hmt_ros.flips.best_combinations import Alternatives, best_combinations, distinct_alternatives
 from hmt_ros.tracking.hypotheses import Hypotheses, relative_joints
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals.chain_votes import chain_votes
