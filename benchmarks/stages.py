@@ -15,7 +15,7 @@ from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals.kinematic_jumps import KinematicJumps
 from hmt_ros.tracking.proposals.limb_search import LimbSearch
-from hmt_ros.tracking.proposals.sampling import ScaledSamples
+from hmt_ros.tracking.proposals.sampling import CovarianceScaledSamples
 
 # Part of the tracker -> name of the stage; time in a part that another part calls is its own.
 Stages = Sequence[tuple[Any, str, str]]
@@ -25,7 +25,7 @@ STAGES: Stages = (
     (Track, 'begin', 'start of the track'),
     (filter_module, 'follow_flow', 'motion'),
     (KinematicJumps, 'propose', 'combinations'),
-    (ScaledSamples, 'propose', 'samples'),
+    (CovarianceScaledSamples, 'propose', 'samples'),
     (LimbSearch, 'find', 'chain search'),
     (KinematicJumps, '_rate', 'rating'),
     (Posterior, 'minimise', 'candidates'),

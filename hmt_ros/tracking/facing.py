@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import Minimum
@@ -41,11 +42,19 @@ class Track:
         camera: that sees the person.
         settings: how.
         seed: of all randomness.
+        extra: further energy terms.
     """
 
-    def __init__(self, body: Body, camera: Camera, settings: TrackerSettings, seed: int) -> None:
+    def __init__(
+        self,
+        body: Body,
+        camera: Camera,
+        settings: TrackerSettings,
+        seed: int,
+        extra: tuple[FrameTerm, ...] = (),
+    ) -> None:
         self.settings = settings
-        self._filters = [MixtureFilter(body, camera, settings, seed)]
+        self._filters = [MixtureFilter(body, camera, settings, seed, extra)]
         self._undecided_until = 0
 
     @property

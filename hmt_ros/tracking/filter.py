@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.bounded_newton import Minimum, resting
 from hmt_ros.inference.mixture import GaussianMixture
@@ -25,7 +26,7 @@ from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses, relat
 from hmt_ros.tracking.loss import unexplained_share
 from hmt_ros.tracking.posterior import Posterior, free_covariances
 from hmt_ros.tracking.prediction import follow_flow, predict, updated_velocities
-from hmt_ros.tracking.proposals import PredictedPoses, Proposal, proposal_of
+from hmt_ros.tracking.proposals import PROPOSALS, PredictedPoses, Proposal
 from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples
 from hmt_ros.tracking.selection import choose_hypotheses
 from hmt_ros.tracking.settings import TrackerSettings
@@ -66,6 +67,7 @@ class MixtureFilter:
         camera: that sees the person.
         settings: how.
         seed: of all randomness.
+        extra: further energy terms.
 
     Attributes:
         body: with the widths that have been estimated.
@@ -74,7 +76,14 @@ class MixtureFilter:
             filter of the same images.
     """
 
-    def __init__(self, body: Body, camera: Camera, settings: TrackerSettings, seed: int) -> None:
+    def __init__(
+        self,
+        body: Body,
+        camera: Camera,
+        settings: TrackerSettings,
+        seed: int,
+        extra: tuple[FrameTerm, ...] = (),
+    ) -> None:
         self.body = body
         self.camera = camera
         self.settings = settings
@@ -87,8 +96,8 @@ class MixtureFilter:
         self._usual_energy = np.inf
         self._outline_costs = np.empty((0, 0))
         self._bad_images = 0
-        self._posterior = Posterior(body, camera, settings)
-        self._proposal = proposal_of(self._posterior)
+        self._posterior = Posterior(body, camera, settings, extra)
+        self._proposal = PROPOSALS[settings.proposals](self._posterior)
 
     @property
     def evaluations(self) -> int:
@@ -171,7 +180,8 @@ class MixtureFilter:
 
     def twin(self) -> MixtureFilter:
         """Another filter of the same person, without modes, with random numbers of its own."""
-        other = MixtureFilter(self.body, self.camera, self.settings, self._seed + 1)
+        extra = self._posterior.extra
+        other = MixtureFilter(self.body, self.camera, self.settings, self._seed + 1, extra)
         other._flesh = deepcopy(self._flesh)
         return other
 
@@ -206,7 +216,7 @@ class MixtureFilter:
         found = [x.propose(base, predicted, covariances, observation, self._rng) for x in proposals]
         candidates = found[0] if len(found) == 1 else found[0].joined(found[1])
         optimised = self._optimise(candidates, precisions, observation)
-        if s.proposals == 'kjs':
+        if self._proposal.iterated:
             optimised = self._search_again(optimised, covariances, precisions, observation)
         self._learn_usual_energy(float(optimised.minima.value.min()))
         hypotheses, solved = optimised.hypotheses, optimised.minima
@@ -408,6 +418,6 @@ class MixtureFilter:
         """Goes on with a body of the same degrees of freedom."""
         self.body = body
         evaluations = self._posterior.evaluations
-        self._posterior = Posterior(body, self.camera, self.settings)
+        self._posterior = Posterior(body, self.camera, self.settings, self._posterior.extra)
         self._posterior.evaluations = evaluations
-        self._proposal = proposal_of(self._posterior)
+        self._proposal = PROPOSALS[self.settings.proposals](self._posterior)

@@ -1,14 +1,16 @@
 """The energy of a pose given one image and where it was expected (KJS 2).
 
-    E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_motion(x)
+    E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_motion(x) + E_extra(x)
 
 E_motion is a Student prior around the expected pose: a Gaussian motion prior with heavy tails.
+E_extra are terms that the user of a tracker adds.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.pose_terms import Posed
+from hmt_ros.body.pose_terms import FrameTerm, Posed
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures, capture_textures
@@ -31,7 +33,9 @@ from hmt_ros.inference.energy import (
     add_energies,
 )
 from hmt_ros.tracking.hypotheses import Hypotheses
-from hmt_ros.tracking.settings import TrackerSettings
+
+if TYPE_CHECKING:
+    from hmt_ros.tracking.settings import TrackerSettings
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -66,13 +70,20 @@ class Posterior:
     Args:
         body, camera: who is seen by what.
         settings: of the tracker.
+        extra: further terms, such as what is known of the floor.
 
     Attributes:
         evaluations: of the likelihood, so far.
     """
 
-    def __init__(self, body: Body, camera: Camera, settings: TrackerSettings) -> None:
-        self.body, self.camera, self.settings = body, camera, settings
+    def __init__(
+        self,
+        body: Body,
+        camera: Camera,
+        settings: TrackerSettings,
+        extra: tuple[FrameTerm, ...] = (),
+    ) -> None:
+        self.body, self.camera, self.settings, self.extra = body, camera, settings, extra
         self.evaluations = 0
         self._step_scale = np.where(body.skeleton.dof_is_rotation, 0.3, 0.2)
         self._last_fit: tuple[Array, Observation, ImageFit] | None = None
@@ -95,7 +106,8 @@ class Posterior:
         texture_rows: Index | None = None,
     ) -> EnergyTerm:
         """The energy without what was expected; its evaluations are counted."""
-        return _Counted(self.likelihood.given(observation, textures, texture_rows), self)
+        terms = self.likelihood.given(observation, textures, texture_rows).terms
+        return _Counted(Posed(self.body.skeleton, (*terms, *self.extra)), self)
 
     def around(self, observation: Observation, centres: Array, precisions: Array) -> EnergyTerm:
         """With a Gaussian prior of precisions (N, d, d) around centres (N, d)."""
@@ -152,7 +164,8 @@ class Posterior:
                 *(term.energy(frames, rows) for term in keypoints),
             ]
         )
-        priors = [term.energy(frames, rows) for term in self.likelihood.priors]
+        known = (*self.likelihood.priors, *self.extra)
+        priors = [term.energy(frames, rows) for term in known]
         fit = ImageFit(add_energies([seen, *priors]), seen.value, image.hessian, image.costs)
         self._last_fit = (poses, observation, fit)
         return fit

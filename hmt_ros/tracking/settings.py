@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from hmt_ros.image.likelihood import LikelihoodSettings
-
-PROPOSALS = ('kjs', 'css', 'ss')
-REWEIGHTINGS = ('ancestry', 'bhattacharyya')
-VOTES = ('trace', 'minima', 'uniform')
+from hmt_ros.tracking.proposals import PROPOSALS
+from hmt_ros.tracking.proposals.chain_votes import VOTES
+from hmt_ros.tracking.weighting import REWEIGHTINGS
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,7 @@ class TrackerSettings:
 
     def __post_init__(self) -> None:
         if self.proposals not in PROPOSALS:
-            raise ValueError(f'proposals must be one of {PROPOSALS}, saw {self.proposals!r}')
+            raise ValueError(f'proposals must be one of {tuple(PROPOSALS)}, saw {self.proposals!r}')
         if self.reweighting not in REWEIGHTINGS:
             raise ValueError(f'reweighting must be one of {REWEIGHTINGS}, saw {self.reweighting!r}')
         if self.vote not in VOTES:

@@ -8,6 +8,7 @@ mixture.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.observation import Box, Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -58,6 +60,7 @@ class Tracker:
         background: the empty scene; None: learned from images before the track starts, and if there
             are none the silhouette is not used.
         seed: of all randomness. The same images, settings and seed give the same numbers.
+        extra: further energy terms of the posterior, such as what is known of the floor.
     """
 
     def __init__(
@@ -67,6 +70,7 @@ class Tracker:
         settings: TrackerSettings | None = None,
         background: BackgroundModel | None = None,
         seed: int = 0,
+        extra: Sequence[FrameTerm] = (),
     ) -> None:
         self.settings = settings or TrackerSettings()
         self.model = body
@@ -76,7 +80,8 @@ class Tracker:
         self._learning = background is None
         self._seed = seed
         self._start: Subject | GaussianMixture | None = None
-        self._track = Track(body, camera, self.settings, seed)
+        self._extra = tuple(extra)
+        self._track = self._new_track(body)
         self._last_image: Image | None = None
         self._last_stamp: int | None = None
 
@@ -94,7 +99,7 @@ class Tracker:
             )
         if start is not None:
             self._start = start
-        self._track = Track(self.body, self.camera, self.settings, self._seed)
+        self._track = self._new_track(self.body)
         self._last_image, self._last_stamp = None, None
 
     def step(
@@ -176,6 +181,9 @@ class Tracker:
     def posterior(self) -> GaussianMixture:
         """The present posterior."""
         return self.modes.mixture
+
+    def _new_track(self, body: Body) -> Track:
+        return Track(body, self.camera, self.settings, self._seed, self._extra)
 
     def _start_at(
         self, stamp: int, prediction: PosePrediction | None

@@ -12,7 +12,6 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings
 from hmt_ros.tracking.facing import faces_like, left_directions
-from hmt_ros.tracking.weighting import log_shares
 
 FRAME = 100_000_000  # ns
 SMALL = TrackerSettings(
@@ -68,11 +67,6 @@ def test_the_reversal_in_depth_faces_the_other_way(human32, motion):
     alike = faces_like(human32, both, motion[0])
     assert alike[: len(motion)].all()
     assert not alike[len(motion) :].any()
-
-
-def test_shares_are_probabilities():
-    assert np.exp(log_shares([-3.0, -3.0])) == pytest.approx([0.5, 0.5])
-    assert log_shares([-1000.0, -1010.0]) == pytest.approx([0.0, -10.0], abs=1e-4)
 
 
 def ways(body, posteriors, pose):

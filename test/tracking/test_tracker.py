@@ -13,6 +13,7 @@ from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.energy import Derivatives, Energy
 from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker, TrackerSettings
 
 ONLY_KEYPOINTS = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
@@ -508,3 +509,28 @@ def test_a_dark_image_without_keypoints(human32, camera):
     posterior, likelihood = tracker.step(np.zeros((camera.height, camera.width, 3), np.uint8), 0)
     assert posterior.weights.sum() == pytest.approx(1.0)
     assert likelihood.weights.sum() == pytest.approx(1.0)
+
+
+class KnownHeight:
+    """A term that only knows how high above the floor the root is."""
+
+    def __init__(self, height: float) -> None:
+        self.height = height
+
+    def energy(self, frames, rows, *, derivatives=Derivatives.POSITIVE):
+        n, d = frames.poses.shape
+        offset = frames.poses[:, 1] - self.height
+        gradient, hessian = np.zeros((n, d)), np.zeros((n, d, d))
+        gradient[:, 1], hessian[:, 1, 1] = 1e8 * offset, 1e8
+        value = 0.5e8 * offset**2
+        return Energy(value, gradient, hessian) if derivatives else Energy(value)
+
+
+def test_a_further_term_takes_part_in_the_posterior(human32, camera, black, motion, subject):
+    height = motion[0, 1] + 0.1
+    tracker = Tracker(human32, camera, keypoint_settings(), extra=[KnownHeight(height)])
+    tracker.reset(subject)
+    posterior, likelihood = tracker.step(black, 0)
+    for mixture in (posterior, likelihood):
+        assert mixture.means[:, 1] == pytest.approx(np.full(len(mixture), height), abs=1e-3)
+        assert (mixture.covariances[:, 1, 1] < 1e-7).all()

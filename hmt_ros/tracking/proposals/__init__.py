@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -12,20 +13,29 @@ from hmt_ros.tracking.hypotheses import Array, Hypotheses
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals.kinematic_jumps import KinematicJumps
 from hmt_ros.tracking.proposals.predicted_poses import PosePrediction, PredictedPoses
-from hmt_ros.tracking.proposals.sampling import ScaledSamples
+from hmt_ros.tracking.proposals.sampling import CovarianceScaledSamples, SphericalSamples
 
 __all__ = [
+    'PROPOSALS',
     'KinematicJumps',
     'PosePrediction',
     'PredictedPoses',
     'Proposal',
-    'ScaledSamples',
-    'proposal_of',
 ]
 
 
 class Proposal(Protocol):
-    """Something that proposes hypotheses for an image."""
+    """Something that proposes hypotheses for an image.
+
+    Attributes:
+        iterated: whether it proposes again, around the optima, when their energies are unusually
+            high.
+    """
+
+    @property
+    def iterated(self) -> bool:
+        """See the class."""
+        ...
 
     def propose(
         self,
@@ -47,8 +57,9 @@ class Proposal(Protocol):
         ...
 
 
-def proposal_of(posterior: Posterior) -> Proposal:
-    """The proposal that the settings of a tracker name: 'kjs', 'css' or 'ss'."""
-    if posterior.settings.proposals == 'kjs':
-        return KinematicJumps(posterior)
-    return ScaledSamples(posterior)
+# What the setting `proposals` selects. A new proposal is a file beside this one and a line here.
+PROPOSALS: dict[str, Callable[[Posterior], Proposal]] = {
+    'kjs': KinematicJumps,
+    'css': CovarianceScaledSamples,
+    'ss': SphericalSamples,
+}

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +90,7 @@ class KinematicJumps:
     """
 
     posterior: Posterior
+    iterated: ClassVar[bool] = True
 
     def propose(
         self,

@@ -85,6 +85,7 @@ class LimbSearch:
         )
         rows = np.full(len(samples), row)
         seen = self._own.seen(observation, textures, rows, explained=others.costs)
+        seen = (*seen, *self.posterior.extra)
         weight = s.likelihood.prior_weight
         term = Sum(
             (

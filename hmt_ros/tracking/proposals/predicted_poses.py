@@ -8,6 +8,7 @@ They are proposals, no evidence, which would count the image twice.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -84,6 +85,7 @@ class PredictedPoses:
     body: Body
     prediction: GaussianMixture
     probability: float
+    iterated: ClassVar[bool] = False
 
     def propose(
         self,

@@ -7,6 +7,7 @@ CSS     x ~ N(m, s^2 S)
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,14 +67,16 @@ def _noise(shape: tuple[int, ...], scale: float, rng: np.random.Generator) -> Ar
 
 
 @dataclass(frozen=True, eq=False)
-class ScaledSamples:
-    """Proposes samples around the predictions, covariance-scaled ('css') or spherical ('ss').
+class CovarianceScaledSamples:
+    """Proposes covariance-scaled samples around the predictions.
 
     Attributes:
         posterior: of the body before the camera.
     """
 
     posterior: Posterior
+    iterated: ClassVar[bool] = False
+    draw: ClassVar = staticmethod(covariance_scaled_samples)
 
     def propose(
         self,
@@ -85,9 +88,8 @@ class ScaledSamples:
     ) -> Hypotheses:
         """See `Proposal`."""
         s, body, k = self.posterior.settings, self.posterior.body, len(sources)
-        draw = covariance_scaled_samples if s.proposals == 'css' else spherical_samples
         each = max(s.samples // k, 1)
-        drawn = draw(body, sources.expected, covariances, each, s.sample_scale, rng)
+        drawn = self.draw(body, sources.expected, covariances, each, s.sample_scale, rng)
         poses = np.concatenate([base.x, drawn.reshape(-1, body.dimension)])
         rows = np.concatenate([np.arange(k), np.repeat(np.arange(k), each)])
         energies = self.posterior.values(
@@ -109,3 +111,10 @@ class ScaledSamples:
             sources.textures,
             sources.texture_rows[rows],
         )
+
+
+@dataclass(frozen=True, eq=False)
+class SphericalSamples(CovarianceScaledSamples):
+    """Proposes spherical samples of the same volume."""
+
+    draw: ClassVar = staticmethod(spherical_samples)
