@@ -9,19 +9,25 @@ alternatives: the configurations of its modes, their flips, and what a search of
 Because limbs are nearly independent given the trunk, the energy of a combination is the energy of
 the group's leading mode plus the change that each alternative makes alone: a few dozen evaluations
 rate thousands of poses.
+
+`distinct_poses` tells which of many poses are distinct: by where their joints are, not by their
+angles. A rotation has two triples of Euler angles, Rx(a) Ry(b) Rz(c) = Rx(a + pi) Ry(pi - b)
+Rz(c + pi), every angle its turns of 2 pi, and the twist of a straight limb moves nothing that is
+seen.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
-from hmt_ros.flips.distinct_poses import distinct_poses
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -169,3 +175,63 @@ def best_combinations(
         poses[:, body.skeleton.chain_dofs[own.chain]] = own.angles[picks[:, c]]
         energies = energies + change[picks[:, c]]
     return Combinations(poses, parent, energies, total[best])
+
+
+class Distinct(NamedTuple):
+    """Poses that stand for all.
+
+    Attributes:
+        kept: (K,) indices, in the order of the poses.
+        owner: (N,) position in `kept` of the pose that stands for each; -1: none, as there were
+            enough before.
+    """
+
+    kept: Index
+    owner: Index
+
+
+def distinct_poses(joints: ArrayLike, apart: float, most: int | None = None) -> Distinct:
+    """Poses that are not one with an earlier one.
+
+    A pose is one with the nearest of those that are kept, in the distance of the joint that is
+    furthest apart, if that is less than `apart`. Earlier poses stand for later ones: best first.
+
+    Args:
+        joints: (N, J, 3) of the poses, m.
+        apart: distance of some joint that makes poses distinct, m.
+        most: how many to keep at most; None: all.
+
+    Raises:
+        ValueError: joints of another shape.
+    """
+    points = np.ascontiguousarray(joints, dtype=np.float64)
+    if points.ndim != 3 or points.shape[2] != 3:
+        raise ValueError(f'joints must have shape (N, J, 3), saw {points.shape}')
+    flat = points.reshape(len(points), 3 * points.shape[1])
+    return Distinct(*_distinct(flat, float(apart), len(flat) if most is None else int(most)))
+
+
+@njit(cache=True, nogil=True)
+def _distinct(points, apart, most):  # type: ignore[no-untyped-def]
+    """Indices of the poses (N, 3 J) that are kept, and which stands for each."""
+    n = len(points)
+    kept, owner = np.empty(n, np.int64), np.full(n, -1)
+    count = 0
+    for i in range(n):
+        least = apart * apart
+        for place in range(count):
+            k = kept[place]
+            gap = 0.0
+            for j in range(0, points.shape[1], 3):
+                x = points[k, j] - points[i, j]
+                y = points[k, j + 1] - points[i, j + 1]
+                z = points[k, j + 2] - points[i, j + 2]
+                gap = max(gap, x * x + y * y + z * z)
+                if gap >= least:
+                    break
+            if gap < least:
+                owner[i], least = place, gap
+        if owner[i] < 0 and count < most:
+            kept[count], owner[i] = i, count
+            count += 1
+    return kept[:count], owner

@@ -19,8 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import Frames, forward
-from hmt_ros.flips.chain_links import ChainLinks, chain_links
-from hmt_ros.flips.tree_growth import grow_leaves
+from hmt_ros.flips.tree_growth import ChainLinks, chain_links, grow_leaves
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -21,8 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
-from hmt_ros.flips.best_combinations import least_sums
-from hmt_ros.flips.distinct_poses import distinct_poses
+from hmt_ros.flips.best_combinations import distinct_poses, least_sums
 from hmt_ros.flips.flip_pruning import DepthOrder, FlipPruning
 from hmt_ros.flips.interpretation_tree import enumerate_flips, rehang_chain
 from hmt_ros.flips.torso_flips import JOINTS, flip_torso
