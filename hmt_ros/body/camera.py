@@ -2,6 +2,10 @@
 
 Frame: camera optical frame of REP 103, x right, y down, z forward, m. Pixels: column u, row v, the
 centre of the first pixel at (0, 0).
+
+A `Viewpoint` says where a still camera stands over a level floor. The world of rendered motions has
+its origin on the floor, straight in front of the camera. A person at rest there faces the camera: x
+to the person's right (left in the image), y towards the camera, z up.
 """
 
 from __future__ import annotations
@@ -180,3 +184,51 @@ class Camera:
         value = np.stack([a * scale, b * scale])
         mixed = a * b * slope
         return value, ((scale + a * a * slope, mixed), (mixed, scale + b * b * slope))
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A camera over a floor.
+
+    Attributes:
+        distance: horizontal, from the camera to the world's origin, m.
+        height: of the camera above the floor, m.
+        pitch: by which the camera looks down, rad.
+
+    Raises:
+        ValueError: a distance or height that is not positive, or a camera that looks straight down.
+    """
+
+    distance: float = 5.6
+    height: float = 1.2
+    pitch: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ('distance', 0.1, 1000.0), ('height', 0.01, 100.0), ('pitch', -1.4, 1.4)
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f'{name} of the camera must lie in [{low}, {high}], saw {value}')
+
+    @property
+    def rotation(self) -> Array:
+        """Rotation (3, 3) from the world to the camera optical frame."""
+        c, s = np.cos(self.pitch), np.sin(self.pitch)
+        return np.array([[-1.0, 0.0, 0.0], [0.0, s, -c], [0.0, -c, -s]])
+
+    @property
+    def translation(self) -> Array:
+        """The world's origin (3,) in the camera optical frame, m."""
+        result: Array = self.rotation @ np.array([0.0, -self.distance, -self.height])
+        return result
+
+    def to_camera(self, points: ArrayLike) -> Array:
+        """Points (..., 3) of the world in the camera optical frame, m."""
+        result: Array = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+        return result
+
+    def to_world(self, points: ArrayLike) -> Array:
+        """Points (..., 3) of the camera optical frame in the world, m."""
+        result: Array = (np.asarray(points, dtype=np.float64) - self.translation) @ self.rotation
+        return result

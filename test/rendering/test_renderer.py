@@ -6,11 +6,11 @@ import pytest
 
 from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import Camera, load_body
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.flesh import Flesh
 from hmt_ros.body.kinematics import forward
-from hmt_ros.motion.arm_posture import arm_posture
+from hmt_ros.motion.limb_motions import arm_posture
 from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.rendering.renderer import render, render_frames, render_silhouettes
 from hmt_ros.rendering.scene import Scene
 
