@@ -30,20 +30,20 @@ LIMIT_TOLERANCE = 1e-9  # rad
 
 
 class ChainLinks(NamedTuple):
-    """The links of a chain.
+    """The links of a chain, K with D degrees of freedom, as the compiled code reads them.
 
     A link is spherical (x y z), a hinge (x) or an end effector (x y): 3, 1 or 2 degrees of freedom.
 
     Attributes:
-        segments: (K,) one a link.
+        segments: (K,) segment of each link.
         parent: segment that the chain hangs on.
-        mounts: (K, 3, 3) as the skeleton's.
-        mounted: (K,) whether the mount turns at all.
+        mounts: (K, 3, 3) mounts of the segments.
+        mounted: (K,) whether the mount is not the identity.
         lengths: (K,) from joint to joint, m.
-        first_dofs: (K + 1,) where in `dofs` those of a link start.
-        dofs: (D,) of all links.
-        lower, upper: (D,) limits.
-        sides: (K, 2) which of the two solutions for its angles a link's limits admit.
+        first_dofs: (K + 1,) position in `dofs` of the first one of each link.
+        dofs: (D,) degrees of freedom of all links.
+        lower, upper: (D,) limits, rad.
+        sides: (K, 2) which of the two solutions for its angles the limits of a link admit.
     """
 
     segments: NDArray[np.int64]
@@ -248,14 +248,16 @@ def _bend_joint(chain, k, joints, given, frames, found):  # type: ignore[no-unty
     v1 = frames[frame, 1, 0] * z0 + frames[frame, 1, 1] * z1 + frames[frame, 1, 2] * z2
     v2 = frames[frame, 2, 0] * z0 + frames[frame, 2, 1] * z1 + frames[frame, 2, 2] * z2
     if dofs == 1:
-        c, e, fits = _hinge(chain, k, v0, v1, v2, given)
+        e = np.arccos(min(max(v2, -1.0), 1.0))
+        c, e, fits = _nearest(chain, k, at - 1, at, e, -e, v0, -v1, given)
         # Until here the twist of the spherical joint was left out of the frame.
         found[at - 1], found[at] = c, e
         if inner and fits:
             _turn(frames, frame, c, 2)
             _turn(frames, frame, e, 0)
         return fits
-    a, b, fits = _two_angles(chain, k, v0, v1, v2, given)
+    b = np.arcsin(min(max(v0, -1.0), 1.0))
+    a, b, fits = _nearest(chain, k, at, at + 1, b, np.pi - b, -v1, v2, given)
     found[at], found[at + 1] = a, b
     if inner and fits:
         _turn(frames, frame, a, 0)
@@ -268,53 +270,30 @@ def _bend_joint(chain, k, joints, given, frames, found):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
-def _two_angles(chain, k, v0, v1, v2, given):  # type: ignore[no-untyped-def]
-    """a and b of v = (sin b, -sin a cos b, cos a cos b), within limits and nearest the given."""
-    i = chain.first_dofs[k]
-    j = i + 1
-    first = np.arcsin(min(max(v0, -1.0), 1.0))
-    free = np.sqrt(v1 * v1 + v2 * v2) < STRAIGHT
-    best_a, best_b, best_cost = given[i], given[j], np.inf
+def _nearest(chain, k, i, j, one, two, y, x, given):  # type: ignore[no-untyped-def]
+    """Angles i and j of link k within their limits, of two solutions those nearest the given.
+
+    Angle j is one or two; angle i is that of (x, y), turned by pi for the second, and stays where
+    (x, y) vanishes: it has no effect on the segment.
+    """
+    free = np.sqrt(y * y + x * x) < STRAIGHT
+    best_i, best_j, best_cost = given[i], given[j], np.inf
     found = False
     for solution in range(2):
         if not chain.sides[k, solution]:
             continue
         side = 1.0 - 2.0 * solution
-        b = first if solution == 0 else np.pi - first
-        b, fits = _into_limits(b, chain.lower[j], chain.upper[j], given[j])
+        b, fits = _into_limits(
+            one if solution == 0 else two, chain.lower[j], chain.upper[j], given[j]
+        )
         if not fits:
             continue
-        # cos b = 0: the first angle has no effect on the segment; keep it.
-        a = given[i] if free else np.arctan2(-side * v1, side * v2)
+        a = given[i] if free else np.arctan2(side * y, side * x)
         a, fits = _into_limits(a, chain.lower[i], chain.upper[i], given[i])
         cost = (a - given[i]) ** 2 + (b - given[j]) ** 2
         if fits and cost < best_cost:
-            best_a, best_b, best_cost, found = a, b, cost, True
-    return best_a, best_b, found
-
-
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
-def _hinge(chain, k, w0, w1, w2, given):  # type: ignore[no-untyped-def]
-    """c and e of w = (sin c sin e, -cos c sin e, cos e), within limits and nearest the given."""
-    j = chain.first_dofs[k]
-    i = j - 1
-    bent = np.arccos(min(max(w2, -1.0), 1.0))
-    free = np.sqrt(w0 * w0 + w1 * w1) < STRAIGHT
-    best_c, best_e, best_cost = given[i], given[j], np.inf
-    found = False
-    for solution in range(2):
-        if not chain.sides[k, solution]:
-            continue
-        side = 1.0 - 2.0 * solution
-        e, fits = _into_limits(side * bent, chain.lower[j], chain.upper[j], given[j])
-        if not fits:
-            continue
-        c = given[i] if free else np.arctan2(side * w0, -side * w1)
-        c, fits = _into_limits(c, chain.lower[i], chain.upper[i], given[i])
-        cost = (c - given[i]) ** 2 + (e - given[j]) ** 2
-        if fits and cost < best_cost:
-            best_c, best_e, best_cost, found = c, e, cost, True
-    return best_c, best_e, found
+            best_i, best_j, best_cost, found = a, b, cost, True
+    return best_i, best_j, found
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

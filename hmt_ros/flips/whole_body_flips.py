@@ -34,19 +34,16 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-# Distance of some joint of the torso below which two trunks are one, m.
-SAME_TRUNK = 0.03
-# Of inverse kinematics, which starts near where it ends.
-ITERATIONS = 20
-# Rejected samples that are drawn anew before it is given up.
-ROUNDS = 200
+SAME_TRUNK = 0.03  # m; torsos of which no joint differs by more are the same
+ITERATIONS = 20  # of inverse kinematics, which starts near its solution
+ROUNDS = 200  # maximum number of times that rejected samples are drawn again
 
 
 class DepthOrder(NamedTuple):
-    """One part of the body is seen before another.
+    """A part of the body that hides another one.
 
     Attributes:
-        front, behind: joints at the two ends of a part; twice the same joint: the joint itself.
+        front, behind: joints at the two ends of each part; the same joint twice is that joint.
     """
 
     front: tuple[str, str]
@@ -58,8 +55,8 @@ class Leaves(NamedTuple):
 
     Attributes:
         poses: (N, d).
-        log_priors: (N,) of the soft prior, up to a constant of the body.
-        trunks: (N,) index of the trunk.
+        log_priors: (N,) log density of the soft prior, up to a constant of the body.
+        trunks: (N,) index of the trunk of each pose.
     """
 
     poses: Array
@@ -73,13 +70,13 @@ class FlipProduct:
 
     Attributes:
         body: the body.
-        chains: (C,) names.
-        trunks: (T, d) poses, of which what is not part of a chain counts.
-        parents: (T,) index of the given pose that each comes from.
-        trunk_log_priors: (T,) of that part.
-        angles: of each chain (T, A, chain dofs), A the most leaves on any trunk.
-        log_priors: of each chain (T, A), -inf where there is no leaf or it is pruned.
-        allowed: of each pair of chains, in the order of `itertools.combinations`, (T, A, A').
+        chains: (C,) names of the chains.
+        trunks: (T, d) poses; their chains do not count.
+        parents: (T,) index of the given pose that each trunk comes from.
+        trunk_log_priors: (T,) log prior of the degrees of freedom outside the chains.
+        angles: (T, A, chain dofs) for each chain; A is the largest number of leaves on a trunk.
+        log_priors: (T, A) for each chain, -inf where there is no leaf or it is pruned.
+        allowed: (T, A, A') for each pair of chains, whether two leaves go together.
     """
 
     body: Body
@@ -132,11 +129,11 @@ class FlipProduct:
         """Leaves drawn by their prior probability.
 
         Args:
-            count: how many.
-            rng: source of randomness.
+            count: number of leaves.
+            rng: random number generator.
 
         Raises:
-            ValueError: there are no leaves, or hardly one in a hundred that pruning leaves.
+            ValueError: there are no leaves, or pruning rejects nearly all that are drawn.
         """
         totals = self.trunk_log_priors.copy()
         cumulative = []
@@ -204,20 +201,20 @@ def full_body_flips(
 ) -> FlipProduct:
     """All flips of poses: of their torsos, by iterative inverse kinematics, and of their chains.
 
-    On the trunk of a given pose all leaves have its image exactly. A torso that is flipped has it
-    within `slack`, as it is not a chain, and its limbs are hung from where it has them: exactly
-    onto their rays, or touching those that miss their sphere by less than the slack, or else, where
-    no leaf is left, by iterative inverse kinematics within the slack.
+    On the trunk of a given pose all leaves have exactly its image. A torso is not a chain: when it
+    flips, its image stays the same within `slack`. Its limbs are put back onto their rays, exactly
+    or, where a ray misses its sphere by less than the slack, to the nearest point. A limb without
+    any such leaf is solved for by iterative inverse kinematics within the slack.
 
     Args:
         body: the body.
         poses: (N, d) or (d,).
-        chains: names; None: all that the body has.
-        torso: whether the torsos flip, too.
-        depth_orders: what is known of which part is before which.
-        most_overlap: leaves are pruned in which parts overlap by more, m; inf: none. The given
-            poses stay.
-        slack: by which the image of a flipped torso may differ, m at the distance of the joints.
+        chains: names of the chains; None selects all chains of the body.
+        torso: whether torsos flip.
+        depth_orders: known orders in depth, which all leaves must satisfy.
+        most_overlap: largest overlap of two parts in a leaf, m; inf switches pruning by
+            self-intersection off. The given poses are kept in any case.
+        slack: largest distance of a joint of a flipped torso from its ray, m.
 
     Raises:
         KeyError, ValueError: as `enumerate_flips`; a depth order over joints of several chains.
@@ -345,15 +342,10 @@ def _torso_flips(body: Body, poses: Array, slack: float) -> tuple[Array, Index]:
         return flips, parents
     which = body.skeleton.joint_index(JOINTS)
     limbs = [j for chain in body.chains for j in body.skeleton.chain_dofs[chain]]
-    free = [name for j, name in enumerate(body.dof_names) if j not in limbs]
     before = body.joint_positions(poses)[:, which]
-    seen = before[parents]
-    flips = solve_joint_positions(
-        body, flips, seen, JOINTS, free_dofs=free, along_rays=True, sigma=0.005,
-        max_iterations=ITERATIONS, tolerance=1e-3,
-    ).x  # fmt: skip
+    seen, free = before[parents], np.setdiff1d(np.arange(body.dimension), limbs)
+    flips, near = _onto_rays(body, flips, seen, which, free, slack)
     torsos = body.joint_positions(flips)[:, which]
-    near = _off_rays(torsos, seen).max(1) <= slack
     kept = []
     for n in range(len(poses)):
         own = np.flatnonzero(near & (parents == n))
@@ -363,11 +355,22 @@ def _torso_flips(body: Body, poses: Array, slack: float) -> tuple[Array, Index]:
     return flips[chosen], parents[chosen]
 
 
-def _off_rays(joints: Array, seen: Array) -> Array:
-    """Distances (...) of points from the rays of others, m."""
+def _onto_rays(
+    body: Body, starts: Array, seen: Array, joints: Index, free: Index, slack: float
+) -> tuple[Array, Mask]:
+    """Poses (N, d) whose joints are near the rays of points (N, J, 3), and which are within slack.
+
+    Only the free degrees of freedom move.
+    """
+    names = [body.joint_names[j] for j in joints]
+    poses = solve_joint_positions(
+        body, starts, seen, names, free_dofs=[body.dof_names[j] for j in free], along_rays=True,
+        sigma=0.005, max_iterations=ITERATIONS, tolerance=1e-3,
+    ).x  # fmt: skip
     rays = seen / np.linalg.norm(seen, axis=-1, keepdims=True)
-    distances: Array = np.linalg.norm(np.cross(joints, rays), axis=-1)
-    return distances
+    misses = np.linalg.norm(np.cross(body.joint_positions(poses)[:, joints], rays), axis=-1)
+    near: Mask = misses.max(1) <= slack
+    return poses, near
 
 
 def _hung(
@@ -400,19 +403,12 @@ def _reached(
     body: Body, poses: Array, trunks: Array, chain: str, slack: float
 ) -> tuple[Array, Index]:
     """Poses whose chain comes within the slack of its rays, where no leaf of its tree does."""
-    dofs = body.skeleton.chain_dofs[chain]
-    skeleton = body.skeleton
-    own = skeleton.chain_joints[chain]
-    names = tuple(skeleton.joint_names[j] for j in own)
-    seen = body.joint_positions(poses)[:, own]
+    dofs, own = body.skeleton.chain_dofs[chain], body.skeleton.chain_joints[chain]
     starts = trunks.copy()
     starts[:, dofs] = poses[:, dofs]
-    solved = solve_joint_positions(
-        body, starts, seen, names, free_dofs=[body.dof_names[j] for j in dofs], along_rays=True,
-        sigma=0.005, max_iterations=ITERATIONS, tolerance=1e-3,
-    ).x  # fmt: skip
-    misses = _off_rays(body.joint_positions(solved)[:, own], seen).max(1)
-    near = np.flatnonzero(misses <= slack)
+    seen = body.joint_positions(poses)[:, own]
+    solved, fits = _onto_rays(body, starts, seen, own, dofs, slack)
+    near = np.flatnonzero(fits)
     return solved[near], near
 
 
