@@ -201,7 +201,6 @@ def rig_body(rig: Rig, name: str, unit_to_m: float) -> Body:
         upper=upper,
         joint_names=tuple(names),
         joint_segments=np.array([*range(s_count), *(t.parent for t in rig.tips)], dtype=np.intp),
-        joint_fixed=np.zeros((len(bones), 3)),
         joint_basis=np.concatenate([np.zeros_like(basis[:s_count]), basis[s_count:]]),
         length_names=tuple(length_names),
         lengths=values,
