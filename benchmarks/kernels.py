@@ -22,6 +22,7 @@ from benchmarks.command import benchmark_parser, show
 from benchmarks.machine import best_time, description
 from benchmarks.smoothing_relations import CLOSE, layers_of
 from hmt_ros.body import Camera, load_body
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.flips.interpretation_tree import enumerate_flips
@@ -32,7 +33,6 @@ from hmt_ros.image.texture import capture_textures
 from hmt_ros.inference.block_tridiagonal import add_band_product
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.smoothing import embedded_network as network_module

@@ -26,6 +26,7 @@ from benchmarks.flips import random_poses
 from benchmarks.machine import description
 from benchmarks.tracking import keypoints_only
 from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.background import BackgroundModel
@@ -34,7 +35,6 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
-from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings

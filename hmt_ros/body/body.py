@@ -235,15 +235,6 @@ class Body:
         """The same body with other factors on the x and y radii of its parts."""
         return replace(self, widths=tuple(float(x) for x in widths))
 
-    def only_parts(self, parts: Sequence[int]) -> Body:
-        """The same skeleton with some parts of the flesh only."""
-        kept = list(parts)
-        return replace(
-            self,
-            shapes=tuple(self.shapes[i] for i in kept),
-            widths=tuple(self.widths[i] for i in kept),
-        )
-
     def _sum_of(self, lengths: Array) -> float:
         names = self.skeleton.length_names
         return float(sum(lengths[names.index(x)] for x in self.stature_lengths)) or 1.0

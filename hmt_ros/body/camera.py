@@ -2,6 +2,10 @@
 
 Frame: camera optical frame of REP 103, x right, y down, z forward, m. Pixels: column u, row v, the
 centre of the first pixel at (0, 0).
+
+A `Viewpoint` says where a still camera stands over a level floor. The world of rendered motions has
+its origin on the floor, straight in front of the camera. A person at rest there faces the camera: x
+to the person's right (left in the image), y towards the camera, z up.
 """
 
 from __future__ import annotations
@@ -99,26 +103,15 @@ class Camera:
         x, y, z = points
         z = np.where(z > NEAR, z, np.nan)
         a, b = x / z, y / z
-        focal = (self.fx, self.fy)
-        centre = (self.cx, self.cy)
-        if not self.distortion:
-            pixels = np.stack([self.fx * a + self.cx, self.fy * b + self.cy])
-            if not derivative:
-                return pixels, np.empty(0)
-            jacobian = np.zeros((2, 3, *np.shape(z)))
-            jacobian[0, 0] = self.fx / z
-            jacobian[1, 1] = self.fy / z
-            jacobian[0, 2] = -a * jacobian[0, 0]
-            jacobian[1, 2] = -b * jacobian[1, 1]
-            return pixels, jacobian
         distorted, inner = self._distort(a, b)
-        pixels = np.stack([focal[i] * distorted[i] + centre[i] for i in range(2)])
+        lens = ((self.fx, self.cx), (self.fy, self.cy))
+        pixels = np.stack([f * x + c for (f, c), x in zip(lens, distorted, strict=True)])
         if not derivative:
             return pixels, np.empty(0)
         jacobian = np.empty((2, 3, *np.shape(z)))
-        for i in range(2):
-            jacobian[i, 0] = focal[i] * inner[i][0] / z
-            jacobian[i, 1] = focal[i] * inner[i][1] / z
+        for i, (f, _) in enumerate(lens):
+            jacobian[i, 0] = f * inner[i][0] / z
+            jacobian[i, 1] = f * inner[i][1] / z
             jacobian[i, 2] = -(jacobian[i, 0] * a + jacobian[i, 1] * b)
         return pixels, jacobian
 
@@ -149,21 +142,11 @@ class Camera:
         result: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         return result
 
-    def scaled(self, factor: float) -> Camera:
-        """The camera of the image resized by a factor."""
-        return Camera(
-            self.fx * factor,
-            self.fy * factor,
-            (self.cx + 0.5) * factor - 0.5,
-            (self.cy + 0.5) * factor - 0.5,
-            round(self.width * factor),
-            round(self.height * factor),
-            self.distortion,
-            self.distortion_model,
-        )
-
     def _distort(self, a: Array, b: Array) -> tuple[Array, tuple[tuple[Array, Array], ...]]:
         """Distorted normalised coordinates (2, ...) and their derivatives d(i) / d(a, b)."""
+        if not self.distortion:
+            one, zero = np.ones(()), np.zeros(())
+            return np.stack([a, b]), ((one, zero), (zero, one))
         if self.distortion_model == 'equidistant':
             return self._equidistant(a, b)
         k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
@@ -201,3 +184,51 @@ class Camera:
         value = np.stack([a * scale, b * scale])
         mixed = a * b * slope
         return value, ((scale + a * a * slope, mixed), (mixed, scale + b * b * slope))
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A camera over a floor.
+
+    Attributes:
+        distance: horizontal, from the camera to the world's origin, m.
+        height: of the camera above the floor, m.
+        pitch: by which the camera looks down, rad.
+
+    Raises:
+        ValueError: a distance or height that is not positive, or a camera that looks straight down.
+    """
+
+    distance: float = 5.6
+    height: float = 1.2
+    pitch: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ('distance', 0.1, 1000.0), ('height', 0.01, 100.0), ('pitch', -1.4, 1.4)
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f'{name} of the camera must lie in [{low}, {high}], saw {value}')
+
+    @property
+    def rotation(self) -> Array:
+        """Rotation (3, 3) from the world to the camera optical frame."""
+        c, s = np.cos(self.pitch), np.sin(self.pitch)
+        return np.array([[-1.0, 0.0, 0.0], [0.0, s, -c], [0.0, -c, -s]])
+
+    @property
+    def translation(self) -> Array:
+        """The world's origin (3,) in the camera optical frame, m."""
+        result: Array = self.rotation @ np.array([0.0, -self.distance, -self.height])
+        return result
+
+    def to_camera(self, points: ArrayLike) -> Array:
+        """Points (..., 3) of the world in the camera optical frame, m."""
+        result: Array = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+        return result
+
+    def to_world(self, points: ArrayLike) -> Array:
+        """Points (..., 3) of the camera optical frame in the world, m."""
+        result: Array = (np.asarray(points, dtype=np.float64) - self.translation) @ self.rotation
+        return result

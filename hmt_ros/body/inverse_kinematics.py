@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.kinematics import assemble, forward, segment_sums
+from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import EnergyFunction, Quadratic, Sum
 
@@ -71,33 +71,17 @@ def solve_joint_positions(
     if free_dofs is not None:
         frozen = np.setdiff1d(np.arange(body.dimension), skeleton.dof_index(tuple(free_dofs)))
         limits_low[:, frozen] = limits_high[:, frozen] = start[:, frozen]
-    segments = np.repeat(skeleton.joint_segments[which], 3)
-    offsets = skeleton.joint_offsets[which]
-    axes = np.tile(np.eye(3), (len(goal), len(which), 1, 1))
+    segments, offsets = skeleton.joint_segments[which], skeleton.joint_offsets[which]
+    across = None
     if along_rays:
         rays = goal / np.maximum(np.linalg.norm(goal, axis=2, keepdims=True), 1e-12)
-        axes -= rays[..., :, None] * rays[..., None, :]
+        across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
 
     def distances(x: Array, problem: Index) -> tuple[Array, Array, Array]:
-        frames = forward(skeleton, x)
-        joints = frames.points(skeleton.joint_segments[which], offsets)
-        w = weight[problem].T
-        across = axes[problem].transpose(1, 2, 3, 0)
-        error = np.einsum('jikn,jkn->jin', across, joints - goal[problem].transpose(1, 2, 0))
-        value = 0.5 * np.einsum('jn,jin,jin->n', w, error, error)
-        weights = np.repeat(w, 3, axis=0)
-        gradient, hessian = assemble(
-            frames,
-            *segment_sums(
-                segments,
-                np.repeat(joints, 3, axis=0),
-                across.reshape(-1, 3, len(x)),
-                weights * error.reshape(-1, len(x)),
-                weights,
-                len(skeleton.parents),
-            ),
-        )
-        return value, gradient, hessian
+        return point_energy(
+            forward(skeleton, x), segments, offsets, goal[problem].transpose(1, 2, 0),
+            weight[problem].T, None if across is None else across[problem].transpose(1, 2, 3, 0),
+        )  # fmt: skip
 
     energy = Sum((EnergyFunction(distances), Quadratic(body.prior_mean, precision)))
     return minimise(

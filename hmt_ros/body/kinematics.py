@@ -237,6 +237,44 @@ def assemble(frames: Frames, wrenches: Array, stiffnesses: Array) -> tuple[Array
     return gradient, hessian
 
 
+def point_energy(
+    frames: Frames,
+    segments: Index,
+    local: Array,
+    targets: Array,
+    weights: Array,
+    across: Array | None = None,
+) -> tuple[Array, Array, Array]:
+    """Energy 1/2 sum w |A (p - t)|^2 of points p that should be at targets t.
+
+    Args:
+        frames: of N poses.
+        segments: (P,) that carry the points.
+        local: (P, 3) places in the frames of the segments, m.
+        targets: (P, 3, N) camera frame, m.
+        weights: (P, N) w, 1/m^2.
+        across: (P, 3, 3, N) A, such as the projection across a ray; the identity when None.
+
+    Returns:
+        Value (N,), gradient (N, d), Gauss-Newton Hessian (N, d, d).
+    """
+    points = frames.points(segments, local)
+    error = points - targets
+    if across is None:
+        across = np.broadcast_to(np.eye(3)[..., None], (len(points), 3, 3, frames.count))
+    else:
+        error = np.einsum('jikn,jkn->jin', across, error)
+    value = 0.5 * np.einsum('jn,jin,jin->n', weights, error, error)
+    rows = np.repeat(weights, 3, axis=0)
+    sums = segment_sums(
+        np.repeat(segments, 3), np.repeat(points, 3, axis=0),
+        across.reshape(-1, 3, frames.count), rows * error.reshape(-1, frames.count), rows,
+        len(frames.skeleton.parents),
+    )  # fmt: skip
+    gradient, hessian = assemble(frames, *sums)
+    return value, gradient, hessian
+
+
 class _Plan(NamedTuple):
     """The tree as the compiled code reads it."""
 

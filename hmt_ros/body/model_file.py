@@ -240,7 +240,6 @@ def _build(content: dict[str, Any]) -> Body:
         upper=np.array(columns[5]),
         joint_names=tuple(joint_names),
         joint_segments=np.array(joint_segments, dtype=np.intp),
-        joint_fixed=np.zeros((len(joint_names), 3)),
         joint_basis=np.array(joint_basis),
         length_names=length_names,
         lengths=lengths,

@@ -28,18 +28,18 @@ class Skeleton:
     """A kinematic tree with S segments, d degrees of freedom, J joints and L lengths.
 
     Attributes:
-        name: of the body, e.g. 'human34'.
-        segment_names, parents: (S,) names and index of the parent (-1: the camera frame); parents
-            stand before their children.
+        name: name of the body, e.g. 'human34'.
+        segment_names, parents: (S,) name and index of the parent (-1: the camera frame); parents
+            come before their children.
         mounts: (S, 3, 3) rotation from the segment's frame at rest to its parent's frame.
-        fixed_offsets, offset_basis: (S, 3), (S, 3, L): offset = fixed + basis @ lengths, m, in the
-            parent's frame.
-        dof_names, dof_segments, dof_axes, dof_is_rotation: (d,) name, segment, axis 0 to 2, kind;
-            in the order in which they act.
+        fixed_offsets, offset_basis: (S, 3), (S, 3, L): offset of a segment in its parent's frame =
+            fixed + basis @ lengths, m.
+        dof_names, dof_segments, dof_axes, dof_is_rotation: (d,) name, segment, axis 0 to 2 and kind
+            of each degree of freedom, in the order in which they act.
         lower, upper: (d,) hard limits, m or rad.
-        joint_names, joint_segments: (J,) named points and the segment that carries them.
-        joint_fixed, joint_basis: (J, 3), (J, 3, L): place of a joint in the frame of its segment.
-        chains: name -> segments of a limb, from its root outwards.
+        joint_names, joint_segments: (J,) name of each joint, and the segment that carries it.
+        joint_basis: (J, 3, L): place of a joint in the frame of its segment = basis @ lengths, m.
+        chains: segments of each limb by its name, from its root outwards.
         length_names, lengths: (L,) m.
     """
 
@@ -57,7 +57,6 @@ class Skeleton:
     upper: Array
     joint_names: tuple[str, ...]
     joint_segments: Index
-    joint_fixed: Array
     joint_basis: Array
     length_names: tuple[str, ...]
     lengths: Array
@@ -69,7 +68,7 @@ class Skeleton:
         wanted = {
             'mounts': (s, 3, 3), 'fixed_offsets': (s, 3), 'offset_basis': (s, 3, n),
             'dof_segments': (d,), 'dof_axes': (d,), 'dof_is_rotation': (d,),
-            'lower': (d,), 'upper': (d,), 'joint_segments': (j,), 'joint_fixed': (j, 3),
+            'lower': (d,), 'upper': (d,), 'joint_segments': (j,),
             'joint_basis': (j, 3, n), 'lengths': (n,),
         }  # fmt: skip
         for key, shape in wanted.items():
@@ -115,7 +114,7 @@ class Skeleton:
     @cached_property
     def joint_offsets(self) -> Array:
         """Places (J, 3) of the joints in the frames of their segments at the present lengths, m."""
-        result: Array = self.joint_fixed + self.joint_basis @ self.lengths
+        result: Array = self.joint_basis @ self.lengths
         return result
 
     @cached_property

@@ -9,19 +9,24 @@ alternatives: the configurations of its modes, their flips, and what a search of
 Because limbs are nearly independent given the trunk, the energy of a combination is the energy of
 the group's leading mode plus the change that each alternative makes alone: a few dozen evaluations
 rate thousands of poses.
+
+`distinct_poses` compares poses by their joint positions, not by their angles: a rotation has two
+triples of Euler angles, Rx(a) Ry(b) Rz(c) = Rx(a + pi) Ry(pi - b) Rz(c + pi), every angle has its
+turns of 2 pi, and the twist of a straight limb moves nothing that is seen.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
-from hmt_ros.flips.distinct_poses import distinct_poses
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -65,9 +70,9 @@ class Alternatives:
     """Configurations of one chain, for the modes of a group.
 
     Attributes:
-        chain: name.
-        angles: (A, chain dofs).
-        penalties: (G, A) -log probability that a mode of the group takes each.
+        chain: name of the chain.
+        angles: (A, chain dofs) angles of each configuration.
+        penalties: (G, A) minus the log probability that a mode of the group takes each of them.
     """
 
     chain: str
@@ -81,9 +86,9 @@ class Combinations:
 
     Attributes:
         poses: (N, d).
-        parents: (N,) mode that each comes from, position in the group.
-        energies: (N,) estimated.
-        log_priors: (N,) log probability of the combination given the modes before.
+        parents: (N,) position in the group of the mode that each pose comes from.
+        energies: (N,) estimated energies.
+        log_priors: (N,) log probability of the combination given the previous modes.
     """
 
     poses: Array
@@ -95,18 +100,18 @@ class Combinations:
 def distinct_alternatives(
     body: Body, pose: Array, chain: str, angles: Array, penalties: Array, apart: float, most: int
 ) -> Alternatives:
-    """Merges configurations of a chain whose joints nowhere differ by more than `apart`, m.
+    """Merges configurations of a chain of which no joint differs by `apart` (m) or more.
 
-    Earlier ones stand for later ones and take the smaller of their penalties.
+    The first of them is kept, with the smallest of their penalties.
 
     Args:
         body: the body.
         pose: (d,) whose trunk the chain hangs on.
-        chain: name.
+        chain: name of the chain.
         angles: (A, chain dofs) candidates, most important first.
-        penalties: (G, A).
-        apart: distance that makes configurations distinct, m.
-        most: how many to keep.
+        penalties: (G, A) of the candidates.
+        apart: distance from which on configurations are distinct, m.
+        most: maximum number of configurations that are kept.
     """
     skeleton = body.skeleton
     poses = np.repeat(pose[None], len(angles), axis=0)
@@ -130,19 +135,20 @@ def best_combinations(
     temperature: float,
     count: int,
 ) -> Combinations:
-    """The most probable combinations of one alternative per chain.
+    """The most probable combinations of one alternative per chain, best first.
 
-    Best first by the sum over chains of energy changes and penalties, without building the product.
+    The cost of a combination is the sum over chains of the tempered changes in energy and the
+    penalties, minus the log weight of the mode.
 
     Args:
         body: the body.
-        modes: (G, d) the group.
-        log_weights: (G,) of the modes.
-        base_energy: of the leading mode.
-        alternatives: one entry a chain.
-        changes: (A,) energy change that each alternative makes alone.
+        modes: (G, d) modes of the group.
+        log_weights: (G,) log weights of the modes.
+        base_energy: energy of the leading mode.
+        alternatives: the alternatives of each chain.
+        changes: (A,) change in energy that each alternative makes alone, for each chain.
         temperature: factor on energies in a log weight.
-        count: how many.
+        count: maximum number of combinations.
     """
     sizes = tuple(len(c) for c in changes)
     keys, costs, parents, priors = [], [], [], []
@@ -169,3 +175,64 @@ def best_combinations(
         poses[:, body.skeleton.chain_dofs[own.chain]] = own.angles[picks[:, c]]
         energies = energies + change[picks[:, c]]
     return Combinations(poses, parent, energies, total[best])
+
+
+class Distinct(NamedTuple):
+    """Poses that represent all of a set.
+
+    Attributes:
+        kept: (K,) indices, in the order of the poses.
+        owner: (N,) position in `kept` of the representative of each pose; -1 where the maximum
+            number was reached before.
+    """
+
+    kept: Index
+    owner: Index
+
+
+def distinct_poses(joints: ArrayLike, apart: float, most: int | None = None) -> Distinct:
+    """Poses that differ from every earlier one.
+
+    The distance of two poses is that of the joint that is furthest apart. A pose that is nearer
+    than `apart` to one that is kept is represented by the nearest of these. So the first, best
+    poses represent later ones.
+
+    Args:
+        joints: (N, J, 3) joint positions of the poses, m.
+        apart: distance from which on two poses are distinct, m.
+        most: maximum number of poses that are kept; None keeps all that are distinct.
+
+    Raises:
+        ValueError: joints of another shape.
+    """
+    points = np.ascontiguousarray(joints, dtype=np.float64)
+    if points.ndim != 3 or points.shape[2] != 3:
+        raise ValueError(f'joints must have shape (N, J, 3), saw {points.shape}')
+    flat = points.reshape(len(points), 3 * points.shape[1])
+    return Distinct(*_distinct(flat, float(apart), len(flat) if most is None else int(most)))
+
+
+@njit(cache=True, nogil=True)
+def _distinct(points, apart, most):  # type: ignore[no-untyped-def]
+    """Indices of the poses (N, 3 J) that are kept, and which stands for each."""
+    n = len(points)
+    kept, owner = np.empty(n, np.int64), np.full(n, -1)
+    count = 0
+    for i in range(n):
+        least = apart * apart
+        for place in range(count):
+            k = kept[place]
+            gap = 0.0
+            for j in range(0, points.shape[1], 3):
+                x = points[k, j] - points[i, j]
+                y = points[k, j + 1] - points[i, j + 1]
+                z = points[k, j + 2] - points[i, j + 2]
+                gap = max(gap, x * x + y * y + z * z)
+                if gap >= least:
+                    break
+            if gap < least:
+                owner[i], least = place, gap
+        if owner[i] < 0 and count < most:
+            kept[count], owner[i] = i, count
+            count += 1
+    return kept[:count], owner

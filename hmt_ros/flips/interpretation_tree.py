@@ -19,8 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import Frames, forward
-from hmt_ros.flips.chain_links import ChainLinks, chain_links
-from hmt_ros.flips.tree_growth import grow_leaves
+from hmt_ros.flips.tree_growth import ChainLinks, chain_links, grow_leaves
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -32,18 +31,18 @@ def enumerate_flips(
     """All poses with the image of the given ones that flips of some chains reach.
 
     Args:
-        body: whose `chains` have the names.
+        body: the body.
         poses: (N, d) in the frame of the camera. Flips move joints along their rays, so that the
             lens of the camera does not matter.
-        chains: one name or several; of several the product of their trees is taken.
+        chains: name of a chain, or several names: then the product of their trees is taken.
 
     Returns:
-        poses (M, d), ordered by the pose they come from, which stands first of its leaves, and the
+        poses (M, d), grouped by the given pose, which is the first of its own leaves, and the
         index (M,) of that pose.
 
     Raises:
-        KeyError: a chain that the body does not have.
-        ValueError: a chain whose joints have no closed form, or that contains another's segments.
+        KeyError: the body does not have a chain.
+        ValueError: the joints of a chain have no closed form, or two chains share segments.
     """
     names = [chains] if isinstance(chains, str) else list(chains)
     skeleton = body.skeleton
@@ -76,15 +75,15 @@ def rehang_chain(
     """Poses whose chain hangs on another trunk and still has the image that it had.
 
     When a trunk turns or flips, its limbs start elsewhere. Their joints are put back onto the rays
-    through their images, in all ways that lengths and limits allow. With `image_of` they are put
-    onto the image of another chain: a left leg onto the right one's.
+    through their images, in all ways that lengths and limits allow. `image_of` puts them onto the
+    image of another chain instead, such as a left leg onto that of the right leg.
 
     Args:
         body: the body.
         poses: (N, d) that have the image.
         new_poses: (N, d) with the other trunk.
-        chain: name.
-        image_of: name of the chain whose image is taken; the chain itself when None.
+        chain: name of the chain.
+        image_of: name of the chain whose image is taken; None selects the chain itself.
         slack: a ray that misses its sphere by less than this touches it, m.
 
     Returns:
@@ -104,7 +103,7 @@ def rehang_chain(
 
 
 def chain_points(body: Body, poses: ArrayLike, chain: str) -> Array:
-    """Where a chain of K links starts and where its links end, (N, K + 1, 3) m.
+    """The start of a chain of K links and the ends of its links, (N, K + 1, 3) m.
 
     Raises:
         KeyError, ValueError: as `enumerate_flips`.
@@ -119,14 +118,14 @@ def chain_points(body: Body, poses: ArrayLike, chain: str) -> Array:
 def place_chain(
     body: Body, poses: ArrayLike, chain: str, points: ArrayLike, *, slack: float = 0.1
 ) -> tuple[Array, Index]:
-    """Poses whose chain is seen where it is wanted, in all ways that lengths and limits allow.
+    """Poses whose chain has a given image, in all ways that lengths and limits allow.
 
     Args:
         body: the body.
         poses: (N, d) whose trunk the chain hangs on.
-        chain: name, of K links.
-        points: (N, K, 3) on the rays through which the ends of the links are to be seen; the first
-            way is the one whose ends lie before or behind their parents as these do.
+        chain: name of a chain with K links.
+        points: (N, K, 3) on the rays of the ends of the links. In the first solution the ends lie
+            before or behind their parents as these points do.
         slack: a ray that misses its sphere by less than this touches it, m.
 
     Returns:
@@ -162,7 +161,7 @@ def _leaves(frames: Frames, poses: Array, chain: ChainLinks) -> tuple[Array, NDA
 
 
 def _ends(frames: Frames, chain: ChainLinks) -> Array:
-    """Where the links of a chain end, (K, 3, N)."""
+    """Ends of the links of a chain, (K, 3, N)."""
     lengths = chain.lengths[:, None, None]
     ends: Array = frames.origins[chain.segments] - lengths * frames.columns[chain.segments, 2]
     return ends
@@ -188,18 +187,9 @@ def _grown(
     *,
     given_stays: bool = False,
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Leaves of the trees of one chain.
+    """Leaves of the trees of one chain: angles (N, 2^K, D), and where there is one (N, 2^K).
 
-    Args:
-        frames: where the chain starts.
-        poses: (N, d) of the frames; the angles nearest to theirs are taken.
-        chain: the links.
-        targets: (K, 3, N) points on the rays of the joints.
-        slack: a ray that misses its sphere by less touches it, m.
-        given_stays: the targets are joints of the given pose, which comes out first.
-
-    Returns:
-        angles (N, 2^K, D), undefined where there is no leaf, and where there is one (N, 2^K).
+    The arguments are those of `grow_leaves`.
     """
     count = 2 ** len(chain.lengths)
     angles = np.empty((len(poses), count, len(chain.dofs)))

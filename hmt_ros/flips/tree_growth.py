@@ -1,4 +1,4 @@
-"""Growth of the interpretation trees of a chain, compiled (KJS 3).
+"""The links of a chain, and the growth of its interpretation trees, compiled (KJS 3).
 
 Joint angles follow from the joint positions by descending the chain, with v the segment's z axis
 seen from the frame before its rotations:
@@ -10,16 +10,119 @@ seen from the frame before its rotations:
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from hmt_ros.flips.chain_links import TURN
+from hmt_ros.body.skeleton import Skeleton
 
+Array = NDArray[np.float64]
+
+TURN = 2.0 * np.pi
 # Two solutions nearer than this are one: the ray touches the sphere, m.
 TOUCHING = 1e-6
 # Sine of an elbow or knee angle below which the segments count as straight: their twist is free.
 STRAIGHT = 1e-6
 LIMIT_TOLERANCE = 1e-9  # rad
+
+
+class ChainLinks(NamedTuple):
+    """The links of a chain, K with D degrees of freedom, as the compiled code reads them.
+
+    A link is spherical (x y z), a hinge (x) or an end effector (x y): 3, 1 or 2 degrees of freedom.
+
+    Attributes:
+        segments: (K,) segment of each link.
+        parent: segment that the chain hangs on.
+        mounts: (K, 3, 3) mounts of the segments.
+        mounted: (K,) whether the mount is not the identity.
+        lengths: (K,) from joint to joint, m.
+        first_dofs: (K + 1,) position in `dofs` of the first one of each link.
+        dofs: (D,) degrees of freedom of all links.
+        lower, upper: (D,) limits, rad.
+        sides: (K, 2) which of the two solutions for its angles the limits of a link admit.
+    """
+
+    segments: NDArray[np.int64]
+    parent: int
+    mounts: Array
+    mounted: NDArray[np.bool_]
+    lengths: Array
+    first_dofs: NDArray[np.int64]
+    dofs: NDArray[np.int64]
+    lower: Array
+    upper: Array
+    sides: NDArray[np.bool_]
+
+
+@lru_cache(maxsize=256)
+def chain_links(skeleton: Skeleton, name: str) -> ChainLinks:
+    """The links of a chain.
+
+    Raises:
+        KeyError: a chain that the skeleton does not have.
+        ValueError: a chain whose joints have no closed form, or limits that no angle satisfies.
+    """
+    if name not in skeleton.chains:
+        raise KeyError(f'{skeleton.name} has no chain {name!r}; it has {sorted(skeleton.chains)}')
+    segments = skeleton.chains[name]
+    lengths: list[float] = []
+    sides: list[list[bool]] = []
+    after_spherical = False
+    for k, s in enumerate(segments):
+        dofs = skeleton.segment_dofs[s]
+        axes = ''.join('xyz'[skeleton.dof_axes[j]] for j in dofs)
+        rotations = all(skeleton.dof_is_rotation[j] for j in dofs)
+        ends = [j for j, owner in enumerate(skeleton.joint_segments) if owner == s]
+        if k + 1 < len(segments):
+            end = skeleton.offsets[segments[k + 1]]
+        else:
+            end = next((x for x in skeleton.joint_offsets[ends] if np.any(x)), np.zeros(3))
+        straight = np.allclose(end[:2], 0.0) and end[2] < 0
+        in_line = np.array_equal(skeleton.mounts[s], np.eye(3))
+        hinge = axes == 'x' and after_spherical and in_line
+        follows = k == 0 or skeleton.parents[s] == segments[k - 1]
+        fits = (axes in ('xyz', 'xy') or hinge) and follows and skeleton.parents[s] >= 0
+        if not (rotations and straight and fits):
+            raise ValueError(
+                f'chain {name} of {skeleton.name} has no closed form at segment '
+                f'{skeleton.segment_names[s]} (rotations {axes!r}); '
+                'use iterative inverse kinematics'
+            )
+        after_spherical = axes == 'xyz'
+        lengths.append(float(-end[2]))
+        # The two solutions differ in the sign of sin e, or in that of cos b.
+        bend = dofs[0] if hinge else dofs[1]
+        sides.append(_signs(skeleton.lower[bend], skeleton.upper[bend], hinge))
+        if not any(sides[-1]):
+            raise ValueError(
+                f'{skeleton.dof_names[bend]} of {skeleton.name} has limits that no angle satisfies'
+            )
+    which = list(segments)
+    own = skeleton.chain_dofs[name]
+    counts = [len(skeleton.segment_dofs[s]) for s in segments]
+    return ChainLinks(
+        np.array(which, dtype=np.int64),
+        int(skeleton.parents[segments[0]]),
+        skeleton.mounts[which],
+        np.array([not np.array_equal(mount, np.eye(3)) for mount in skeleton.mounts[which]]),
+        np.array(lengths),
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        own,
+        skeleton.lower[own],
+        skeleton.upper[own],
+        np.array(sides),
+    )
+
+
+def _signs(lower: float, upper: float, sine: bool) -> list[bool]:
+    """Whether angles within the limits give the sine, or the cosine, a sign: first +, then -."""
+    samples = np.linspace(lower, min(upper, lower + TURN), 721)
+    values = np.sin(samples) if sine else np.cos(samples)
+    return [bool(np.any(values > 1e-6)), bool(np.any(values < -1e-6))]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -145,14 +248,16 @@ def _bend_joint(chain, k, joints, given, frames, found):  # type: ignore[no-unty
     v1 = frames[frame, 1, 0] * z0 + frames[frame, 1, 1] * z1 + frames[frame, 1, 2] * z2
     v2 = frames[frame, 2, 0] * z0 + frames[frame, 2, 1] * z1 + frames[frame, 2, 2] * z2
     if dofs == 1:
-        c, e, fits = _hinge(chain, k, v0, v1, v2, given)
+        e = np.arccos(min(max(v2, -1.0), 1.0))
+        c, e, fits = _nearest(chain, k, at - 1, at, e, -e, v0, -v1, given)
         # Until here the twist of the spherical joint was left out of the frame.
         found[at - 1], found[at] = c, e
         if inner and fits:
             _turn(frames, frame, c, 2)
             _turn(frames, frame, e, 0)
         return fits
-    a, b, fits = _two_angles(chain, k, v0, v1, v2, given)
+    b = np.arcsin(min(max(v0, -1.0), 1.0))
+    a, b, fits = _nearest(chain, k, at, at + 1, b, np.pi - b, -v1, v2, given)
     found[at], found[at + 1] = a, b
     if inner and fits:
         _turn(frames, frame, a, 0)
@@ -165,53 +270,30 @@ def _bend_joint(chain, k, joints, given, frames, found):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
-def _two_angles(chain, k, v0, v1, v2, given):  # type: ignore[no-untyped-def]
-    """a and b of v = (sin b, -sin a cos b, cos a cos b), within limits and nearest the given."""
-    i = chain.first_dofs[k]
-    j = i + 1
-    first = np.arcsin(min(max(v0, -1.0), 1.0))
-    free = np.sqrt(v1 * v1 + v2 * v2) < STRAIGHT
-    best_a, best_b, best_cost = given[i], given[j], np.inf
+def _nearest(chain, k, i, j, one, two, y, x, given):  # type: ignore[no-untyped-def]
+    """Angles i and j of link k within their limits, of two solutions those nearest the given.
+
+    Angle j is one or two; angle i is that of (x, y), turned by pi for the second, and stays where
+    (x, y) vanishes: it has no effect on the segment.
+    """
+    free = np.sqrt(y * y + x * x) < STRAIGHT
+    best_i, best_j, best_cost = given[i], given[j], np.inf
     found = False
     for solution in range(2):
         if not chain.sides[k, solution]:
             continue
         side = 1.0 - 2.0 * solution
-        b = first if solution == 0 else np.pi - first
-        b, fits = _into_limits(b, chain.lower[j], chain.upper[j], given[j])
+        b, fits = _into_limits(
+            one if solution == 0 else two, chain.lower[j], chain.upper[j], given[j]
+        )
         if not fits:
             continue
-        # cos b = 0: the first angle has no effect on the segment; keep it.
-        a = given[i] if free else np.arctan2(-side * v1, side * v2)
+        a = given[i] if free else np.arctan2(side * y, side * x)
         a, fits = _into_limits(a, chain.lower[i], chain.upper[i], given[i])
         cost = (a - given[i]) ** 2 + (b - given[j]) ** 2
         if fits and cost < best_cost:
-            best_a, best_b, best_cost, found = a, b, cost, True
-    return best_a, best_b, found
-
-
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
-def _hinge(chain, k, w0, w1, w2, given):  # type: ignore[no-untyped-def]
-    """c and e of w = (sin c sin e, -cos c sin e, cos e), within limits and nearest the given."""
-    j = chain.first_dofs[k]
-    i = j - 1
-    bent = np.arccos(min(max(w2, -1.0), 1.0))
-    free = np.sqrt(w0 * w0 + w1 * w1) < STRAIGHT
-    best_c, best_e, best_cost = given[i], given[j], np.inf
-    found = False
-    for solution in range(2):
-        if not chain.sides[k, solution]:
-            continue
-        side = 1.0 - 2.0 * solution
-        e, fits = _into_limits(side * bent, chain.lower[j], chain.upper[j], given[j])
-        if not fits:
-            continue
-        c = given[i] if free else np.arctan2(side * w0, -side * w1)
-        c, fits = _into_limits(c, chain.lower[i], chain.upper[i], given[i])
-        cost = (c - given[i]) ** 2 + (e - given[j]) ** 2
-        if fits and cost < best_cost:
-            best_c, best_e, best_cost, found = c, e, cost, True
-    return best_c, best_e, found
+            best_i, best_j, best_cost, found = a, b, cost, True
+    return best_i, best_j, found
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -5,13 +5,16 @@ interpretation tree, hung back onto its rays. A whole pose is a trunk with one l
 and its prior probability is a product over these: so the leaves of the body can be taken in order
 of probability, or sampled, from lists of a few dozen entries, before any pose is built.
 
-What is known to be wrong is pruned before any pose is built (`flip_pruning`).
+What is known to be wrong is pruned before any pose is built: leaves of chains that run through the
+trunk or themselves, pairs of leaves of two chains that run through each other, and what contradicts
+a known order in depth.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
 
@@ -21,9 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
-from hmt_ros.flips.best_combinations import least_sums
-from hmt_ros.flips.distinct_poses import distinct_poses
-from hmt_ros.flips.flip_pruning import DepthOrder, FlipPruning
+from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.body.self_intersection import deepest_overlaps
+from hmt_ros.flips.best_combinations import distinct_poses, least_sums
 from hmt_ros.flips.interpretation_tree import enumerate_flips, rehang_chain
 from hmt_ros.flips.torso_flips import JOINTS, flip_torso
 
@@ -31,12 +34,20 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-# Distance of some joint of the torso below which two trunks are one, m.
-SAME_TRUNK = 0.03
-# Of inverse kinematics, which starts near where it ends.
-ITERATIONS = 20
-# Rejected samples that are drawn anew before it is given up.
-ROUNDS = 200
+SAME_TRUNK = 0.03  # m; torsos of which no joint differs by more are the same
+ITERATIONS = 20  # of inverse kinematics, which starts near its solution
+ROUNDS = 200  # maximum number of times that rejected samples are drawn again
+
+
+class DepthOrder(NamedTuple):
+    """A part of the body that hides another one.
+
+    Attributes:
+        front, behind: joints at the two ends of each part; the same joint twice is that joint.
+    """
+
+    front: tuple[str, str]
+    behind: tuple[str, str]
 
 
 class Leaves(NamedTuple):
@@ -44,8 +55,8 @@ class Leaves(NamedTuple):
 
     Attributes:
         poses: (N, d).
-        log_priors: (N,) of the soft prior, up to a constant of the body.
-        trunks: (N,) index of the trunk.
+        log_priors: (N,) log density of the soft prior, up to a constant of the body.
+        trunks: (N,) index of the trunk of each pose.
     """
 
     poses: Array
@@ -59,13 +70,13 @@ class FlipProduct:
 
     Attributes:
         body: the body.
-        chains: (C,) names.
-        trunks: (T, d) poses, of which what is not part of a chain counts.
-        parents: (T,) index of the given pose that each comes from.
-        trunk_log_priors: (T,) of that part.
-        angles: of each chain (T, A, chain dofs), A the most leaves on any trunk.
-        log_priors: of each chain (T, A), -inf where there is no leaf or it is pruned.
-        allowed: of each pair of chains, in the order of `itertools.combinations`, (T, A, A').
+        chains: (C,) names of the chains.
+        trunks: (T, d) poses; their chains do not count.
+        parents: (T,) index of the given pose that each trunk comes from.
+        trunk_log_priors: (T,) log prior of the degrees of freedom outside the chains.
+        angles: (T, A, chain dofs) for each chain; A is the largest number of leaves on a trunk.
+        log_priors: (T, A) for each chain, -inf where there is no leaf or it is pruned.
+        allowed: (T, A, A') for each pair of chains, whether two leaves go together.
     """
 
     body: Body
@@ -76,6 +87,11 @@ class FlipProduct:
     angles: tuple[Array, ...]
     log_priors: tuple[Array, ...]
     allowed: tuple[Mask, ...]
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Pairs of chains, in the order of `allowed`."""
+        return list(combinations(range(len(self.chains)), 2))
 
     @property
     def size(self) -> int:
@@ -91,12 +107,11 @@ class FlipProduct:
         """
         costs, trunks = [np.empty(0)], [np.empty(0, dtype=np.intp)]
         picks = [np.empty((0, len(self.chains)), dtype=np.intp)]
-        pairs = list(combinations(range(len(self.chains)), 2))
         for t, base in enumerate(self.trunk_log_priors):
             leaves = [np.flatnonzero(np.isfinite(own[t])) for own in self.log_priors]
             ruled_out = {
                 (i, j): table[t][np.ix_(leaves[i], leaves[j])]
-                for (i, j), table in zip(pairs, self.allowed, strict=True)
+                for (i, j), table in zip(self.pairs, self.allowed, strict=True)
                 if not table[t].all()
             }
             lists = [-own[t][which] for own, which in zip(self.log_priors, leaves, strict=True)]
@@ -114,11 +129,11 @@ class FlipProduct:
         """Leaves drawn by their prior probability.
 
         Args:
-            count: how many.
-            rng: source of randomness.
+            count: number of leaves.
+            rng: random number generator.
 
         Raises:
-            ValueError: there are no leaves, or hardly one in a hundred that pruning leaves.
+            ValueError: there are no leaves, or pruning rejects nearly all that are drawn.
         """
         totals = self.trunk_log_priors.copy()
         cumulative = []
@@ -142,9 +157,8 @@ class FlipProduct:
             for c, sums in enumerate(cumulative):
                 drawn[:, c] = (rng.random((missing, 1)) * sums[t, -1:] >= sums[t]).sum(1)
             fits = np.ones(missing, dtype=np.bool_)
-            pairs = combinations(range(len(self.chains)), 2)
-            for (first, second), table in zip(pairs, self.allowed, strict=True):
-                fits &= table[t, drawn[:, first], drawn[:, second]]
+            for (i, j), table in zip(self.pairs, self.allowed, strict=True):
+                fits &= table[t, drawn[:, i], drawn[:, j]]
             trunks, picks = np.append(trunks, t[fits]), np.append(picks, drawn[fits], axis=0)
         if len(trunks) < count:
             raise ValueError(
@@ -162,6 +176,18 @@ class FlipProduct:
             _put_angles(poses, dofs, self.angles[c], trunks, picks[:, c])
         return Leaves(poses, log_priors, trunks)
 
+    @cached_property
+    def _frames(self) -> tuple[Frames, list[Index]]:
+        """Frames of every trunk with every leaf of every chain, and their rows (T, A)."""
+        poses, rows, count = [], [], 0
+        for chain, angles in zip(self.chains, self.angles, strict=True):
+            block = np.repeat(self.trunks[:, None], angles.shape[1], axis=1)
+            block[..., self.body.skeleton.chain_dofs[chain]] = angles
+            poses.append(block.reshape(-1, self.body.dimension))
+            rows.append(count + np.arange(len(poses[-1])).reshape(angles.shape[:2]))
+            count += len(poses[-1])
+        return forward(self.body.skeleton, np.concatenate([self.trunks[:0], *poses])), rows
+
 
 def full_body_flips(
     body: Body,
@@ -175,20 +201,20 @@ def full_body_flips(
 ) -> FlipProduct:
     """All flips of poses: of their torsos, by iterative inverse kinematics, and of their chains.
 
-    On the trunk of a given pose all leaves have its image exactly. A torso that is flipped has it
-    within `slack`, as it is not a chain, and its limbs are hung from where it has them: exactly
-    onto their rays, or touching those that miss their sphere by less than the slack, or else, where
-    no leaf is left, by iterative inverse kinematics within the slack.
+    On the trunk of a given pose all leaves have exactly its image. A torso is not a chain: when it
+    flips, its image stays the same within `slack`. Its limbs are put back onto their rays, exactly
+    or, where a ray misses its sphere by less than the slack, to the nearest point. A limb without
+    any such leaf is solved for by iterative inverse kinematics within the slack.
 
     Args:
         body: the body.
         poses: (N, d) or (d,).
-        chains: names; None: all that the body has.
-        torso: whether the torsos flip, too.
-        depth_orders: what is known of which part is before which.
-        most_overlap: leaves are pruned in which parts overlap by more, m; inf: none. The given
-            poses stay.
-        slack: by which the image of a flipped torso may differ, m at the distance of the joints.
+        chains: names of the chains; None selects all chains of the body.
+        torso: whether torsos flip.
+        depth_orders: known orders in depth, which all leaves must satisfy.
+        most_overlap: largest overlap of two parts in a leaf, m; inf switches pruning by
+            self-intersection off. The given poses are kept in any case.
+        slack: largest distance of a joint of a flipped torso from its ray, m.
 
     Raises:
         KeyError, ValueError: as `enumerate_flips`; a depth order over joints of several chains.
@@ -211,18 +237,102 @@ def full_body_flips(
     offset = (trunks - body.prior_mean) / body.prior_sigma
     offset[:, limbs] = 0.0
     trunk_log_priors = -0.5 * (offset * offset).sum(1)
-    pruning = FlipPruning(body, names, given, trunks, parents, angles, log_priors)
-    allowed = pruning.allowed(most_overlap)
+    sizes = combinations([own.shape[1] for own in angles], 2)
+    allowed = tuple(np.ones((len(trunks), *size), dtype=np.bool_) for size in sizes)
+    product = FlipProduct(
+        body, names, trunks, parents, trunk_log_priors, tuple(angles), tuple(log_priors), allowed
+    )
+    if np.isfinite(most_overlap) and body.shapes:
+        _prune_overlaps(product, len(given), most_overlap)
     for order in depth_orders:
-        pruning.keep_order(order, trunk_log_priors, allowed)
+        _prune_order(product, given, order)
     fits = np.isfinite(trunk_log_priors)
     for own in log_priors:
         fits &= np.isfinite(own).any(1)
-    return FlipProduct(
-        body, names, trunks[fits], parents[fits], trunk_log_priors[fits],
-        tuple(a[fits] for a in angles), tuple(p[fits] for p in log_priors),
-        tuple(table[fits] for table in allowed),
+    return replace(
+        product, trunks=trunks[fits], parents=parents[fits],
+        trunk_log_priors=trunk_log_priors[fits], angles=tuple(a[fits] for a in angles),
+        log_priors=tuple(p[fits] for p in log_priors), allowed=tuple(x[fits] for x in allowed),
     )  # fmt: skip
+
+
+def _prune_overlaps(product: FlipProduct, given: int, most: float) -> None:
+    """Rules out leaves, and pairs of them, that overlap by more than most, m; given poses stay."""
+    body, own = product.body, [product.body.chains[chain] for chain in product.chains]
+    frames, rows = product._frames
+    placed = frames.by_pose()
+    limbs = {s for segments in own for s in segments}
+    trunk = [s for s in range(len(body.skeleton.parents)) if s not in limbs]
+    for leaf_rows, segments, log_priors in zip(rows, own, product.log_priors, strict=True):
+        flat = leaf_rows.ravel()
+        depth = deepest_overlaps(body, *placed, flat, segments, flat, [*trunk, *segments])
+        deep = depth.reshape(leaf_rows.shape) > most
+        deep[:given, 0] = False
+        log_priors[deep] = -np.inf
+    for (i, j), table in zip(product.pairs, product.allowed, strict=True):
+        first = np.broadcast_to(rows[i][:, :, None], table.shape).ravel()
+        second = np.broadcast_to(rows[j][:, None, :], table.shape).ravel()
+        depth = deepest_overlaps(body, *placed, first, own[i], second, own[j])
+        table &= depth.reshape(table.shape) <= most
+        table[:given, 0, 0] = True
+
+
+def _prune_order(product: FlipProduct, given: Array, order: DepthOrder) -> None:
+    """Rules out what contradicts an order in depth."""
+    body = product.body
+    frames, rows = product._frames
+    joints = frames.joints()[:, 2]
+    crossings = np.array([_crossing(body, pose, order) for pose in given])
+    owners, depths = [], []
+    for part, at in zip(order, crossings[product.parents].T, strict=True):
+        owner = _owner(product, part)
+        which = body.skeleton.joint_index(part)
+        if owner < 0:
+            places, share = body.joint_positions(product.trunks)[:, which, 2].T, at
+        else:
+            places, share = joints[which][:, rows[owner]], at[:, None]
+        # Along the image of a straight line the inverse of the depth is linear.
+        depths.append(1.0 / ((1.0 - share) / places[0] + share / places[1]))
+        owners.append(owner)
+    (i, j), (front, behind) = owners, depths
+    if i < 0 and j < 0:
+        product.trunk_log_priors[~(front < behind)] = -np.inf
+    elif i < 0 or j < 0 or i == j:
+        front, behind = (x[:, None] if x.ndim == 1 else x for x in (front, behind))
+        product.log_priors[max(i, j)][~(front < behind)] = -np.inf
+    else:
+        fits = front[:, :, None] < behind[:, None, :]
+        table = product.allowed[product.pairs.index((min(i, j), max(i, j)))]
+        table &= fits if i < j else fits.transpose(0, 2, 1)
+
+
+def _owner(product: FlipProduct, part: tuple[str, str]) -> int:
+    """The chain that carries a part, -1: the trunk."""
+    skeleton = product.body.skeleton
+    owners = set()
+    for joint in skeleton.joint_index(part):
+        segment = skeleton.joint_segments[joint]
+        if not np.any(skeleton.joint_offsets[joint]):
+            segment = skeleton.parents[segment]  # which has it at its end
+        owners |= {c for c, x in enumerate(product.chains) if segment in skeleton.chains[x]}
+    if len(owners) > 1:
+        raise ValueError(f'joints {part} of a depth order belong to different chains')
+    return int(owners.pop()) if owners else -1
+
+
+def _crossing(body: Body, pose: Array, order: DepthOrder) -> tuple[float, float]:
+    """Where in the image two parts cross, or come nearest, as shares of their lengths there."""
+    ends = []
+    for part in order:
+        joints = body.joint_positions(pose[None])[0, body.skeleton.joint_index(part)]
+        ends.append(joints[:, :2] / joints[:, 2:])
+    (a, b), (c, e) = ends
+    u, v, w = b - a, e - c, a - c
+    uu, uv, vv, uw, vw = u @ u, u @ v, v @ v, u @ w, v @ w
+    s = np.clip((uv * vw - vv * uw) / max(uu * vv - uv * uv, 1e-15), 0.0, 1.0)
+    t = np.clip((uv * s + vw) / max(vv, 1e-15), 0.0, 1.0)
+    s = np.clip((uv * t - uw) / max(uu, 1e-15), 0.0, 1.0)
+    return float(s), float(t)
 
 
 def _torso_flips(body: Body, poses: Array, slack: float) -> tuple[Array, Index]:
@@ -232,15 +342,10 @@ def _torso_flips(body: Body, poses: Array, slack: float) -> tuple[Array, Index]:
         return flips, parents
     which = body.skeleton.joint_index(JOINTS)
     limbs = [j for chain in body.chains for j in body.skeleton.chain_dofs[chain]]
-    free = [name for j, name in enumerate(body.dof_names) if j not in limbs]
     before = body.joint_positions(poses)[:, which]
-    seen = before[parents]
-    flips = solve_joint_positions(
-        body, flips, seen, JOINTS, free_dofs=free, along_rays=True, sigma=0.005,
-        max_iterations=ITERATIONS, tolerance=1e-3,
-    ).x  # fmt: skip
+    seen, free = before[parents], np.setdiff1d(np.arange(body.dimension), limbs)
+    flips, near = _onto_rays(body, flips, seen, which, free, slack)
     torsos = body.joint_positions(flips)[:, which]
-    near = _off_rays(torsos, seen).max(1) <= slack
     kept = []
     for n in range(len(poses)):
         own = np.flatnonzero(near & (parents == n))
@@ -250,11 +355,22 @@ def _torso_flips(body: Body, poses: Array, slack: float) -> tuple[Array, Index]:
     return flips[chosen], parents[chosen]
 
 
-def _off_rays(joints: Array, seen: Array) -> Array:
-    """Distances (...) of points from the rays of others, m."""
+def _onto_rays(
+    body: Body, starts: Array, seen: Array, joints: Index, free: Index, slack: float
+) -> tuple[Array, Mask]:
+    """Poses (N, d) whose joints are near the rays of points (N, J, 3), and which are within slack.
+
+    Only the free degrees of freedom move.
+    """
+    names = [body.joint_names[j] for j in joints]
+    poses = solve_joint_positions(
+        body, starts, seen, names, free_dofs=[body.dof_names[j] for j in free], along_rays=True,
+        sigma=0.005, max_iterations=ITERATIONS, tolerance=1e-3,
+    ).x  # fmt: skip
     rays = seen / np.linalg.norm(seen, axis=-1, keepdims=True)
-    distances: Array = np.linalg.norm(np.cross(joints, rays), axis=-1)
-    return distances
+    misses = np.linalg.norm(np.cross(body.joint_positions(poses)[:, joints], rays), axis=-1)
+    near: Mask = misses.max(1) <= slack
+    return poses, near
 
 
 def _hung(
@@ -287,19 +403,12 @@ def _reached(
     body: Body, poses: Array, trunks: Array, chain: str, slack: float
 ) -> tuple[Array, Index]:
     """Poses whose chain comes within the slack of its rays, where no leaf of its tree does."""
-    dofs = body.skeleton.chain_dofs[chain]
-    skeleton = body.skeleton
-    own = skeleton.chain_joints[chain]
-    names = tuple(skeleton.joint_names[j] for j in own)
-    seen = body.joint_positions(poses)[:, own]
+    dofs, own = body.skeleton.chain_dofs[chain], body.skeleton.chain_joints[chain]
     starts = trunks.copy()
     starts[:, dofs] = poses[:, dofs]
-    solved = solve_joint_positions(
-        body, starts, seen, names, free_dofs=[body.dof_names[j] for j in dofs], along_rays=True,
-        sigma=0.005, max_iterations=ITERATIONS, tolerance=1e-3,
-    ).x  # fmt: skip
-    misses = _off_rays(body.joint_positions(solved)[:, own], seen).max(1)
-    near = np.flatnonzero(misses <= slack)
+    seen = body.joint_positions(poses)[:, own]
+    solved, fits = _onto_rays(body, starts, seen, own, dofs, slack)
+    near = np.flatnonzero(fits)
     return solved[near], near
 
 

@@ -8,17 +8,27 @@ follow by inverse kinematics, so that a foot on the floor stays where it is. All
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
-from hmt_ros.motion.arm_posture import SIDES, SIGNS, Posture, arm_posture, reaching_posture
-from hmt_ros.motion.footsteps import ahead, sole, standing_foot, walking_foot
-from hmt_ros.motion.smooth_curves import rests, smooth_below
-from hmt_ros.motion.viewpoint import Viewpoint
+from hmt_ros.body.mirror import root_angles, root_rotations
+from hmt_ros.motion.limb_motions import (
+    SIGNS,
+    Posture,
+    ahead,
+    arm_posture,
+    minimum_jerk,
+    reaching_posture,
+    sole,
+    standing_foot,
+    walking_foot,
+)
+from hmt_ros.motion.rig import SIDES
 
 Array = NDArray[np.float64]
 
@@ -58,26 +68,11 @@ DANCING_WRISTS = np.array([[-0.45, 0.05, -0.85], [0.95, 0.90, 0.95]])
 SIDE_STEPS = np.array([-1.0, -1.0, -1.0, 1.0, 1.0, 1.0])
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """A motion before the legs are known: T times; world of a viewpoint, m and rad.
-
-    Attributes:
-        body: that moves.
-        pelvis: (T, 3) where the pelvis would like to be; it goes lower where a leg is too short.
-        angles: degree of freedom -> (T,); what the body does not have is left out.
-        ankles, toes: (2, T, 3) of the left and of the right foot.
-        rate: times per second.
-    """
-
-    body: Body
-    pelvis: Array
-    angles: dict[str, Array]
-    ankles: Array
-    toes: Array
-    rate: float
-
-
+# A motion before the legs are known, at T times, in the world of a viewpoint, m and rad: where the
+# pelvis would like to be (T, 3) (it goes lower where a leg is too short); angles (T,) by degree of
+# freedom, of which the body may lack some; ankle and toe (T, 3) of the left and of the right foot.
+Feet = list[tuple[Array, Array]]
+Plan = tuple[Array, dict[str, Array], Feet]
 Motion = Callable[[Body, Array, float, 'float | None', np.random.Generator], Plan]
 
 
@@ -121,7 +116,8 @@ def procedural_motion(
     time = np.arange(-margin * fine, (frames + margin) * fine) / (fps * fine)
     rng = np.random.default_rng([seed, sorted(PROCEDURAL_MOTIONS).index(name)])
     plan = PROCEDURAL_MOTIONS[name](body, time, duration, heading, rng)
-    return _poses(plan, slice(margin * fine, (margin + frames) * fine, fine), viewpoint)
+    chosen = slice(margin * fine, (margin + frames) * fine, fine)
+    return _poses(body, plan, fps * fine, chosen, viewpoint)
 
 
 def walk(
@@ -179,7 +175,7 @@ def walk(
     for name in forth:  # an arm swings with the leg of the other side
         share = 0.5 - 0.5 * np.cos(wave) * (1.0 if name.startswith('left') else -1.0)
         angles[name] = back[name] + share * (forth[name] - back[name])
-    return _plan(body, pelvis, angles, feet, time)
+    return pelvis, angles, feet
 
 
 def reach(
@@ -217,7 +213,7 @@ def reach(
         place = scale * (0.13 * sign * ahead(facing - np.pi / 2) - 0.03 * ahead(facing))
         yaw = np.full(len(time), facing - sign * 8 * DEGREE)
         feet.append(standing_foot(body, np.tile(place, (len(time), 1)), 0.0, 0.0, yaw))
-    return _plan(body, pelvis, angles, feet, time)
+    return pelvis, angles, feet
 
 
 def dance(
@@ -281,21 +277,10 @@ def dance(
     postures = [reaching_posture(body, None, {}, DANCING_WRISTS, rng)]
     for _ in times[1:]:
         postures.append(reaching_posture(body, postures[-1], {}, DANCING_WRISTS, rng))
-    return _plan(body, pelvis, angles | _between(clock, times, postures), feet, time)
+    return pelvis, angles | _between(clock, times, postures), feet
 
 
 PROCEDURAL_MOTIONS: dict[str, Motion] = {'walk': walk, 'reach': reach, 'dance': dance}
-
-
-def _plan(
-    body: Body,
-    pelvis: Array,
-    angles: dict[str, Array],
-    feet: list[tuple[Array, Array]],
-    time: Array,
-) -> Plan:
-    ankles, toes = (np.stack(x) for x in zip(*feet))
-    return Plan(body, pelvis, angles, ankles, toes, float(1.0 / (time[1] - time[0])))
 
 
 def _hanging(forwards: float, outwards: float) -> Array:
@@ -309,61 +294,73 @@ def _between(time: Array, times: list[float], postures: list[Posture]) -> dict[s
     return {name: rests(time, times, [p[name] for p in postures]) for name in postures[0]}
 
 
-def _poses(plan: Plan, chosen: slice, viewpoint: Viewpoint) -> Array:
-    """Poses (T', d) of a plan at some of its times."""
-    body, skeleton = plan.body, plan.body.skeleton
-    poses = np.zeros((len(plan.pelvis), body.dimension))
+def _poses(body: Body, plan: Plan, rate: float, chosen: slice, viewpoint: Viewpoint) -> Array:
+    """Poses (T', d) at some of the times of a plan with so many times per second."""
+    skeleton, (pelvis, angles, feet) = body.skeleton, plan
+    ankles, toes = (np.stack(x) for x in zip(*feet))
+    poses = np.zeros((len(pelvis), body.dimension))
     # Knees are bent at the start, so that inverse kinematics finds the side to which they bend.
     bent = {'hip_x': 20 * DEGREE, 'knee': -25 * DEGREE}
     for side in SIDES:
         for joint, angle in bent.items():
             poses[:, skeleton.dof_index((f'{side}_{joint}',))] = angle
-    for name, values in plan.angles.items():
+    for name, values in angles.items():
         if name in body.dof_names:
             poses[:, body.dof_names.index(name)] = values
     where = skeleton.dof_index(('root_tx', 'root_ty', 'root_tz'))
     turn = skeleton.dof_index(('root_z', 'root_y', 'root_x'))
-    pelvis = _supported(plan, poses)
+    pelvis = _supported(body, pelvis, poses, ankles, max(round(0.035 * rate), 1))
     poses = poses[chosen]
-    poses[:, turn] = _tilted(poses[:, turn], skeleton.mounts[0], viewpoint)
+    # The camera may look up or down.
+    tilt = viewpoint.rotation @ skeleton.mounts[0].T
+    poses[:, turn] = np.unwrap(root_angles(body, tilt @ root_rotations(body, poses)), axis=0)
     poses[:, where] = viewpoint.to_camera(pelvis[chosen])
     joints = tuple(f'{side}_{joint}' for joint in ('ankle', 'toe') for side in SIDES)
-    goals = np.concatenate([plan.ankles, plan.toes])[:, chosen].transpose(1, 0, 2)
+    goals = np.concatenate([ankles, toes])[:, chosen].transpose(1, 0, 2)
     legs = tuple(f'{side}_{dof}' for side in SIDES for dof in LEG_DOFS)
     return solve_joint_positions(
         body, poses, viewpoint.to_camera(goals), joints, free_dofs=legs, prior_weight=1e-3
     ).x
 
 
-def _supported(plan: Plan, poses: Array) -> Array:
-    """Places (T, 3) of the pelvis from where both legs reach their ankles."""
-    body, level = plan.body, Viewpoint()
-    hips = body.skeleton.joint_index(('left_hip', 'right_hip'))
-    joints = level.to_world(body.joint_positions(poses))
-    offset = (joints[:, hips] - joints[:, body.skeleton.joint_index(('pelvis',))]).transpose(
-        1, 0, 2
-    )
+def _supported(body: Body, pelvis: Array, poses: Array, ankles: Array, half_width: int) -> Array:
+    """Places (T, 3) of the pelvis from where both legs reach their ankles (2, T, 3)."""
+    which = body.skeleton.joint_index(('pelvis', 'left_hip', 'right_hip'))
+    joints = Viewpoint().to_world(body.joint_positions(poses)[:, which])
+    offset = (joints[:, 1:] - joints[:, :1]).transpose(1, 0, 2)
     leg = REACHABLE * (body.segment_lengths['thigh'] + body.segment_lengths['shin'])
-    away = plan.pelvis[:, :2] + offset[..., :2] - plan.ankles[..., :2]
+    away = pelvis[:, :2] + offset[..., :2] - ankles[..., :2]
     height = np.sqrt(np.maximum(leg**2 - (away**2).sum(2), (0.5 * leg) ** 2))
-    highest = (plan.ankles[..., 2] + height - offset[..., 2]).min(0)
-    result = plan.pelvis.copy()
-    half_width = max(round(0.035 * plan.rate), 1)
-    result[:, 2] = smooth_below(np.minimum(highest, plan.pelvis[:, 2]), half_width)
+    highest = (ankles[..., 2] + height - offset[..., 2]).min(0)
+    result = pelvis.copy()
+    result[:, 2] = smooth_below(np.minimum(highest, pelvis[:, 2]), half_width)
     return result
 
 
-def _tilted(angles: Array, mount: Array, viewpoint: Viewpoint) -> Array:
-    """Angles (T, 3) about z, y, x of the root in the frame of a camera that may look up or down."""
-    (sz, sy, sx), (cz, cy, cx) = np.sin(angles).T, np.cos(angles).T
-    world = np.array(
-        [
-            [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
-            [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
-            [-sy, cy * sx, cy * cx],
-        ]
-    )
-    r = np.einsum('ij,jkn->ikn', mount.T @ viewpoint.rotation, world)
-    y = np.arctan2(-r[2, 0], np.hypot(r[2, 1], r[2, 2]))
-    z, x = np.arctan2(r[1, 0], r[0, 0]), np.arctan2(r[2, 1], r[2, 2])
-    return np.unwrap(np.stack([z, y, x], axis=1), axis=0)
+def rests(time: Array, times: ArrayLike, values: ArrayLike) -> Array:
+    """Values (T,) that go from one to the next by minimum jerk and rest at each.
+
+    Args:
+        time: (T,).
+        times: (n,) of the rests, increasing; before the first and after the last nothing moves.
+        values: (n,) at the rests.
+    """
+    at, value = np.asarray(times, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    after = np.clip(np.searchsorted(at, time, side='right'), 1, len(at) - 1)
+    share = np.clip((time - at[after - 1]) / (at[after] - at[after - 1]), 0.0, 1.0)
+    result: Array = value[after - 1] + minimum_jerk(share) * (value[after] - value[after - 1])
+    return result
+
+
+def smooth_below(limit: Array, half_width: int) -> Array:
+    """A smooth curve (T,) that nowhere exceeds a limit (T,).
+
+    Args:
+        limit: (T,).
+        half_width: of each of three moving averages, in samples.
+    """
+    # The averages together reach three half-widths to each side, and so does the minimum.
+    lowest = minimum_filter1d(limit, 6 * half_width + 1, mode='nearest')
+    for _ in range(3):
+        lowest = uniform_filter1d(lowest, 2 * half_width + 1, mode='nearest')
+    return np.asarray(lowest, dtype=np.float64)

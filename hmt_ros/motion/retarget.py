@@ -9,22 +9,24 @@ positions leave open, the twist of a straight limb.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.kinematics import assemble, forward, segment_sums
+from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference import minimise
 from hmt_ros.inference.energy import EnergyFunction
 from hmt_ros.motion.limb_angles import limb_angles
 from hmt_ros.motion.motion_file import Motion
-from hmt_ros.motion.rig_names import SIDES
+from hmt_ros.motion.rig import SIDES
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
+# Poses of some frames (n, d), and the frames (n,) -> value, gradient, Hessian.
+Misfit = Callable[[Array, Index], tuple[Array, Array, Array]]
 
 # Joints a motion must have, and how closely each is followed, m.
 SIGMA = {
@@ -40,6 +42,7 @@ BELIEF = 4.0  # the body's soft prior counts with its deviations times this
 NEIGHBOURS = np.radians(4.0)  # deviation of an angle from the mean of the frames beside it
 BRANCH = np.radians(120.0)  # frames beside each other whose angles differ by more do not pull
 APART = np.radians(750.0)  # rad/s; faster changes are tried from the solution of the frame beside
+SWEEPS = 6  # passes in which every frame is drawn towards its neighbours
 SAME = 2.0  # a misfit this much larger is worth a continuous motion
 
 
@@ -96,8 +99,6 @@ def retarget(
     motion: Motion,
     body: Body,
     camera_from_world: tuple[ArrayLike, ArrayLike],
-    *,
-    sweeps: int = 6,
 ) -> Array:
     """Poses of a body that follow a motion, (T, d) in the camera optical frame.
 
@@ -107,7 +108,6 @@ def retarget(
             they are, see `body_from_motion`.
         camera_from_world: rotation (3, 3) and translation (3,) m that take a point of the motion's
             world (z up) to the camera optical frame (x right, y down, z forward).
-        sweeps: passes in which every frame is drawn towards its neighbours.
 
     Returns:
         Poses within the limits of the body, continuous in time wherever the limits allow it.
@@ -130,7 +130,21 @@ def retarget(
         )
     start = limb_angles(skeleton, place, motion.fps)
     front = place['pelvis'] + FRONT * _recorded_front(motion, rotation, skeleton, start)
-    return _refined(body, _markers(skeleton, place, front), start, motion.fps, sweeps)
+    # The joints, and the point before the pelvis.
+    joints = skeleton.joint_index(tuple(place))
+    sigma = [SIGMA[n.removeprefix('left_').removeprefix('right_')] for n in place]
+    segments = np.append(skeleton.joint_segments[joints], 0)
+    local = np.append(skeleton.joint_offsets[joints], [[0.0, FRONT, 0.0]], axis=0)
+    targets = np.stack([*(points.T for points in place.values()), front.T])
+    weights = np.append(sigma, FRONT_SIGMA)[:, None] ** -2.0
+
+    def misfit(poses: Array, rows: Index) -> tuple[Array, Array, Array]:
+        return point_energy(
+            forward(skeleton, poses), segments, local, targets[:, :, rows],
+            np.broadcast_to(weights, (len(weights), len(rows))),
+        )  # fmt: skip
+
+    return _refined(body, misfit, start, motion.fps)
 
 
 def _check_camera(rotation: Array, translation: Array) -> None:
@@ -167,33 +181,6 @@ def _median_norm(x: Array) -> float:
     return float(np.median(np.linalg.norm(x, axis=-1)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Markers:
-    """Points of the body (P,) segments, (P, 3) places in them, and where they should be.
-
-    Attributes:
-        targets: (P, 3, T) camera frame, m.
-        stiffness: (P,) 1/m^2.
-    """
-
-    segments: Index
-    local: Array
-    targets: Array
-    stiffness: Array
-
-
-def _markers(skeleton: Skeleton, place: dict[str, Array], front: Array) -> _Markers:
-    """The joints, and a point before the pelvis that should be at (T, 3)."""
-    joints = skeleton.joint_index(tuple(place))
-    sigma = [SIGMA[n.removeprefix('left_').removeprefix('right_')] for n in place]
-    return _Markers(
-        np.append(skeleton.joint_segments[joints], 0),
-        np.append(skeleton.joint_offsets[joints], [[0.0, FRONT, 0.0]], axis=0),
-        np.stack([*(points.T for points in place.values()), front.T]),
-        np.append(sigma, FRONT_SIGMA) ** -2.0,
-    )
-
-
 def _recorded_front(motion: Motion, rotation: Array, skeleton: Skeleton, start: Array) -> Array:
     """Unit vectors (T, 3) to the front of the pelvis, as the recorded pelvis turns.
 
@@ -210,8 +197,8 @@ def _recorded_front(motion: Motion, rotation: Array, skeleton: Skeleton, start: 
     return result
 
 
-def _refined(body: Body, markers: _Markers, start: Array, fps: float, sweeps: int) -> Array:
-    """The poses (T, d) whose points follow the markers, from a start (T, d)."""
+def _refined(body: Body, misfit: Misfit, start: Array, fps: float) -> Array:
+    """The poses (T, d) of least misfit, from a start (T, d)."""
     skeleton = body.skeleton
     rotation = skeleton.dof_is_rotation
     step_scale = np.where(rotation, 0.3, 0.1)
@@ -223,7 +210,7 @@ def _refined(body: Body, markers: _Markers, start: Array, fps: float, sweeps: in
         """Poses (n, d) of some frames with a pull towards means (n, d); and their misfit (n,)."""
 
         def objective(x: Array, part: Index) -> tuple[Array, Array, Array]:
-            value, gradient, hessian = _misfit(skeleton, x, markers, rows[part])
+            value, gradient, hessian = misfit(x, rows[part])
             off, pull = x - mean[part], precision[part]
             hessian[:, diagonal, diagonal] += pull
             return value + 0.5 * (pull * off * off).sum(1), gradient + pull * off, hessian
@@ -253,7 +240,7 @@ def _refined(body: Body, markers: _Markers, start: Array, fps: float, sweeps: in
         poses[rows[better]], value[rows[better]] = trial[better], cost[better]
 
     weight = (NEIGHBOURS * min(1.0, 30.0 / fps)) ** -2
-    for _ in range(sweeps if len(poses) > 2 else 0):
+    for _ in range(SWEEPS if len(poses) > 2 else 0):
         before, after = np.roll(poses, 1, axis=0), np.roll(poses, -1, axis=0)
         before[0], after[-1] = poses[0], poses[-1]
         near_before = np.abs(before - poses) < BRANCH
@@ -267,25 +254,3 @@ def _refined(body: Body, markers: _Markers, start: Array, fps: float, sweeps: in
         centre = (belief * mean + pull * middle) / np.maximum(total, 1e-12)
         poses, _ = solve(everyone, poses, centre, total, 5)
     return poses
-
-
-def _misfit(
-    skeleton: Skeleton, poses: Array, markers: _Markers, rows: Index
-) -> tuple[Array, Array, Array]:
-    """Half the weighted squared distances (n,) of some frames, gradient, Gauss-Newton Hessian."""
-    frames = forward(skeleton, poses)
-    points = frames.points(markers.segments, markers.local)  # (P, 3, n)
-    away = points - markers.targets[:, :, rows]
-    stiffness = np.broadcast_to(markers.stiffness[:, None, None], away.shape)
-    value = 0.5 * (stiffness * away * away).sum((0, 1))
-    count, n = 3 * len(points), len(poses)
-    sums = segment_sums(
-        np.repeat(markers.segments, 3),
-        np.repeat(points, 3, axis=0),
-        np.broadcast_to(np.tile(np.eye(3), (len(points), 1))[:, :, None], (count, 3, n)),
-        (stiffness * away).reshape(count, n),
-        stiffness.reshape(count, n),
-        len(skeleton.parents),
-    )
-    gradient, hessian = assemble(frames, *sums)
-    return value, gradient, hessian

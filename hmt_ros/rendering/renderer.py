@@ -19,8 +19,7 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import Frames, forward
-from hmt_ros.rendering.clothes import Clothes
-from hmt_ros.rendering.scene import Scene
+from hmt_ros.rendering.scene import Clothes, Scene
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -84,14 +83,15 @@ def render_silhouettes(body: Body, poses: ArrayLike, camera: Camera) -> Mask:
     mesh = _mesh(body)
     result = np.zeros((len(poses), camera.height, camera.width), dtype=bool)
     for start in range(0, len(poses), CHUNK):
-        points = _vertices(mesh, forward(body.skeleton, poses[start : start + CHUNK]))
+        frames = forward(body.skeleton, poses[start : start + CHUNK])
+        points = frames.points(mesh.segments, mesh.vertices)
         pixels = _fill(_project(mesh, points, camera), camera.height, camera.width).pixels
         result[start : start + CHUNK].reshape(-1)[pixels] = True
     return result
 
 
 @dataclass(frozen=True, eq=False)
-class Renderer:
+class _Renderer:
     """What pictures of the same body, camera and scene share.
 
     Attributes:
@@ -108,19 +108,12 @@ class Renderer:
     places: Array
     clothes: Clothes
 
-    @classmethod
-    def of(cls, body: Body, camera: Camera, scene: Scene) -> Renderer:
-        """The renderer of a body in a scene."""
-        mesh = _mesh(body)
-        clothes = Clothes.of_seed(body, scene.seed)
-        return cls(body, camera, scene, mesh, clothes.places(mesh.segments, mesh.vertices), clothes)
-
     def render(self, pose: ArrayLike, frame: int = 0) -> Rendered:
         """Picture number `frame`, of a pose (d,)."""
         camera, scene = self.camera, self.scene
         shape = (camera.height, camera.width)
         frames = forward(self.body.skeleton, np.asarray(pose, dtype=np.float64)[None])
-        points = _vertices(self.mesh, frames)
+        points = frames.points(self.mesh.segments, self.mesh.vertices)
         triangles = _project(self.mesh, points, camera)
         image = scene.background(camera).copy()
         if scene.shadow > 0:
@@ -255,14 +248,15 @@ class _Front(_Filled):
     inverse_depth: Array
 
 
+@lru_cache(maxsize=8)
 def _mesh(body: Body) -> Mesh:
+    """Triangles of the flesh, the normals of which point outwards.
+
+    Raises:
+        ValueError: a body without flesh.
+    """
     if not body.shapes:
         raise ValueError(f'body {body.name} has no flesh: it can not be drawn')
-    return _mesh_of_flesh(body)
-
-
-@lru_cache(maxsize=8)
-def _mesh_of_flesh(body: Body) -> Mesh:
     mesh = body.flesh.mesh(STACKS, SLICES)
     # What faces the camera is told from the order of the corners: make it that of the normals.
     a, b, c = mesh.vertices[mesh.triangles.T]
@@ -272,13 +266,10 @@ def _mesh_of_flesh(body: Body) -> Mesh:
 
 
 @lru_cache(maxsize=4)
-def _renderer(body: Body, camera: Camera, scene: Scene) -> Renderer:
-    return Renderer.of(body, camera, scene)
-
-
-def _vertices(mesh: Mesh, frames: Frames) -> Array:
-    """Vertices (V, 3, N) of the mesh, camera frame, m."""
-    return frames.points(mesh.segments, mesh.vertices)
+def _renderer(body: Body, camera: Camera, scene: Scene) -> _Renderer:
+    mesh, clothes = _mesh(body), Clothes.of_seed(body, scene.seed)
+    places = clothes.places(mesh.segments, mesh.vertices)
+    return _Renderer(body, camera, scene, mesh, places, clothes)
 
 
 @lru_cache(maxsize=8)

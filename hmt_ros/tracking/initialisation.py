@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward, joint_length_jacobians, point_jacobians
-from hmt_ros.flips.distinct_poses import distinct_poses
+from hmt_ros.flips.best_combinations import distinct_poses
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation

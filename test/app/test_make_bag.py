@@ -8,7 +8,7 @@ import pytest
 
 from hmt_ros.app.make_bag import main
 from hmt_ros.body import load_body
-from hmt_ros.motion.viewpoint import Viewpoint
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking.subject import read_subject
 from msg_tools import BagReader

@@ -21,7 +21,7 @@ def two_segments() -> dict:
         'dof_segments': np.array([0, 0, 1]), 'dof_axes': np.array([2, 0, 0]),
         'dof_is_rotation': np.array([False, True, True]), 'lower': -np.ones(3), 'upper': np.ones(3),
         'joint_names': ('start', 'end'), 'joint_segments': np.array([0, 1]),
-        'joint_fixed': np.zeros((2, 3)), 'joint_basis': np.zeros((2, 3, 1)),
+        'joint_basis': np.zeros((2, 3, 1)),
         'length_names': ('rod',), 'lengths': np.array([0.5]),
     }  # fmt: skip
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.experts.descriptor.contour import person_blob
 from hmt_ros.experts.descriptor.silhouette_descriptor import PlaceAndSize, place_and_size
 from hmt_ros.experts.pose_encoding import PoseEncoding
 from hmt_ros.experts.root_placement import place_roots, placed_gaussians
 from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.rendering.renderer import render_silhouettes
 
 CAMERA = Camera(660.0, 660.0, 319.5, 239.5, 640, 480)

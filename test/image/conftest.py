@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera, load_body
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.experts.descriptor.centred_view import centred_view
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError, person_blob
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
@@ -13,7 +14,6 @@ from hmt_ros.experts.descriptor.silhouette_descriptor import (
     silhouette_parts,
 )
 from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.rendering.renderer import render_silhouettes
 
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)

@@ -2,13 +2,23 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
-from hmt_ros.motion.arm_posture import arm_posture, reaching_posture
-from hmt_ros.motion.footsteps import ahead, sole
-from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
-from hmt_ros.motion.smooth_curves import cubic, minimum_jerk, rests, smooth_below
-from hmt_ros.motion.viewpoint import Viewpoint
+from hmt_ros.motion.limb_motions import (
+    ahead,
+    arm_posture,
+    cubic,
+    minimum_jerk,
+    reaching_posture,
+    sole,
+)
+from hmt_ros.motion.procedural_motion import (
+    PROCEDURAL_MOTIONS,
+    procedural_motion,
+    rests,
+    smooth_below,
+)
 
 VIEW = Viewpoint()
 FPS = 20.0

@@ -4,12 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.flesh import Flesh, occluding_contour
+from hmt_ros.body.camera import Viewpoint
+from hmt_ros.body.flesh import Flesh
 from hmt_ros.body.kinematics import forward
-from hmt_ros.motion.arm_posture import arm_posture
+from hmt_ros.motion.limb_motions import arm_posture
 from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.rendering.renderer import render, render_frames, render_silhouettes
 from hmt_ros.rendering.scene import Scene
 
@@ -30,7 +31,8 @@ def poses(body):
 
 
 def camera(factor=1.0, distortion=()):
-    return Camera(330.0, 330.0, 159.5, 119.5, 320, 240, distortion).scaled(factor)
+    focal, size = 330.0 * factor, (round(320 * factor), round(240 * factor))
+    return Camera(focal, focal, 160.0 * factor - 0.5, 120.0 * factor - 0.5, *size, distortion)
 
 
 def standing(body, **angles):

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera, load_body
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.motion.viewpoint import Viewpoint
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
 from hmt_ros.smoothing.image_sequence import ImageSequence
 
