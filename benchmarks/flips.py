@@ -74,8 +74,8 @@ def measure(seconds: float = 1.0) -> dict[str, Any]:
         ('left_arm', many, ['left_arm']),
         ('left_leg', many, ['left_leg']),
     ):
-        leaves = len(enumerate_flips(body, None, poses, names)[0])
-        spent = best_time(partial(enumerate_flips, body, None, poses, names), seconds=seconds)
+        leaves = len(enumerate_flips(body, poses, names)[0])
+        spent = best_time(partial(enumerate_flips, body, poses, names), seconds=seconds)
         cases[name] = {
             'poses': len(poses),
             'leaves': leaves,

@@ -146,11 +146,11 @@ def _flips(seconds: float) -> Iterator[dict[str, Any]]:
     body = load_body('human37')
     for batch in (1, 128):
         poses = _any_poses(batch)
-        found, _ = enumerate_flips(body, None, poses, 'left_arm')
-        wanted, _ = numpy_flips.enumerate_flips(body, None, poses, 'left_arm')
+        found, _ = enumerate_flips(body, poses, 'left_arm')
+        wanted, _ = numpy_flips.enumerate_flips(body, poses, 'left_arm')
         difference = float(np.abs(found - wanted).max()) if len(found) == len(wanted) else np.inf
-        slow = partial(numpy_flips.enumerate_flips, body, None, poses, 'left_arm')
-        fast = partial(enumerate_flips, body, None, poses, 'left_arm')
+        slow = partial(numpy_flips.enumerate_flips, body, poses, 'left_arm')
+        fast = partial(enumerate_flips, body, poses, 'left_arm')
         yield _case(
             'flips of an arm', batch, best_time(slow, seconds=seconds),
             best_time(fast, seconds=seconds), None, difference,

@@ -18,7 +18,7 @@ from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.flips import enumerate_flips
-from hmt_ros.flips.distinct_poses import distinct_poses
+from hmt_ros.flips.best_combinations import distinct_poses
 from hmt_ros.flips.interpretation_tree import flip_counts
 from hmt_ros.flips.whole_body_flips import full_body_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
@@ -196,7 +196,7 @@ def kinematic_jumps(setting: Setting, name: str) -> Samples:
 
     def draw() -> Array:
         if chains is not None:
-            return enumerate_flips(setting.body, CAMERA, setting.pose, chains)[0]
+            return enumerate_flips(setting.body, setting.pose, chains)[0]
         product = full_body_flips(setting.body, setting.pose, most_overlap=np.inf)
         return product.most_probable(MOST_LEAVES).poses
 

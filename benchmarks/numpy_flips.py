@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.flips.tree_growth import LIMIT_TOLERANCE, STRAIGHT, TOUCHING
@@ -20,10 +19,9 @@ Index = NDArray[np.intp]
 
 
 def enumerate_flips(
-    body: Body, camera: Camera | None, poses: ArrayLike, chains: Sequence[str] | str
+    body: Body, poses: ArrayLike, chains: Sequence[str] | str
 ) -> tuple[Array, Index]:
-    """As `hmt_ros.body.enumerate_flips`."""
-    del camera
+    """As `hmt_ros.flips.enumerate_flips`."""
     names = [chains] if isinstance(chains, str) else list(chains)
     skeleton = body.skeleton
     q = np.array(poses, dtype=np.float64, ndmin=2)

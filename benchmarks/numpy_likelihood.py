@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import Body, Camera
-from hmt_ros.body.flesh import occluding_contour
 from hmt_ros.body.kinematics import Frames, assemble, forward, segment_sums
 from hmt_ros.image.likelihood import ImageLikelihood, TermSettings
 from hmt_ros.image.observation import Observation, Outline

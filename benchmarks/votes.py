@@ -191,7 +191,7 @@ def new_minima(name: str, vote: str, seed: int, count: int, budget: int) -> dict
             votes = chain_votes(body, covariance, CHAINS, vote, pose, np.array(own.poses))[0]
             chain = CHAINS[int(rng.choice(len(CHAINS), p=votes))]
             drawn = covariance_scaled_samples(body, pose, covariance, 1, 1.0, rng)[0]
-            leaves, _ = enumerate_flips(body, camera, drawn, chain)
+            leaves, _ = enumerate_flips(body, drawn, chain)
             _add(own, body, _optimised(likelihood, leaves, observation))
             own.samples += len(leaves)
     samples = sum(own.samples for own in known)

@@ -1,14 +1,18 @@
-"""Settings that all tests share: a ROS domain of their own, reproducible hypothesis runs."""
+"""What tests share: a ROS domain of their own, reproducible hypothesis runs, poses, motions."""
 
 from __future__ import annotations
 
 import os
 import socket
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import settings
+
+from hmt_ros.body import Body, load_body
 
 # Speed is no property of a result: a busy machine must not fail a test.
 settings.register_profile('hmt_ros', deadline=None, derandomize=True)
@@ -53,3 +57,38 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     if item.get_closest_marker('ros') is not None and 'AMENT_PREFIX_PATH' not in os.environ:
         reason = 'no ROS environment: "make test" or "source tools/environment.bash" first'
         item.add_marker(pytest.mark.skip(reason=reason))
+
+
+@pytest.fixture(scope='session')
+def mocap() -> Path:
+    """Folder of the development motions; tests that want it are skipped where it is absent."""
+    root = Path(__file__).resolve().parents[1]
+    folder = Path(os.environ.get('HMT_SHARED', root / '..' / 'shared')) / 'mocap'
+    if not (folder / 'index.csv').is_file():
+        pytest.skip(f'no development motions in {folder} (set HMT_SHARED)')
+    return folder
+
+
+@pytest.fixture(scope='session')
+def human32() -> Body:
+    return load_body('human32')
+
+
+RandomPoses = Callable[[Body, int, int], np.ndarray]
+
+
+@pytest.fixture(scope='session')
+def random_poses() -> RandomPoses:
+    """Function (body, n, seed) -> poses (n, d) inside the limits, root 2 to 5 m from the camera."""
+
+    def draw(body: Body, n: int, seed: int) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        lower = np.maximum(body.lower, -np.pi)
+        upper = np.minimum(body.upper, np.pi)
+        poses = rng.uniform(lower, upper, size=(n, body.dimension))
+        shifts = np.flatnonzero(~body.skeleton.dof_is_rotation)
+        poses[:, shifts] = rng.uniform(-0.5, 0.5, size=(n, len(shifts)))
+        poses[:, shifts[-1]] += 3.5
+        return poses
+
+    return draw

@@ -55,7 +55,7 @@ def remembered(clip):
 
 def test_the_tree_that_is_timed_has_1024_leaves(body):
     pose, chains = flips.pose_with_leaves(body, flips.LEAVES)
-    assert len(enumerate_flips(body, None, pose[None], list(chains))[0]) == 1024
+    assert len(enumerate_flips(body, pose[None], list(chains))[0]) == 1024
     result = flips.measure(seconds=0.0)
     first = next(iter(result['cases'].values()))
     assert (first['poses'], first['leaves']) == (1, 1024)

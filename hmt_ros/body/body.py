@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body import kinematics
 from hmt_ros.body.flesh import Flesh, Superquadric
-from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.body.skeleton import Skeleton, sided_pairs
 
 Array = NDArray[np.float64]
 
@@ -68,6 +68,8 @@ class Body:
         widths: factors on the x and y radii of each part.
         prior_mean, prior_sigma: (d,) soft prior of each degree of freedom; sigma is inf where
             nothing is believed.
+        rates: (d,) variances that the degrees of freedom gain per second while nothing is seen, m^2
+            or rad^2.
         length_sigma: (L,) standard deviation of the lengths over people, m.
         stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra (m,
             at the default lengths; it scales with them).
@@ -78,6 +80,7 @@ class Body:
     shapes: tuple[PartShape, ...]
     prior_mean: Array
     prior_sigma: Array
+    rates: Array
     length_sigma: Array
     stature_lengths: tuple[str, ...]
     stature_extra: float
@@ -89,6 +92,10 @@ class Body:
             object.__setattr__(self, 'widths', (1.0,) * len(self.shapes))
         if len(self.widths) != len(self.shapes):
             raise ValueError(f'{len(self.widths)} widths for {len(self.shapes)} parts')
+        if self.rates.shape != (self.dimension,) or not (self.rates > 0).all():
+            raise ValueError(
+                f'{self.name}: rates must be {self.dimension} positive numbers, saw {self.rates}'
+            )
 
     @property
     def name(self) -> str:
@@ -124,6 +131,21 @@ class Body:
     def chains(self) -> Mapping[str, tuple[int, ...]]:
         """Limbs: name -> segments from the root outwards."""
         return self.skeleton.chains
+
+    @property
+    def chain_pairs(self) -> tuple[tuple[str, str], ...]:
+        """Names of the chains that are the left and the right one of a pair."""
+        return sided_pairs(self.skeleton.chains)
+
+    @property
+    def trunk_joints(self) -> tuple[str, ...]:
+        """Names of the joints that no chain moves."""
+        return self.skeleton.trunk_joints
+
+    @property
+    def trunk_pairs(self) -> tuple[tuple[str, str], ...]:
+        """Names of the left and right joints of the trunk, which tell where the person faces."""
+        return sided_pairs(self.skeleton.trunk_joints)
 
     @property
     def segment_lengths(self) -> dict[str, float]:
@@ -212,15 +234,6 @@ class Body:
     def with_widths(self, widths: Sequence[float]) -> Body:
         """The same body with other factors on the x and y radii of its parts."""
         return replace(self, widths=tuple(float(x) for x in widths))
-
-    def only_parts(self, parts: Sequence[int]) -> Body:
-        """The same skeleton with some parts of the flesh only."""
-        kept = list(parts)
-        return replace(
-            self,
-            shapes=tuple(self.shapes[i] for i in kept),
-            widths=tuple(self.widths[i] for i in kept),
-        )
 
     def _sum_of(self, lengths: Array) -> float:
         names = self.skeleton.length_names

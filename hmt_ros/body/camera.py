@@ -99,26 +99,15 @@ class Camera:
         x, y, z = points
         z = np.where(z > NEAR, z, np.nan)
         a, b = x / z, y / z
-        focal = (self.fx, self.fy)
-        centre = (self.cx, self.cy)
-        if not self.distortion:
-            pixels = np.stack([self.fx * a + self.cx, self.fy * b + self.cy])
-            if not derivative:
-                return pixels, np.empty(0)
-            jacobian = np.zeros((2, 3, *np.shape(z)))
-            jacobian[0, 0] = self.fx / z
-            jacobian[1, 1] = self.fy / z
-            jacobian[0, 2] = -a * jacobian[0, 0]
-            jacobian[1, 2] = -b * jacobian[1, 1]
-            return pixels, jacobian
         distorted, inner = self._distort(a, b)
-        pixels = np.stack([focal[i] * distorted[i] + centre[i] for i in range(2)])
+        lens = ((self.fx, self.cx), (self.fy, self.cy))
+        pixels = np.stack([f * x + c for (f, c), x in zip(lens, distorted, strict=True)])
         if not derivative:
             return pixels, np.empty(0)
         jacobian = np.empty((2, 3, *np.shape(z)))
-        for i in range(2):
-            jacobian[i, 0] = focal[i] * inner[i][0] / z
-            jacobian[i, 1] = focal[i] * inner[i][1] / z
+        for i, (f, _) in enumerate(lens):
+            jacobian[i, 0] = f * inner[i][0] / z
+            jacobian[i, 1] = f * inner[i][1] / z
             jacobian[i, 2] = -(jacobian[i, 0] * a + jacobian[i, 1] * b)
         return pixels, jacobian
 
@@ -149,21 +138,11 @@ class Camera:
         result: Array = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
         return result
 
-    def scaled(self, factor: float) -> Camera:
-        """The camera of the image resized by a factor."""
-        return Camera(
-            self.fx * factor,
-            self.fy * factor,
-            (self.cx + 0.5) * factor - 0.5,
-            (self.cy + 0.5) * factor - 0.5,
-            round(self.width * factor),
-            round(self.height * factor),
-            self.distortion,
-            self.distortion_model,
-        )
-
     def _distort(self, a: Array, b: Array) -> tuple[Array, tuple[tuple[Array, Array], ...]]:
         """Distorted normalised coordinates (2, ...) and their derivatives d(i) / d(a, b)."""
+        if not self.distortion:
+            one, zero = np.ones(()), np.zeros(())
+            return np.stack([a, b]), ((one, zero), (zero, one))
         if self.distortion_model == 'equidistant':
             return self._equidistant(a, b)
         k1, k2, p1, p2, k3, k4, k5, k6 = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))

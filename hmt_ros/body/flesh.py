@@ -7,20 +7,26 @@ segment) and the angle w around the axis, its surface in the frame of the segmen
     z = c_z - a_z s,
     r(s) = a (1 + t s) (1 - |s|^(2/e1))^(e1/2),   C = sgn(cos) |cos|^e2,   S = sgn(sin) |sin|^e2
 
-with three radii a, two exponents e, two tapers t and two bends b: nine shape parameters. Contours
-are exact: on every ring the points whose normal is perpendicular to the ray from the camera.
+with three radii a, two exponents e, two tapers t and two bends b: nine shape parameters.
+
+The occluding contour is exact: on every ring it has the points whose normal is perpendicular to the
+ray from the camera. On a ring with centre u relative to the camera, in the segment's frame, the
+condition normal . point = 0 reads
+
+    g(w) = 1 + U_x C'(w) + U_y S'(w) - u_z (k_x cos^2 w + k_y sin^2 w) = 0,
+
+with U = (u - u_z lean) / radius, k the slopes, C' and S' the signed powers 2 - e2. With one slope
+and e2 = 1 it has a closed form (`image.surface` solves it).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-
-from hmt_ros.body.kinematics import Frames
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -54,11 +60,6 @@ class Superquadric:
         if not all(abs(t) < 1 for t in self.taper):
             raise ValueError(f'tapers must lie in (-1, 1), saw {self.taper}')
 
-    def scaled(self, width: float, length: float = 1.0) -> Superquadric:
-        """The part with its x and y radii and its z radius multiplied."""
-        rx, ry, rz = self.radii
-        return replace(self, radii=(rx * width, ry * width, rz * length))
-
     def surface(self, s: Array, w: Array) -> tuple[Array, Array]:
         """Points and outward unit normals (..., 3) at heights s in (-1, 1) and angles w."""
         ring = rings(self, np.ravel(s))
@@ -67,14 +68,14 @@ class Superquadric:
         cos, sin = np.cos(w), np.sin(w)
         point = ring.centre + np.stack(
             [
-                ring.radius[:, 0] * _signed_power(cos, e2),
-                ring.radius[:, 1] * _signed_power(sin, e2),
+                ring.radius[:, 0] * signed_power(cos, e2),
+                ring.radius[:, 1] * signed_power(sin, e2),
                 np.zeros_like(w),
             ],
             axis=1,
         )
         lateral = (
-            np.stack([_signed_power(cos, 2 - e2), _signed_power(sin, 2 - e2)], axis=1) / ring.radius
+            np.stack([signed_power(cos, 2 - e2), signed_power(sin, 2 - e2)], axis=1) / ring.radius
         )
         along = -(ring.slope * np.stack([cos * cos, sin * sin], axis=1)).sum(1) - (
             lateral * ring.lean
@@ -160,18 +161,6 @@ class Flesh:
         """Part of each ring."""
         return np.repeat(np.arange(len(self.parts)), self.ring_count)
 
-    @cached_property
-    def ring_segments(self) -> Index:
-        """Segment of each ring."""
-        return np.array([p.segment for p in self.parts], dtype=np.intp)[self.ring_parts]
-
-    def with_widths(self, factors: Sequence[float]) -> Flesh:
-        """The flesh with the x and y radii of each part multiplied."""
-        if len(factors) != len(self.parts):
-            raise ValueError(f'{len(factors)} factors for {len(self.parts)} parts')
-        parts = tuple(p.scaled(float(f)) for p, f in zip(self.parts, factors, strict=True))
-        return replace(self, parts=parts)
-
     def mesh(self, stacks: int = 9, slices: int = 12) -> Mesh:
         """Triangles of all parts: `stacks` rings of `slices` points each, and two tips a part."""
         return _mesh(self.parts, stacks, slices)
@@ -195,119 +184,8 @@ class Mesh:
     triangles: Index
 
 
-@dataclass(frozen=True, eq=False)
-class Contour:
-    """Occluding contour of the flesh for N poses: two points on each of R rings.
-
-    Attributes:
-        segments, parts: (2R,) of each point.
-        local: (2R, 3, N) places in the frames of the segments, m.
-        points: (2R, 3, N) camera frame, m.
-        normals: (2R, 3, N) outward unit normals, camera frame; perpendicular to the ray.
-        exists: (2R, N) false where a ring is seen from its end and has no contour.
-    """
-
-    segments: Index
-    parts: Index
-    local: Array
-    points: Array
-    normals: Array
-    exists: NDArray[np.bool_]
-
-
-def occluding_contour(flesh: Flesh, frames: Frames) -> Contour:
-    """Points of the flesh whose normal is perpendicular to the ray from the camera.
-
-    On a ring with centre u relative to the camera, in the segment's frame, and angle w the
-    condition normal . point = 0 reads
-
-        g(w) = 1 + U_x C'(w) + U_y S'(w) - u_z (k_x cos^2 w + k_y sin^2 w) = 0,
-
-    with U = (u - u_z lean) / radius, k the slopes, C' and S' the signed powers 2 - e2. With one
-    slope and e2 = 1 it is solved in closed form, elsewhere by bracketing.
-    """
-    ring, segments = flesh.rings, flesh.ring_segments
-    columns, origins = frames.columns[segments], frames.origins[segments]
-    # The camera's centre seen from the segment: -R^T o; u = centre + R^T o.
-    u = np.einsum('rixn,rxn->rin', columns, origins) + ring.centre[:, :, None]
-    uz = u[:, 2]
-    radius, slope, lean = ring.radius[:, :, None], ring.slope[:, :, None], ring.lean[:, :, None]
-    big_u = (u[:, :2] - uz[:, None] * lean) / radius
-    length = np.hypot(big_u[:, 0], big_u[:, 1])
-    cosine = -(1.0 - uz * slope[:, 0]) / np.maximum(length, 1e-12)
-    exists = np.abs(cosine) < 1.0
-    middle = np.arctan2(big_u[:, 1], big_u[:, 0])
-    half = np.arccos(np.clip(cosine, -1.0, 1.0))
-    w = np.stack([middle + half, middle - half])  # (2, R, N)
-    general = np.flatnonzero((ring.exponent != 1.0) | (ring.slope[:, 0] != ring.slope[:, 1]))
-    if len(general):
-        w[:, general], exists[general] = _bracketed_angles(
-            big_u[general], uz[general], ring.slope[general], ring.exponent[general]
-        )
-    cos, sin = np.cos(w), np.sin(w)
-    e2 = ring.exponent[:, None]
-    powers = np.stack([cos, sin], axis=2)  # (2, R, 2, N)
-    outline, lateral = powers, powers
-    if len(general) and np.any(ring.exponent != 1.0):
-        outline = _signed_power(powers, e2[..., None])
-        lateral = _signed_power(powers, 2 - e2[..., None])
-    count = 2 * len(segments)
-    local: Array = np.empty((2, len(segments), 3, frames.count))
-    local[:, :, :2] = ring.centre[:, :2, None] + radius * outline
-    local[:, :, 2] = ring.centre[:, 2, None]
-    normal: Array = np.empty_like(local)
-    normal[:, :, :2] = lateral / radius
-    normal[:, :, 2] = -(slope * powers * powers).sum(2) - (normal[:, :, :2] * lean).sum(2)
-    normal /= np.sqrt(np.einsum('krin,krin->krn', normal, normal))[:, :, None]
-    local = local.reshape(count, 3, -1)
-    both = np.tile(segments, 2)
-    points = frames.points(both, local)
-    normal = normal.reshape(count, 3, -1)
-    c = frames.columns[both]
-    normals = c[:, 0] * normal[:, 0, None] + c[:, 1] * normal[:, 1, None]
-    normals += c[:, 2] * normal[:, 2, None]
-    return Contour(
-        both, np.tile(flesh.ring_parts, 2), local, points, normals, np.tile(exists, (2, 1))
-    )
-
-
-def _bracketed_angles(
-    big_u: Array, uz: Array, slopes: Array, exponent: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """The two roots w (2, R, N) of g, and where there are two, by bracketing and false position."""
-    power = (2.0 - exponent)[:, None]
-    kx, ky = slopes.T[:, :, None]
-
-    def g(w: Array) -> Array:
-        cos, sin = np.cos(w), np.sin(w)
-        result: Array = 1 + big_u[:, 0] * _signed_power(cos, power)
-        result += big_u[:, 1] * _signed_power(sin, power)
-        slope: Array = kx * cos * cos + ky * sin * sin
-        return result - uz * slope
-
-    steps = 48
-    grid = np.linspace(-np.pi, np.pi, steps + 1)
-    values = np.stack([g(np.full_like(uz, w)) for w in grid])
-    positive = values > 0
-    roots = []
-    exists = np.ones(uz.shape, dtype=bool)
-    for change in (~positive[:-1] & positive[1:], positive[:-1] & ~positive[1:]):
-        exists &= change.any(0)
-        k = change.argmax(0)
-        low, high = grid[k], grid[k + 1]
-        at_low = np.take_along_axis(values, k[None], 0)[0]
-        at_high = np.take_along_axis(values, k[None] + 1, 0)[0]
-        for _ in range(16):  # Illinois: false position that never stalls at one end
-            w = low - at_low * (high - low) / np.where(at_high != at_low, at_high - at_low, 1.0)
-            at = g(w)
-            same = (at > 0) == (at_high > 0)
-            low, at_low = np.where(same, low, high), np.where(same, 0.5 * at_low, at_high)
-            high, at_high = w, at
-        roots.append(w)
-    return np.stack(roots), exists
-
-
-def _signed_power(x: Array, exponent: Array | float) -> Array:
+def signed_power(x: Array, exponent: Array | float) -> Array:
+    """sgn(x) |x|^exponent."""
     result: Array = np.sign(x) * np.abs(x) ** exponent
     return result
 

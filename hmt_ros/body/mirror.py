@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.body.skeleton import Skeleton, other_side
 
 Array = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ def mirror(body: Body, poses: ArrayLike) -> Array:
     """Poses (N, d) of the mirror image, left for right: x in the camera frame changes its sign."""
     q = np.array(poses, dtype=np.float64, ndmin=2)
     skeleton = body.skeleton
-    order = skeleton.dof_index(tuple(_other_side(name) for name in skeleton.dof_names))
+    order = skeleton.dof_index(tuple(other_side(name) for name in skeleton.dof_names))
     along_x = skeleton.dof_axes == 0
     signs = np.where(along_x == skeleton.dof_is_rotation, 1.0, -1.0)
     result: Array = q[:, order] * signs
@@ -92,11 +92,3 @@ def root_angles(body: Body, rotations: Array) -> Array:
     y = np.clip(y, body.lower[limits], body.upper[limits])
     z, x = np.arctan2(r[:, 1, 0], r[:, 0, 0]), np.arctan2(r[:, 2, 1], r[:, 2, 2])
     return np.stack([z, y, x], axis=1)
-
-
-def _other_side(name: str) -> str:
-    if name.startswith('left_'):
-        return 'right_' + name.removeprefix('left_')
-    if name.startswith('right_'):
-        return 'left_' + name.removeprefix('right_')
-    return name

@@ -23,6 +23,7 @@ AXES = {
     'tx': (0, False), 'ty': (1, False), 'tz': (2, False),
 }  # fmt: skip
 MIRROR = np.array([-1.0, 1.0, 1.0])
+DIFFUSION = (0.25, 1.4)  # of a root whose model file says nothing, m and rad after one second
 LARGEST_FILE = 1_000_000  # bytes; a body is a few kB
 
 
@@ -130,7 +131,9 @@ def _mount(entry: dict[str, Any]) -> Array:
 
 
 KEYS = {'name', 'lengths', 'stature', 'stature_extra', 'segments', 'joints', 'chains', 'fixed'}
-SEGMENT_KEYS = {'name', 'parent', 'offset', 'points', 'x_axis', 'length', 'dofs', 'flesh'}
+SEGMENT_KEYS = {
+    'name', 'parent', 'offset', 'points', 'x_axis', 'length', 'diffusion', 'dofs', 'flesh',
+}  # fmt: skip
 FLESH_KEYS = {'centre', 'radii', 'exponents', 'taper', 'bend', 'extend', 'rings'}
 
 
@@ -161,6 +164,8 @@ def _build(content: dict[str, Any]) -> Body:
     names: list[str] = []
     parents, mounts, fixed, basis = [], [], [], []
     dofs: list[tuple[str, int, int, bool, float, float, float, float]] = []
+    diffusions: list[tuple[float, float]] = []
+    rates: list[float] = []
     shapes: list[PartShape] = []
     own_length: list[int | None] = []
     for entry, name, mirrored in _expand(content['segments']):
@@ -183,6 +188,8 @@ def _build(content: dict[str, Any]) -> Body:
         mounts.append(mount)
         fixed.append(sign * constant)
         basis.append(sign[:, None] * coefficients)
+        inherited = diffusions[parent] if parent >= 0 else DIFFUSION
+        diffusions.append(_diffusion(entry, inherited))
         span = entry.get('length')
         own_length.append(
             None if span is None else _named(span, length_names, f'segment {name}: length')
@@ -193,6 +200,7 @@ def _build(content: dict[str, Any]) -> Body:
                 left_over.discard(dof_name)
                 continue
             dofs.append((dof_name, segment, *_dof(dof, mirrored)))
+            rates.append(diffusions[-1][int(dofs[-1][3])] ** 2)
         if 'flesh' in entry:
             shapes.append(_shape(entry['flesh'], segment, own_length[-1], mirrored))
     if left_over:
@@ -243,11 +251,19 @@ def _build(content: dict[str, Any]) -> Body:
         shapes=tuple(shapes),
         prior_mean=np.array(columns[6]),
         prior_sigma=np.array(columns[7]),
+        rates=np.array(rates),
         length_sigma=relative * lengths,
         stature_lengths=tuple(content['stature']),
         stature_extra=float(content['stature_extra']),
         default_lengths=lengths,
     )
+
+
+def _diffusion(entry: dict[str, Any], inherited: tuple[float, float]) -> tuple[float, float]:
+    """Standard deviations of a segment's translations and rotations after one second, m and rad."""
+    given = entry.get('diffusion', inherited)
+    shift, turn = given if isinstance(given, (list, tuple)) else (inherited[0], given)
+    return float(shift), float(turn)
 
 
 def _dof(entry: list[Any], mirrored: bool) -> tuple[int, bool, float, float, float, float]:

@@ -12,7 +12,7 @@ estimated.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -143,6 +143,20 @@ class Skeleton:
         }
 
     @cached_property
+    def trunk_joints(self) -> tuple[str, ...]:
+        """Names of the joints that no chain moves."""
+        roots = {own[0] for own in self.chains.values()}
+        limbs = {s for own in self.chains.values() for s in own}
+        for s, parent in enumerate(self.parents):
+            if parent in limbs:
+                limbs.add(s)
+        return tuple(
+            name
+            for name, s, offset in zip(self.joint_names, self.joint_segments, self.joint_offsets)
+            if s not in limbs or (s in roots and not np.any(offset))
+        )
+
+    @cached_property
     def moves(self) -> NDArray[np.bool_]:
         """(S, d): whether a degree of freedom moves a segment."""
         result = np.zeros((len(self.parents), self.dimension), dtype=bool)
@@ -202,6 +216,21 @@ class Skeleton:
         if not np.isfinite(new).all():
             raise ValueError(f'{self.name}: lengths must be finite, saw {dict(lengths)}')
         return replace(self, lengths=new)
+
+
+def sided_pairs(names: Iterable[str]) -> tuple[tuple[str, str], ...]:
+    """The pairs (left_x, right_x) among names, in the order of the names."""
+    known = tuple(names)
+    pairs = [(name, other_side(name)) for name in known if name.startswith('left_')]
+    return tuple(pair for pair in pairs if pair[1] in known)
+
+
+def other_side(name: str) -> str:
+    """The name with left for right and right for left."""
+    for side, other in (('left_', 'right_'), ('right_', 'left_')):
+        if name.startswith(side):
+            return other + name.removeprefix(side)
+    return name
 
 
 def _positions(

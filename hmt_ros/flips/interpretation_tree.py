@@ -18,25 +18,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames, forward
-from hmt_ros.flips.chain_links import ChainLinks, chain_links
-from hmt_ros.flips.tree_growth import grow_leaves
+from hmt_ros.flips.tree_growth import ChainLinks, chain_links, grow_leaves
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 
 def enumerate_flips(
-    body: Body, camera: Camera | None, poses: ArrayLike, chains: Sequence[str] | str
+    body: Body, poses: ArrayLike, chains: Sequence[str] | str
 ) -> tuple[Array, Index]:
     """All poses with the image of the given ones that flips of some chains reach.
 
     Args:
         body: whose `chains` have the names.
-        camera: that looks; flips live on its rays, whatever its lens, so it only has to stand at
-            the origin of the poses' frame. May be None.
-        poses: (N, d).
+        poses: (N, d) in the frame of the camera. Flips move joints along their rays, so that the
+            lens of the camera does not matter.
         chains: one name or several; of several the product of their trees is taken.
 
     Returns:
@@ -47,7 +44,6 @@ def enumerate_flips(
         KeyError: a chain that the body does not have.
         ValueError: a chain whose joints have no closed form, or that contains another's segments.
     """
-    del camera
     names = [chains] if isinstance(chains, str) else list(chains)
     skeleton = body.skeleton
     q = np.array(poses, dtype=np.float64, ndmin=2, order='C')

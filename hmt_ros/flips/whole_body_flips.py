@@ -3,9 +3,9 @@
 Poses and their flipped torsos are the trunks. On each of them every chain has the leaves of its
 interpretation tree, hung back onto its rays. A whole pose is a trunk with one leaf of each chain,
 and its prior probability is a product over these: so the leaves of the body can be taken in order
-of probability, or sampled, from lists of a few dozen entries, without building their product.
+of probability, or sampled, from lists of a few dozen entries, before any pose is built.
 
-What is known to be wrong is pruned before any pose is built (`body.flip_pruning`).
+What is known to be wrong is pruned before any pose is built (`flip_pruning`).
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
-from hmt_ros.flips.best_first import best_first
-from hmt_ros.flips.distinct_poses import distinct_poses
+from hmt_ros.flips.best_combinations import distinct_poses, least_sums
 from hmt_ros.flips.flip_pruning import DepthOrder, FlipPruning
 from hmt_ros.flips.interpretation_tree import enumerate_flips, rehang_chain
 from hmt_ros.flips.torso_flips import JOINTS, flip_torso
@@ -86,35 +85,29 @@ class FlipProduct:
     def most_probable(self, count: int) -> Leaves:
         """The leaves of highest prior probability, most probable first.
 
-        Chains are joined in two halves, each with the sorted list of its own product; the sums of
-        two lists come best first from a heap, over all trunks at once.
-
         Args:
-            count: how many at most.
+            count: maximum number.
         """
-        capacity = min(int(count), self.size)
-        halves = self._halves()
-        lists = [self._half(half) for half in halves]
-        picks = np.empty((capacity, len(self.chains)), dtype=np.int64)
-        trunks, log_priors = np.empty(capacity, dtype=np.int64), np.empty(capacity)
-        crossing = [
-            (first, second, table)
-            for (first, second), table in zip(
-                combinations(range(len(self.chains)), 2), self.allowed, strict=True
-            )
-            if (first in halves[0]) != (second in halves[0])
-        ]
-        widest = max((a.shape[1] for a in self.angles), default=1)
-        tables = np.ones((max(len(crossing), 1), len(self.trunks), widest, widest), dtype=np.bool_)
-        for place, (_, _, table) in enumerate(crossing):
-            tables[place, :, : table.shape[1], : table.shape[2]] = table
-        found = best_first(
-            self.trunk_log_priors, *lists[0], *lists[1],
-            np.array(halves[0], dtype=np.int64), np.array(halves[1], dtype=np.int64),
-            np.array([c[:2] for c in crossing], dtype=np.int64).reshape(-1, 2), tables,
-            picks, trunks, log_priors,
-        )  # fmt: skip
-        return self._leaves(trunks[:found], picks[:found], log_priors[:found])
+        costs, trunks = [np.empty(0)], [np.empty(0, dtype=np.intp)]
+        picks = [np.empty((0, len(self.chains)), dtype=np.intp)]
+        pairs = list(combinations(range(len(self.chains)), 2))
+        for t, base in enumerate(self.trunk_log_priors):
+            leaves = [np.flatnonzero(np.isfinite(own[t])) for own in self.log_priors]
+            ruled_out = {
+                (i, j): table[t][np.ix_(leaves[i], leaves[j])]
+                for (i, j), table in zip(pairs, self.allowed, strict=True)
+                if not table[t].all()
+            }
+            lists = [-own[t][which] for own, which in zip(self.log_priors, leaves, strict=True)]
+            sums, chosen = least_sums(lists, count, ruled_out)
+            costs.append(sums - base)
+            trunks.append(np.full(len(sums), t))
+            picks.append(np.stack([own[c] for own, c in zip(leaves, chosen.T)], axis=1))
+        cost = np.concatenate(costs)
+        order = np.argsort(cost, kind='stable')[:count]
+        return self._leaves(
+            np.concatenate(trunks)[order], np.concatenate(picks)[order], -cost[order]
+        )
 
     def sample(self, count: int, rng: np.random.Generator) -> Leaves:
         """Leaves drawn by their prior probability.
@@ -168,39 +161,6 @@ class FlipProduct:
             _put_angles(poses, dofs, self.angles[c], trunks, picks[:, c])
         return Leaves(poses, log_priors, trunks)
 
-    def _halves(self) -> tuple[list[int], list[int]]:
-        """The chains in two groups whose products are about as large."""
-        counts = [int(np.isfinite(p).sum(1).max(initial=1)) for p in self.log_priors]
-        halves: tuple[list[int], list[int]] = ([], [])
-        sizes = [1, 1]
-        for c in np.argsort(counts, kind='stable')[::-1].tolist():
-            least = int(sizes[1] < sizes[0])
-            halves[least].append(c)
-            sizes[least] *= max(counts[c], 1)
-        return sorted(halves[0]), sorted(halves[1])
-
-    def _half(self, half: list[int]) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
-        """Sums (E,) and choices (E, chains) of a group, trunk by trunk, best first; and bounds."""
-        sums, bounds = [np.empty(0)], [0]
-        picks = [np.empty((0, len(half)), dtype=np.int64)]
-        tables = dict(zip(combinations(range(len(self.chains)), 2), self.allowed, strict=True))
-        for t in range(len(self.trunks)):
-            total, chosen = np.zeros(1), np.zeros((1, 0), dtype=np.int64)
-            for place, c in enumerate(half):
-                own = self.log_priors[c][t]
-                leaves = np.flatnonzero(np.isfinite(own))
-                fits = np.ones((len(total), len(leaves)), dtype=np.bool_)
-                for before, b in enumerate(half[:place]):
-                    fits &= tables[b, c][t][chosen[:, before]][:, leaves]
-                i, j = np.nonzero(fits)
-                total = total[i] + own[leaves[j]]
-                chosen = np.column_stack([chosen[i], leaves[j]])
-            order = np.argsort(-total, kind='stable')
-            sums.append(total[order])
-            picks.append(chosen[order])
-            bounds.append(bounds[-1] + len(total))
-        return np.concatenate(sums), np.concatenate(picks), np.array(bounds, dtype=np.int64)
-
 
 def full_body_flips(
     body: Body,
@@ -234,7 +194,7 @@ def full_body_flips(
     """
     given = np.array(poses, dtype=np.float64, ndmin=2)
     names = tuple(body.chains) if chains is None else tuple(chains)
-    enumerate_flips(body, None, given[:0], names)  # raises where chains do not go together
+    enumerate_flips(body, given[:0], names)  # raises where chains do not go together
     trunks, parents = given, np.arange(len(given))
     if torso:
         flips, roots = _torso_flips(body, given, slack)
@@ -304,7 +264,7 @@ def _hung(
     The first trunks are those of the poses; each has the given leaf first.
     """
     dofs, count = body.skeleton.chain_dofs[chain], len(poses)
-    leaves, roots = enumerate_flips(body, None, poses, chain)
+    leaves, roots = enumerate_flips(body, poses, chain)
     seen, others = poses[parents[count:]], trunks[count:]
     hung, owners = rehang_chain(body, seen, others, chain, slack=slack)
     missing = np.setdiff1d(np.arange(len(others)), owners)

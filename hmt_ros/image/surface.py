@@ -1,6 +1,6 @@
 """The occluding contour in the image, and which parts of it can be seen; compiled, pose by pose.
 
-The counterpart of `body.flesh.occluding_contour` and `Camera.project` for the inner loop of the
+The counterpart of the contours of `body.flesh` and `Camera.project` for the inner loop of the
 likelihood: on every ring of the flesh the two points whose normal is perpendicular to the ray.
 """
 
@@ -240,7 +240,7 @@ def _signed_power(x, exponent):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _bracketed_roots(bx, by, uz, kx, ky, power, cosines, sines):  # type: ignore[no-untyped-def]
-    """Cosines, sines of the two roots of g(w) of `flesh.occluding_contour`; False: none."""
+    """Cosines, sines of the two roots of g(w) of `body.flesh`; False: none."""
     steps = 48
     found_up, found_down = False, False
     before = 0.0

@@ -87,7 +87,7 @@ def read_asf(path: Path, text: str) -> Acclaim:
         bones[bone.name] = bone
     order = _hierarchy(path, sections['hierarchy'], bones)
     degrees = units.get('angle', 1.0) > 0
-    return _acclaim(path, bones, order, units.get('length', 1.0), degrees)
+    return _acclaim(bones, order, units.get('length', 1.0), degrees)
 
 
 def read_amc(path: Path, text: str, skeleton: Acclaim) -> Array:
@@ -349,9 +349,7 @@ def _hierarchy(path: Path, lines: Lines, bones: dict[str, _Bone]) -> list[str]:
     return order
 
 
-def _acclaim(
-    path: Path, bones: dict[str, _Bone], order: list[str], length: float, degrees: bool
-) -> Acclaim:
+def _acclaim(bones: dict[str, _Bone], order: list[str], length: float, degrees: bool) -> Acclaim:
     unit = np.pi / 180 if degrees else 1.0
     segments: list[RigSegment] = []
     tips: list[RigJoint] = []

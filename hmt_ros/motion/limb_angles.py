@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton
-from hmt_ros.motion.rig_names import ARM, LEG, SIDES
+from hmt_ros.motion.rig import ARM, LEG, SIDES
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from hmt_ros.inference import minimise
 from hmt_ros.inference.energy import EnergyFunction
 from hmt_ros.motion.limb_angles import limb_angles
 from hmt_ros.motion.motion_file import Motion
-from hmt_ros.motion.rig_names import SIDES
+from hmt_ros.motion.rig import SIDES
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

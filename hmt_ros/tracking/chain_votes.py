@@ -1,8 +1,8 @@
 """Which chain of the body is worth a jump: votes from the local uncertainty (KJS 5).
 
-The paper's vote reads the covariance alone, and leaves open how good it is. Here stand beside it a
-vote that reads only what one camera can not see, and one that counts what a jump brings: leaves of
-the chain's interpretation tree that are not known yet. `python -m benchmarks votes` compares them.
+The vote of the paper reads the covariance alone. Another one counts what a jump brings: the leaves
+of the chain's interpretation tree that are not known yet. `python -m benchmarks votes` compares
+them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from hmt_ros.tracking.candidates import relative_joints
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-VOTES = ('trace', 'eigenvalue', 'uniform', 'depth', 'minima')
+VOTES = ('trace', 'uniform', 'minima')
 
 # Poses are different minima from this distance of a joint, m.
 APART = 0.08
@@ -40,17 +40,15 @@ def chain_votes(
 
     'trace': the trace of the block of the covariance that belongs to the rotations of the chain,
     which equals the sum over the eigenvectors of eigenvalue times squared length inside the chain;
-    'eigenvalue': the largest eigenvalue of that block; 'uniform': all alike; 'depth': variance of
-    the depths of the chain's joints, which the image does not show; 'minima': the share of the
-    leaves of the chain's interpretation tree that are minima which are not known yet, plus a little
-    by its trace, for those that no flip reaches.
+    'uniform': all alike; 'minima': the share of the leaves of the chain's interpretation tree that
+    are minima which are not known yet, plus a little by its trace, for those that no flip reaches.
 
     Args:
         body: with the chains.
         covariances: (K, d, d) of the modes.
         chains: names.
         vote: one of `VOTES`.
-        poses: (K, d) of the modes, which 'depth' and 'minima' read.
+        poses: (K, d) of the modes, which 'minima' reads.
         known: (M, d) minima that are not new to 'minima'; None: the pose of each mode alone.
 
     Raises:
@@ -59,43 +57,17 @@ def chain_votes(
     if vote not in VOTES:
         raise ValueError(f'vote must be one of {VOTES}, saw {vote!r}')
     result = np.ones((len(covariances), len(chains)))
-    if vote in ('trace', 'eigenvalue', 'minima'):
+    if vote != 'uniform':
         for i, chain in enumerate(chains):
             own = body.skeleton.chain_dofs[chain]
-            block = covariances[:, own[:, None], own]
-            if vote == 'eigenvalue':
-                result[:, i] = np.linalg.eigvalsh(block)[:, -1]
-            else:
-                result[:, i] = np.einsum('kii->k', block)
-    if vote in ('depth', 'minima'):
+            result[:, i] = np.einsum('kii->k', covariances[:, own[:, None], own])
+    if vote == 'minima':
         if poses is None:
             raise ValueError(f'vote {vote!r} needs the poses of the modes')
-        if vote == 'depth':
-            each = [depth_variances(body, poses, covariances, chain) for chain in chains]
-            result = np.stack(each, axis=1)
-        else:
-            result *= WITHOUT_FLIP / result.mean(1, keepdims=True)
-            result += np.stack(
-                [shares_of_new_minima(body, poses, c, known) for c in chains], axis=1
-            )
+        result *= WITHOUT_FLIP / result.mean(1, keepdims=True)
+        result += np.stack([shares_of_new_minima(body, poses, c, known) for c in chains], axis=1)
     shares: Array = result / result.sum(1, keepdims=True)
     return shares
-
-
-def depth_variances(body: Body, poses: Array, covariances: Array, chain: str) -> Array:
-    """Sum (K,) of the variances of the depths of a chain's joints, m^2; the trunk is given.
-
-    A joint that moves along its ray is seen where it was: this is the covariance projected onto
-    the displacements that leave the image as it is.
-    """
-    own = body.skeleton.chain_dofs[chain]
-    moved = body.skeleton.chain_joints[chain]
-    joints = body.joint_positions(poses)[:, moved]
-    rays = joints / np.linalg.norm(joints, axis=2, keepdims=True)
-    along = np.einsum('kjx,kjxd->kjd', rays, body.joint_jacobians(poses)[:, moved][..., own])
-    block = covariances[:, own[:, None], own]
-    variances: Array = np.einsum('kjd,kde,kje->k', along, block, along)
-    return variances
 
 
 def shares_of_new_minima(body: Body, poses: Array, chain: str, known: Array | None = None) -> Array:
@@ -111,7 +83,7 @@ def shares_of_new_minima(body: Body, poses: Array, chain: str, known: Array | No
         chain: name.
         known: (M, d); None: none but the pose itself.
     """
-    leaves, parents = enumerate_flips(body, None, poses, chain)
+    leaves, parents = enumerate_flips(body, poses, chain)
     joints, before = (relative_joints(body, x) for x in (leaves, poses))
     new = np.linalg.norm(joints - before[parents], axis=2).max(1) > APART
     if known is not None and len(known):

@@ -18,8 +18,6 @@ from hmt_ros.body.body import Body
 
 Array = NDArray[np.float64]
 
-# What points to a person's left.
-ACROSS = (('left_shoulder', 'right_shoulder'), ('left_hip', 'right_hip'))
 # Of two ways to face one is given up when it is less probable by this, nats.
 DECIDED = 25.0
 
@@ -30,7 +28,7 @@ def left_directions(body: Body, poses: Array) -> Array:
     Raises:
         ValueError: a body without shoulders and hips.
     """
-    names = [pair for pair in ACROSS if set(pair) <= set(body.joint_names)]
+    names = body.trunk_pairs
     if not names:
         raise ValueError(f'body {body.name} has neither shoulders nor hips: it faces nowhere')
     joints = body.joint_positions(poses)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward, joint_length_jacobians, point_jacobians
-from hmt_ros.flips.distinct_poses import distinct_poses
+from hmt_ros.flips.best_combinations import distinct_poses
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
 from hmt_ros.image.observation import Keypoints, Observation, Outline
@@ -82,13 +82,8 @@ def start_from_keypoints(
         return likelihood.energy(x, observation)
 
     heads = _distinct(_solve(energy, fits.x[:, :d], body), body, 4)
-    chains = [
-        c for c in ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck') if c in body.chains
-    ]
-    flips = np.concatenate(
-        [heads.x] + [enumerate_flips(body, camera, heads.x, c)[0] for c in chains]
-    )
-    flips = np.concatenate([flips, *_pairs_of_flips(body, camera, heads.x, chains)])
+    trees = [enumerate_flips(body, heads.x, c)[0] for c in (*body.chains, *body.chain_pairs)]
+    flips = np.concatenate([heads.x, *trees])
     raw = likelihood.energy(flips, observation)[0]
     keep = np.argsort(raw, kind='stable')[:192]
     solved = _distinct(_solve(energy, flips[keep], body), body, 96)
@@ -232,16 +227,6 @@ def _first_guesses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
     turned = body.joint_positions(result)[:, body.skeleton.joint_index(names)]
     result[:, :3] = middle - turned.mean(1)
     return result
-
-
-def _pairs_of_flips(body: Body, camera: Camera, poses: Array, chains: list[str]) -> list[Array]:
-    """Products of the trees of both arms and of both legs."""
-    pairs = [('left_arm', 'right_arm'), ('left_leg', 'right_leg')]
-    return [
-        enumerate_flips(body, camera, poses, pair)[0]
-        for pair in pairs
-        if all(c in chains for c in pair)
-    ]
 
 
 def _solve(energy: object, poses: Array, body: Body) -> Minimum:

@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.skeleton import other_side
+from hmt_ros.flips.best_combinations import Alternatives, best_combinations, distinct_alternatives
 from hmt_ros.flips.interpretation_tree import chain_points, enumerate_flips, rehang_chain
 from hmt_ros.flips.torso_flips import flip_torso
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures, with_swapped_sides
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.tracking.candidates import Candidates, relative_joints
-from hmt_ros.tracking.chain_product import Alternatives, best_combinations, distinct_alternatives
 from hmt_ros.tracking.chain_search import ChainSearch
 from hmt_ros.tracking.chain_votes import chain_votes
 from hmt_ros.tracking.edge_jumps import EdgeJumps
@@ -37,10 +38,6 @@ Index = NDArray[np.intp]
 
 # Groups of modes with a trunk of their own whose products are rated.
 MOST_GROUPS = 3
-TRUNK = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
-CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
-PAIRS = (('left_arm', 'right_arm'), ('left_leg', 'right_leg'))
-SIBLINGS = {a: b for pair in PAIRS for a, b in (pair, pair[::-1])}
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +104,8 @@ class KinematicJumps:
         s = self.settings
         return {
             chain: ChainSearch(self.body, self.camera, s.likelihood, chain, s.search)
-            for chain in CHAINS[:4]
-            if chain in self.body.chains
+            for pair in self.body.chain_pairs
+            for chain in pair
         }
 
     @cached_property
@@ -116,8 +113,8 @@ class KinematicJumps:
         s = self.settings
         return {
             chain: EdgeJumps(self.body, self.camera, s.likelihood, chain)
-            for chain in CHAINS[:4]
-            if chain in self.body.chains
+            for pair in self.body.chain_pairs
+            for chain in pair
         }
 
     def propose(
@@ -153,8 +150,7 @@ class KinematicJumps:
             edges = self._on_other_edges(lead, excess) if s.edge_jumps > 0 and again else {}
             alternatives = [
                 self._alternatives(base.x[group], chain, found.get(chain), edges.get(chain))
-                for chain in CHAINS
-                if chain in self.body.chains
+                for chain in self.body.chains
             ]
             products, textures = self._products(
                 lead, base.x[group], group, sources.log_priors[group], alternatives, excess
@@ -195,8 +191,7 @@ class KinematicJumps:
 
     def _groups(self, base: Minimum) -> list[Index]:
         """Modes with nearly the same trunk, each group with its best mode first."""
-        names = [name for name in TRUNK if name in self.body.joint_names]
-        which = self.body.skeleton.joint_index(names)
+        which = self.body.skeleton.joint_index(self.body.trunk_joints)
         trunk = self.body.joint_positions(base.x)[:, which]
         left = list(np.argsort(base.value, kind='stable'))
         groups = []
@@ -232,9 +227,7 @@ class KinematicJumps:
         weight = np.array(
             [np.logaddexp.reduce(log_weights) + np.log(self.settings.jump_probability)]
         )
-        for pair in PAIRS:
-            if not set(pair) <= set(self.body.chains):
-                continue
+        for pair in self.body.chain_pairs:
             if not self._may_be_exchanged(lead, pair, excess):
                 continue
             swapped = self._swap(lead, pair)
@@ -345,17 +338,16 @@ class KinematicJumps:
         if found is not None:
             angles.append(found)
             penalties.append(np.full((len(modes), len(found)), jump))
-        if chain in SIBLINGS:
+        sibling = other_side(chain)
+        if sibling != chain:
             # Limbs that cross in the image are easily taken for each other.
-            swapped, _ = rehang_chain(
-                self.body, modes[:1], modes[:1], chain, image_of=SIBLINGS[chain]
-            )
+            swapped, _ = rehang_chain(self.body, modes[:1], modes[:1], chain, image_of=sibling)
             angles.append(swapped[:, own])
             penalties.append(np.full((len(modes), len(swapped)), jump))
         sources = np.concatenate(angles)
         poses = np.repeat(modes[:1], len(sources), axis=0)
         poses[:, own] = sources
-        flips, parents = enumerate_flips(self.body, self.camera, poses, chain)
+        flips, parents = enumerate_flips(self.body, poses, chain)
         first = np.concatenate([[True], parents[1:] != parents[:-1]])
         flips, parents = flips[~first], parents[~first]
         angles.append(flips[:, own])

@@ -32,8 +32,7 @@ class TrackerSettings:
             comes from and of its jumps, or 'bhattacharyya', the weight of the nearest mode before
             (KJS 5.1).
         exploration: power of the weights when candidates are chosen; below 1 favours unlikely ones.
-        vote: how chains are chosen for search: 'trace', 'eigenvalue', 'uniform', 'depth' or
-            'minima'.
+        vote: how chains are chosen for search: 'trace', 'uniform' or 'minima'.
         searched_chains: chains searched in an image.
         edge_jumps: other image edges that are looked for in an image that is searched again, for a
             limb whose contour costs more than usual; 0: none.

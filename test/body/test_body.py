@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -60,6 +61,29 @@ def test_joints_and_chains_have_the_standard_names(body):
         assert len(segments) == (1 if name == 'neck' else 3)
         for a, b in pairwise(segments):
             assert body.skeleton.parents[b] == a
+
+
+def test_pairs_of_chains_and_joints_of_the_trunk(body):
+    assert body.chain_pairs == (('left_arm', 'right_arm'), ('left_leg', 'right_leg'))
+    hips, shoulders = ('left_hip', 'right_hip'), ('left_shoulder', 'right_shoulder')
+    assert body.trunk_joints == ('pelvis', 'neck', *hips, *shoulders)
+    assert body.trunk_pairs == (hips, shoulders)
+    limbs = [j for own in body.skeleton.chain_dofs.values() for j in own]
+    moved = body.joint_jacobians(standing(body))[0][:, :, limbs].any((1, 2))
+    assert body.trunk_joints == tuple(np.array(body.joint_names)[~moved])
+
+
+def test_rates_are_squared_deviations_after_one_second(body):
+    deviations = {
+        'root_t': 0.25, 'root_': 1.4, 'trunk': 1.2, 'clavicle': 0.3, 'neck': 0.7, 'shoulder': 2.2,
+        'elbow': 2.2, 'wrist': 1.2, 'hip': 1.3, 'knee': 1.6, 'ankle': 1.2,
+    }  # fmt: skip
+    wanted = [next(v for k, v in deviations.items() if k in name) for name in body.dof_names]
+    np.testing.assert_allclose(body.rates, np.square(wanted), rtol=1e-15)
+    scaled = body.with_stature(1.5)
+    assert np.array_equal(scaled.rates, body.rates)
+    with pytest.raises(ValueError, match='rates must be'):
+        replace(body, rates=body.rates[1:])
 
 
 def test_a_person_at_rest_stands_upright_and_faces_the_camera(body):

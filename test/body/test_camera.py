@@ -97,17 +97,6 @@ def test_every_pixel_has_a_ray_that_projects_to_it(u, v, depth, lens):
     np.testing.assert_allclose(camera.project(depth * ray), [u, v], atol=1e-5)
 
 
-@given(factor=st.sampled_from([0.25, 0.5, 2.0]), seed=st.integers(0, 1000))
-def test_a_resized_image_has_the_scaled_camera(factor, seed):
-    """The corner of the first pixel, not its centre, stays where it is."""
-    camera = Camera(610.0, 590.0, 322.5, 238.0, 640, 480, (-0.2, 0.05, 0.001, 0.0))
-    small = camera.scaled(factor)
-    points = points_in_view(5, seed)
-    expected = (camera.project(points) + 0.5) * factor - 0.5
-    np.testing.assert_allclose(small.project(points), expected, atol=1e-9)
-    assert (small.width, small.height) == (640 * factor, 480 * factor)
-
-
 def test_zero_coefficients_are_no_distortion():
     assert Camera(600, 600, 320, 240, 640, 480, (0.0,) * 5).distortion == ()
 

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import load_body
-from hmt_ros.body.flesh import Flesh, Superquadric, occluding_contour
+from hmt_ros.body.flesh import Flesh, Superquadric
 from hmt_ros.body.kinematics import Frames, forward
 
 HUMAN = load_body('human37')
@@ -200,8 +201,7 @@ def test_volume_of_a_fine_mesh_is_that_of_the_ellipsoid():
 
 def test_widths_scale_the_cross_sections_alone():
     factors = np.linspace(0.8, 1.3, len(HUMAN.flesh.parts))
-    wide = HUMAN.flesh.with_widths(factors)
-    assert HUMAN.with_widths(factors).flesh.parts == wide.parts
+    wide = HUMAN.with_widths(factors).flesh
     for before, after, factor in zip(HUMAN.flesh.parts, wide.parts, factors):
         assert after.radii == pytest.approx(
             (before.radii[0] * factor, before.radii[1] * factor, before.radii[2])
@@ -227,8 +227,6 @@ def test_an_impossible_part_is_refused(change, message):
 def test_wrong_counts_are_refused():
     with pytest.raises(ValueError, match='2 ring counts for 1 parts'):
         Flesh((PARTS['flat'],), (5, 5))
-    with pytest.raises(ValueError, match='1 factors for'):
-        HUMAN.flesh.with_widths([1.0])
     with pytest.raises(ValueError, match='1 widths for'):
         HUMAN.with_widths([1.0])
     with pytest.raises(ValueError, match='a mesh needs'):

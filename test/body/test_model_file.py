@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from hmt_ros.body import load_body
+from hmt_ros.body.model_file import read_body
 
 TEXT = (resources.files('hmt_ros.body') / 'models' / 'human37.yaml').read_text('utf-8')
 
@@ -103,6 +104,18 @@ def test_a_length_that_is_no_number_is_refused(tmp_path):
     path = write(tmp_path / 'wrong.yaml', lambda c: c['lengths'].update(thigh=[float('nan'), 0.05]))
     with pytest.raises(ValueError, match=r'wrong\.yaml'):
         load_body(path)
+
+
+def test_a_segment_without_a_diffusion_has_that_of_its_parent(tmp_path):
+    def drop(content):
+        for segment in content['segments']:
+            if segment['name'] in ('pelvis', '{side}_forearm', 'trunk', 'head'):
+                del segment['diffusion']
+
+    body = read_body(write(tmp_path / 'own.yaml', drop))
+    rates = dict(zip(body.dof_names, np.sqrt(body.rates)))
+    wanted = {'root_tz': 0.25, 'root_z': 1.4, 'trunk_x': 1.4, 'neck_y': 1.4, 'left_elbow': 2.2}
+    assert {name: rates[name] for name in wanted} == pytest.approx(wanted)
 
 
 def test_a_misspelt_entry_of_a_segment_is_refused(tmp_path):

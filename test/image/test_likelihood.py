@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks import numpy_likelihood as oracle
+from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.flesh import occluding_contour
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image import likelihood as likelihood_module
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings

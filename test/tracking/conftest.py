@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body import Body, Camera
 from hmt_ros.image.observation import Keypoints
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.motion.viewpoint import Viewpoint
@@ -16,11 +16,6 @@ from hmt_ros.rendering.scene import Scene
 
 KeypointsOf = Callable[..., Keypoints]
 Filmed = Callable[..., tuple[np.ndarray, list[np.ndarray], np.ndarray]]
-
-
-@pytest.fixture(scope='session')
-def human32() -> Body:
-    return load_body('human32')
 
 
 @pytest.fixture(scope='session')

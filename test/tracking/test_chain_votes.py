@@ -1,4 +1,4 @@
-"""Votes against eigenvectors, differences of depth, and the leaves of the trees."""
+"""Votes against eigenvectors and the leaves of the trees."""
 
 from __future__ import annotations
 
@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.flips.interpretation_tree import enumerate_flips, flip_counts
-from hmt_ros.tracking.chain_votes import (
-    VOTES,
-    chain_votes,
-    depth_variances,
-    shares_of_new_minima,
-)
+from hmt_ros.tracking.chain_votes import VOTES, chain_votes, shares_of_new_minima
 
 CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
 
@@ -29,23 +24,6 @@ def test_votes_by_trace_are_those_of_the_eigenvectors(human32, modes):
         assert np.allclose(votes[k], np.array(shares) / np.sum(shares), rtol=1e-10)
 
 
-def test_votes_by_the_largest_eigenvalue(human32, modes):
-    """Found by power iteration on the block of the chain."""
-    _, covariances = modes
-    votes = chain_votes(human32, covariances, CHAINS, 'eigenvalue')
-    for k in range(2):
-        largest = []
-        for chain in CHAINS:
-            own = human32.skeleton.chain_dofs[chain]
-            block = covariances[k][own][:, own]
-            x = np.ones(len(own))
-            for _ in range(3000):
-                x = block @ x
-                x /= np.linalg.norm(x)
-            largest.append(x @ block @ x)
-        assert np.allclose(votes[k], np.array(largest) / np.sum(largest), rtol=1e-6)
-
-
 def test_uniform_votes(human32, modes):
     votes = chain_votes(human32, modes[1], CHAINS[:4], 'uniform')
     assert np.array_equal(votes, np.full((2, 4), 0.25))
@@ -55,10 +33,10 @@ def test_an_uncertain_chain_gets_the_votes(human32):
     covariance = 1e-4 * np.eye(32)[None]
     own = human32.skeleton.chain_dofs['right_arm']
     covariance[:, own, own] = 1e-2
-    for vote, share in (('trace', 100 * 6 / (100 * 6 + 3 * 6 + 2)), ('eigenvalue', 100 / 104)):
-        votes = chain_votes(human32, covariance, CHAINS, vote)
-        assert votes[0, CHAINS.index('right_arm')] == pytest.approx(share, rel=1e-12)
-        assert votes.sum() == pytest.approx(1.0, rel=1e-12)
+    votes = chain_votes(human32, covariance, CHAINS, 'trace')
+    share = 100 * 6 / (100 * 6 + 3 * 6 + 2)
+    assert votes[0, CHAINS.index('right_arm')] == pytest.approx(share, rel=1e-12)
+    assert votes.sum() == pytest.approx(1.0, rel=1e-12)
 
 
 def test_votes_are_probabilities(human32, motion):
@@ -70,28 +48,10 @@ def test_votes_are_probabilities(human32, motion):
         assert np.allclose(votes.sum(1), 1.0, rtol=1e-12)
 
 
-def test_depth_variances_are_those_of_samples(human32, motion):
-    """Of a chain that is moved by little, joint by joint along its ray."""
-    rng = np.random.default_rng(0)
-    own = human32.skeleton.chain_dofs['left_leg']
-    root = 1e-4 * rng.normal(size=(32, 32))
-    covariance = root @ root.T
-    poses = np.tile(motion[3], (20_000, 1))
-    poses[:, own] += rng.multivariate_normal(
-        np.zeros(len(own)), covariance[np.ix_(own, own)], 20_000
-    )
-    joints = human32.joint_positions(poses)
-    mean = human32.joint_positions(motion[3:4])[0]
-    ray = mean / np.linalg.norm(mean, axis=1)[:, None]
-    wanted = np.einsum('njx,jx->nj', joints, ray).var(axis=0).sum()
-    found = depth_variances(human32, motion[3:4], covariance[None], 'left_leg')
-    assert found[0] == pytest.approx(wanted, rel=0.05)
-
-
 def test_shares_of_new_minima(human32, motion):
     """Leaves that are not the pose; none is left when all leaves are known."""
     for chain in CHAINS[:4]:
-        leaves, parents = enumerate_flips(human32, None, motion, chain)
+        leaves, parents = enumerate_flips(human32, motion, chain)
         joints = human32.joint_positions(leaves)
         joints -= joints[:, :1]
         first = np.array([joints[parents == k][0] for k in range(len(motion))])
@@ -110,7 +70,7 @@ def test_known_minima_get_no_votes(human32, motion):
     shares = [[shares_of_new_minima(human32, p[None], c)[0] for c in CHAINS] for p in motion]
     k, i = np.unravel_index(np.argmax(shares), np.shape(shares))
     pose = motion[k : k + 1]
-    leaves, _ = enumerate_flips(human32, None, pose, CHAINS[i])
+    leaves, _ = enumerate_flips(human32, pose, CHAINS[i])
     before = chain_votes(human32, covariance, CHAINS, 'minima', pose)[0]
     after = chain_votes(human32, covariance, CHAINS, 'minima', pose, leaves)[0]
     assert before[i] == max(before)
@@ -122,6 +82,5 @@ def test_what_is_unknown_is_refused(human32, modes):
         chain_votes(human32, modes[1], CHAINS, 'loud')
     with pytest.raises(KeyError, match='tail'):
         chain_votes(human32, modes[1], ('tail',))
-    for vote in ('depth', 'minima'):
-        with pytest.raises(ValueError, match=f"vote '{vote}' needs the poses"):
-            chain_votes(human32, modes[1], CHAINS, vote)
+    with pytest.raises(ValueError, match="vote 'minima' needs the poses"):
+        chain_votes(human32, modes[1], CHAINS, 'minima')

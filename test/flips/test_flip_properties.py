@@ -50,7 +50,7 @@ def leaves_of(pose, kind):
     if kind == 'body':
         found = full_body_flips(BODY, pose, slack=SLACK).most_probable(3000)
         return found.poses, found.trunks == 0
-    leaves, _ = enumerate_flips(BODY, None, pose, kind)
+    leaves, _ = enumerate_flips(BODY, pose, kind)
     return leaves, np.ones(len(leaves), dtype=bool)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_ros.body import load_body
 from hmt_ros.motion.motion_file import Motion, read_motion, read_skeleton
 
 FRAMES = 6  # of each clip are evaluated the plain way
@@ -192,6 +193,25 @@ def test_every_clip_has_the_standard_joints_and_limbs(clips):
             towards_left = ahead[0] * across[1] - ahead[1] * across[0]
             if name != 'train/cmu_60_12_salsa.bvh':  # turns about twice: no mean heading
                 assert (towards_left > 0) == (side == 'left'), name
+
+
+def test_every_clip_has_the_rates_of_human37_at_its_joints(clips):
+    person = load_body('human37')
+    known = dict(zip(person.dof_names, person.rates))
+    joints = {'hip': 'hip_x', 'knee': 'knee', 'ankle': 'ankle_x', 'shoulder': 'shoulder_x'}
+    for _, motion in clips.values():
+        skeleton, rates = motion.body.skeleton, motion.body.rates
+        assert rates.shape == (motion.body.dimension,)
+        for joint, dof in joints.items():
+            for side in ('left', 'right'):
+                segment = skeleton.joint_segments[skeleton.joint_index((f'{side}_{joint}',))[0]]
+                own = [j for j in skeleton.segment_dofs[segment] if skeleton.dof_is_rotation[j]]
+                assert (rates[own] == known[f'{side}_{dof}']).all()
+        moves = skeleton.dof_is_rotation & (skeleton.dof_segments == 0)
+        assert (rates[moves] == known['root_z']).all()
+        assert (rates[~skeleton.dof_is_rotation] == known['root_tx']).all()
+        assert set(person.trunk_joints) <= set(motion.body.trunk_joints)
+        assert sorted(motion.body.chain_pairs) == sorted(person.chain_pairs)
 
 
 def test_an_asf_has_limits_and_56_degrees_of_freedom_of_the_joints(mocap):

@@ -19,8 +19,7 @@ from hmt_ros.motion.motion_file import (
     read_motion,
     read_skeleton,
 )
-from hmt_ros.motion.rig import LARGEST_MOTION, rig_body
-from hmt_ros.motion.rig_names import standard_names
+from hmt_ros.motion.rig import LARGEST_MOTION, rig_body, standard_names
 
 BVH = """HIERARCHY
 ROOT base

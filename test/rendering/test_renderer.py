@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.flesh import Flesh, occluding_contour
+from hmt_ros.body.flesh import Flesh
 from hmt_ros.body.kinematics import forward
 from hmt_ros.motion.arm_posture import arm_posture
 from hmt_ros.motion.procedural_motion import procedural_motion
@@ -30,7 +31,8 @@ def poses(body):
 
 
 def camera(factor=1.0, distortion=()):
-    return Camera(330.0, 330.0, 159.5, 119.5, 320, 240, distortion).scaled(factor)
+    focal, size = 330.0 * factor, (round(320 * factor), round(240 * factor))
+    return Camera(focal, focal, 160.0 * factor - 0.5, 120.0 * factor - 0.5, *size, distortion)
 
 
 def standing(body, **angles):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from hmt_ros.tracking.chain_product import Alternatives, best_combinations, distinct_alternatives
+from hmt_ros.flips.best_combinations import Alternatives, best_combinations, distinct_alternatives
 
 CHAINS = ('left_arm', 'right_arm', 'left_leg')
 TEMPERATURE = 0.3

@@ -85,7 +85,7 @@ def test_the_best_are_the_first_of_all(product, count):
 
 def test_without_torso_and_pruning_it_is_the_product_of_the_trees(body, pose):
     product = full_body_flips(body, pose, torso=False, most_overlap=np.inf)
-    leaves, _ = enumerate_flips(body, None, pose, list(body.chains))
+    leaves, _ = enumerate_flips(body, pose, list(body.chains))
     assert product.size == len(leaves)
     assert as_rows(product.most_probable(ALL).poses) == as_rows(leaves)
 
@@ -93,7 +93,7 @@ def test_without_torso_and_pruning_it_is_the_product_of_the_trees(body, pose):
 def test_some_chains_only(body, pose):
     chains = ('left_arm', 'neck')
     product = full_body_flips(body, pose, chains, torso=False, most_overlap=np.inf)
-    leaves, _ = enumerate_flips(body, None, pose, chains)
+    leaves, _ = enumerate_flips(body, pose, chains)
     assert as_rows(product.most_probable(ALL).poses) == as_rows(leaves)
 
 
