@@ -24,7 +24,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import gammaln, logsumexp
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.smoothing.dynamics import LinearGaussianDynamics
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.smoothing.likelihood import check_mixtures
 
 Array = NDArray[np.float64]
@@ -163,11 +163,10 @@ def _with_first(
         return EmbeddedNetwork((nodes,), ())
     rest = embedded_network(mixtures, dynamics, intervals[1:])
     d = dynamics.dimension
-    a, q = dynamics.transition(float(intervals[0]))
+    means, spread = dynamics.predict(first.means, first.covariances, float(intervals[0]))
     pairs = np.indices((len(first), len(mixtures[0]))).reshape(2, -1).T
-    spread = (a @ first.covariances @ a.T + q)[:, :d, :d]
     links = pair_log_densities(
-        (first.means @ a.T)[:, :d], spread, mixtures[0].means, mixtures[0].covariances, pairs
+        means[:, :d], spread[:, :d, :d], mixtures[0].means, mixtures[0].covariances, pairs
     )
     return EmbeddedNetwork(
         (nodes, *rest.nodes), (links.reshape(len(first), len(mixtures[0])), *rest.links)
