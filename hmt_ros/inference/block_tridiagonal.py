@@ -23,7 +23,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs, dtrtri
 
-from hmt_ros.inference.exact_sums import dot, fma
+from hmt_ros.inference.exact_sums import dot
 
 Array = NDArray[np.float64]
 
@@ -241,4 +241,4 @@ def add_band_product(columns: Array, x: Array, result: Array) -> None:
             own = x[s, c]
             result[s, c] += dot(columns[c], x[s], c, last)
             for b in range(1, last):
-                result[s, c + b] = fma(columns[c, b], own, result[s, c + b])
+                result[s, c + b] += columns[c, b] * own

@@ -33,13 +33,13 @@ from hmt_ros.experts.shipped_models import SHIPPED, load_predictor
 from hmt_ros.experts.training_set import RATE
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE, CameraInput, InTime, WaitingImage
 from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.picture_file import read_picture
 from hmt_ros.sessions.published_topic import PublishedTopic
 from hmt_ros.sessions.session import Session, entropy, everything
-from hmt_ros.tracking.dynamics import PoseRates
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.headers import SECOND_NS, header_message, time_ns
 from msg_tools.messages.images import decode_image
@@ -54,8 +54,6 @@ Mask = NDArray[np.bool_]
 
 # Relative standard deviation of the size of a person whose stature is known.
 _MEASURED_SPREAD = 0.02
-# How fast poses change where the step that dynamics were learned for is exceeded.
-_RATES = PoseRates()
 
 
 @dataclass(frozen=True)
@@ -218,9 +216,10 @@ class BmeSession(Session):
         interval = (stamp_ns - previous.stamp_ns) / SECOND_NS
         if interval > p.longest_interval:
             return None
-        gained = _RATES.rates(self._predictor.body.skeleton) * max(interval - 1.0 / RATE, 0.0)
-        m = previous.mixture
-        return GaussianMixture(m.weights, m.means, m.covariances + np.diag(gained))
+        # By what exceeds the step that dynamics were learned for, poses change as the body may.
+        m, beyond = previous.mixture, max(interval - 1.0 / RATE, 0.0)
+        dynamics = LinearGaussianDynamics.random_walk(self._predictor.body.rates)
+        return GaussianMixture(m.weights, *dynamics.predict(m.means, m.covariances, beyond))
 
     def _seen(self, mask: Mask, camera: Camera, previous: GaussianMixture | None) -> Prediction:
         return self._predictor.observe(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.body import Body
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     NEXT_WINDOW,
@@ -21,23 +21,20 @@ from hmt_ros.sessions.declared_parameters import (
 )
 from hmt_ros.sessions.parameter_file import parameter_file_text
 from hmt_ros.smoothing import LinearGaussianDynamics
-from hmt_ros.tracking.dynamics import MODELS, PoseRates
 
+MODELS = ('random_walk', 'constant_velocity')
 METHODS = ('paths', 'variational')
 
 
 @dataclass(frozen=True)
-class SmootherDynamics(PoseRates):
-    """Motion model of the smoother.
+class SmootherDynamics:
+    """Motion model of the smoother, with the rates of the body.
 
     Attributes:
-        model: 'random_walk', or 'constant_velocity', whose state has velocities besides the pose
-            and costs several times as much.
-        velocity_time: how long a velocity lasts at constant velocity, s; velocities then gain so
-            much that after it poses have moved as the deviations say.
-        translation: standard deviation of the root's position after one second, m.
-        root, trunk, hip, knee, shoulder, elbow, neck, extremity: of the angles, rad after one
-            second. Deviations grow with the square root of time.
+        model: Motion model: 'random_walk', or 'constant_velocity', whose state has velocities
+            besides the pose and costs several times as much.
+        velocity_time: Time for which a velocity lasts at constant velocity, s; velocities then gain
+            so much that after it poses have moved as far as the random walk.
     """
 
     model: str = 'random_walk'
@@ -46,13 +43,12 @@ class SmootherDynamics(PoseRates):
     def __post_init__(self) -> None:
         if self.model not in MODELS:
             raise ValueError(f'dynamics.model must be one of {MODELS}, saw {self.model!r}')
-        for name in PoseRates.__dataclass_fields__:
-            if not getattr(self, name) > 0:
-                raise ValueError(f'dynamics.{name} must be positive, saw {getattr(self, name)}')
+        if not self.velocity_time > 0:
+            raise ValueError(f'dynamics.velocity_time must be positive, saw {self.velocity_time}')
 
-    def of(self, skeleton: Skeleton) -> LinearGaussianDynamics:
-        """The dynamics of the poses of a skeleton."""
-        rates = self.rates(skeleton)
+    def of(self, body: Body) -> LinearGaussianDynamics:
+        """The dynamics of the poses of a body."""
+        rates = body.rates
         if self.model == 'random_walk':
             return LinearGaussianDynamics.random_walk(rates)
         # A velocity that is forgotten after a time tau moves the pose as a random walk of these

@@ -316,7 +316,7 @@ class SmootherSession(Session):
         p = self.parameters
         kind = closed_form if p.method == 'paths' else MixtureSmoother
         return kind(
-            p.dynamics.of(body.skeleton),
+            p.dynamics.of(body),
             body.lower,
             body.upper,
             p.max_trajectories,

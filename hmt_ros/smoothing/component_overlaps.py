@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hmt_ros.inference.exact_sums import dot, fma
+from hmt_ros.inference.exact_sums import dot
 
 Array = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ def add_overlaps(
                         c -= total
                     y = dot(bands[j, c], delta, c, width)
                     white[j, c] = y
-                    square = fma(y, y, square)
+                    square += y * y
                     if i % STRIDE == 0 and log - 0.5 * square < best - NEGLIGIBLE_DENSITY:
                         break
                 log -= 0.5 * square
@@ -130,19 +130,19 @@ def add_overlaps(
                 y = white[j, c]
                 last = min(width, total - c)
                 for b in range(last):
-                    pull[c + b] = fma(y, bands[j, c, b], pull[c + b])
+                    pull[c + b] += y * bands[j, c, b]
             factor = responsibility / inflation[j]
             for c in range(total):
                 move = factor * pull[c]
                 gradient[s, c] -= move
-                mean_gradient[j, c] = fma(share, move, mean_gradient[j, c])
+                mean_gradient[j, c] += share * move
             if len(band_gradient):
                 for c in range(total):
                     delta[c] = (samples[s, c] - means[j, c]) / inflation[j]
                 for c in range(total):
                     y = share * responsibility * white[j, c]
                     for b in range(min(width, total - c)):
-                        band_gradient[j, c, b] = fma(-y, delta[c + b], band_gradient[j, c, b])
+                        band_gradient[j, c, b] -= y * delta[c + b]
             inflation_gradient[j] += share * responsibility * (squares[j] - total)
             weight_gradient[j] += share * responsibility
 

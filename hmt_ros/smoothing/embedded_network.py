@@ -24,8 +24,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import gammaln, logsumexp
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.exact_sums import fma
-from hmt_ros.smoothing.dynamics import LinearGaussianDynamics
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.smoothing.likelihood import check_mixtures
 
 Array = NDArray[np.float64]
@@ -164,11 +163,10 @@ def _with_first(
         return EmbeddedNetwork((nodes,), ())
     rest = embedded_network(mixtures, dynamics, intervals[1:])
     d = dynamics.dimension
-    a, q = dynamics.transition(float(intervals[0]))
+    means, spread = dynamics.predict(first.means, first.covariances, float(intervals[0]))
     pairs = np.indices((len(first), len(mixtures[0]))).reshape(2, -1).T
-    spread = (a @ first.covariances @ a.T + q)[:, :d, :d]
     links = pair_log_densities(
-        (first.means @ a.T)[:, :d], spread, mixtures[0].means, mixtures[0].covariances, pairs
+        means[:, :d], spread[:, :d, :d], mixtures[0].means, mixtures[0].covariances, pairs
     )
     return EmbeddedNetwork(
         (nodes, *rest.nodes), (links.reshape(len(first), len(mixtures[0])), *rest.links)
@@ -327,39 +325,39 @@ def _pair_log_densities(
                 q0, q1, q2, q3 = f[i, j + 1, 0], f[i, j + 1, 1], f[i, j + 1, 2], f[i, j + 1, 3]
                 for k in range(j):
                     x0, x1, x2, x3 = f[i, k, 0], f[i, k, 1], f[i, k, 2], f[i, k, 3]
-                    p0 = fma(-x0, f[j, k, 0], p0)
-                    p1 = fma(-x1, f[j, k, 1], p1)
-                    p2 = fma(-x2, f[j, k, 2], p2)
-                    p3 = fma(-x3, f[j, k, 3], p3)
-                    q0 = fma(-x0, f[j + 1, k, 0], q0)
-                    q1 = fma(-x1, f[j + 1, k, 1], q1)
-                    q2 = fma(-x2, f[j + 1, k, 2], q2)
-                    q3 = fma(-x3, f[j + 1, k, 3], q3)
+                    p0 -= x0 * f[j, k, 0]
+                    p1 -= x1 * f[j, k, 1]
+                    p2 -= x2 * f[j, k, 2]
+                    p3 -= x3 * f[j, k, 3]
+                    q0 -= x0 * f[j + 1, k, 0]
+                    q1 -= x1 * f[j + 1, k, 1]
+                    q2 -= x2 * f[j + 1, k, 2]
+                    q3 -= x3 * f[j + 1, k, 3]
                 # The diagonal holds inverses.
                 p0 *= f[j, j, 0]
                 p1 *= f[j, j, 1]
                 p2 *= f[j, j, 2]
                 p3 *= f[j, j, 3]
                 f[i, j, 0], f[i, j, 1], f[i, j, 2], f[i, j, 3] = p0, p1, p2, p3
-                f[i, j + 1, 0] = fma(-p0, f[j + 1, j, 0], q0) * f[j + 1, j + 1, 0]
-                f[i, j + 1, 1] = fma(-p1, f[j + 1, j, 1], q1) * f[j + 1, j + 1, 1]
-                f[i, j + 1, 2] = fma(-p2, f[j + 1, j, 2], q2) * f[j + 1, j + 1, 2]
-                f[i, j + 1, 3] = fma(-p3, f[j + 1, j, 3], q3) * f[j + 1, j + 1, 3]
+                f[i, j + 1, 0] = (q0 - p0 * f[j + 1, j, 0]) * f[j + 1, j + 1, 0]
+                f[i, j + 1, 1] = (q1 - p1 * f[j + 1, j, 1]) * f[j + 1, j + 1, 1]
+                f[i, j + 1, 2] = (q2 - p2 * f[j + 1, j, 2]) * f[j + 1, j + 1, 2]
+                f[i, j + 1, 3] = (q3 - p3 * f[j + 1, j, 3]) * f[j + 1, j + 1, 3]
                 j += 2
             if j < i:
                 for lane in range(LANES):
                     total = f[i, j, lane]
                     for k in range(j):
-                        total = fma(-f[i, k, lane], f[j, k, lane], total)
+                        total -= f[i, k, lane] * f[j, k, lane]
                     f[i, j, lane] = total * f[j, j, lane]
             if i == d:
                 break
             s0, s1, s2, s3 = f[i, i, 0], f[i, i, 1], f[i, i, 2], f[i, i, 3]
             for k in range(i):
-                s0 = fma(-f[i, k, 0], f[i, k, 0], s0)
-                s1 = fma(-f[i, k, 1], f[i, k, 1], s1)
-                s2 = fma(-f[i, k, 2], f[i, k, 2], s2)
-                s3 = fma(-f[i, k, 3], f[i, k, 3], s3)
+                s0 -= f[i, k, 0] * f[i, k, 0]
+                s1 -= f[i, k, 1] * f[i, k, 1]
+                s2 -= f[i, k, 2] * f[i, k, 2]
+                s3 -= f[i, k, 3] * f[i, k, 3]
             f[i, i, 0] = 1.0 / np.sqrt(s0)
             f[i, i, 1] = 1.0 / np.sqrt(s1)
             f[i, i, 2] = 1.0 / np.sqrt(s2)

@@ -17,7 +17,7 @@ from scipy.linalg.lapack import dtrtri
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy, EnergyTerm
-from hmt_ros.inference.exact_sums import dot, fma
+from hmt_ros.inference.exact_sums import dot
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -275,9 +275,9 @@ def add_mixture_energy(
             for a in range(d):
                 factor = white[k, a]
                 for b in range(a + 1):
-                    pull[k, b] = fma(factor, whiteners[mode, a, b], pull[k, b])
+                    pull[k, b] += factor * whiteners[mode, a, b]
             for a in range(d):
-                gradient[i, a] = fma(logs[k], pull[k, a], gradient[i, a])
+                gradient[i, a] += logs[k] * pull[k, a]
         if not second:
             continue
         opened = False
@@ -289,7 +289,7 @@ def add_mixture_energy(
             if opened:
                 for a in range(d):
                     for b in range(d):
-                        hessian[i, a, b] = fma(share, precisions[mode, a, b], hessian[i, a, b])
+                        hessian[i, a, b] += share * precisions[mode, a, b]
             else:
                 for a in range(d):
                     for b in range(d):
@@ -302,4 +302,4 @@ def add_mixture_energy(
                 for a in range(d):
                     one = logs[k] * (pull[k, a] - gradient[i, a])
                     for b in range(d):
-                        hessian[i, a, b] = fma(-one, pull[k, b] - gradient[i, b], hessian[i, a, b])
+                        hessian[i, a, b] -= one * (pull[k, b] - gradient[i, b])

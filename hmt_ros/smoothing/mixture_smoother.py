@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.block_tridiagonal import BlockCholesky
 from hmt_ros.inference.energy import Derivatives
-from hmt_ros.smoothing.dynamics import LinearGaussianDynamics, TrajectoryPrior
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.smoothing.likelihood import SequenceLikelihood, check_mixtures
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.path_gaussians import path_gaussians

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.smoothing.component_overlaps import pair_distances
-from hmt_ros.smoothing.dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, embedded_network
 from hmt_ros.smoothing.likelihood import MixtureLikelihood, WindowLikelihood
 from hmt_ros.smoothing.paths import (

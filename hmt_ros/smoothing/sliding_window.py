@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.smoothing.dynamics import LinearGaussianDynamics
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.smoothing.embedded_network import pair_log_densities
 from hmt_ros.smoothing.likelihood import check_mixtures
 from hmt_ros.smoothing.mixture_smoother import MixtureSmoother, intervals_of
@@ -241,9 +241,7 @@ def filtered_state(
         followed: weights (M,) of trajectories and their states (M, n) at the new time.
     """
     d, n = dynamics.dimension, dynamics.state_dimension
-    a, q = dynamics.transition(interval)
-    means = state.means @ a.T
-    covariances = a @ state.covariances @ a.T + q
+    means, covariances = dynamics.predict(state.means, state.covariances, interval)
     pairs = np.indices((len(state), len(mixture))).reshape(2, -1).T
     log = pair_log_densities(
         means[:, :d], covariances[:, :d, :d], mixture.means, mixture.covariances, pairs

@@ -26,8 +26,8 @@ from hmt_ros.inference.block_tridiagonal import (
     factorise_band,
 )
 from hmt_ros.inference.energy import Derivatives
+from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 from hmt_ros.inference.trust_region import Status, TrustRegion
-from hmt_ros.smoothing.dynamics import TrajectoryPrior
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 Array = NDArray[np.float64]

@@ -26,8 +26,8 @@ from scipy.special import logsumexp
 
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, add_band_product
 from hmt_ros.inference.energy import Derivatives
+from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 from hmt_ros.smoothing.component_overlaps import NEGLIGIBLE, add_overlaps, pair_distances
-from hmt_ros.smoothing.dynamics import TrajectoryPrior
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 Array = NDArray[np.float64]

@@ -8,7 +8,6 @@ from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, BmeSession
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Handled
-from hmt_ros.tracking.dynamics import PoseRates
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.images import compressed_image_message, image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
@@ -106,7 +105,7 @@ def test_predictions_take_those_before_into_account(session, somebody, stub_pred
     assert len(second) == 2
     # The dynamics were learned for a step of 1/30 s; of the rest little is known.
     gained = second.covariances[0] - 1e-2 * np.eye(37)
-    assert np.allclose(gained, np.diag(PoseRates().rates(stub_predictor.body.skeleton) * 2 / 30))
+    assert np.allclose(gained, np.diag(stub_predictor.body.rates * 2 / 30))
     assert third is None
     alone = session()
     alone.take(CAMERA_INFO, somebody.info())

@@ -75,3 +75,20 @@ def test_velocities_couple_the_band_no_more_than_they_must():
 def test_bad_dynamics_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    'dynamics',
+    [
+        LinearGaussianDynamics.random_walk([1.0, 2.0]),
+        LinearGaussianDynamics.constant_velocity([1.0], 2.0),
+    ],
+)
+def test_modes_are_predicted_in_one_go_as_in_two(dynamics):
+    means, covariances = np.array([[1.0, 2.0], [0.0, -1.0]]), np.array([np.eye(2), 3 * np.eye(2)])
+    a, q = dynamics.transition(0.7)
+    whole = dynamics.predict(means, covariances, 0.7)
+    np.testing.assert_allclose(whole[0], [a @ mean for mean in means])
+    np.testing.assert_allclose(whole[1], [a @ s @ a.T + q for s in covariances])
+    for one, other in zip(dynamics.predict(*dynamics.predict(means, covariances, 0.3), 0.4), whole):
+        np.testing.assert_allclose(one, other, rtol=1e-9)

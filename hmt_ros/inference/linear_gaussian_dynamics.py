@@ -203,6 +203,13 @@ class LinearGaussianDynamics:
         q = a @ both[:n, n:]
         return a, 0.5 * (q + q.T)
 
+    def predict(self, means: Array, covariances: Array, interval: float) -> tuple[Array, Array]:
+        """Means (K, n) and covariances (K, n, n) of states after an interval in seconds."""
+        a, q = self.transition(interval)
+        if not self.drift.any():
+            return means, covariances + q
+        return means @ a.T, a @ covariances @ a.T + q
+
     def transitions(self, intervals: Array) -> tuple[Array, Array]:
         """A and Q, both (T-1, n, n), over intervals (T-1,) in seconds."""
         different, which = np.unique(intervals, return_inverse=True)
