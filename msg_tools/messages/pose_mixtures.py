@@ -14,6 +14,7 @@ from hmt_ros.inference import GaussianMixture
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.message_error import (
     MessageError,
+    MessageFault,
     check_covariances,
     check_finite,
     check_names,
@@ -73,7 +74,7 @@ class PoseMixture:
     def __post_init__(self) -> None:
         components, d = self.mixture.means.shape
         if components == 0:
-            raise MessageError('mixture has no components')
+            raise MessageError('mixture has no components', MessageFault.NO_COMPONENTS)
         object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'mixture: dof_names'))
         object.__setattr__(self, 'joint_names', names_of(self.joint_names, 'mixture: joint_names'))
         if len(self.dof_names) != d:
@@ -147,7 +148,7 @@ def pose_mixture_of(
     check_names(names, dof_names, 'mixture: dof_names')
     check_names(joints, joint_names, 'mixture: joint_names')
     if not message.components:
-        raise MessageError('mixture has no components')
+        raise MessageError('mixture has no components', MessageFault.NO_COMPONENTS)
     if len(message.components) > MAX_COMPONENTS:
         raise MessageError(
             f'mixture has {len(message.components)} components, the limit is {MAX_COMPONENTS}'
@@ -158,7 +159,7 @@ def pose_mixture_of(
         what = f'mixture: component {k}'
         means.append(numbers(component.mean, (d,), f'{what}: mean'))
         if len(component.covariance) == 0 and d:
-            raise MessageError(f'{what} has no covariance')
+            raise MessageError(f'{what} has no covariance', MessageFault.COVARIANCES)
         covariances.append(numbers(component.covariance, (d, d), f'{what}: covariance'))
         points = component.joint_positions
         if len(points) != len(joints):

@@ -132,7 +132,7 @@ def test_one_warning_for_each_kind_and_the_node_lives(running, likelihoods):
     assert values['mixtures smoothed'] == '2'
     assert values['mixtures skipped'] == '8'
     assert (values['gaps'], values['longest gap, s']) == ('1', '0.800')
-    assert values['faults: dof_names'] == '2'
+    assert values['faults: names'] == '2'
 
 
 def test_diagnostics(world, likelihoods):
