@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping
 from typing import Any
 
-from hmt_msgs.msg import Body, PoseMixture, TrajectoryMixture
+from hmt_msgs.msg import PoseMixture, TrajectoryMixture
 from hmt_msgs.srv import SmoothWindow
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
@@ -21,12 +21,11 @@ from visualization_msgs.msg import MarkerArray
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
-from hmt_ros.nodes.subscribed_topic import LATCHED, SubscribedTopic
+from hmt_ros.nodes.subscribed_topic import SubscribedTopic
 from hmt_ros.sessions.handled import Output
 from hmt_ros.sessions.smoothed_messages import TOPICS
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import (
-    BODY,
     MIXTURE,
     SmootherSession,
     SmootherState,
@@ -68,7 +67,6 @@ class SmootherNode(SessionNode):
         yield SmoothWindow, '~/smooth_window', self._on_smooth_window
 
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
-        yield SubscribedTopic(BODY, 'body', Body, 'hmt_msgs/msg/Body', LATCHED)
         kind = 'hmt_msgs/msg/PoseMixture'
         yield SubscribedTopic(MIXTURE, 'likelihood_mixture', PoseMixture, kind, _MIXTURES)
 

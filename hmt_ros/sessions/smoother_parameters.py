@@ -70,7 +70,7 @@ class SmootherParameters:
     """All parameters of the smoother node.
 
     Attributes:
-        body_model: a name or a YAML file, where the name in the messages on body is not one that
+        body_model: a name or a YAML file, where the name in the mixtures is not one that
             is known; empty: that name.
         method: 'paths', the most probable paths in closed form, or 'variational', refined as in
             VMS, which takes seconds an image.
@@ -90,8 +90,7 @@ class SmootherParameters:
             it.
         publish_covariances: whether trajectory_mixture has covariances, which makes it forty times
             as large.
-        queue_size: mixtures that wait at most, for the body or when the node is late; the oldest
-            are dropped.
+        queue_size: mixtures that wait at most; when the node is late the oldest are dropped.
         status_interval: a line on the console says every so many seconds what the node does, while
             messages come, s; 0: never.
         autostart: whether the node configures and activates itself; otherwise it waits for its

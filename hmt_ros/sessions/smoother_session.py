@@ -8,9 +8,9 @@ same messages in the same order give the same bytes. The rules:
   when the window ends: at the end of the stream (`finish`), where time jumps back, at a new body.
 - A mixture that is not younger than the one before is skipped, or starts a new window where
   `reset_on_time_jump` says so.
-- A mixture waits until the body has come that its joint positions are of: topics may overtake each
-  other. At most `queue_size` wait; the oldest are dropped. A body with other lengths is a new
-  track, and starts a new window.
+- A mixture names its body and carries the segment lengths of the person; without lengths it is
+  about the model at its own lengths. Another body, other lengths or another frame are a new track,
+  and start a new window.
 - Gaps are bridged by the dynamics. One that is longer than `longest_interval` is told.
 - What can not be used is skipped. Of each kind of fault the first is told, all are counted.
 """
@@ -18,7 +18,7 @@ same messages in the same order give the same bytes. The rules:
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -41,18 +41,13 @@ from hmt_ros.smoothing.mode_sequence import merge_close_modes
 from hmt_ros.smoothing.path_smoother import PathSmoother
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
+from msg_tools.messages.bodies import body_of
 from msg_tools.messages.headers import SECOND_NS, time_ns
-from msg_tools.messages.message_error import check_names
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
-BODY, MIXTURE = 'body', 'likelihood_mixture'
+MIXTURE = 'likelihood_mixture'
 FINISH = 'finish'  # what `finish` calls the end of the stream
-
-# Positions of joints agree with the kinematics up to this, m.
-_SAME_PLACE = 1e-4
-# Kinds of faults of a mixture, by words of what is said of them.
-_FAULTS = ('dof_names', 'no components', 'not finite', 'not positive definite', 'weight')
 
 
 @dataclass(frozen=True)
@@ -60,7 +55,7 @@ class SmootherState:
     """What is going on, for diagnostics.
 
     Attributes:
-        status: 'no body', 'waiting' or 'smoothing'.
+        status: 'waiting' or 'smoothing'.
         wants: what the next step waits for, '' while smoothing.
         window: poses in the window.
         trajectories: components of the mixture over them.
@@ -88,7 +83,7 @@ class KeptMixtures(NamedTuple):
     """Likelihoods that have been smoothed since the window began, the newest.
 
     Attributes:
-        of: whose poses they are; None: nobody is known.
+        of: whose poses they are; None: no mixture has come.
         items: (stamp, mixture), as they were received.
     """
 
@@ -127,8 +122,8 @@ class SmootherSession(Session):
             known_body(parameters.body_model)
         super().__init__(parameters, publish, wanted)
         self._of: SmoothedBody | None = None
+        self._resolved: tuple[Any, SmoothedBody] | None = None
         self._window: SlidingWindow | None = None
-        self._waiting: deque[Any] = deque()
         self._newest: int | None = None
         self._weights = np.empty(0)
         self._gaps, self._longest_gap = 0, 0.0
@@ -141,18 +136,12 @@ class SmootherSession(Session):
         """Handles a message.
 
         Args:
-            source: `BODY` or `MIXTURE`.
-            message: hmt_msgs/Body or PoseMixture.
+            source: `MIXTURE`.
+            message: hmt_msgs/PoseMixture.
         """
         self._log.begin()
-        if source == BODY:
-            self._take_body(message)
-        else:
-            self._log.counts['received'] += 1
-            self._waiting.append(message)
-        self._smooth_what_is_ready()
-        while len(self._waiting) > self.parameters.queue_size:
-            self._drop(self._waiting.popleft())
+        self._log.counts['received'] += 1
+        self._take_mixture(message)
         self.state = self._present_state()
         return self._log.handled(source, time_ns(message.header.stamp))
 
@@ -172,62 +161,23 @@ class SmootherSession(Session):
         self.kept = KeptMixtures(self._of, ())
         self.state = self._present_state()
 
-    def _take_body(self, message: Any) -> None:
-        try:
-            body = self._body_of(message)
-        except ValueError as error:
-            self._log.fault('body', str(error))
-            return
-        known, self._of = self._of, SmoothedBody(body, str(message.header.frame_id))
-        if known is None:
-            self.kept = KeptMixtures(self._of, ())
-        elif not _same(known, self._of):
-            if self._newest is not None:
-                self._log.note('new body', 'another body has come: a new window begins')
-            new, self._of = self._of, known
-            self._end_window()
-            self._of = new
-            self.kept = KeptMixtures(new, ())
-
-    def _body_of(self, message: Any) -> Body:
-        chosen = self.parameters.body_model
-        name = chosen or str(message.name)
-        # A message must not have files read: what it names ships with the package.
-        body = known_body(name, load_body if chosen else named_body)
-        lengths = dict(
-            zip(map(str, message.segment_names), map(float, message.segment_lengths), strict=False)
-        )
-        try:
-            body = body.with_segment_lengths(lengths)
-        except KeyError as error:
-            raise ValueError(f'body {name}: {error.args[0]}') from error
-        check_names(tuple(map(str, message.dof_names)), body.dof_names, f'body {name}: dof_names')
-        return body
-
-    def _smooth_what_is_ready(self) -> None:
-        received, self._waiting = self._waiting, deque()
-        for message in received:
-            content = None if self._of is None else _content(message, self._of.body)
-            if self._of is None or not (content is None or _is_of(content, self._of.body)):
-                self._waiting.append(message)
-                continue
-            # The body of those before will not come any more.
-            for older in self._waiting:
-                self._drop(older)
-            self._waiting.clear()
-            self._take_mixture(message, content, self._of)
-
-    def _drop(self, message: Any) -> None:
-        self._log.counts['dropped'] += 1
+    def _take_mixture(self, message: Any) -> None:
         stamp = time_ns(message.header.stamp)
-        what = 'no body has come' if self._of is None else 'no body that its joints are of has come'
-        self._log.fault('no body', f'mixture of {stamp} ns is dropped: {what}')
-
-    def _take_mixture(self, message: Any, content: PoseMixture | None, of: SmoothedBody) -> None:
-        stamp = time_ns(message.header.stamp)
-        mixture = self._readable(message, content, stamp, of)
-        if mixture is None or not self._in_time(stamp):
+        try:
+            content = pose_mixture_of(message)
+            mixture, of = content.mixture, self._whose(content)
+        except MessageError as error:
+            self._log.skip(error.kind, f'mixture of {stamp} ns: {error}')
             return
+        if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
+            self._log.note(
+                'kind of mixture',
+                f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
+                'say counts more than once',
+            )
+        if not self._in_time(stamp):
+            return
+        self._begin_track(of)
         p = self.parameters
         if self._newest is not None:
             interval = (stamp - self._newest) / SECOND_NS
@@ -265,28 +215,35 @@ class SmootherSession(Session):
         for pose in update.final:
             self._publish_final(pose, of)
 
-    def _readable(
-        self, message: Any, content: PoseMixture | None, stamp: int, of: SmoothedBody
-    ) -> GaussianMixture | None:
-        """The mixture of a message, None where it can not be used."""
-        name = str(message.body_model)
+    def _whose(self, content: PoseMixture) -> SmoothedBody:
+        """The person that a mixture is about; the same object while that does not change.
+
+        Raises:
+            MessageError: a body that is not known, or not the one that the parameters name.
+        """
+        about = content.body_model, content.dof_names, content.segment_lengths, content.frame_id
+        if self._window is not None and self._resolved is not None and self._resolved[0] == about:
+            return self._resolved[1]
+        chosen = self.parameters.body_model
         try:
-            if not self.parameters.body_model and name and name != of.body.name:
-                raise MessageError(f'mixture is of the body {name}, wanted one of {of.body.name}')
-            if content is None:
-                content = pose_mixture_of(message, of.body.dof_names)
+            # A message must not have files read: what it names ships with the package.
+            model = known_body(chosen) if chosen else known_body(content.body_model, named_body)
         except ValueError as error:
-            text = str(error)
-            kind = next((words for words in _FAULTS if words in text), 'mixture')
-            self._log.skip(kind, f'mixture of {stamp} ns: {text}')
-            return None
-        if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
-            self._log.note(
-                'kind of mixture',
-                f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
-                'say counts more than once',
-            )
-        return content.mixture
+            raise MessageError(str(error), 'body') from error
+        of = SmoothedBody(body_of(content, model, any_name=bool(chosen)), content.frame_id)
+        self._resolved = about, of
+        return of
+
+    def _begin_track(self, of: SmoothedBody) -> None:
+        """Ends the window of another person."""
+        known = self._of
+        if known is not None and _same(known, of):
+            return
+        if self._newest is not None:
+            self._log.note('new body', 'mixtures are about another body: a new window begins')
+        self._end_window()
+        self._of = of
+        self.kept = KeptMixtures(of, ())
 
     def _in_time(self, stamp: int) -> bool:
         """Whether a mixture comes after the one before, or may begin a new window."""
@@ -375,10 +332,8 @@ class SmootherSession(Session):
     # What is told.
 
     def _present_state(self) -> SmootherState:
-        status, wants = 'no body', 'body'
-        if self._of is not None:
-            smooths = self._newest is not None
-            status, wants = ('smoothing', '') if smooths else ('waiting', 'likelihood_mixture')
+        smooths = self._newest is not None
+        status, wants = ('smoothing', '') if smooths else ('waiting', 'likelihood_mixture')
         return SmootherState(
             status,
             wants,
@@ -404,20 +359,6 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
     except OSError as error:
         text = error_line(error)
         raise ValueError(f'{text}; body_model names it, or a file with it') from error
-
-
-def _content(message: Any, body: Body) -> PoseMixture | None:
-    """The content of a mixture with the joints of a body; None: there are none, or faults."""
-    try:
-        return pose_mixture_of(message, body.dof_names, body.joint_names)
-    except ValueError:
-        return None
-
-
-def _is_of(content: PoseMixture, body: Body) -> bool:
-    """Whether the joints of a mixture are where the body has them."""
-    computed = body.joint_positions(content.mixture.means[:1])
-    return bool(np.abs(computed - content.joint_positions[:1]).max() < _SAME_PLACE)
 
 
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:
