@@ -43,6 +43,7 @@ from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.headers import SECOND_NS, time_ns
+from msg_tools.messages.message_error import MessageFault
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
@@ -167,7 +168,7 @@ class SmootherSession(Session):
             content = pose_mixture_of(message)
             mixture, of = content.mixture, self._whose(content)
         except MessageError as error:
-            self._log.skip(error.kind, f'mixture of {stamp} ns: {error}')
+            self._log.skip(error.fault.value, f'mixture of {stamp} ns: {error}')
             return
         if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
             self._log.note(
@@ -229,7 +230,7 @@ class SmootherSession(Session):
             # A message must not have files read: what it names ships with the package.
             model = known_body(chosen) if chosen else known_body(content.body_model, named_body)
         except ValueError as error:
-            raise MessageError(str(error), 'body') from error
+            raise MessageError(str(error), MessageFault.BODY) from error
         of = SmoothedBody(body_of(content, model, any_name=bool(chosen)), content.frame_id)
         self._resolved = about, of
         return of

@@ -19,6 +19,7 @@ from hmt_ros.inference import GaussianMixture
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.message_error import (
     MessageError,
+    MessageFault,
     check_covariances,
     check_finite,
     check_lengths,
@@ -170,9 +171,9 @@ class PoseMixture:
             MessageError: there is no component, or the covariances are unknown.
         """
         if not len(self.weights):
-            raise MessageError('mixture has no components', 'no components')
+            raise MessageError('mixture has no components', MessageFault.NO_COMPONENTS)
         if self.covariances is None:
-            raise MessageError('mixture has no covariances', 'covariance')
+            raise MessageError('mixture has no covariances', MessageFault.COVARIANCES)
         return GaussianMixture(self.weights, self.means, self.covariances)
 
 
@@ -241,7 +242,9 @@ def pose_mixture_of(
         what = f'mixture: component {k}'
         means.append(numbers(component.mean, (d,), f'{what}: mean'))
         if known and len(component.covariance) == 0:
-            raise MessageError(f'{what} has no covariance, others have one', 'covariance')
+            raise MessageError(
+                f'{what} has no covariance, others have one', MessageFault.COVARIANCES
+            )
         if known:
             covariances.append(numbers(component.covariance, (d, d), f'{what}: covariance'))
         points = component.joint_positions
