@@ -20,10 +20,9 @@ from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
 from hmt_ros.sessions.session import Session
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
-from hmt_ros.sessions.smoother_session import BODY, MIXTURE, SmootherSession
+from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.tracking import TrackerSettings
 from msg_tools import RosbagsMessages
-from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.images import decode_image, image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
@@ -163,19 +162,15 @@ def _bme() -> Scene:
 
 
 def _smoother() -> Scene:
-    body = message_of_body(RosbagsMessages(), load_body('human37'), 10**18, 'lens')
     return Scene(
         'smoother_node',
         SmootherParameters(max_trajectories=4, window_length=8, queue_size=5),
         SmootherSession,
-        {
-            BODY: ('body', 'hmt_msgs/msg/Body'),
-            MIXTURE: ('likelihood_mixture', 'hmt_msgs/msg/PoseMixture'),
-        },
+        {MIXTURE: ('likelihood_mixture', 'hmt_msgs/msg/PoseMixture')},
         (),
-        ((BODY, body),),
+        (),
         tuple(_mixture(index, MixtureKind.LIKELIHOOD) for index in range(10)),
-        {BODY: body},
+        {},
         10**18,
         ({}, {'reset_on_time_jump': True}, {'body_model': 'human37', 'fixed_lag': 0}),
     )
@@ -190,16 +185,7 @@ def _mixture(index: int, kind: MixtureKind) -> Any:
     means[:, elbow] = (0.5 + 0.05 * index, 1.3 + 0.05 * index)
     covariances = np.tile(1e-3 * np.eye(body.dimension), (2, 1, 1))
     mixture = GaussianMixture(np.array([0.6, 0.4]), means, covariances)
-    content = PoseMixture(
-        mixture=mixture,
-        body_model=body.name,
-        dof_names=body.dof_names,
-        joint_names=body.joint_names,
-        joint_positions=body.joint_positions(means),
-        kind=kind,
-        stamp_ns=10**18,
-        frame_id='lens',
-    )
+    content = PoseMixture.of_body(body, mixture, kind, 10**18, 'lens')
     return pose_mixture_message(RosbagsMessages(), content)
 
 

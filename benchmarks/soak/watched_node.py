@@ -11,7 +11,6 @@ from benchmarks.soak.scenes import Scene
 from hmt_ros.app.replay.live_node import LiveNode
 from hmt_ros.app.replay.player import LiveNodeError, Player
 from hmt_ros.sessions.handled import Handled
-from hmt_ros.sessions.smoother_session import BODY
 
 # How long one message may take, s.
 PATIENCE = 60.0
@@ -52,7 +51,6 @@ class Watched:
                 inputs=scene.inputs,
                 topics=scene.session.TOPICS,
                 sensors=scene.sensors,
-                latched=(BODY,),
                 write=_ignored,
             )
             self.node.wait_until_active()

@@ -18,9 +18,9 @@ from rclpy.serialization import deserialize_message
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
-from hmt_ros.nodes.subscribed_topic import LATCHED, SubscribedTopic
+from hmt_ros.nodes.subscribed_topic import SubscribedTopic
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
-from hmt_ros.sessions.smoother_session import BODY, MIXTURE, SmootherSession
+from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
@@ -42,7 +42,6 @@ class SmootherNode(SessionNode[SmootherSession, SmootherParameters]):
         yield SmoothWindow, '~/smooth_window', self._on_smooth_window
 
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
-        yield SubscribedTopic(BODY, 'body', 'hmt_msgs/msg/Body', LATCHED)
         kind = 'hmt_msgs/msg/PoseMixture'
         yield SubscribedTopic(MIXTURE, 'likelihood_mixture', kind, _MIXTURES)
 

@@ -44,7 +44,7 @@ from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.session import PublishedTopic, SessionState, everything
 from hmt_ros.tracking.dynamics import PoseRates
 from msg_tools.files.error_line import error_line
-from msg_tools.messages.headers import SECOND_NS, header_message, time_ns
+from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import decode_image
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
@@ -196,25 +196,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             return self._background.silhouette(image)
 
     def _message(self, mixture: GaussianMixture | None, stamp: int, frame_id: str) -> Any:
-        body = self._predictor.body
-        if mixture is None:
-            return self._messages.create(
-                'hmt_msgs/msg/PoseMixture',
-                header=header_message(self._messages, stamp, frame_id),
-                body_model=body.name,
-                dof_names=list(body.dof_names),
-                joint_names=list(body.joint_names),
-                kind=int(MixtureKind.PREDICTION),
-            )
-        content = PoseMixture(
-            mixture=mixture,
-            body_model=body.name,
-            dof_names=body.dof_names,
-            joint_names=body.joint_names,
-            joint_positions=body.joint_positions(mixture.means),
-            kind=MixtureKind.PREDICTION,
-            stamp_ns=stamp,
-            frame_id=frame_id,
+        content = PoseMixture.of_body(
+            self._predictor.body, mixture, MixtureKind.PREDICTION, stamp, frame_id
         )
         return pose_mixture_message(self._messages, content)
 

@@ -40,6 +40,7 @@ from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
+from msg_tools.messages.bodies import body_of
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.keypoints import keypoints_of
 from msg_tools.messages.pose_mixtures import pose_mixture_of
@@ -181,23 +182,14 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         )
 
     def _prediction_in(self, message: Any) -> PosePrediction | None:
-        """The mixture and the body at the lengths of its joints; None where nobody was seen."""
+        """The mixture and its body, see `body_of`; None where nobody was seen."""
         if len(message.components) == 0:
             return None
-        body = self.start.body
         try:
-            if message.body_model and str(message.body_model) != body.name:
-                raise MessageError(
-                    f'pose_prediction is of the body {message.body_model}, wanted one of '
-                    f'{body.name}'
-                )
-            content = pose_mixture_of(message, body.dof_names)
-            body = body.with_joints_at(
-                content.mixture.means, content.joint_names, content.joint_positions
-            )
-            return PosePrediction(content.mixture, body)
+            content = pose_mixture_of(message)
+            return PosePrediction(content.mixture, body_of(content, self.start.body))
         except ValueError as error:
-            self._log.fault(Fault.PREDICTION, str(error))
+            self._log.fault(Fault.PREDICTION, f'pose_prediction: {error}')
             return None
 
     def _is_ready(self, stamp: int) -> bool:

@@ -31,9 +31,7 @@ class Fault(Enum):
     START = 'start'
     OLD_START = 'old start'
     ESTIMATE = 'estimate'
-    BODY = 'body'
     NEW_BODY = 'new body'
-    NO_BODY = 'no body'
     MIXTURE_KIND = 'kind of mixture'
     GAP = 'gap'
 

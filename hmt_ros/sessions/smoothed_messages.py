@@ -59,6 +59,7 @@ def trajectory_content(
         body_model=of.body.name,
         dof_names=of.body.dof_names,
         frame_id=of.frame_id,
+        segment_lengths=of.body.segment_lengths,
     )
 
 
@@ -132,17 +133,12 @@ def final_messages(
     if not wanted('smoothed_pose_mixture') and not wanted('smoothed_joint_states'):
         return
     mixture = pose.mixture.reduce(components).normalised()
-    content = PoseMixture(
-        mixture=GaussianMixture(
-            mixture.weights, mixture.means, _symmetric(np.array(mixture.covariances))
-        ),
-        body_model=of.body.name,
-        dof_names=of.body.dof_names,
-        joint_names=of.body.joint_names,
-        joint_positions=of.body.joint_positions(mixture.means),
-        kind=MixtureKind.SMOOTHED,
-        stamp_ns=pose.stamp_ns,
-        frame_id=of.frame_id,
+    content = PoseMixture.of_body(
+        of.body,
+        GaussianMixture(mixture.weights, mixture.means, _symmetric(np.array(mixture.covariances))),
+        MixtureKind.SMOOTHED,
+        pose.stamp_ns,
+        of.frame_id,
     )
     if wanted('smoothed_pose_mixture'):
         publish('smoothed_pose_mixture', pose_mixture_message(messages, content))

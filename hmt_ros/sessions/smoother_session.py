@@ -8,21 +8,18 @@ same order give the same bytes. The rules:
   when the window ends: at the end of the stream (`finish`), where time jumps back, at a new body.
 - A mixture that is not younger than the one before is skipped, or starts a new window with
   `reset_on_time_jump`.
-- Topics may overtake each other: a mixture waits for the body to which its joint positions belong.
-  At most `queue_size` wait; the oldest are dropped. A body with other lengths is a new track, and
-  starts a new window.
+- A mixture names its body and carries the segment lengths of the person; without lengths it is
+  about the model at its own lengths. Another body, other lengths or another frame are a new track,
+  and start a new window.
 - The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
 - What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.inference import GaussianMixture
@@ -41,21 +38,19 @@ from hmt_ros.smoothing.mode_sequence import merge_close_modes
 from hmt_ros.smoothing.path_smoother import PathSmoother
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
-from msg_tools.messages.headers import SECOND_NS, time_ns
-from msg_tools.messages.message_error import MessageFault, check_names
+from msg_tools.messages.bodies import body_of
+from msg_tools.messages.headers import SECOND_NS
+from msg_tools.messages.message_error import MessageFault
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
-BODY, MIXTURE = 'body', 'likelihood_mixture'
+MIXTURE = 'likelihood_mixture'
 FINISH = 'finish'  # what `finish` calls the end of the stream
-
-# Positions of joints agree with the kinematics up to this, m.
-_SAME_PLACE = 1e-4
 
 
 @dataclass(frozen=True)
 class SmootherState(SessionState):
-    """State of the smoother: its status is 'no body', 'waiting' or 'smoothing'.
+    """State of the smoother: its status is 'waiting' or 'smoothing'.
 
     Attributes:
         window: poses in the window.
@@ -88,7 +83,7 @@ class KeptMixtures(NamedTuple):
     """Likelihoods that have been smoothed since the window began, the newest.
 
     Attributes:
-        of: whose poses they are; None: no body has come.
+        of: whose poses they are; None: no mixture has come.
         items: (stamp, mixture), as they were received.
     """
 
@@ -122,8 +117,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             known_body(parameters.body_model)
         super().__init__(parameters, publish, wanted)
         self._of: SmoothedBody | None = None
+        self._resolved: tuple[Any, SmoothedBody] | None = None
         self._window: SlidingWindow | None = None
-        self._waiting: deque[Any] = deque()
         self._newest: int | None = None
         self._gaps, self._longest_gap = 0, 0.0
         self.kept = KeptMixtures(None, ())
@@ -138,79 +133,30 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._end_window()
         return self._handled(FINISH, stamp)
 
-    def _take(self, source: str, message: Any, stamp: int) -> None:
-        if source == BODY:
-            self._take_body(message)
-        else:
-            self._waiting.append(message)
-        self._smooth_what_is_ready()
-        while len(self._waiting) > self.parameters.queue_size:
-            self._drop(self._waiting.popleft())
-
     def _forget(self) -> None:
         self._window = None
         self._newest = None
         self.kept = KeptMixtures(self._of, ())
 
-    def _take_body(self, message: Any) -> None:
+    def _take(self, source: str, message: Any, stamp: int) -> None:
         try:
-            body = self._body_of(message)
-        except ValueError as error:
-            self._log.fault(Fault.BODY, str(error))
+            content = pose_mixture_of(message)
+            mixture, of = content.mixture, self._whose(content)
+        except MessageError as error:
+            self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
             return
-        known, self._of = self._of, SmoothedBody(body, str(message.header.frame_id))
-        if known is None:
-            self.kept = KeptMixtures(self._of, ())
-        elif not _same(known, self._of):
-            if self._newest is not None:
-                self._log.note(Fault.NEW_BODY, 'another body has come: a new window begins')
-            new, self._of = self._of, known
-            self._end_window()
-            self._of = new
-            self.kept = KeptMixtures(new, ())
-
-    def _body_of(self, message: Any) -> Body:
-        chosen = self.parameters.body_model
-        name = chosen or str(message.name)
-        # A message must not have files read: what it names ships with the package.
-        body = known_body(name, load_body if chosen else named_body)
-        lengths = dict(
-            zip(map(str, message.segment_names), map(float, message.segment_lengths), strict=False)
-        )
-        try:
-            body = body.with_segment_lengths(lengths)
-        except KeyError as error:
-            raise ValueError(f'body {name}: {error.args[0]}') from error
-        check_names(tuple(map(str, message.dof_names)), body.dof_names, f'body {name}: dof_names')
-        return body
-
-    def _smooth_what_is_ready(self) -> None:
-        received, self._waiting = self._waiting, deque()
-        for message in received:
-            content = None if self._of is None else _content(message, self._of.body)
-            if self._of is None or not (content is None or _is_of(content, self._of.body)):
-                self._waiting.append(message)
-                continue
-            # The body of those before will not come any more.
-            for older in self._waiting:
-                self._drop(older)
-            self._waiting.clear()
-            self._take_mixture(message, content, self._of)
-
-    def _drop(self, message: Any) -> None:
-        self._log.counts['dropped'] += 1
-        stamp = time_ns(message.header.stamp)
-        what = 'no body has come' if self._of is None else 'no body that its joints are of has come'
-        self._log.fault(Fault.NO_BODY, f'mixture of {stamp} ns is dropped: {what}')
-
-    def _take_mixture(self, message: Any, content: PoseMixture | None, of: SmoothedBody) -> None:
-        stamp = time_ns(message.header.stamp)
-        mixture = self._readable(message, content, stamp, of)
-        order = Order.SKIPPED if mixture is None else self._order(stamp, self._newest)
-        if mixture is None or order is Order.SKIPPED:
+        if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
+            self._log.note(
+                Fault.MIXTURE_KIND,
+                f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
+                'say counts more than once',
+            )
+        order = self._order(stamp, self._newest)
+        if order is Order.SKIPPED:
             return
         if order is Order.JUMP:
             self._end_window()
+        self._begin_track(of)
         p = self.parameters
         if self._newest is not None:
             interval = (stamp - self._newest) / SECOND_NS
@@ -248,27 +194,36 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         for pose in update.final:
             self._publish_final(pose, of)
 
-    def _readable(
-        self, message: Any, content: PoseMixture | None, stamp: int, of: SmoothedBody
-    ) -> GaussianMixture | None:
-        """The mixture of a message, None where it can not be used."""
-        name = str(message.body_model)
+    def _whose(self, content: PoseMixture) -> SmoothedBody:
+        """The person that a mixture is about; the same object while that does not change.
+
+        Raises:
+            MessageError: a body that is not known, or not the one that the parameters name.
+        """
+        about = content.body_model, content.dof_names, content.segment_lengths, content.frame_id
+        if self._window is not None and self._resolved is not None and self._resolved[0] == about:
+            return self._resolved[1]
+        chosen = self.parameters.body_model
         try:
-            if not self.parameters.body_model and name and name != of.body.name:
-                raise MessageError(f'mixture is of the body {name}, wanted one of {of.body.name}')
-            if content is None:
-                content = pose_mixture_of(message, of.body.dof_names)
+            # A message must not have files read: what it names ships with the package.
+            model = known_body(chosen) if chosen else known_body(content.body_model, named_body)
         except ValueError as error:
-            kind = error.fault if isinstance(error, MessageError) else MessageFault.OTHER
-            self._log.skip(kind, f'mixture of {stamp} ns: {error}')
-            return None
-        if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
-            self._log.note(
-                Fault.MIXTURE_KIND,
-                f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
-                'say counts more than once',
-            )
-        return content.mixture
+            raise MessageError(str(error), MessageFault.BODY) from error
+        of = SmoothedBody(body_of(content, model, any_name=bool(chosen)), content.frame_id)
+        self._resolved = about, of
+        return of
+
+    def _begin_track(self, of: SmoothedBody) -> None:
+        """Ends the window of another person."""
+        known = self._of
+        if known is not None and _same(known, of):
+            return
+        if self._newest is not None:
+            text = 'mixtures are about another body: a new window begins'
+            self._log.note(Fault.NEW_BODY, text)
+        self._end_window()
+        self._of = of
+        self.kept = KeptMixtures(of, ())
 
     def _new_window(self, body: Body) -> SlidingWindow:
         p = self.parameters
@@ -338,10 +293,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     # State.
 
     def _present_state(self) -> SmootherState:
-        status, wants = 'no body', 'body'
-        if self._of is not None:
-            smooths = self._newest is not None
-            status, wants = ('smoothing', '') if smooths else ('waiting', 'likelihood_mixture')
+        smooths = self._newest is not None
+        status, wants = ('smoothing', '') if smooths else ('waiting', 'likelihood_mixture')
         return SmootherState(
             status,
             wants,
@@ -364,20 +317,6 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
     except OSError as error:
         text = error_line(error)
         raise ValueError(f'{text}; body_model names it, or a file with it') from error
-
-
-def _content(message: Any, body: Body) -> PoseMixture | None:
-    """The content of a mixture with the joints of a body; None: there are none, or faults."""
-    try:
-        return pose_mixture_of(message, body.dof_names, body.joint_names)
-    except ValueError:
-        return None
-
-
-def _is_of(content: PoseMixture, body: Body) -> bool:
-    """Whether the joints of a mixture are where the body has them."""
-    computed = body.joint_positions(content.mixture.means[:1])
-    return bool(np.abs(computed - content.joint_positions[:1]).max() < _SAME_PLACE)
 
 
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:

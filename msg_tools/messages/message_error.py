@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import Any
 
@@ -22,6 +22,7 @@ class MessageFault(Enum):
     """Kinds of contradictions in a message."""
 
     NAMES = 'names'
+    BODY = 'body'
     NO_COMPONENTS = 'no components'
     NOT_FINITE = 'not finite'
     WEIGHTS = 'weights'
@@ -119,3 +120,23 @@ def check_names(names: tuple[str, ...], wanted: Sequence[str] | None, what: str)
     raise MessageError(
         f'{what} has {names[index]!r} at {index}, wanted {wanted[index]!r}', MessageFault.NAMES
     )
+
+
+def lengths_of(message: Any, what: str) -> dict[str, float]:
+    """Segment lengths of a message by name, m; empty where it has none.
+
+    Bags older than the fields carry a definition without them: such a message has none, either.
+
+    Raises:
+        MessageError: a name that is there twice, another number of lengths than of names.
+    """
+    names = names_of(getattr(message, 'segment_names', ()), f'{what}: segment_names')
+    lengths = numbers(
+        getattr(message, 'segment_lengths', ()), (len(names),), f'{what}: segment_lengths'
+    )
+    return dict(zip(names, lengths.tolist(), strict=True))
+
+
+def check_lengths(lengths: Mapping[str, float], what: str) -> None:
+    """Raises MessageError where a segment length is not finite."""
+    check_finite(np.array(list(lengths.values()), dtype=np.float64), f'{what}: segment_lengths')

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.app.replay.command import live_node, main
+from hmt_ros.app.replay import live_node
+from hmt_ros.app.replay.command import main
 from hmt_ros.app.replay.played_track import LiveTrack, NodeParameters
 from hmt_ros.app.replay.player import (
     LiveNodeError,
