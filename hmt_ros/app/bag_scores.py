@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.app.recorded_bodies import BODY, SAME_PLACE, RecordedBodies, body_topics
-from hmt_ros.app.report.recorded_track import bare_mixture
-from hmt_ros.app.truth import POSE_MIXTURE, Truth, is_truth, mixture_topics
+from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
+from hmt_ros.app.truth import Truth, is_truth, mixture_topics
 from hmt_ros.body import Body
 from hmt_ros.evaluation.pose_scores import (
     BATCH,
@@ -28,14 +28,19 @@ from hmt_ros.evaluation.pose_scores import (
     score,
 )
 from hmt_ros.inference import GaussianMixture
-from msg_tools import BagMessage, BagReader
-from msg_tools.messages.headers import time_ns
-from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
-from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_of
+from msg_tools import BagMessage, BagReader, MessageError
+from msg_tools.messages.pose_mixtures import POSE_MIXTURE, pose_mixture_of
+from msg_tools.messages.trajectory_mixtures import (
+    TRAJECTORY_MIXTURE,
+    TrajectoryMixture,
+    trajectory_mixture_of,
+)
 
 Array = NDArray[np.float64]
+_Content = TypeVar('_Content')
 
-TRAJECTORY_MIXTURE = 'hmt_msgs/msg/TrajectoryMixture'
+# Positions of joints in a message agree with the body's kinematics up to this, m.
+SAME_PLACE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -255,44 +260,44 @@ def _indices(names: tuple[str, ...], joints: tuple[str, ...], source: str) -> ND
 
 
 def _read_pose(stored: BagMessage, topic: _Topic, bodies: RecordedBodies) -> None:
-    message = stored.message
-    _check_frame(topic, str(message.header.frame_id))
-    names = tuple(str(name) for name in message.joint_names)
-    if not message.components and int(message.kind) == MixtureKind.PREDICTION:
-        topic.kind = MixtureKind.PREDICTION.name.lower()
+    content = _content(pose_mixture_of, stored)
+    _check_frame(topic, content.frame_id)
+    topic.kind = content.kind.name.lower()
+    if not len(content.weights):
         return  # nobody was seen: the frame is missing
-    try:
-        if message.components and all(len(c.covariance) for c in message.components):
-            content = pose_mixture_of(message)
-            topic.kind = content.kind.name.lower()
-            body = bodies.of_pose(stored.topic, content)
-            pose = _Pose(
-                content.stamp_ns, content.mixture.weights, content.mixture,
-                content.joint_positions, names, body,
-            )  # fmt: skip
-        else:
-            weights, positions, names = bare_mixture(message)
-            pose = _Pose(time_ns(message.header.stamp), weights, None, positions, names, None)
-            topic.kind = MixtureKind(int(message.kind)).name.lower()
-    except ValueError as error:
-        raise ValueError(f'{stored.topic} at {stored.log_time_ns} ns: {error}') from error
-    topic.take(pose)
+    mixture = None if content.covariances is None else content.mixture
+    body = None if mixture is None else bodies.of(stored.topic, content)
+    topic.take(
+        _Pose(
+            content.stamp_ns, content.weights, mixture, content.joint_positions,
+            content.joint_names, body,
+        )
+    )  # fmt: skip
 
 
 def _read_trajectories(stored: BagMessage, topic: _Topic, bodies: RecordedBodies) -> None:
     """Takes the marginals of a window; those of an older window hold where no newer one reaches."""
-    try:
-        content = trajectory_mixture_of(stored.message)
-    except ValueError as error:
-        raise ValueError(f'{stored.topic} at {stored.log_time_ns} ns: {error}') from error
+    content = _content(trajectory_mixture_of, stored)
     _check_frame(topic, content.frame_id)
     topic.kind = 'trajectories'
     for stamp in sorted(topic.window):
         if stamp < content.stamps_ns[0]:
             topic.take(topic.window.pop(stamp))
-    body = bodies.of(stored.topic, content.dof_names)
+    body = bodies.of(stored.topic, content)
     for t, stamp in enumerate(content.stamps_ns):
         topic.window[stamp] = _marginal(content, t, stamp, body)
+
+
+def _content(read: Callable[[Any], _Content], stored: BagMessage) -> _Content:
+    """The content of a message.
+
+    Raises:
+        ValueError: it can not be understood; one line that names it.
+    """
+    try:
+        return read(stored.message)
+    except MessageError as error:
+        raise ValueError(f'{stored.topic} at {stored.log_time_ns} ns: {error}') from error
 
 
 def _marginal(content: TrajectoryMixture, t: int, stamp: int, body: Body | None) -> _Pose:

@@ -8,7 +8,6 @@ need: `background.png` (the empty scene), `subject.yaml` (joints as clicked in t
 
 from __future__ import annotations
 
-import math
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,9 +25,9 @@ from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.files.new_folder import FolderKind
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.camera_info import camera_info_message
-from msg_tools.messages.headers import SECOND_NS, header_message
+from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.images import compressed_image_message
-from msg_tools.messages.pose_mixtures import MixtureKind
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 Array = NDArray[np.float64]
 
@@ -134,23 +133,20 @@ def ground_truth(
     messages: RosbagsMessages, body: Body, pose: Array, joints: Array, stamp_ns: int
 ) -> Any:
     """hmt_msgs/PoseMixture of a known pose: one component, whose covariance is empty."""
-    component = messages.create(
-        'hmt_msgs/msg/PoseComponent',
-        weight=1.0,
-        mean=pose,
-        covariance=np.empty(0),
-        log_likelihood=math.nan,
-        joint_positions=messages.points(joints),
-    )
-    return messages.create(
-        'hmt_msgs/msg/PoseMixture',
-        header=header_message(messages, stamp_ns, FRAME_ID),
+    content = PoseMixture(
+        weights=np.ones(1),
+        means=pose[None],
+        covariances=None,
         body_model=body.name,
-        dof_names=list(body.dof_names),
-        joint_names=list(body.joint_names),
-        kind=int(MixtureKind.GROUND_TRUTH),
-        components=[component],
+        dof_names=body.dof_names,
+        joint_names=body.joint_names,
+        joint_positions=joints[None],
+        kind=MixtureKind.GROUND_TRUTH,
+        stamp_ns=stamp_ns,
+        frame_id=FRAME_ID,
+        segment_lengths=body.segment_lengths,
     )
+    return pose_mixture_message(messages, content)
 
 
 def subject_text(take: Take, camera: Camera, pixels: Array, seed: int) -> str:

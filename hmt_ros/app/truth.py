@@ -8,14 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_tools import BagReader
+from msg_tools import BagReader, MessageError
 from msg_tools.files.array_file import read_archive
-from msg_tools.messages.headers import time_ns
-from msg_tools.messages.pose_mixtures import MixtureKind
+from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mixture_of
 
 Array = NDArray[np.float64]
 
-POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
 FIELDS = ('stamps', 'joint_names', 'joints')
 
 
@@ -146,12 +144,12 @@ def _truth_of(bag: BagReader, topic: str) -> Truth:
     names: tuple[str, ...] | None = None
     frame_id = ''
     for stored in bag.messages([topic]):
-        message = stored.message
-        own = tuple(str(name) for name in message.joint_names)
-        names, frame_id = names or own, frame_id or str(message.header.frame_id)
-        if own != names or not message.components:
-            what = 'other joints' if message.components else 'no component'
-            raise ValueError(f'{source}: message at {stored.log_time_ns} ns has {what}')
-        points = message.components[0].joint_positions
-        joints[time_ns(message.header.stamp)] = np.array([(p.x, p.y, p.z) for p in points])
+        try:
+            content = pose_mixture_of(stored.message, None, names)
+            if not len(content.weights):
+                raise MessageError('mixture has no components')
+        except MessageError as error:
+            raise ValueError(f'{source}: message at {stored.log_time_ns} ns: {error}') from error
+        names, frame_id = content.joint_names, frame_id or content.frame_id
+        joints[content.stamp_ns] = content.joint_positions[0]
     return Truth(source, names or (), joints, frame_id)

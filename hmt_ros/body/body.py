@@ -200,37 +200,6 @@ class Body:
         skeleton = replace(self.skeleton, lengths=self.skeleton.lengths * factor)
         return replace(self, skeleton=skeleton)
 
-    def with_joints_at(
-        self, poses: ArrayLike, joint_names: Sequence[str], joints: ArrayLike
-    ) -> Body:
-        """The same body at the lengths that put its joints where they are seen.
-
-        Args:
-            poses: (N, d).
-            joint_names: (J,) some of those of the body.
-            joints: (N, J, 3) where they are at the poses, m.
-
-        Raises:
-            ValueError: no lengths do within 1 mm, or a name that is not known.
-        """
-        try:
-            which = self.skeleton.joint_index(tuple(joint_names))
-        except KeyError as error:
-            raise ValueError(error.args[0]) from error
-        wanted = np.asarray(joints, dtype=np.float64) - self.joint_positions(poses)[:, which]
-        # Joints are linear in the lengths.
-        slopes = kinematics.joint_length_jacobians(self.skeleton, poses)[:, which]
-        columns = slopes.reshape(wanted.size, -1)
-        change = np.linalg.lstsq(columns, wanted.reshape(-1), rcond=1e-9)[0]
-        gap = float(np.abs(columns @ change - wanted.reshape(-1)).max())
-        if not gap < 1e-3:
-            raise ValueError(
-                f'joints are {1e3 * gap:.0f} mm from where {self.name} of whatever lengths has them'
-            )
-        lengths = self.skeleton.lengths + change
-        names = self.skeleton.length_names
-        return self.with_segment_lengths(dict(zip(names, lengths.tolist(), strict=True)))
-
     def with_widths(self, widths: Sequence[float]) -> Body:
         """The same body with other factors on the x and y radii of its parts."""
         return replace(self, widths=tuple(float(x) for x in widths))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body import Body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions.published_topic import PublishedTopic
+from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
 from msg_tools import MessageFactory
 from msg_tools.messages.joint_states import heaviest_joint_state
@@ -59,6 +59,7 @@ def trajectory_content(
         body_model=of.body.name,
         dof_names=of.body.dof_names,
         frame_id=of.frame_id,
+        segment_lengths=of.body.segment_lengths,
     )
 
 
@@ -132,17 +133,12 @@ def final_messages(
     if not wanted('smoothed_pose_mixture') and not wanted('smoothed_joint_states'):
         return
     mixture = pose.mixture.reduce(components).normalised()
-    content = PoseMixture(
-        mixture=GaussianMixture(
-            mixture.weights, mixture.means, _symmetric(np.array(mixture.covariances))
-        ),
-        body_model=of.body.name,
-        dof_names=of.body.dof_names,
-        joint_names=of.body.joint_names,
-        joint_positions=of.body.joint_positions(mixture.means),
-        kind=MixtureKind.SMOOTHED,
-        stamp_ns=pose.stamp_ns,
-        frame_id=of.frame_id,
+    content = PoseMixture.of_body(
+        of.body,
+        GaussianMixture(mixture.weights, mixture.means, _symmetric(np.array(mixture.covariances))),
+        MixtureKind.SMOOTHED,
+        pose.stamp_ns,
+        of.frame_id,
     )
     if wanted('smoothed_pose_mixture'):
         publish('smoothed_pose_mixture', pose_mixture_message(messages, content))

@@ -64,8 +64,8 @@ class SmootherParameters(NodeParameters):
     """All parameters of the smoother node.
 
     Attributes:
-        body_model: Body model, a name or a YAML file, where the name in the messages on body is not
-            a known one; if empty, that name.
+        body_model: Body model, a name or a YAML file, where the name in the mixtures is not a known
+            one; if empty, that name.
         method: Smoothing method: 'paths', the most probable paths in closed form, or 'variational',
             refined as in VMS, which takes seconds for an image.
         fixed_lag: Number of later poses after which a pose is final; 0 is filtering.
@@ -82,8 +82,8 @@ class SmootherParameters(NodeParameters):
             dynamics bridge it.
         publish_covariances: If true, trajectory_mixture has covariances, which make it forty times
             as large.
-        queue_size: Maximum number of mixtures that wait, for the body or because the node is late;
-            the oldest are dropped.
+        queue_size: Maximum number of mixtures that wait; when the node is late the oldest are
+            dropped.
         through_modes: whether the best path through every single mode is a candidate, besides the
             best between first and last modes.
         dynamics: settings of the motion model.

@@ -17,7 +17,7 @@ from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.overlay import draw_modes
-from hmt_ros.sessions.published_topic import PublishedTopic
+from hmt_ros.sessions.session import PublishedTopic
 from msg_tools import MessageFactory
 from msg_tools.messages.bodies import description_message, message_of_body
 from msg_tools.messages.images import compressed_image_message
@@ -112,15 +112,17 @@ def track_messages(
     skeleton = track.body.skeleton
     frames = forward(skeleton, track.posterior.means)
     joints = frames.joints().transpose(2, 0, 1)
-    posterior = _content(
-        track, track.posterior, joints, MixtureKind.POSTERIOR, track.log_likelihoods
+    posterior = PoseMixture.of_body(
+        track.body,
+        track.posterior,
+        MixtureKind.POSTERIOR,
+        stamp,
+        frame,
+        joint_positions=joints,
+        log_likelihoods=track.log_likelihoods,
     )
-    likelihood = _content(
-        track,
-        track.likelihood,
-        track.body.joint_positions(track.likelihood.means),
-        MixtureKind.LIKELIHOOD,
-        None,
+    likelihood = PoseMixture.of_body(
+        track.body, track.likelihood, MixtureKind.LIKELIHOOD, stamp, frame
     )
     if track.starts:
         publish('body', message_of_body(messages, track.body, stamp, frame))
@@ -163,26 +165,6 @@ def track_messages(
         publish(
             'overlay/compressed', compressed_image_message(messages, drawn, stamp, frame, quality)
         )
-
-
-def _content(
-    track: TrackedImage,
-    mixture: GaussianMixture,
-    joints: Array,
-    kind: MixtureKind,
-    log_likelihoods: Array | None,
-) -> PoseMixture:
-    return PoseMixture(
-        mixture=mixture,
-        body_model=track.body.name,
-        dof_names=track.body.dof_names,
-        joint_names=track.body.joint_names,
-        joint_positions=joints,
-        kind=kind,
-        stamp_ns=track.stamp_ns,
-        frame_id=track.frame_id,
-        log_likelihoods=log_likelihoods,
-    )
 
 
 def _link_transforms(

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,18 +63,8 @@ def truth_file(tmp_path_factory, body, poses):
 
 
 def mixture_message(body, mixture, stamp, kind=MixtureKind.POSTERIOR, frame_id=FRAME_ID, name=None):
-    positions = body.joint_positions(mixture.means)
-    content = PoseMixture(
-        mixture,
-        name or body.name,
-        body.dof_names,
-        body.joint_names,
-        positions,
-        kind,
-        stamp,
-        frame_id,
-    )
-    return pose_mixture_message(MESSAGES, content)
+    content = PoseMixture.of_body(body, mixture, kind, stamp, frame_id)
+    return pose_mixture_message(MESSAGES, replace(content, body_model=name or body.name))
 
 
 def write(path, body, mixtures, *, poses=None, with_body=True, change=None):
@@ -179,7 +170,7 @@ def test_frames_without_mixture_and_mixtures_without_truth(capsys, tmp_path, bod
 
 
 def test_a_bag_without_body(capsys, tmp_path, body, mixtures, bag, truth_file):
-    """Joints tell the lengths of a body that is known by name; of another there are only errors."""
+    """Mixtures carry the lengths of a known model; of another there are only errors."""
 
     def of_a_stranger(message):
         message.body_model = 'stranger'
@@ -214,8 +205,8 @@ def test_unknown_covariances(capsys, tmp_path, body, mixtures, truth_file):
 
 
 @pytest.mark.parametrize('torn', [False, True])
-def test_joints_tell_the_lengths(capsys, tmp_path, body, mixtures, truth_file, torn):
-    """The bag's body is of another person; joints that no lengths explain are noticed."""
+def test_mixtures_carry_the_lengths(capsys, tmp_path, body, mixtures, truth_file, torn):
+    """The bag's body is of another person; joints that lie elsewhere are noticed."""
     path = tmp_path / 'out'
     with BagWriter(path) as bag:
         other = body.with_stature(1.6)
@@ -228,6 +219,23 @@ def test_joints_tell_the_lengths(capsys, tmp_path, body, mixtures, truth_file, t
     note = 'joint positions are not those of the body human37 of the bag'
     assert found['note'] == (note if torn else '')
     assert (found['coverage_90'] is None) == torn
+
+
+def without_lengths(message):
+    message.segment_names, message.segment_lengths = [], np.empty(0)
+    return message
+
+
+def test_mixtures_without_lengths(capsys, tmp_path, body, mixtures, bag, truth_file):
+    """They are about the body that the bag describes; without one only positions are compared."""
+    wanted = report(capsys, bag, '--truth', truth_file)['topics']['pose_mixture']
+    described = write(tmp_path / 'described', body, mixtures, change=without_lengths)
+    found = report(capsys, described, '--truth', truth_file)['topics']['pose_mixture']
+    assert found == wanted
+    bare = write(tmp_path / 'bare', body, mixtures, with_body=False, change=without_lengths)
+    found = report(capsys, bare, '--truth', truth_file)['topics']['pose_mixture']
+    assert found['best_mm'] == wanted['best_mm']
+    assert found['coverage_90'] is None
 
 
 def test_predictions_without_anybody_are_missing(capsys, tmp_path, body, mixtures, truth_file):

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hmt_ros.app.replay import live_node, main
+from hmt_ros.app.replay import live_node
+from hmt_ros.app.replay.command import main
 from hmt_ros.app.replay.played_track import LiveTrack, NodeParameters
 from hmt_ros.app.replay.player import (
     LiveNodeError,
@@ -16,7 +17,7 @@ from hmt_ros.app.replay.player import (
     environment,
     reserved_domain,
 )
-from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS

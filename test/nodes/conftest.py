@@ -25,7 +25,6 @@ from hmt_ros.sessions.declared_parameters import EFFECTS, declared_parameters
 from hmt_ros.sessions.parameter_file import read_parameter_file
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
 from msg_tools import RosbagsMessages
-from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import header_message
@@ -241,10 +240,6 @@ class Likelihoods:
     def stamp(self, index):
         return START_NS + round(index * FRAME_NS)
 
-    def body_message(self, index=0, body=None):
-        body = self.body if body is None else body
-        return message_of_body(self.messages, body, self.stamp(index), 'lens')
-
     def mixture(self, index):
         """A mixture over poses; the second mode is an elbow that bends more."""
         means = np.tile(self.body.prior_mean, (2, 1))
@@ -265,16 +260,7 @@ class Likelihoods:
 
     def message(self, index, body=None, kind=MixtureKind.LIKELIHOOD):
         body, mixture = self.body if body is None else body, self.mixture(index)
-        content = PoseMixture(
-            mixture=mixture,
-            body_model=body.name,
-            dof_names=body.dof_names,
-            joint_names=body.joint_names,
-            joint_positions=body.joint_positions(mixture.means),
-            kind=kind,
-            stamp_ns=self.stamp(index),
-            frame_id='lens',
-        )
+        content = PoseMixture.of_body(body, mixture, kind, self.stamp(index), 'lens')
         return pose_mixture_message(self.messages, content)
 
 

@@ -27,11 +27,9 @@ def running(stub_tracker, subject_file, world_of):
 @pytest.fixture
 def smoother(world_of):
     """A smoother to which nobody publishes mixtures."""
-    from hmt_msgs.msg import Body
-
     from hmt_ros.nodes.smoother_node import SmootherNode
 
-    return world_of(SmootherNode, 'smoother_node', {'body': Body}).start()
+    return world_of(SmootherNode, 'smoother_node', {}).start()
 
 
 def best_effort():
@@ -46,10 +44,9 @@ def transient_local():
     return QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def test_publisher_that_does_not_fit_is_one_warning_with_topic_and_policy(smoother, likelihoods):
+def test_publisher_that_does_not_fit_is_one_warning_with_topic_and_policy(smoother):
     from hmt_msgs.msg import PoseMixture
 
-    smoother.send('body', likelihoods.body_message())
     wrong = [
         smoother.other.create_publisher(PoseMixture, 'likelihood_mixture', best_effort())
         for _ in range(2)
@@ -86,7 +83,7 @@ def test_subscription_that_does_not_fit_is_one_warning(smoother):
 
 
 def test_lost_messages_are_told_once_and_counted():
-    from hmt_ros.nodes.middleware_events import MiddlewareEvents
+    from hmt_ros.nodes.diagnostics import MiddlewareEvents
 
     texts = []
     events = MiddlewareEvents(texts.append)
@@ -107,7 +104,7 @@ def test_lost_messages_are_told_once_and_counted():
 
 
 def test_other_types_and_unknown_policies_are_told():
-    from hmt_ros.nodes.middleware_events import MiddlewareEvents
+    from hmt_ros.nodes.diagnostics import MiddlewareEvents
 
     texts = []
     events = MiddlewareEvents(texts.append)

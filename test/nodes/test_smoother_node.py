@@ -21,11 +21,11 @@ FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
 
 @pytest.fixture
 def world(world_of):
-    from hmt_msgs.msg import Body, PoseMixture
+    from hmt_msgs.msg import PoseMixture
 
     from hmt_ros.nodes.smoother_node import SmootherNode
 
-    inputs = {'body': Body, 'likelihood_mixture': PoseMixture}
+    inputs = {'likelihood_mixture': PoseMixture}
 
     def make(**values):
         values = {'fixed_lag': 1, 'max_trajectories': 4, **values}
@@ -35,10 +35,8 @@ def world(world_of):
 
 
 @pytest.fixture
-def running(world, likelihoods):
-    one = world().start()
-    one.send('body', likelihoods.body_message())
-    return one
+def running(world):
+    return world().start()
 
 
 def published(handled):
@@ -80,7 +78,7 @@ def test_mixtures_become_smoothed_poses(running, likelihoods):
     assert {m.kind for m in poses} == {3}
     assert len(found['trajectory_mixture'][-1].stamps) == 2
     assert len(found['trajectory_markers'][-1].markers) == 16
-    # A new window begins when it is activated again; the body is latched.
+    # A new window begins when it is activated again.
     assert running.change_state('activate')
     running.connect()
     handled = running.send('likelihood_mixture', likelihoods.message(5))
@@ -132,13 +130,12 @@ def test_one_warning_for_each_kind_and_the_node_lives(running, likelihoods):
     assert values['mixtures smoothed'] == '2'
     assert values['mixtures skipped'] == '8'
     assert (values['gaps'], values['longest gap, s']) == ('1', '0.800')
-    assert values['faults: dof_names'] == '2'
+    assert values['faults: names'] == '2'
 
 
 def test_diagnostics(world, likelihoods):
     one = world().start()
-    assert one.diagnosis()[:2] == (1, 'waits for body')
-    one.send('body', likelihoods.body_message())
+    assert one.diagnosis()[:2] == (1, 'waits for likelihood_mixture')
     one.send('likelihood_mixture', likelihoods.message(0))
     one.spin_until(lambda: 'smoothing' in one.diagnostics[-1].status[0].message)
     _, _, values = one.diagnosis()
@@ -198,7 +195,6 @@ def test_lifecycle(world, likelihoods):
     assert not one.call(SmoothWindow, 'smooth_window').success
     assert one.change_state('activate')
     one.connect()
-    one.send('body', likelihoods.body_message())
     assert values_of(one.send('likelihood_mixture', likelihoods.message(0)), 'fault') == []
     assert one.change_state('deactivate')
     assert one.change_state('cleanup')

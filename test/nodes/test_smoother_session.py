@@ -8,7 +8,7 @@ import pytest
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.smoothed_messages import TOPICS
 from hmt_ros.sessions.smoother_parameters import SmootherDynamics, SmootherParameters
-from hmt_ros.sessions.smoother_session import BODY, FINISH, MIXTURE, SmootherSession
+from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
 from hmt_ros.smoothing import MixtureSmoother
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import EARLIEST_NS, header_message, time_ns
@@ -32,18 +32,6 @@ def session(outputs):
     return make
 
 
-@pytest.fixture
-def running(session, likelihoods):
-    """A session that knows the body."""
-
-    def make(*arguments, **values):
-        one = session(*arguments, **values)
-        one.take(BODY, likelihoods.body_message())
-        return one
-
-    return make
-
-
 def smoothed(outputs):
     """Stamps of the poses that have become final."""
     return [output.stamp_ns for output in outputs if output.topic == 'smoothed_pose_mixture']
@@ -54,8 +42,8 @@ def read(outputs, topic):
     return [deserialise(output.data, kind) for output in outputs if output.topic == topic]
 
 
-def test_poses_become_final_after_the_lag(running, outputs, likelihoods):
-    one = running()
+def test_poses_become_final_after_the_lag(session, outputs, likelihoods):
+    one = session()
     stamps = [likelihoods.stamp(index) for index in range(5)]
     for index in range(5):
         handled = one.take(MIXTURE, likelihoods.message(index))
@@ -66,7 +54,7 @@ def test_poses_become_final_after_the_lag(running, outputs, likelihoods):
             wanted += [(topic, stamps[index - LAG]) for topic in FINAL]
         assert list(handled.published) == wanted
     assert smoothed(outputs) == stamps[:3]
-    assert one.state.mixtures == {'received': 5, 'smoothed': 5}
+    assert one.state.counts == {'received': 5, 'smoothed': 5}
     assert (one.state.status, one.state.wants, one.state.window) == ('smoothing', '', LAG + 1)
     finished = one.finish()
     assert (finished.source, finished.stamp_ns) == (FINISH, stamps[-1])
@@ -76,8 +64,8 @@ def test_poses_become_final_after_the_lag(running, outputs, likelihoods):
     assert one.finish().published == ()
 
 
-def test_final_poses_are_mixtures_that_need_no_kinematics(running, outputs, likelihoods):
-    one = running(error_correlation=0.0)
+def test_final_poses_are_mixtures_that_need_no_kinematics(session, outputs, likelihoods):
+    one = session(error_correlation=0.0)
     for index in range(6):
         one.take(MIXTURE, likelihoods.message(index))
     one.finish()
@@ -102,9 +90,9 @@ def test_final_poses_are_mixtures_that_need_no_kinematics(running, outputs, like
         assert 0.6 < mixture.weights[straight].sum() < 0.95
 
 
-def test_errors_that_last_make_mixtures_wider(running, outputs, likelihoods):
+def test_errors_that_last_make_mixtures_wider(session, outputs, likelihoods):
     for time in (0.0, 0.1):
-        one = running(error_correlation=time, max_trajectories=1)
+        one = session(error_correlation=time, max_trajectories=1)
         for index in range(3):
             one.take(MIXTURE, likelihoods.message(index))
     narrow, wide = (pose_mixture_of(m).mixture for m in read(outputs, 'smoothed_pose_mixture'))
@@ -112,8 +100,8 @@ def test_errors_that_last_make_mixtures_wider(running, outputs, likelihoods):
     assert np.array_equal(wide.means, narrow.means)
 
 
-def test_trajectories(running, outputs, likelihoods):
-    one = running(max_trajectories=3)
+def test_trajectories(session, outputs, likelihoods):
+    one = session(max_trajectories=3)
     for index in range(4):
         one.take(MIXTURE, likelihoods.message(index))
     *_, last = read(outputs, 'trajectory_mixture')
@@ -132,9 +120,9 @@ def test_trajectories(running, outputs, likelihoods):
     np.testing.assert_allclose(found.covariances, covariances, atol=1e-12)
 
 
-def test_same_messages_same_bytes(running, outputs, likelihoods):
+def test_same_messages_same_bytes(session, outputs, likelihoods):
     for _ in range(2):
-        one = running()
+        one = session()
         for index in range(4):
             one.take(MIXTURE, likelihoods.message(index))
         one.finish()
@@ -143,72 +131,63 @@ def test_same_messages_same_bytes(running, outputs, likelihoods):
     assert outputs[:half] == outputs[half:]
 
 
-def test_what_nobody_wants_is_not_made(running, outputs, likelihoods):
-    one = running(wanted=lambda topic: topic == 'smoothed_joint_states')
+def test_what_nobody_wants_is_not_made(session, outputs, likelihoods):
+    one = session(wanted=lambda topic: topic == 'smoothed_joint_states')
     for index in range(4):
         one.take(MIXTURE, likelihoods.message(index))
     assert {output.topic for output in outputs} == {'smoothed_joint_states'}
-    assert one.state.mixtures['smoothed'] == 4
+    assert one.state.counts['smoothed'] == 4
 
 
-def test_variational_smoothing_is_chosen_by_a_parameter(running, likelihoods):
-    one = running(method='variational', max_trajectories=2, fixed_lag=1)
+def test_variational_smoothing_is_chosen_by_a_parameter(session, likelihoods):
+    one = session(method='variational', max_trajectories=2, fixed_lag=1)
     one.take(MIXTURE, likelihoods.message(0))
     assert type(one._window.smoother) is MixtureSmoother
-    assert one.state.mixtures['smoothed'] == 1
+    assert one.state.counts['smoothed'] == 1
 
 
-def test_constant_velocity(running, outputs, likelihoods):
-    one = running(dynamics=SmootherDynamics(model='constant_velocity'))
+def test_constant_velocity(session, outputs, likelihoods):
+    one = session(dynamics=SmootherDynamics(model='constant_velocity'))
     for index in range(4):
         assert one.take(MIXTURE, likelihoods.message(index)).faults == ()
     assert len(smoothed(outputs)) == 2
 
 
-def test_mixtures_wait_for_their_body(session, outputs, likelihoods):
-    one = session(queue_size=2)
-    assert (one.state.status, one.state.wants) == ('no body', 'body')
-    handled = [one.take(MIXTURE, likelihoods.message(index)) for index in range(4)]
-    assert [len(h.faults) for h in handled] == [0, 0, 1, 1]
-    assert [len(h.warnings) for h in handled] == [0, 0, 1, 0]
-    assert 'no body has come' in handled[2].warnings[0]
-    handled = one.take(BODY, likelihoods.body_message())
-    assert [stamp for topic, stamp in handled.published if topic == 'trajectory_mixture'] == [
-        likelihoods.stamp(2),
-        likelihoods.stamp(3),
-    ]
-    assert one.state.mixtures == {'received': 4, 'dropped': 2, 'smoothed': 2}
+def test_mixtures_without_lengths_are_about_the_model(session, outputs, likelihoods):
+    one = session()
+    assert (one.state.status, one.state.wants) == ('waiting', 'likelihood_mixture')
+    tall = likelihoods.body.with_stature(1.9)
+    message = likelihoods.message(0, tall)
+    message.segment_names, message.segment_lengths = [], np.empty(0)
+    assert one.take(MIXTURE, message).faults == ()
+    one.finish()
+    (final,) = read(outputs, 'smoothed_pose_mixture')
+    content = pose_mixture_of(final)
+    assert content.segment_lengths == likelihoods.body.segment_lengths
 
 
-def test_a_new_body_begins_a_new_window(running, outputs, likelihoods):
-    one = running()
+def test_a_new_body_begins_a_new_window(session, outputs, likelihoods):
+    one = session()
     other = likelihoods.body.with_stature(1.6)
     one.take(MIXTURE, likelihoods.message(0))
-    # The mixture of the new body overtakes it.
-    assert one.take(MIXTURE, likelihoods.message(1, other)).published == ()
-    handled = one.take(BODY, likelihoods.body_message(1, other))
-    assert handled.warnings == ('another body has come: a new window begins',)
+    handled = one.take(MIXTURE, likelihoods.message(1, other))
+    assert handled.warnings == ('mixtures are about another body: a new window begins',)
     assert smoothed(outputs) == [likelihoods.stamp(0)]
+    # The same body once more changes nothing.
+    assert one.take(MIXTURE, likelihoods.message(2, other)).warnings == ()
     one.finish()
-    assert smoothed(outputs) == [likelihoods.stamp(0), likelihoods.stamp(1)]
+    assert smoothed(outputs) == [likelihoods.stamp(index) for index in range(3)]
     for message, body in zip(
-        read(outputs, 'smoothed_pose_mixture'), (likelihoods.body, other), strict=True
+        read(outputs, 'smoothed_pose_mixture'), (likelihoods.body, other, other), strict=True
     ):
         content = pose_mixture_of(message)
+        assert content.segment_lengths == body.segment_lengths
         np.testing.assert_allclose(
             content.joint_positions, body.joint_positions(content.mixture.means), atol=1e-9
         )
-    # The same body once more changes nothing.
-    assert one.take(BODY, likelihoods.body_message(2, other)).warnings == ()
-
-
-def test_mixtures_of_a_body_that_is_gone_are_dropped(running, outputs, likelihoods):
-    one = running()
-    other = likelihoods.body.with_stature(1.6)
-    one.take(MIXTURE, likelihoods.message(0, other))
-    handled = one.take(MIXTURE, likelihoods.message(1))
-    assert 'no body that its joints are of' in handled.faults[0]
-    assert one.state.mixtures == {'received': 2, 'dropped': 1, 'smoothed': 1}
+    windows = [trajectory_mixture_of(m) for m in read(outputs, 'trajectory_mixture')]
+    assert [len(window.stamps_ns) for window in windows] == [1, 1, 2]
+    assert windows[2].segment_lengths == other.segment_lengths
 
 
 def change(message, **fields):
@@ -236,21 +215,24 @@ BAD = {
         lambda m: change(m, dof_names=[*m.dof_names[:-1], 'tail']),
         "has 'tail' at 36, wanted ",
     ),
-    'fewer dof_names': (lambda m: change(m, dof_names=m.dof_names[:-1]), '36 names, wanted 37'),
+    'fewer dof_names': (
+        lambda m: change(m, dof_names=m.dof_names[:-1]),
+        'mean has 37 values, wanted 36',
+    ),
     'not finite': (nan_in_mean, 'mixture: mean has values that are not finite'),
     'not positive definite': (lambda m: covariance_of(m, 1.0), 'is not positive definite'),
     'weight': (lambda m: change(m.components[0], weight=3.0) and m, 'weights that sum to 3.4'),
     'body': (
         lambda m: change(m, body_model='horse'),
-        'is of the body horse, wanted one of human37',
+        "no body 'horse': wanted one of",
     ),
 }
 
 
 @pytest.mark.parametrize('name', BAD)
-def test_bad_mixtures_are_skipped(running, outputs, likelihoods, name):
+def test_bad_mixtures_are_skipped(session, outputs, likelihoods, name):
     spoil, text = BAD[name]
-    one = running(longest_interval=1.0)
+    one = session(longest_interval=1.0)
     handled = []
     for index in range(4):
         message = likelihoods.message(index)
@@ -259,46 +241,45 @@ def test_bad_mixtures_are_skipped(running, outputs, likelihoods, name):
     assert [len(h.warnings) for h in handled] == [0, 1, 0, 0]
     assert text in handled[1].warnings[0]
     assert '\n' not in handled[1].warnings[0]
-    assert one.state.mixtures == {'received': 4, 'smoothed': 2, 'skipped': 2}
+    assert one.state.counts == {'received': 4, 'smoothed': 2, 'skipped': 2}
     one.finish()
     assert smoothed(outputs) == [likelihoods.stamp(0), likelihoods.stamp(3)]
 
 
-def test_every_kind_of_fault_is_told_once(running, likelihoods):
-    one = running()
+def test_every_kind_of_fault_is_told_once(session, likelihoods):
+    one = session()
     one.take(MIXTURE, likelihoods.message(0))
     warnings = []
     for _ in range(2):
         for spoil, _ in BAD.values():
             warnings += one.take(MIXTURE, spoil(likelihoods.message(1))).warnings
         warnings += one.take(MIXTURE, likelihoods.message(0)).warnings
-    # Two faults are of the names.
-    assert len(warnings) == len(BAD)
-    assert one.state.faults['dof_names'] == 4
+    assert len(warnings) == len(BAD) + 1
+    assert one.state.faults['names'] == one.state.faults['covariances'] == 2
     assert one.state.faults['time stands still'] == 2
 
 
-def test_time_that_stands_still_or_jumps_back_is_skipped(running, outputs, likelihoods):
-    one = running()
+def test_time_that_stands_still_or_jumps_back_is_skipped(session, outputs, likelihoods):
+    one = session()
     handled = [one.take(MIXTURE, likelihoods.message(index)) for index in (1, 1, 0, 2)]
     assert [len(h.faults) for h in handled] == [0, 1, 1, 0]
     assert 'wanted stamps that increase' in handled[1].warnings[0]
-    assert 'with reset_on_time_jump a new window would begin' in handled[2].warnings[0]
+    assert 'with reset_on_time_jump the window would start anew' in handled[2].warnings[0]
     one.finish()
     assert smoothed(outputs) == [likelihoods.stamp(1), likelihoods.stamp(2)]
 
 
-def test_the_earliest_of_all_times(running, outputs, likelihoods):
+def test_the_earliest_of_all_times(session, outputs, likelihoods):
     """Nothing is before it, not even the end of what was final before."""
     message = likelihoods.message(0)
     header = header_message(likelihoods.messages, EARLIEST_NS, 'lens')
-    assert running().take(MIXTURE, replace(message, header=header)).faults == ()
+    assert session().take(MIXTURE, replace(message, header=header)).faults == ()
     (window,) = read(outputs, 'trajectory_mixture')
     assert time_ns(window.final_until) == time_ns(window.stamps[0]) == EARLIEST_NS
 
 
-def test_time_that_jumps_back_begins_a_new_window(running, outputs, likelihoods):
-    one = running(reset_on_time_jump=True)
+def test_time_that_jumps_back_begins_a_new_window(session, outputs, likelihoods):
+    one = session(reset_on_time_jump=True)
     for _ in range(2):
         for index in range(4):
             assert one.take(MIXTURE, likelihoods.message(index)).faults == ()
@@ -311,8 +292,8 @@ def test_time_that_jumps_back_begins_a_new_window(running, outputs, likelihoods)
     assert one.state.faults == {'time jumps back': 1}
 
 
-def test_gaps_are_bridged_and_told(running, outputs, likelihoods):
-    one = running(longest_interval=0.15)
+def test_gaps_are_bridged_and_told(session, outputs, likelihoods):
+    one = session(longest_interval=0.15)
     handled = [one.take(MIXTURE, likelihoods.message(index)) for index in (0, 1, 6, 7, 14)]
     assert [len(h.faults) for h in handled] == [0] * 5
     assert [len(h.warnings) for h in handled] == [0, 0, 1, 0, 0]
@@ -328,31 +309,31 @@ def test_gaps_are_bridged_and_told(running, outputs, likelihoods):
     assert variances[4] > variances[0]
 
 
-def test_posteriors_are_told_but_smoothed(running, likelihoods):
-    one = running()
+def test_posteriors_are_told_but_smoothed(session, likelihoods):
+    one = session()
     message = likelihoods.message(0, kind=MixtureKind.POSTERIOR)
     handled = one.take(MIXTURE, message)
     assert handled.faults == ()
     assert 'kind POSTERIOR, wanted LIKELIHOOD' in handled.warnings[0]
-    assert one.state.mixtures['smoothed'] == 1
+    assert one.state.counts['smoothed'] == 1
 
 
 def test_bodies_that_are_not_known(session, likelihoods, tmp_path):
     one = session()
-    strange = change(likelihoods.body_message(), name='horse')
-    handled = one.take(BODY, strange)
+    handled = one.take(MIXTURE, change(likelihoods.message(0), body_model='horse'))
     assert 'horse' in handled.faults[0]
     assert 'body_model names it' in handled.faults[0]
     one.parameters = with_values(one.parameters, {'body_model': 'human37'})
-    assert one.take(BODY, strange).faults == ()
-    handled = one.take(BODY, change(likelihoods.body_message(), segment_names=['tail']))
-    assert 'tail' in handled.faults[0]
+    assert one.take(MIXTURE, change(likelihoods.message(0), body_model='horse')).faults == ()
+    strange = change(likelihoods.message(1), segment_names=['tail'], segment_lengths=np.ones(1))
+    assert 'tail' in one.take(MIXTURE, strange).faults[0]
+    assert one.state.faults == {'body': 2}
     with pytest.raises(ValueError, match='body_model names it'):
         session(body_model=str(tmp_path / 'none.yaml'))
 
 
-def test_a_span_is_smoothed_on_demand(running, likelihoods):
-    one = running(window_length=4, max_trajectories=4)
+def test_a_span_is_smoothed_on_demand(session, likelihoods):
+    one = session(window_length=4, max_trajectories=4)
     with pytest.raises(ValueError, match='none is'):
         one.smooth_span()
     for index in range(6):
@@ -388,12 +369,11 @@ def test_body_in_a_message_leads_to_no_file(session, likelihoods, tmp_path):
     """Files are read where a parameter names them, not where somebody on the network does."""
     path = tmp_path / 'own.yaml'
     path.write_text('extends: human37\n')
-    message = likelihoods.body_message()
-    message.name = str(path)
+    message = change(likelihoods.message(0), body_model=str(path))
     one = session()
-    (fault,) = one.take(BODY, message).faults
+    (fault,) = one.take(MIXTURE, message).faults
     assert 'own.yaml' in fault
     assert 'wanted one of' in fault
-    assert one.state.status == 'no body'
+    assert one.state.status == 'waiting'
     trusting = session(body_model=str(path))
-    assert trusting.take(BODY, message).faults == ()
+    assert trusting.take(MIXTURE, message).faults == ()

@@ -113,8 +113,8 @@ def test_mixtures_go_before_the_subject(subject_file, body):
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
-        ({'body_model': 'human34'}, 'the mixture is of the body human34, wanted one of human37'),
-        ({'dof_names': ['x']}, 'dof_names has 1 names, wanted 37'),
+        ({'body_model': 'human34'}, 'mixture is of the body human34, wanted one of human37'),
+        ({'dof_names': ['x']}, 'component 0: mean has 37 values, wanted 1'),
     ],
 )
 def test_mixtures_of_other_bodies(body, changes, message):

@@ -24,7 +24,7 @@ from hmt_ros.app.replay.player import LiveNodeError, Player, environment
 from hmt_ros.sessions.declared_parameters import values_of
 from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.parameter_file import yaml_scalar
-from hmt_ros.sessions.published_topic import SUBSCRIBERS, PublishedTopic
+from hmt_ros.sessions.session import SUBSCRIBERS, PublishedTopic
 from msg_tools.messages.cdr import canonical, deserialise, serialise
 
 # Generous: they end a replay that hangs. A node that ends is noticed at once.
@@ -44,7 +44,6 @@ class LiveNode:
         inputs: topic and type by source, of what is published for it.
         topics: that it publishes.
         sensors: topics that it would take from sensors, which may lose data; a replay may not.
-        latched: inputs of which a subscriber that comes late wants the last message.
         namespace: of the node and of all its topics, '/humans/bodies/7' for example.
         module: that runs it; empty: the one in `hmt_ros.nodes` with its name.
         write: takes topic, stamp and bytes of all that the node publishes, in its order.
@@ -63,7 +62,6 @@ class LiveNode:
         inputs: Mapping[str, tuple[str, str]],
         topics: Mapping[str, PublishedTopic],
         sensors: tuple[str, ...] = (),
-        latched: tuple[str, ...] = (),
         namespace: str = '',
         module: str = '',
         write: Callable[[str, int, bytes], None],
@@ -75,7 +73,7 @@ class LiveNode:
         self._arrived: dict[str, deque[bytes]] = {topic: deque() for topic in topics}
         self._answers: deque[bytes] = deque()
         self._process: subprocess.Popen[bytes] | None = None
-        self._open_topics(inputs, latched)
+        self._open_topics(inputs)
         opened.callback(self.stop)
         self._process = self._start(parameters, sensors)
 
@@ -275,7 +273,7 @@ class LiveNode:
     def _topic(self, name: str) -> str:
         return name if name.startswith('/') else f'{self._namespace}/{name}'
 
-    def _open_topics(self, inputs: Mapping[str, tuple[str, str]], latched: tuple[str, ...]) -> None:
+    def _open_topics(self, inputs: Mapping[str, tuple[str, str]]) -> None:
         from lifecycle_msgs.srv import GetState
 
         player, node = self._player, self._player.node
@@ -283,7 +281,7 @@ class LiveNode:
             source: node.create_publisher(
                 player.classes[msgtype],
                 self._topic(topic),
-                player.latched if source in latched else player.reliable,
+                player.reliable,
             )
             for source, (topic, msgtype) in inputs.items()
         }

@@ -1,8 +1,8 @@
 """BME, filter and smoother that take the messages of a bag, offline or as real nodes.
 
 The BME takes an image before the filter does, and the filter what it publishes on
-`pose_prediction`; what the filter publishes on `body` and `likelihood_mixture` the smoother takes,
-in the same order; then the next message follows. At the end of the bag the smoother is told that
+`pose_prediction`; the smoother takes what the filter publishes on `likelihood_mixture`; then the
+next message follows. At the end of the bag the smoother is told that
 there is no more: the node, to which no message says so, is deactivated.
 """
 
@@ -17,17 +17,17 @@ from hmt_ros.app.replay.player import Player
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
-from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
 from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
-from hmt_ros.sessions.smoother_session import BODY, FINISH, MIXTURE, SmootherSession
+from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
 from msg_tools.messages.cdr import deserialise
 
 FILTER, SMOOTHER, BME = 'filter_node', 'smoother_node', 'bme_node'
-# What the smoother takes of the filter: topics, which it calls by the same names.
-HANDED_ON = (BODY, MIXTURE)
+# What the smoother takes of the filter: a topic, which it calls by the same name.
+HANDED_ON = (MIXTURE,)
 # What the BME takes of the bag.
 SEEN_BY_BME = (CAMERA_INFO, IMAGE)
 

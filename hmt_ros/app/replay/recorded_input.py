@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Generator
 from dataclasses import dataclass
 
-from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.filter_session import KEYPOINTS
 from msg_tools import BagError, BagMessage, BagReader, Topic
+from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 RAW, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 _KEYPOINTS = 'hmt_msgs/msg/Keypoints2D'
-_POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
 
 # Topics of these names are taken before all others.
 _USUAL = ('image/compressed', 'image')
@@ -73,7 +73,7 @@ def recorded_input(
         image,
         _camera_info_topic(bag, image, camera_info_topic),
         _named(bag, 'keypoints', (_KEYPOINTS,)),
-        _named(bag, GROUND_TRUTH, (_POSE_MIXTURE,)),
+        _named(bag, GROUND_TRUTH, (POSE_MIXTURE,)),
     )
 
 

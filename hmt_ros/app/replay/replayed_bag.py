@@ -30,7 +30,7 @@ from hmt_ros.app.replay.recorded_input import (
 from hmt_ros.app.replay.write_behind import WriteBehind
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS

@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 
 from hmt_ros.app.bag_scores import chosen_topics
 from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
-from hmt_ros.app.report.recorded_track import Moment, RecordedTrack, bare_mixture
-from hmt_ros.app.truth import POSE_MIXTURE
+from hmt_ros.app.report.recorded_track import Moment, RecordedTrack
 from msg_tools import BagMessage, BagReader
-from msg_tools.messages.headers import time_ns
 from msg_tools.messages.message_error import MessageError
-from msg_tools.messages.pose_mixtures import MixtureKind
+from msg_tools.messages.pose_mixtures import POSE_MIXTURE, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
 
 Array = NDArray[np.float64]
@@ -181,19 +179,19 @@ class _Reading:
             raise ValueError(f'{stored.topic} at {stored.log_time_ns} ns: {error}') from error
 
     def _take_pose(self, topic: str, message: Any) -> None:
-        kind = _kind(message)
+        content = pose_mixture_of(message)
         moments = self._moments.setdefault(topic, {})
-        if kind == 'prediction' and not message.components:
+        if not len(content.weights):
             return  # nobody was seen
-        weights, joints, names = bare_mixture(message)
-        self._tell(topic, kind, str(message.header.frame_id), names)
-        order = np.argsort(-weights, kind='stable')
-        stamp = time_ns(message.header.stamp)
-        moments.setdefault(stamp, Moment(stamp, weights[order], joints[order]))
+        self._tell(topic, content.kind.name.lower(), content.frame_id, content.joint_names)
+        order = np.argsort(-content.weights, kind='stable')
+        stamp = content.stamp_ns
+        moment = Moment(stamp, content.weights[order], content.joint_positions[order])
+        moments.setdefault(stamp, moment)
 
     def _take_window(self, topic: str, message: Any) -> None:
         content = trajectory_mixture_of(message)
-        body = self._bodies.of(topic, content.dof_names)
+        body = self._bodies.of(topic, content)
         ends = () if body is None else tuple(x for x in ENDS if x in body.joint_names)
         self._tell(topic, 'trajectories', content.frame_id, ends)
         order = np.argsort(-content.weights, kind='stable')
@@ -233,13 +231,6 @@ class _Reading:
                 layers.append(Layer(name, kind, frame_id, RecordedTrack(joints, moments)))
         layers.sort(key=lambda layer: _ORDER.index(layer.kind))
         return RecordedMixtures(layers, trajectories)
-
-
-def _kind(message: Any) -> str:
-    try:
-        return MixtureKind(int(message.kind)).name.lower()
-    except ValueError:
-        raise MessageError(f'mixture has the kind {message.kind}, which is not known') from None
 
 
 def _check_frames(path: Path, found: RecordedMixtures) -> None:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.app.truth import Truth
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN
-from msg_tools.messages.message_error import MessageError, check_finite, check_weights, names_of
 
 Array = NDArray[np.float64]
 
@@ -41,33 +39,6 @@ class RecordedTrack:
 
     joint_names: tuple[str, ...]
     moments: list[Moment]
-
-
-def bare_mixture(message: Any) -> tuple[Array, Array, tuple[str, ...]]:
-    """Weights (K,), joint positions (K, J, 3) and joint names of a PoseMixture.
-
-    Covariances are not looked at: they may be unknown.
-
-    Raises:
-        MessageError: no components, weights that are no probabilities, positions that are not
-            finite or do not fit the names.
-    """
-    names = names_of(message.joint_names, 'mixture: joint_names')
-    components = message.components
-    if not components:
-        raise MessageError('mixture has no components')
-    weights = np.array([component.weight for component in components], dtype=np.float64)
-    check_weights(weights, 'mixture')
-    for k, component in enumerate(components):
-        if len(component.joint_positions) != len(names):
-            raise MessageError(
-                f'mixture: component {k} has {len(component.joint_positions)} joint_positions, '
-                f'wanted {len(names)}'
-            )
-    positions = np.array([[(p.x, p.y, p.z) for p in c.joint_positions] for c in components])
-    positions = positions.reshape(len(weights), len(names), 3)
-    check_finite(positions, 'mixture: joint_positions')
-    return weights, positions, names
 
 
 def mode_errors(track: RecordedTrack, truth: Truth) -> dict[int, Array]:

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hmt_ros.body import load_body
 from msg_tools import MessageError, RosbagsMessages
-from msg_tools.messages.bodies import body_message
+from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.headers import header_message, time_message, time_ns
 from msg_tools.messages.joint_states import heaviest_joint_state, joint_state_message
+from msg_tools.messages.message_error import lengths_of
 from msg_tools.messages.pose_mixtures import PoseMixture
 from msg_tools.messages.transforms import quaternions, transforms_message
 
@@ -87,20 +89,9 @@ def test_transforms_that_do_not_fit(
 
 
 def test_body_message(messages: RosbagsMessages) -> None:
-    arguments: dict[str, Any] = {
-        'name': 'human37',
-        'dof_names': ['x', 'bend'],
-        'lower': [-1, 0],
-        'upper': [1, 2],
-        'joint_names': ['pelvis'],
-        'segment_lengths': {'thigh': 0.4, 'shin': 0.41},
-        'urdf': '<robot/>',
-        'stamp_ns': 5,
-        'frame_id': 'camera',
-    }
-    message = body_message(messages, **arguments)
-    assert message.segment_names == ['thigh', 'shin']
-    assert message.segment_lengths.tolist() == [0.4, 0.41]
-    assert message.upper.tolist() == [1.0, 2.0]
-    with pytest.raises(MessageError, match=r'2 dof_names, but limits of shapes \(2,\) and \(3,\)'):
-        body_message(messages, **{**arguments, 'upper': [1, 2, 3]})
+    body = load_body('human37').with_stature(1.6)
+    message = message_of_body(messages, body, 5, 'camera')
+    assert (message.name, message.header.frame_id) == ('human37', 'camera')
+    assert lengths_of(message, 'body') == body.segment_lengths
+    np.testing.assert_array_equal(message.upper, body.upper)
+    assert '<link name="camera" />' in message.urdf

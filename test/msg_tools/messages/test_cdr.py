@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hmt_ros.body import load_body
 from msg_tools import GeneratedMessages, MessageFactory, RosbagsMessages, typestore
-from msg_tools.messages.bodies import body_message
+from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.cdr import canonical, deserialise, serialise
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.images import compressed_image_message, image_message
@@ -67,18 +68,7 @@ def diagnostics(messages: MessageFactory) -> Any:
 
 
 def body(messages: MessageFactory) -> Any:
-    return body_message(
-        messages,
-        name='human37',
-        dof_names=['root_x', 'bend'],
-        lower=[-1.0, -2.0],
-        upper=[1.0, 2.0],
-        joint_names=['pelvis', 'head', 'neck'],
-        segment_lengths={'thigh': 0.41, 'shin': 0.4},
-        urdf='<robot name="human37"/>',
-        stamp_ns=STAMP,
-        frame_id='camera',
-    )
+    return message_of_body(messages, load_body('human32'), STAMP, 'camera')
 
 
 def makers(content: PoseMixture) -> dict[str, Callable[[MessageFactory], Any]]:
@@ -94,7 +84,7 @@ def makers(content: PoseMixture) -> dict[str, Callable[[MessageFactory], Any]]:
             content.joint_positions,
             content.joint_names,
             [('pelvis', 'head')],
-            content.mixture.weights,
+            content.weights,
             STAMP,
             'camera',
             ranks=5,
@@ -258,7 +248,7 @@ def test_type_hashes_are_those_of_ros() -> None:
 
     folder = Path(get_package_share_directory('hmt_msgs')) / 'msg'
     paths = sorted(folder.glob('*.json'))
-    assert len(paths) == 6
+    assert len(paths) == 7
     for path in paths:
         hashes = json.loads(path.read_text())['type_hashes']
         wanted = {entry['type_name']: entry['hash_string'] for entry in hashes}

@@ -89,7 +89,7 @@ def test_a_writer_that_is_killed_loses_at_most_the_last_chunk(tmp_path: Path) ->
         [sys.executable, '-c', WRITER, str(tmp_path / 'bag')],
         stdout=subprocess.PIPE,
         text=True,
-        cwd=Path(__file__).resolve().parents[2],
+        cwd=Path(__file__).resolve().parents[3],
     ) as process:
         assert process.stdout is not None
         written = [next(process.stdout) for _ in range(90)]

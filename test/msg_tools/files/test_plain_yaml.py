@@ -10,7 +10,7 @@ import pytest
 from hmt_ros.body import load_body, model_names, named_body
 from msg_tools.files.plain_yaml import load_plain_yaml
 
-MODEL = Path(__file__).resolve().parents[2] / 'hmt_ros' / 'body' / 'models' / 'human37.yaml'
+MODEL = Path(__file__).resolve().parents[3] / 'hmt_ros' / 'body' / 'models' / 'human37.yaml'
 BOMB = 'a: &a [x, x, x, x, x, x, x, x, x, x]\n' + ''.join(
     f'{new}: &{new} [{", ".join([f"*{old}"] * 10)}]\n'
     for old, new in zip('abcdefghi', 'bcdefghij', strict=True)
