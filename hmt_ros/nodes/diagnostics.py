@@ -1,14 +1,10 @@
-"""What a node tells of its work: rates on /diagnostics, and each message on `~/handled`."""
+"""Rates of the messages that a node receives and uses, for its diagnostics."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections import Counter
-
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-
-from hmt_ros.sessions.handled import Handled
 
 
 class Rates:
@@ -70,19 +66,3 @@ class Rates:
             f'{self._received:.1f} {self._name} a second, {self._used:.1f} {self._done}'
             f'{latency}{dropped}'
         )
-
-
-def handled_message(handled: Handled) -> DiagnosticStatus:
-    """What `~/handled` tells of a message."""
-    values = [
-        ('stamp', handled.stamp_ns),
-        *(('fault', text) for text in handled.faults),
-        *(('warning', text) for text in handled.warnings),
-        *handled.published,
-    ]
-    return DiagnosticStatus(
-        level=DiagnosticStatus.WARN if handled.faults else DiagnosticStatus.OK,
-        name=handled.source,
-        message='; '.join(handled.faults),
-        values=[KeyValue(key=key, value=str(value)) for key, value in values],
-    )
