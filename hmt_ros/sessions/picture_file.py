@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
+from msg_tools.files.bounded_file import read_bytes
 from msg_tools.messages.images import ImageError, decode_picture
 
 _LARGEST_FILE = 2**28  # bytes
@@ -18,15 +17,9 @@ def read_picture(file: str) -> NDArray[np.uint8]:
     Raises:
         ValueError: there is none in the file, or one that is too large.
     """
-    path = Path(file)
     try:
-        size = path.stat().st_size
-        if size > _LARGEST_FILE:
-            raise ValueError(f'{path}: {size} bytes, the limit for a picture is {_LARGEST_FILE}')
-        content = path.read_bytes()
-    except OSError as error:
-        raise ValueError(f'{path}: can not be read ({error.strerror})') from error
-    try:
-        return decode_picture(content)
+        return decode_picture(read_bytes(file, _LARGEST_FILE))
     except ImageError as error:
-        raise ValueError(f'{path}: not a picture ({error})') from error
+        raise ValueError(f'{file}: not a picture ({error})') from error
+    except ValueError as error:
+        raise ValueError(f'{file}: {error}') from error
