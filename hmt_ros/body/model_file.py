@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body, PartShape
 from hmt_ros.body.skeleton import Skeleton
-from msg_tools.files.plain_yaml import load_plain_yaml
+from msg_tools.files.plain_yaml import load_plain_yaml, read_plain_yaml
 
 Array = NDArray[np.float64]
 
@@ -66,9 +66,7 @@ def _read(source: str | Path) -> dict[str, Any]:
             f'no body {str(source)!r}: wanted one of {model_names()}, a YAML file, or a motion '
             f'file (.bvh, .asf, .amc)'
         )
-    if path.stat().st_size > LARGEST_FILE:
-        raise ValueError(f'the file has {path.stat().st_size} bytes, wanted {LARGEST_FILE}')
-    return _whole(load_plain_yaml(path.read_text('utf-8')))
+    return _whole(read_plain_yaml(path, LARGEST_FILE))
 
 
 @cache

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hmt_ros.body import Camera
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.session import Order, Parameters, Session, State, everything
+from msg_tools.files.bounded_file import read_bytes
 from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
 from msg_tools.messages.images import ImageError, decode_image, decode_picture
 
@@ -209,17 +210,9 @@ def read_picture(file: str) -> Image:
     Raises:
         ValueError: there is none in the file, or one that is too large.
     """
-    path = Path(file)
     try:
-        size = path.stat().st_size
-        if size > _LARGEST_PICTURE_FILE:
-            raise ValueError(
-                f'{path}: {size} bytes, the limit for a picture is {_LARGEST_PICTURE_FILE}'
-            )
-        content = path.read_bytes()
-    except OSError as error:
-        raise ValueError(f'{path}: can not be read ({error.strerror})') from error
-    try:
-        return decode_picture(content)
+        return decode_picture(read_bytes(file, _LARGEST_PICTURE_FILE))
     except ImageError as error:
-        raise ValueError(f'{path}: not a picture ({error})') from error
+        raise ValueError(f'{file}: not a picture ({error})') from error
+    except ValueError as error:
+        raise ValueError(f'{file}: {error}') from error

@@ -10,6 +10,7 @@ import yaml
 from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
 
 from msg_tools.bags.bag_error import BagError, reason
+from msg_tools.files.bounded_file import read_bytes
 
 FILE_NAME = 'metadata.yaml'
 # What the names of the other files of a bag end with.
@@ -37,20 +38,18 @@ def read_file_names(folder: Path) -> list[str]:
         BagError: no metadata, or not that of a bag.
     """
     path = folder / FILE_NAME
+    if not path.is_file():
+        raise BagError(
+            f'{folder} is no bag: it has no {FILE_NAME}; give the .mcap file itself, or write '
+            'the metadata anew with `ros2 bag reindex`'
+        )
     try:
-        if not path.is_file():
-            raise BagError(
-                f'{folder} is no bag: it has no {FILE_NAME}; give the .mcap file itself, or write '
-                'the metadata anew with `ros2 bag reindex`'
-            )
-        if path.stat().st_size > MAX_BYTES:
-            raise BagError(f'{path} has more than {MAX_BYTES} bytes: it is not that of a bag')
-        document = yaml.safe_load(path.read_text('utf-8'))
-    except OSError as error:
-        raise BagError(f'{path} can not be read: {reason(error)}') from error
+        content = read_bytes(path, MAX_BYTES)
+    except ValueError as error:
+        raise BagError(f'{path}: {error}') from error
+    try:
+        document = yaml.safe_load(content.decode('utf-8'))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        if isinstance(error, BagError):
-            raise
         raise BagError(f'{path} is not YAML: {reason(error)}') from error
     information = None
     if isinstance(document, dict):

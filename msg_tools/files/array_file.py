@@ -19,6 +19,8 @@ import numpy as np
 from numpy.lib import format as array_format
 from numpy.typing import NDArray
 
+from msg_tools.files.error_line import error_line
+
 # Bytes of all arrays of an archive together.
 LARGEST_ARCHIVE = 2**31
 _MOST_ARRAYS = 10_000
@@ -59,7 +61,7 @@ def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, 
         with np.load(path, allow_pickle=False) as content:
             return {name: content[name] for name in content.files}
     except _FAULTS as fault:
-        raise ValueError(' '.join(str(fault).split()) or type(fault).__name__) from fault
+        raise ValueError(error_line(fault)) from fault
 
 
 def _check_sizes(archive: zipfile.ZipFile, largest: int) -> None:

@@ -64,7 +64,7 @@ def test_backgrounds_that_are_none(tmp_path):
     # A file that is nearly all hole.
     with path.open('wb') as file:
         file.truncate(2**28 + 1)
-    with pytest.raises(ValueError, match=r'268435457 bytes, the limit for a picture is 268435456'):
+    with pytest.raises(ValueError, match=r'268435457 bytes, wanted at most 268435456'):
         prepare_start(parameters(background_file=path))
 
 
