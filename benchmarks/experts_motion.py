@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from benchmarks.clips import ROOT
 from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score
-from hmt_ros.experts.descriptor.shape_context import cluster_centres, squared_distances
 from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
-from hmt_ros.experts.learned_models import KINDS, new_model
 from hmt_ros.experts.pose_encoding import PoseEncoding
 from hmt_ros.experts.pose_predictor import JITTER, PosePredictor
 from hmt_ros.experts.predictor_learning import (
+    KINDS,
     Described,
     described,
     learned_predictor,
+    new_model,
     target_basis,
 )
 from hmt_ros.experts.training_set import (
@@ -44,6 +44,7 @@ from hmt_ros.experts.training_set import (
 )
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.calibration import coverage
+from hmt_ros.inference.clustering import k_means, squared_distances
 
 Array = NDArray[np.float64]
 
@@ -158,9 +159,7 @@ def seen_motions(
                 boundary_noise=1.0, seed=int(rng.integers(2**31)),
             )  # fmt: skip
             parts = [silhouette_parts(mask, descriptor.points) for mask in seen.masks]
-            result.append(
-                SeenMotion(sequence.activity, seen.poses, descriptor.describe_parts(parts))
-            )
+            result.append(SeenMotion(sequence.activity, seen.poses, descriptor.describe(parts)))
     return result
 
 
@@ -179,8 +178,7 @@ def ambiguous_share(learned: Learned, motions: Sequence[SeenMotion]) -> dict[str
 
 def two_groups(states: Array) -> bool:
     """Whether states (n, D) fall into two groups that are apart."""
-    centres = cluster_centres(states, 2, 0)
-    own = squared_distances(states, centres).argmin(1)
+    centres, own = k_means(states, 2, np.random.default_rng(0))
     if min(np.bincount(own, minlength=2)) < MINORITY * len(states):
         return False
     spread = np.sqrt(((states - centres[own]) ** 2).sum(1).mean())

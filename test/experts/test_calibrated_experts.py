@@ -13,7 +13,7 @@ from hmt_ros.experts.calibrated_experts import (
     folds_of,
 )
 from hmt_ros.experts.conditional_density import Components
-from hmt_ros.experts.learned_models import KINDS, new_model
+from hmt_ros.experts.predictor_learning import KINDS, new_model
 
 GROUPS, EACH = 12, 40
 

@@ -18,7 +18,6 @@ from hmt_ros.experts.training_set import (
     motion_files,
     procedural_sequence,
     seen_from,
-    side_view,
     training_set,
     typical_body,
 )
@@ -102,14 +101,6 @@ def test_typical_lengths_are_medians(body: Body) -> None:
     lengths = [body.segment_lengths | {'thigh': x} for x in (0.3, 0.4, 0.7)]
     sequences = [PoseSequence('m', 'm', np.zeros((1, 37)), x) for x in lengths]
     assert typical_body(body, sequences).segment_lengths['thigh'] == pytest.approx(0.4)
-
-
-def test_a_view_from_the_side(body: Body, sequences: list[PoseSequence]) -> None:
-    seen = side_view(body, sequences[1], 20)
-    assert seen.masks.shape == (20, SIDE, SIDE)
-    front = PoseEncoding(body).encode(seen.poses)[:, :3].mean(0)
-    assert abs(front[2]) < 0.05
-    assert front[0] > 0.3
 
 
 @pytest.mark.parametrize(
