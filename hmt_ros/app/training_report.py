@@ -76,11 +76,11 @@ def _affinity_figure(body: Body, sequences: Sequence[PoseSequence], training: De
             row = axes[number]
             # The person on average looks across the image; long motions have half the rate.
             step = 2 if len(sequence.poses) >= 2 * FRAMES else 1
-            seen = seen_from(body, sequence, 90.0, frames=slice(0, FRAMES * step, step))
-            parts = [silhouette_parts(mask, training.descriptor.points) for mask in seen.masks]
+            poses, masks = seen_from(body, sequence, 90.0, frames=slice(0, FRAMES * step, step))
+            parts = [silhouette_parts(mask, training.descriptor.points) for mask in masks]
             histograms = [training.descriptor.codebook_.histogram(part.contexts) for part in parts]
             vectors = (
-                seen.poses[:, AXES:],
+                poses[:, AXES:],
                 np.sqrt(np.array(histograms)),
                 np.sqrt(np.array([part.edge_pairs for part in parts])),
                 training.descriptor.describe(parts),
@@ -91,7 +91,7 @@ def _affinity_figure(body: Body, sequences: Sequence[PoseSequence], training: De
                 one.set_yticks([])
                 if number == 0:
                     one.set_title(title)
-            row[0].set_ylabel(f'{sequence.activity}, {len(seen.masks)} frames')
+            row[0].set_ylabel(f'{sequence.activity}, {len(masks)} frames')
         figure.tight_layout()
     return figure
 

@@ -141,7 +141,8 @@ class ExpertMixture(ConditionalDensity):
         self.n_inputs_, self.n_outputs_ = pairs.inputs.shape[1], pairs.targets.shape[1]
         self._scaling = Standardisation.of(pairs.inputs, pairs.weights, self.scaling)
         self._target_scaling = Standardisation.of(pairs.targets, pairs.weights)
-        self._prior = self._regression_prior()
+        strength = 0.0 if self.learning == 'maximum_likelihood' else self.n_outputs_ + 3.0
+        self._prior = RegressionPrior(strength, strength * NOISE_FLOOR * np.eye(self.n_outputs_))
         if responsibilities is not None:
             given = np.asarray(responsibilities, dtype=np.float64)
             wanted = (len(np.atleast_1d(np.asarray(inputs))), self.n_experts)
@@ -196,14 +197,9 @@ class ExpertMixture(ConditionalDensity):
     # Learning.
 
     def _check_parameters(self) -> None:
-        for name, value, least in (
-            ('n_experts', self.n_experts, 1),
-            ('max_kernels', self.max_kernels, 1),
-            ('n_starts', self.n_starts, 1),
-            ('max_iterations', self.max_iterations, 1),
-        ):
-            if value < least:
-                raise ValueError(f'{name} is {value}, wanted at least {least}')
+        for name in ('n_experts', 'max_kernels', 'n_starts', 'max_iterations'):
+            if getattr(self, name) < 1:
+                raise ValueError(f'{name} is {getattr(self, name)}, wanted at least 1')
         if self.basis not in BASES:
             raise ValueError(f'basis is {self.basis!r}, wanted one of {", ".join(BASES)}')
         if self.learning not in LEARNING:
@@ -215,10 +211,6 @@ class ExpertMixture(ConditionalDensity):
             )
         if self.width is not None and not self.width > 0:
             raise ValueError(f'width is {self.width}, wanted a positive number or None')
-
-    def _regression_prior(self) -> RegressionPrior:
-        strength = 0.0 if self.learning == 'maximum_likelihood' else self.n_outputs_ + 3.0
-        return RegressionPrior(strength, strength * NOISE_FLOOR * np.eye(self.n_outputs_))
 
     def _bases(self, pairs: TrainingPairs) -> list[Basis]:
         """The candidate basis functions, for each candidate width."""

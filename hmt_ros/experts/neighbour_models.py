@@ -86,17 +86,17 @@ class _NeighbourModel(ConditionalDensity):
 
         With as many dimensions as descriptors have, no tree is faster than a full search.
         """
-        parts = [points[i : i + BATCH] for i in range(0, len(points), BATCH)]
-        found = [self._nearest_of(x, count) for x in parts]
-        return np.concatenate([x[0] for x in found]), np.concatenate([x[1] for x in found])
-
-    def _nearest_of(self, points: Array, count: int) -> tuple[Array, Index]:
-        squared = self._norms - 2.0 * points @ self._scaled.T
-        index = np.argpartition(squared, count - 1, axis=1)[:, :count]
-        squared = np.take_along_axis(squared, index, axis=1) + (points * points).sum(1)[:, None]
-        order = np.argsort(squared, axis=1, kind='stable')
-        distances = np.sqrt(np.maximum(np.take_along_axis(squared, order, axis=1), 0.0))
-        return distances, np.take_along_axis(index, order, axis=1)
+        distances, rows = np.empty((len(points), count)), np.empty((len(points), count), np.intp)
+        for i in range(0, len(points), BATCH):
+            some = points[i : i + BATCH]
+            squared = self._norms - 2.0 * some @ self._scaled.T
+            index = np.argpartition(squared, count - 1, axis=1)[:, :count]
+            squared = np.take_along_axis(squared, index, axis=1) + (some * some).sum(1)[:, None]
+            order = np.argsort(squared, axis=1, kind='stable')
+            squared = np.take_along_axis(squared, order, axis=1)
+            distances[i : i + BATCH] = np.sqrt(np.maximum(squared, 0.0))
+            rows[i : i + BATCH] = np.take_along_axis(index, order, axis=1)
+        return distances, rows
 
     def _learned(self) -> Arrays:
         precision, of_weights = self._stored

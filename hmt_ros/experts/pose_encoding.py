@@ -114,11 +114,12 @@ class PoseEncoding:
         to_ray = ray_rotations(pose[:, :3])[0].T
         axes = forward(self.body.skeleton, pose).axes[3:AXES, :, 0].T  # (3, angle)
         front_up = root_rotations(self.body, pose)[0].T[1:]  # camera frame
+        by_root = _rotation_by_root(pose[:, :3])[0]
         for k, axis in enumerate(front_up):
             rows = slice(3 * k, 3 * k + 3)
-            result[rows, 3:AXES] = to_ray @ -_cross_matrix(axis) @ axes
+            result[rows, 3:AXES] = to_ray @ np.cross(axes, axis, axisa=0, axisc=0)
             # The frame of the ray turns with the root, so in it the axis turns back.
-            result[rows, :3] = to_ray @ _cross_matrix(axis) @ _rotation_by_root(pose[:, :3])[0]
+            result[rows, :3] = to_ray @ np.cross(axis, by_root, axisb=0, axisc=0)
         result[AXES:, AXES:] = np.eye(d - AXES)
         return result
 
@@ -217,7 +218,3 @@ def _unit(vectors: Array) -> Array:
     result: Array = vectors / np.maximum(norm, 1e-9)
     result[norm[:, 0] <= 1e-9] = 0.0, 0.0, -1.0
     return result
-
-
-def _cross_matrix(v: Array) -> Array:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -100,16 +100,20 @@ def place_roots(
     roots = _first_roots(encoding, camera, sides, targets)
     start, prior = roots.copy(), _prior(roots)
     nearest = 1.05 * body.lower[2]
-    slopes = encoding.jacobians(targets, roots)
-    for _ in range(STEPS):
+
+    def linearised(slopes: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
+        """r, J and J_x at the roots, and J' S^-1."""
         residual, by_root, by_target = _box_error(
             encoding, mesh, camera, targets, roots, slopes, sides, cut
         )
         spread = by_target @ covariances @ by_target.transpose(0, 2, 1) + noise * np.eye(4)
-        weighted = np.linalg.solve(spread, by_root).transpose(0, 2, 1)
-        precision = weighted @ by_root + prior
+        return residual, by_root, by_target, np.linalg.solve(spread, by_root).transpose(0, 2, 1)
+
+    slopes = encoding.jacobians(targets, roots)
+    for _ in range(STEPS):
+        residual, by_root, _, weighted = linearised(slopes)
         pull = weighted @ residual[..., None] + prior @ (roots - start)[..., None]
-        step = -np.linalg.solve(precision, pull)[..., 0]
+        step = -np.linalg.solve(weighted @ by_root + prior, pull)[..., 0]
         depth = roots[:, 2]
         share = np.linalg.norm(step, axis=1) / depth
         step *= np.minimum(1.0, LONGEST_STEP / np.maximum(share, 1e-12))[:, None]
@@ -120,11 +124,7 @@ def place_roots(
         if share.max() > TURNED:
             slopes = encoding.jacobians(targets, roots)
     slopes = encoding.jacobians(targets, roots)
-    residual, by_root, by_target = _box_error(
-        encoding, mesh, camera, targets, roots, slopes, sides, cut
-    )
-    spread = by_target @ covariances @ by_target.transpose(0, 2, 1) + noise * np.eye(4)
-    weighted = np.linalg.solve(spread, by_root).transpose(0, 2, 1)
+    residual, by_root, by_target, weighted = linearised(slopes)
     gain = np.linalg.solve(weighted @ by_root + prior, weighted)  # (M, 3, 4)
     left = np.eye(3) - gain @ by_root
     own = noise * gain @ gain.transpose(0, 2, 1)

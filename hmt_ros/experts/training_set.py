@@ -154,16 +154,13 @@ def motion_files(folder: Path) -> list[Path]:
     Raises:
         ValueError: there is no such folder, or no motion in it.
     """
+    wanted = ' or '.join(MOTION_SUFFIXES)
     if not folder.is_dir():
-        raise ValueError(f'{folder} is no folder: wanted one with motions ({_suffixes()})')
+        raise ValueError(f'{folder} is no folder: wanted one with motions ({wanted})')
     found = sorted(x for x in folder.rglob('*') if x.suffix.lower() in MOTION_SUFFIXES)
     if not found:
-        raise ValueError(f'{folder} has no motion: wanted files {_suffixes()}')
+        raise ValueError(f'{folder} has no motion: wanted files {wanted}')
     return found
-
-
-def _suffixes() -> str:
-    return ' or '.join(MOTION_SUFFIXES)
 
 
 def recorded_sequence(path: Path, body: Body) -> PoseSequence:
@@ -370,19 +367,6 @@ def _uneven(mask: Bytes, deviation: float, rng: np.random.Generator) -> Bytes:
     return result if result.any() else mask
 
 
-@dataclass(frozen=True, eq=False)
-class SeenSequence:
-    """A motion as a camera sees it, frame by frame.
-
-    Attributes:
-        poses: (n, d) with the middle of the joints on the optical axis.
-        masks: (n, SIDE, SIDE) silhouettes, 1 inside.
-    """
-
-    poses: Array
-    masks: Bytes
-
-
 def seen_from(
     body: Body,
     sequence: PoseSequence,
@@ -393,7 +377,7 @@ def seen_from(
     distance: float = 5.0,
     boundary_noise: float = 0.0,
     seed: int = 0,
-) -> SeenSequence:
+) -> tuple[Array, Bytes]:
     """Frames of a motion, seen by a camera with a fixed direction.
 
     Args:
@@ -407,6 +391,10 @@ def seen_from(
         boundary_noise: Standard deviation of the outline, px of a person 200 px tall.
         seed: Seed of that noise.
 
+    Returns:
+        Poses (n, d) with the middle of the joints on the optical axis, and silhouettes
+        (n, SIDE, SIDE), 1 inside.
+
     Raises:
         ValueError: there are no frames.
     """
@@ -418,8 +406,6 @@ def seen_from(
     down = np.full(len(poses), np.radians(elevation))
     view = _about(0, down) @ _about(1, np.full(len(poses), turn))
     poses, _ = _seen(body, poses, poses, view, np.full(len(poses), distance))
-    camera = _fitting_camera(body, poses)
     rng = np.random.default_rng(seed)
-    drawn = render_silhouettes(body, poses, camera)
-    masks = np.stack([_uneven(mask.view(np.uint8), boundary_noise, rng) for mask in drawn])
-    return SeenSequence(poses, masks)
+    drawn = render_silhouettes(body, poses, _fitting_camera(body, poses))
+    return poses, np.stack([_uneven(mask.view(np.uint8), boundary_noise, rng) for mask in drawn])

@@ -109,18 +109,18 @@ def test_typical_lengths_are_medians(body: Body) -> None:
 def test_a_motion_seen_from_a_heading(
     body: Body, sequences: list[PoseSequence], heading: float, wanted: tuple[int, int]
 ) -> None:
-    seen = seen_from(body, sequences[1], heading, frames=slice(10, 30, 2))
-    assert seen.masks.shape == (10, SIDE, SIDE)
-    front = root_rotations(body, seen.poses)[:, :, 1].mean(0)
+    poses, masks = seen_from(body, sequences[1], heading, frames=slice(10, 30, 2))
+    assert masks.shape == (10, SIDE, SIDE)
+    front = root_rotations(body, poses)[:, :, 1].mean(0)
     across, _, away = front
     np.testing.assert_allclose(np.array([across, away]) / np.hypot(across, away), wanted, atol=1e-9)
     # The posture is that of the motion.
-    np.testing.assert_array_equal(seen.poses[:, 6:], sequences[1].poses[10:30:2, 6:])
+    np.testing.assert_array_equal(poses[:, 6:], sequences[1].poses[10:30:2, 6:])
 
 
 def test_a_motion_seen_from_above(body: Body, sequences: list[PoseSequence]) -> None:
     level, above = (
-        root_rotations(body, seen_from(body, sequences[0], 30.0, e, frames=slice(4)).poses)
+        root_rotations(body, seen_from(body, sequences[0], 30.0, e, frames=slice(4))[0])
         for e in (0.0, 25.0)
     )
     # From above, what is up comes nearer to the camera.
@@ -133,9 +133,9 @@ def test_a_motion_seen_from_above(body: Body, sequences: list[PoseSequence]) -> 
 
 def test_the_outline_of_a_seen_motion_is_uneven(body: Body, sequences: list[PoseSequence]) -> None:
     def masks(noise: float, seed: int) -> np.ndarray:
-        return seen_from(
-            body, sequences[0], 0.0, frames=slice(3), boundary_noise=noise, seed=seed
-        ).masks
+        return seen_from(body, sequences[0], 0.0, frames=slice(3), boundary_noise=noise, seed=seed)[
+            1
+        ]
 
     clean, noisy = masks(0.0, 0), masks(1.0, 1)
     np.testing.assert_array_equal(noisy, masks(1.0, 1))

@@ -126,16 +126,7 @@ class SilhouetteDescriptor:
         rows = [self._features(part) for part in parts]
         names = list(rows[0])
         columns = {name: np.array([row[name] for row in rows]) for name in names}
-        self.scale_ = np.concatenate(
-            [
-                np.full(columns[name].shape[1], WEIGHTS[name] / _spread(columns[name]))
-                if name != 'moments'
-                else WEIGHTS[name]
-                / np.sqrt(columns[name].shape[1])
-                / np.maximum(columns[name].std(0), 1e-6)
-                for name in names
-            ]
-        )
+        self.scale_ = np.concatenate([_weights(name, columns[name]) for name in names])
         features = np.concatenate([columns[name] for name in names], axis=1) * self.scale_
         self.centre_ = features.mean(0)
         _, deviations, directions = np.linalg.svd(features - self.centre_, full_matrices=False)
@@ -220,8 +211,14 @@ class SilhouetteDescriptor:
         return result
 
 
-def _spread(columns: Array) -> float:
-    return max(float(np.sqrt(columns.var(0).sum())), 1e-9)
+def _weights(name: str, columns: Array) -> Array:
+    """Weights (k,) of the features (N, k) of a part; moments are weighted one by one."""
+    if name == 'moments':
+        spread = np.sqrt(columns.shape[1]) * np.maximum(columns.std(0), 1e-6)
+    else:
+        spread = np.full(columns.shape[1], max(float(np.sqrt(columns.var(0).sum())), 1e-9))
+    result: Array = WEIGHTS[name] / spread
+    return result
 
 
 def _at_one_size(mask: Bytes) -> Bytes:
