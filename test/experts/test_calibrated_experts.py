@@ -14,7 +14,6 @@ from hmt_ros.experts.calibrated_experts import (
 )
 from hmt_ros.experts.conditional_density import Components
 from hmt_ros.experts.model_file import nested
-from hmt_ros.experts.predictor_learning import KINDS, new_model
 
 GROUPS, EACH = 12, 40
 
@@ -117,16 +116,6 @@ def test_bad_input() -> None:
         CalibratedExperts(NearestNeighbours(3)).components(inputs)
     with pytest.raises(ValueError, match='temperature must be at least 1'):
         Calibration(0.5, np.zeros((2, 2)), 1.0)
-
-
-def test_models_by_name() -> None:
-    for name in KINDS:
-        assert isinstance(new_model(name), CalibratedExperts)
-    few = new_model('joint', samples=200)
-    assert isinstance(few, CalibratedExperts)
-    assert few.model.get_params()['n_experts'] == 5
-    with pytest.raises(ValueError, match="no model 'forest'"):
-        new_model('forest')
 
 
 def test_files_that_nest_calibrated_models_are_refused() -> None:
