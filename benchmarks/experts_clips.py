@@ -21,6 +21,7 @@ from hmt_ros.experts.descriptor.contour import NoSilhouetteError
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
+from msg_tools.files.array_file import read_archive
 
 Mask = NDArray[np.uint8]
 
@@ -96,11 +97,11 @@ def wanted(result: dict[str, Any]) -> list[dict[str, Any]]:
 
 def true_masks(clip: Clip) -> list[Mask] | None:
     """The true silhouettes of a clip; None if its truth has none."""
-    with np.load(clip.folder / 'truth.npz') as content:
-        if 'masks' not in content:
-            return None
-        width = clip.images[0].shape[1]
-        packed = dict(zip(content['stamps'].tolist(), content['masks'], strict=True))
+    content = read_archive(clip.folder / 'truth.npz')
+    if 'masks' not in content:
+        return None
+    width = clip.images[0].shape[1]
+    packed = dict(zip(content['stamps'].tolist(), content['masks'], strict=True))
     return [np.unpackbits(packed[stamp], axis=1)[:, :width] for stamp in clip.stamps]
 
 
