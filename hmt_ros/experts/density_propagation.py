@@ -1,16 +1,17 @@
 """Discriminative density propagation: mixtures through conditional densities (BME 2.1).
 
-Rule (1), with a model of p(x_t | x_{t-1}, r_t) whose input is the state, then the observation:
+Rule (1) needs a model of p(x_t | x_{t-1}, r_t), whose input is the state, then the observation:
 
-    p(x_t | R_t) = integral p(x_t | x_{t-1}, r_t) p(x_{t-1} | R_{t-1}) dx_{t-1}
+    p(x_t | R_t) = integral p(x_t | x_{t-1}, r_t) p(x_{t-1} | R_{t-1}) dx_{t-1}         (BME 1)
 
-Each expert i is linearised at the mean m_j of each component before, which leaves
+Each expert i is linearised at the mean m_j of each previous component. The integral becomes
 
     sum_ij g_i(m_j, r) w_j N(x; f_i(m_j, r), F_ij S_j F_ij' + c_i O_i),    F = df / dx_{t-1}
 
-Rule (9), with models of p(x_t | r_t), of the dynamics p(x_t | x_{t-1}), and the equilibrium p(x_t):
+Rule (9) needs models of p(x_t | r_t), of the dynamics p(x_t | x_{t-1}), and the equilibrium p(x_t):
 
-    p(x_t | R_t) ~ p(x_t | r_t) / p(x_t) integral p(x_t | x_{t-1}) p(x_{t-1} | R_{t-1}) dx_{t-1}
+    p(x_t | R_t) ~ p(x_t | r_t) / p(x_t)                                                (BME 9)
+                   integral p(x_t | x_{t-1}) p(x_{t-1} | R_{t-1}) dx_{t-1}
 
 The M^2 components are reduced to M: clusters of means first, which then descend a bound on the
 Kullback-Leibler divergence from the large mixture to the small one.
@@ -45,19 +46,19 @@ def propagate(
 ) -> GaussianMixture:
     """p(x_t | R_t) by rule (1).
 
-    Components before in whose place the model has no support give their weight to the prediction
-    from the observation alone; where none has support, that prediction is the result.
+    Previous components without support of the model give their weight to the prediction from the
+    observation alone; without any support, that prediction is the result.
 
     Args:
-        model: of p(x_t | x_{t-1}, r_t) with inputs (x_{t-1}, r_t), states first.
+        model: Model of p(x_t | x_{t-1}, r_t) with inputs (x_{t-1}, r_t), states first.
         previous: p(x_{t-1} | R_{t-1}) over states (d,).
-        observation: r_t (q,), perhaps with q = 0.
-        n_components: M of the result; None for as many as the model has experts.
+        observation: r_t (q,); q may be 0.
+        n_components: Number of components M of the result; None takes the number of experts.
         without_past: p(x_t | r_t); None trusts the model everywhere.
-        least_support: of `ConditionalDensity.support`.
+        least_support: Minimum of `ConditionalDensity.support`.
 
     Raises:
-        ValueError: dimensions that do not fit, an observation that is not finite.
+        ValueError: dimensions do not fit, or the observation is not finite.
     """
     previous = previous.normalised()
     inputs = _inputs(model, previous, observation)
@@ -95,15 +96,15 @@ def propagate_by_dynamics(
     """p(x_t | R_t) by rule (9).
 
     Args:
-        dynamics: model of p(x_t | x_{t-1}).
+        dynamics: Model of p(x_t | x_{t-1}).
         previous: p(x_{t-1} | R_{t-1}).
         predicted: p(x_t | r_t).
-        equilibrium: p(x_t). A single Gaussian is divided out exactly, as long as it is wider than
-            what it divides; else each product is weighted by 1 / p at its mean.
-        n_components: of the result; None for as many as `predicted` has.
+        equilibrium: p(x_t). The division by a single Gaussian is exact where that is wider than the
+            product; else each product is weighted by 1 / p at its mean.
+        n_components: Number of components of the result; None takes that of `predicted`.
 
     Raises:
-        ValueError: dimensions that do not fit.
+        ValueError: dimensions do not fit.
     """
     count = n_components or len(predicted)
     prior = reduced(linearised_products(dynamics, previous, np.zeros(0)), count)
@@ -118,11 +119,11 @@ def propagate_by_dynamics(
 def linearised_products(
     model: ConditionalDensity, previous: GaussianMixture, observation: ArrayLike
 ) -> GaussianMixture:
-    """The integral of rule (1) with experts linearised at each mean, all products kept.
+    """The integral of rule (1) with experts linearised at each mean; all products are kept.
 
     Args:
-        model: with inputs (x_{t-1}, r_t).
-        previous: J components over states (d,); their weights are kept as they are.
+        model: Model with inputs (x_{t-1}, r_t).
+        previous: J components over states (d,); their weights need not sum to 1.
         observation: r_t (q,).
     """
     inputs = _inputs(model, previous, observation)
@@ -152,7 +153,7 @@ def divided_product(
         divisor = divisor.normalised()
         precision_d, shift_d, constant_d = _canonical(divisor)
         less = precision - precision_d
-        # A divisor that is nearly as narrow leaves next to no Gaussian.
+        # A divisor that is nearly as narrow as the product leaves no proper Gaussian.
         exact = np.linalg.eigvalsh(less)[:, 0] > 1e-3 * np.linalg.eigvalsh(precision)[:, 0]
         precision = np.where(exact[:, None, None], less, precision)
         shift = np.where(exact[:, None], shift - shift_d, shift)
@@ -162,7 +163,7 @@ def divided_product(
     means = np.einsum('nij,nj->ni', covariances, shift)
     log_det = np.linalg.slogdet(covariances)[1]
     log = constant + 0.5 * ((shift * means).sum(1) + log_det)
-    # Without the division there is one factor of 2 pi more in the denominator.
+    # Without exact division, one factor (2 pi)^(d/2) more is in the denominator.
     at_mean = 0.5 * d * np.log(2.0 * np.pi) + divisor.log_density(means)
     log = np.where(exact, log, log - at_mean)
     return GaussianMixture(np.exp(log - logsumexp(log)), means, covariances)
@@ -282,7 +283,7 @@ def _canonical(mixture: GaussianMixture) -> tuple[Array, Array, Array]:
 
 
 def _inputs(model: ConditionalDensity, previous: GaussianMixture, observation: ArrayLike) -> Array:
-    """Inputs (J, d + q) at the means of the components before."""
+    """Inputs (J, d + q) at the means of the previous components."""
     observation = np.asarray(observation, dtype=np.float64)
     if observation.ndim != 1 or previous.dimension + len(observation) != model.n_inputs_:
         raise ValueError(

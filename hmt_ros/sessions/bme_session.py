@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 
 from hmt_ros.body import Camera
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
-from hmt_ros.experts.pose_predictor import PosePredictor, Prediction
+from hmt_ros.experts.pose_predictor import SHIPPED, PosePredictor, Prediction, load_predictor
 from hmt_ros.experts.root_placement import SIZE_SPREAD
-from hmt_ros.experts.shipped_models import SHIPPED, load_predictor
 from hmt_ros.experts.training_set import RATE
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture

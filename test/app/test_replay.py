@@ -8,7 +8,7 @@ import pytest
 
 from hmt_ros.app.replay.command import main
 from hmt_ros.app.replay.recorded_input import recorded_input
-from hmt_ros.experts.shipped_models import load_predictor
+from hmt_ros.experts import load_predictor
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions import track_start
 from hmt_ros.sessions.smoothed_messages import TOPICS as SMOOTHED_TOPICS

@@ -3,14 +3,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hmt_ros.experts.descriptor.shape_context import (
+from hmt_ros.experts.descriptor.contour import sample_contour
+from hmt_ros.experts.descriptor.contour_histograms import (
     ANGULAR,
+    PAIR_ANGLES,
+    PAIR_BINS,
+    PAIR_DISTANCES,
     RADIAL,
     RADII,
     ShapeContextCodebook,
-    cluster_centres,
+    edge_pairs,
     shape_contexts,
-    squared_distances,
 )
 
 
@@ -35,7 +38,7 @@ def test_contexts_count_points_by_distance_and_direction() -> None:
         np.testing.assert_allclose(found[i], wanted.ravel(), atol=1e-12)
 
 
-def test_place_and_size_do_not_count_but_rotation_does() -> None:
+def test_contexts_change_with_rotation_alone() -> None:
     points = cloud(1)
     np.testing.assert_allclose(shape_contexts(3.0 * points + [100, -7]), shape_contexts(points))
     assert np.abs(shape_contexts(points[:, ::-1]) - shape_contexts(points)).max() > 0.05
@@ -61,20 +64,6 @@ def test_codebook_is_the_same_for_the_same_contexts() -> None:
     np.testing.assert_array_equal(first.centres, second.centres)
 
 
-def test_clusters_of_separate_groups_are_found() -> None:
-    rng = np.random.default_rng(5)
-    middles = np.array([[0, 0], [10, 0], [0, 10.0]])
-    points = (middles[:, None] + 0.1 * rng.normal(size=(3, 40, 2))).reshape(-1, 2)
-    centres = cluster_centres(points, 3, seed=1)
-    nearest = squared_distances(middles, centres).min(1)
-    assert nearest.max() < 0.01
-
-
-def test_more_clusters_than_different_points() -> None:
-    centres = cluster_centres(np.repeat([[1.0, 2.0], [3.0, 4.0]], 5, axis=0), 4)
-    assert np.isfinite(centres).all()
-
-
 @pytest.mark.parametrize('bad', ['few', 'nan'])
 def test_contexts_that_give_no_codebook(bad: str) -> None:
     contexts = shape_contexts(cloud(6))
@@ -90,3 +79,62 @@ def test_contexts_that_give_no_codebook(bad: str) -> None:
 def test_centres_of_another_shape() -> None:
     with pytest.raises(ValueError, match='60'):
         ShapeContextCodebook(np.zeros((5, 7)))
+
+
+def described(mask: np.ndarray) -> np.ndarray:
+    points, directions = sample_contour(mask, 100)
+    return edge_pairs(points, directions, mask)
+
+
+def rectangle(height: int, width: int) -> np.ndarray:
+    mask = np.zeros((220, 220), np.uint8)
+    mask[10 : 10 + height, 10 : 10 + width] = 1
+    return mask
+
+
+def test_edge_pairs_are_a_histogram() -> None:
+    found = described(rectangle(150, 40))
+    assert found.shape == (PAIR_BINS,)
+    np.testing.assert_allclose(found.sum(), 1.0)
+    assert found.min() >= 0
+
+
+def test_both_sides_of_a_limb_run_against_each_other() -> None:
+    table = described(rectangle(200, 30)).reshape(PAIR_DISTANCES, PAIR_ANGLES)
+    # Two edges of one side run alike, of opposite sides against each other; but for the ends there
+    # is no other angle.
+    assert table[:, -1].sum() > 0.35
+    assert table[:, 0].sum() > 0.35
+    assert table[:, [0, -1]].sum() > 0.75
+
+
+def test_rotation_place_and_size_hardly_change_edge_pairs() -> None:
+    tall = rectangle(160, 50)
+    wide = np.ascontiguousarray(tall.T)
+    large = np.ascontiguousarray(np.kron(tall, np.ones((2, 2), np.uint8)))
+    moved = np.roll(tall, (30, 40), axis=(0, 1))
+    for other in (wide, large, moved):
+        assert np.abs(described(other) - described(tall)).sum() < 0.12
+
+
+def test_pairs_across_a_gap_do_not_count() -> None:
+    # Two bars beside each other: what connects one with the other leaves the silhouette.
+    two = np.zeros((200, 120), np.uint8)
+    two[10:190, 10:40] = 1
+    two[10:190, 80:110] = 1
+    points, directions = sample_contour(two, 100)
+    counted = edge_pairs(points, directions, two).reshape(PAIR_DISTANCES, PAIR_ANGLES)
+    every = edge_pairs(points, directions, np.ones_like(two)).reshape(PAIR_DISTANCES, PAIR_ANGLES)
+    first, second = np.triu_indices(100, 1)
+    left = points[:, 0] < 60
+    off = points[second] - points[first]
+    distance = np.linalg.norm(off, axis=1)
+    same = left[first] == left[second]
+    near = distance[same] / distance.mean()
+    wanted = np.clip(np.log(8 * near) * PAIR_DISTANCES / np.log(24), 0, PAIR_DISTANCES - 1).astype(
+        int
+    )
+    np.testing.assert_allclose(
+        counted.sum(1), np.bincount(wanted, minlength=PAIR_DISTANCES) / len(wanted), atol=0.02
+    )
+    assert np.abs(every - counted).sum() > 0.3
