@@ -7,6 +7,7 @@ import re
 import runpy
 import shlex
 from collections.abc import Iterator
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 
@@ -145,8 +146,8 @@ def test_marked_commands_run(workplace, capsys):
     assert (workplace / 'reach_report' / 'report.html').is_file()
 
 
-def test_subject_file_of_the_readme():
-    (text,) = (code for code, _ in blocks(ROOT / 'README.md', 'yaml'))
+def test_subject_file_of_the_page_on_bags():
+    (text,) = (code for code, _ in blocks(ROOT / 'docs' / 'bags.md', 'yaml'))
     subject = parse_subject(yaml.safe_load(text), load_body('human37'))
     assert len(subject.keypoints.names) == 14
     assert subject.stature == 1.7
@@ -190,9 +191,21 @@ def test_topics_of_a_node(node):
     wanted = {topic: kind.msgtype.replace('/msg/', '/') for topic, kind in NODES[node][1].items()}
     assert {topic: published[topic] for topic in wanted} == wanted
     assert set(published) - set(wanted) == {'/diagnostics', '~/handled'}
-    readme = rows((ROOT / 'README.md').read_text('utf-8'), '## The nodes and their topics')
-    named = {name for row in readme for name in re.findall(r'`([^`]+)`', row[0])}
-    assert set(wanted) <= named
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / 'README.md').read_text('utf-8').splitlines()) <= 180
+
+
+@pytest.mark.parametrize('page', PAGES, ids=PAGE_IDS)
+def test_modules_exist(page):
+    """Dotted names and paths of the two packages lead to a module, a folder or a name in one."""
+    text = page.read_text('utf-8')
+    for name in re.findall(r'`((?:hmt_ros|msg_tools)(?:\.\w+)+)`', text):
+        parent, _, last = name.rpartition('.')
+        assert find_spec(name) or hasattr(importlib.import_module(parent), last), name
+    for name in re.findall(r'`((?:hmt_ros|msg_tools|test|benchmarks)/[\w/.*]*)`', text):
+        assert list(ROOT.glob(name.rstrip('/'))), name
 
 
 def test_numbers_of_evaluate_are_explained():
