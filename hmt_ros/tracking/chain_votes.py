@@ -1,4 +1,4 @@
-"""Which chain of the body is worth a jump: votes from the local uncertainty (KJS 5).
+"""Which chain of the body is worth a jump: votes from the local uncertainty (KJS figure 5).
 
 The paper's vote reads the covariance alone, and leaves open how good it is. Here stand beside it a
 vote that reads only what one camera can not see, and one that counts what a jump brings: leaves of
