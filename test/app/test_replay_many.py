@@ -6,8 +6,7 @@ import sys
 import pytest
 
 from hmt_ros.app.make_bag import main as make_bag
-from hmt_ros.app.replay import replay_many
-from hmt_ros.app.replay.command import main
+from hmt_ros.app.replay.command import main, replay_many
 from msg_tools import BagReader
 
 TINY = ['--fps', '10', '--size', '240x180', '--fov', '40']
