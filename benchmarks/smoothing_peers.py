@@ -98,7 +98,7 @@ def scipy_trajectory(
 def gtsam_missing() -> str | None:
     """Why GTSAM can not be compared with, or None."""
     if importlib.util.find_spec('gtsam') is None:
-        return 'gtsam is not installed (pip install gtsam)'
+        return 'gtsam is not installed (on Python 3.10 its wheels need numpy 1)'
     return None
 
 

@@ -1,4 +1,4 @@
-"""votes: which chain of the body to flip, or to search, by the vote that chooses it (KJS 5).
+"""votes: which chain of the body to flip, or to search, by the vote that chooses it (KJS figure 5).
 
 New minima: from the optimum of the joints' likelihood at a random pose, a mode that is known, a
 chain by vote, a covariance-scaled sample and all leaves of its tree, each optimised; again, until

@@ -1,4 +1,4 @@
-"""Which chain of the body is worth a jump: votes from the local uncertainty (KJS 5).
+"""Which chain of the body is worth a jump: votes from the local uncertainty (KJS figure 5).
 
 The vote of the paper reads the covariance alone. Another one counts what a jump brings: the leaves
 of the chain's interpretation tree that are not known yet. `python -m benchmarks votes` compares
