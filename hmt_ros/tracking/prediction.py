@@ -18,6 +18,7 @@ from hmt_ros.body.pose_terms import AnglePrior, Posed
 from hmt_ros.image.likelihood import ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.energy import Quadratic, Sum
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses
 from hmt_ros.tracking.posterior import Posterior
 
@@ -36,10 +37,8 @@ def predict(modes: Modes, body: Body, dt: float, velocity_kept: float) -> tuple[
         dt: time since the last image, s.
         velocity_kept: share kappa of the velocity that lasts.
     """
-    means, covariances = (
-        modes.poses,
-        modes.filtered + np.diag(body.rates * dt),
-    )
+    dynamics = LinearGaussianDynamics.random_walk(body.rates)
+    means, covariances = dynamics.predict(modes.poses, modes.filtered, dt)
     moved = np.clip(means + velocity_kept * dt * modes.velocities, body.lower, body.upper)
     predicted = replace(
         new_hypotheses(moved, modes.log_weights),
