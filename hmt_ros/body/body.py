@@ -74,6 +74,7 @@ class Body:
         stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra (m,
             at the default lengths; it scales with them).
         default_lengths: (L,) of the model file, m.
+        keypoint_aliases: other names of joints, as keypoint detectors use them.
     """
 
     skeleton: Skeleton
@@ -86,6 +87,7 @@ class Body:
     stature_extra: float
     default_lengths: Array
     widths: tuple[float, ...] = field(default=())
+    keypoint_aliases: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.widths and self.shapes:

@@ -128,7 +128,10 @@ def _mount(entry: dict[str, Any]) -> Array:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-KEYS = {'name', 'lengths', 'stature', 'stature_extra', 'segments', 'joints', 'chains', 'fixed'}
+KEYS = {
+    'name', 'lengths', 'stature', 'stature_extra', 'segments', 'joints', 'keypoint_aliases',
+    'chains', 'fixed',
+}  # fmt: skip
 SEGMENT_KEYS = {
     'name', 'parent', 'offset', 'points', 'x_axis', 'length', 'diffusion', 'dofs', 'flesh',
 }  # fmt: skip
@@ -216,6 +219,12 @@ def _build(content: dict[str, Any]) -> Body:
             joint_names.append(joint)
             joint_segments.append(segment)
             joint_basis.append(coefficients)
+    aliases = {}
+    for template, joint_template in content.get('keypoint_aliases', {}).items():
+        for alias, mirrored in _sides(template):
+            joint = joint_template.format(side='left' if mirrored else 'right')
+            _named(joint, tuple(joint_names), f'keypoint_aliases: {alias}:')
+            aliases[alias] = joint
     chains = {}
     for template, members in content.get('chains', {}).items():
         for chain, mirrored in _sides(template):
@@ -253,6 +262,7 @@ def _build(content: dict[str, Any]) -> Body:
         stature_lengths=tuple(content['stature']),
         stature_extra=float(content['stature_extra']),
         default_lengths=lengths,
+        keypoint_aliases=aliases,
     )
 
 

@@ -165,21 +165,12 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         except MessageError as error:
             self._log.fault(Fault.KEYPOINTS, str(error))
             return None
-        joints = self.start.body.joint_names
-        known = np.array([name in joints for name in content.names])
-        if not known.all():
-            strange = [name for name, ok in zip(content.names, known, strict=True) if not ok]
+        known, strange = content.named_for(self.start.body)
+        if strange:
             text = f'keypoints {strange} are no joints of the body'
             self._log.note(Fault.KEYPOINT_NAMES, text)
-        use = np.flatnonzero(known & content.seen)
-        if len(use) == 0:
-            return None
-        return Keypoints(
-            tuple(content.names[i] for i in use),
-            content.pixels[use],
-            content.covariances[use],
-            content.confidence[use],
-        )
+        seen = known[np.flatnonzero(known.seen)]
+        return seen if seen.names else None
 
     def _prediction_in(self, message: Any) -> PosePrediction | None:
         """The mixture and its body, see `body_of`; None where nobody was seen."""

@@ -8,7 +8,7 @@ below 1 divides the precision.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames
 from hmt_ros.body.skeleton import Skeleton
@@ -38,9 +39,9 @@ class Keypoints:
 
     Attributes:
         names: (n,) joints of the body.
-        pixels: (n, 2); NaN where a joint was not seen.
+        pixels: (n, 2) column and row, px; NaN where a joint was not seen.
         covariances: (n, 2, 2) px^2.
-        confidences: (n,) 0 to 1.
+        confidences: (n,) from 0, ignore, to 1, sure.
     """
 
     names: tuple[str, ...]
@@ -53,6 +54,28 @@ class Keypoints:
         shapes = (self.pixels.shape, self.covariances.shape, self.confidences.shape)
         if shapes != ((n, 2), (n, 2, 2), (n,)):
             raise ValueError(f'{n} keypoints with arrays of shapes {shapes}')
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(n,) joints that have a position."""
+        return np.asarray(np.isfinite(self.pixels).all(1), dtype=np.bool_)
+
+    def __getitem__(self, which: Index) -> Keypoints:
+        """Some of them."""
+        names = tuple(self.names[i] for i in which)
+        return Keypoints(
+            names, self.pixels[which], self.covariances[which], self.confidences[which]
+        )
+
+    def named_for(self, body: Body) -> tuple[Keypoints, list[str]]:
+        """Those that are joints of a body, under the body's names, and the names of the others."""
+        names = [body.keypoint_aliases.get(name, name) for name in self.names]
+        strange = [name for name in names if name not in body.joint_names]
+        # A joint that a detector names twice counts once.
+        first = {name: i for i, name in reversed([*enumerate(names)]) if name not in strange}
+        which = np.array(sorted(first.values()), dtype=np.intp)
+        kept = self[which]
+        return replace(kept, names=tuple(names[i] for i in which)), strange
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +117,7 @@ class KeypointTerm:
     @cached_property
     def _joints(self) -> _Joints:
         k, skeleton = self.keypoints, self.skeleton
-        seen = np.isfinite(k.pixels).all(1) & (k.confidences > 0)
+        seen = k.seen & (k.confidences > 0)
         which = skeleton.joint_index([name for name, ok in zip(k.names, seen, strict=True) if ok])
         precision = np.linalg.inv(k.covariances[seen])
         precision *= k.confidences[seen][:, None, None]
