@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
+from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools import GeneratedMessages, MessageFactory, RosbagsMessages, typestore
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.cdr import canonical, deserialise, serialise
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.images import compressed_image_message, image_message
 from msg_tools.messages.joint_states import heaviest_joint_state
-from msg_tools.messages.keypoints import Keypoints, keypoints_message
+from msg_tools.messages.keypoints import keypoints_message
 from msg_tools.messages.markers import skeleton_markers
 from msg_tools.messages.pose_mixtures import PoseMixture, pose_mixture_message
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
@@ -33,8 +34,6 @@ KEYPOINTS = Keypoints(
     np.array([[1.0, 2.5], [np.nan, np.nan], [3.0, 4.0]]),
     np.tile([[4.0, 1.0], [1.0, 9.0]], (3, 1, 1)),
     np.array([1.0, 0.0, 0.5]),
-    STAMP,
-    'camera',
 )
 TRAJECTORIES = TrajectoryMixture(
     weights=np.array([0.25, 0.75]),
@@ -106,7 +105,9 @@ def makers(content: PoseMixture) -> dict[str, Callable[[MessageFactory], Any]]:
         'hmt_msgs/msg/PoseComponent': pose_component,
         'hmt_msgs/msg/TrajectoryMixture': lambda m: trajectory_mixture_message(m, TRAJECTORIES),
         'hmt_msgs/msg/TrajectoryComponent': trajectory_component,
-        'hmt_msgs/msg/Keypoints2D': lambda messages: keypoints_message(messages, KEYPOINTS),
+        'hmt_msgs/msg/Keypoints2D': lambda messages: keypoints_message(
+            messages, KEYPOINTS, STAMP, 'camera'
+        ),
         'hmt_msgs/msg/Body': body,
         'sensor_msgs/msg/JointState': lambda messages: heaviest_joint_state(messages, content),
         'sensor_msgs/msg/CompressedImage': lambda m: compressed_image_message(
