@@ -37,10 +37,10 @@ class Superquadric:
     """One part of the flesh; m, in the frame of its segment.
 
     Attributes:
-        segment: index of the segment that carries it.
-        centre: of the part.
+        segment: index of the segment that carries the part.
+        centre: centre of the part.
         radii: semi-axes along x, y and z.
-        exponents: along the axis and around it; 1: elliptic, towards 0: boxy.
+        exponents: shape along the axis and around it; 1 is elliptic, towards 0 boxy.
         taper: relative change of the x and y radii from the middle to the end (s = 1).
         bend: shift in x and y of the middle against both ends, m.
     """
@@ -126,11 +126,11 @@ def rings(part: Superquadric, s: Array) -> Rings:
 
 @dataclass(frozen=True, eq=False)
 class Flesh:
-    """All parts of a body, and the rings on which its contours are taken.
+    """All parts of a body, and the rings at which their contours are sampled.
 
     Attributes:
         parts: the superquadrics.
-        ring_count: rings per part that its contour is sampled at.
+        ring_count: number of rings of each part.
     """
 
     parts: tuple[Superquadric, ...]

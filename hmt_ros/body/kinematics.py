@@ -32,11 +32,12 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Where the segments of N poses are; camera frame, m.
+    """Frames of the segments at N poses; camera frame, m.
 
     Attributes:
+        skeleton: the skeleton.
         columns: (S, 3, 3, N): columns[s, i, :, n] is the i-th axis of segment s.
-        origins: (S, 3, N) of the segments.
+        origins: (S, 3, N) origins of the segments.
         axes: (d, 3, N) unit vector of each degree of freedom.
         dof_origins: (d, 3, N) a point on the axis of each rotation.
     """
@@ -57,7 +58,7 @@ class Frames:
 
         Args:
             segments: (P,) the segment of each point.
-            local: (P, 3), or (P, 3, N) where the place differs from pose to pose, m.
+            local: (P, 3), or (P, 3, N) where the points differ from pose to pose, m.
 
         Returns:
             (P, 3, N) m.

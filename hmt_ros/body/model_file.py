@@ -73,7 +73,7 @@ def _read(source: str | Path) -> dict[str, Any]:
 
 @cache
 def _shipped(name: str) -> dict[str, Any]:
-    """The content of a model that ships; read once, because that takes a twentieth of a second."""
+    """The content of a model that ships; cached, as reading takes 50 ms."""
     file = resources.files('hmt_ros.body') / 'models' / f'{name}.yaml'
     return _whole(load_plain_yaml(file.read_text('utf-8')))
 
