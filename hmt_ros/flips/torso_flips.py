@@ -2,8 +2,8 @@
 
 The line of the hips may turn towards or away from the camera, the neck may lie before or behind the
 pelvis, and the line of the shoulders may turn either way: three binary choices, with nearly the
-same image. The torso is not a chain of links that each end in one joint, so its flips do not keep
-the image of hips and shoulders exactly; limbs are then put back onto their rays by `rehang_chain`.
+same image. The torso is not a chain of links that each end in one joint, so its flips change the
+image of hips and shoulders a little; `rehang_chain` then puts the limbs back onto their rays.
 """
 
 from __future__ import annotations
@@ -22,21 +22,20 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 JOINTS = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
-# A flip that moves no joint of the torso by more than this in depth is none, m.
-SIGNIFICANT = 0.04
+SIGNIFICANT = 0.04  # m; a flip changes the depth of some joint of the torso by more
 
 
 def flip_torso(body: Body, poses: ArrayLike) -> tuple[Array, Index]:
     """Poses whose torso is flipped in depth, up to seven for each given one.
 
     Args:
-        body: with the joints of a torso, a root that turns about z, y and x, and a segment 'trunk'
-            that turns about x, y and, if it can twist, z. Other bodies have no such flips.
+        body: body with the joints of a torso, a root that turns about z, y and x, and a segment
+            'trunk' that turns about x, y and, if it can twist, z. Others have no such flips.
         poses: (N, d).
 
     Returns:
-        poses (M, d) within the limits, limbs at their old angles, and the index (M,) of the pose
-        that each comes from.
+        poses (M, d) within the limits, with the given angles of the limbs, and the index (M,) of
+        the pose that each comes from.
     """
     skeleton = body.skeleton
     q = np.array(poses, dtype=np.float64, ndmin=2)

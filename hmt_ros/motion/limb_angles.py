@@ -24,12 +24,10 @@ from hmt_ros.motion.rig import ARM, LEG, SIDES
 
 Array = NDArray[np.float64]
 
-# How much a foot says about the twist of its leg, and the frames around about that of any limb,
-# against a hinge bent by a right angle; and the time that counts as around.
-FOOT = 0.3
-AROUND = 0.2
-AROUND_TIME = 0.2  # s, standard deviation
-REST = 1e-3  # in favour of no twist
+# Weights of what shows the twist of a limb; a hinge bent by a right angle has weight 1.
+FOOT = 0.3  # a foot, for its leg
+AROUND, AROUND_TIME = 0.2, 0.2  # the frames around; standard deviation of their distance, s
+REST = 1e-3  # no twist
 FLEXIBLE = 0.05  # weight of neck and shoulders for the root of a body whose trunk can bend
 
 
@@ -38,11 +36,11 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float) -> A
 
     Args:
         skeleton: with the limbs of KJS fig. 3, such as those of the bodies that ship.
-        place: the joints; toes and hands may be missing.
-        fps: frames a second.
+        place: positions of the joints; toes and hands may be missing.
+        fps: frames per second.
 
     Raises:
-        ValueError: a skeleton with other limbs.
+        ValueError: the skeleton has other limbs.
     """
     count = len(place['pelvis'])
     poses = np.zeros((count, skeleton.dimension))
@@ -138,8 +136,8 @@ def _twist(
 ) -> Array:
     """The third angle of a spherical joint, from what hangs on the segment.
 
-    The hinge of a limb says it as far as it is bent; a foot says it where the leg is straight;
-    where nothing does, the frames around. For the trunk it is the line of the shoulders.
+    The hinge of a limb shows it as far as it is bent; a foot shows it where the leg is straight;
+    elsewhere the twist is that of the frames around. For the trunk it is the line of the shoulders.
     """
     if not next_end:
         line = _local(turn, place['right_shoulder'] - place['left_shoulder'])
