@@ -174,11 +174,15 @@ class Body:
 
     def joint_positions(self, poses: ArrayLike) -> Array:
         """Joint positions (N, J, 3) of poses (N, d), camera frame, m."""
-        return kinematics.joint_positions(self.skeleton, poses)
+        joints = kinematics.forward(self.skeleton, poses).joints()
+        return np.ascontiguousarray(joints.transpose(2, 0, 1))
 
     def joint_jacobians(self, poses: ArrayLike) -> Array:
         """Derivatives (N, J, 3, d) of the joint positions with respect to the poses (N, d)."""
-        return kinematics.joint_jacobians(self.skeleton, poses)
+        frames = kinematics.forward(self.skeleton, poses)
+        segments = self.skeleton.joint_segments
+        jacobian = kinematics.point_jacobians(frames, segments, frames.joints())
+        return np.ascontiguousarray(jacobian.transpose(3, 0, 2, 1))
 
     def with_segment_lengths(self, lengths: Mapping[str, float]) -> Body:
         """The same body with other values (m) of some lengths.

@@ -133,18 +133,6 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
     return Frames(skeleton, columns, origins, axes, dof_origins)
 
 
-def joint_positions(skeleton: Skeleton, poses: ArrayLike) -> Array:
-    """Joint positions (N, J, 3) of poses (N, d), camera frame, m."""
-    return np.ascontiguousarray(forward(skeleton, poses).joints().transpose(2, 0, 1))
-
-
-def joint_jacobians(skeleton: Skeleton, poses: ArrayLike) -> Array:
-    """Derivatives (N, J, 3, d) of the joint positions with respect to the poses (N, d)."""
-    frames = forward(skeleton, poses)
-    jacobian = point_jacobians(frames, skeleton.joint_segments, frames.joints())
-    return np.ascontiguousarray(jacobian.transpose(3, 0, 2, 1))
-
-
 def point_jacobians(frames: Frames, segments: Index, points: Array) -> Array:
     """Derivatives (P, d, 3, N) of points (P, 3, N) fixed to segments (P,)."""
     skeleton = frames.skeleton

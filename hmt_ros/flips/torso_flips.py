@@ -39,8 +39,8 @@ def flip_torso(body: Body, poses: ArrayLike) -> tuple[Array, Index]:
     """
     skeleton = body.skeleton
     q = np.array(poses, dtype=np.float64, ndmin=2)
-    root, trunk = _root_dofs(skeleton), _trunk_dofs(skeleton)
-    if root is None or trunk is None or not set(JOINTS) <= set(skeleton.joint_names):
+    (root, axes), trunk = rotations_of(skeleton, 0), _trunk_dofs(skeleton)
+    if axes != ROOT_AXES or trunk is None or not set(JOINTS) <= set(skeleton.joint_names):
         return np.empty((0, body.dimension)), np.empty(0, dtype=np.intp)
     frames = forward(skeleton, q)
     which = skeleton.joint_index(JOINTS)
@@ -81,18 +81,11 @@ def _flips(trunk_dofs: int) -> list[tuple[bool, bool, bool]]:
     ]
 
 
-def _root_dofs(skeleton: Skeleton) -> tuple[int, ...] | None:
-    """The rotations of the root, if they are about z, y and x in this order."""
-    own, axes = rotations_of(skeleton, 0)
-    return tuple(own) if axes == ROOT_AXES else None
-
-
-def _trunk_dofs(skeleton: Skeleton) -> tuple[int, ...] | None:
+def _trunk_dofs(skeleton: Skeleton) -> list[int] | None:
     """The rotations of the trunk, if they are about x, y and z, or x and y, or none."""
     if 'trunk' not in skeleton.segment_names:
         return None
-    own = skeleton.segment_dofs[skeleton.segment_names.index('trunk')]
-    axes = ''.join('xyz'[skeleton.dof_axes[j]] for j in own)
+    own, axes = rotations_of(skeleton, skeleton.segment_names.index('trunk'))
     return own if axes in ('', 'xy', 'xyz') else None
 
 
@@ -118,7 +111,7 @@ def _leaned(start: Array, end: Array) -> Array:
 
 
 def _turn_root(
-    skeleton: Skeleton, z: Array, dofs: tuple[int, ...], hips: Array, poses: Array
+    skeleton: Skeleton, z: Array, dofs: list[int], hips: Array, poses: Array
 ) -> NDArray[np.bool_]:
     """Turns the root: its x axis follows the hips, its z axis stays as near to z as it can."""
     x = hips / np.sqrt((hips * hips).sum(0))
@@ -132,7 +125,7 @@ def _turn_root(
 
 
 def _turn_trunk(
-    skeleton: Skeleton, dofs: tuple[int, ...], up: Array, shoulders: Array, poses: Array
+    skeleton: Skeleton, dofs: list[int], up: Array, shoulders: Array, poses: Array
 ) -> NDArray[np.bool_]:
     """Turns the trunk so that it points up as wanted and its x axis follows the shoulders."""
     trunk = skeleton.segment_names.index('trunk')
@@ -152,7 +145,7 @@ def _turn_trunk(
 
 
 def _set_within_limits(
-    skeleton: Skeleton, dofs: tuple[int, ...], angles: tuple[Array, ...], poses: Array
+    skeleton: Skeleton, dofs: list[int], angles: tuple[Array, ...], poses: Array
 ) -> NDArray[np.bool_]:
     """Writes angles into poses (N, d), nearest to the old ones modulo a turn; where they fit."""
     fits = np.ones(len(poses), dtype=bool)

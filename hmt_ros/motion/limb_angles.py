@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from hmt_ros.body.kinematics import forward
+from hmt_ros.body.mirror import root_rotation_dofs, rotations_of
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.motion.rig import ARM, LEG, SIDES
 
@@ -51,14 +52,13 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float) -> A
             turns[s] = _set_root(skeleton, place, poses)
             continue
         turn = turns[parent] @ skeleton.mounts[s]
-        own = [i for i in skeleton.segment_dofs[s] if skeleton.dof_is_rotation[i]]
-        axes = [int(skeleton.dof_axes[i]) for i in own]
+        own, axes = rotations_of(skeleton, s)
         if s in aims and axes:
             start, end, next_end = aims[s]
-            if axes not in ([0, 1, 2], [0, 1], [0]):
+            if axes not in ('xyz', 'xy', 'x'):
                 raise ValueError(
-                    f'{skeleton.name}: {skeleton.segment_names[s]} turns about {axes}, wanted Rx, '
-                    f'Rx Ry or Rx Ry Rz'
+                    f'{skeleton.name}: {skeleton.segment_names[s]} turns about {axes!r}, wanted x, '
+                    f'xy or xyz'
                 )
             if start in place and end in place:
                 along = _local(turn, place[start] - place[end])
@@ -101,10 +101,8 @@ def _aims(skeleton: Skeleton) -> dict[int, Aim]:
 
 def _set_root(skeleton: Skeleton, place: Mapping[str, Array], poses: Array) -> Array:
     """Sets the root's degrees of freedom from the joints of the trunk; returns its rotation."""
-    rotations = [i for i in skeleton.segment_dofs[0] if skeleton.dof_is_rotation[i]]
+    rotations = root_rotation_dofs(skeleton)
     shifts = skeleton.dof_index(('root_tx', 'root_ty', 'root_tz'))
-    if [int(skeleton.dof_axes[i]) for i in rotations] != [2, 1, 0]:
-        raise ValueError(f'{skeleton.name}: wanted a root that turns by Rz Ry Rx')
     flexible = bool(skeleton.moves[skeleton.chains['neck'][0]].sum() > 8)  # root and neck have 8
     names = ['pelvis', 'left_hip', 'right_hip', 'neck', 'left_shoulder', 'right_shoulder']
     weights = np.array([1.0, 1.0, 1.0, *([FLEXIBLE if flexible else 1.0] * 3)])
