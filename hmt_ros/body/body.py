@@ -1,4 +1,4 @@
-"""The body: skeleton, flesh and what is believed of a pose before an image is seen."""
+"""The body: its skeleton, its flesh, and the prior of its poses."""
 
 from __future__ import annotations
 
@@ -22,11 +22,13 @@ class PartShape:
 
     Attributes:
         segment: index of the segment that carries the part.
-        length: index of the length that the part spans, or None where `centre` and three radii say
-            all.
-        centre: of the part in its segment's frame, m; with a length, its shift from the middle.
-        radii: (x, y) with a length, else (x, y, z), m.
-        extend: how far the part reaches beyond the start and the end of the length, m.
+        length: index of the length that the part spans; None for a part of fixed size.
+        centre: centre of the part in its segment's frame, m; with a length, its shift from the
+            middle of that length.
+        radii: semi-axes (x, y) with a length, else (x, y, z), m.
+        exponents, taper, bend: shape parameters, as in `Superquadric`.
+        extend: distances by which the part exceeds the start and the end of the length, m.
+        rings: number of rings at which the contour of the part is sampled.
     """
 
     segment: int
@@ -63,17 +65,16 @@ class Body:
     angles (rad). Made by `load_body`.
 
     Attributes:
-        skeleton: segments, degrees of freedom, joints, lengths.
-        shapes: one entry a part of the flesh; empty for a bare skeleton.
-        widths: factors on the x and y radii of each part.
-        prior_mean, prior_sigma: (d,) soft prior of each degree of freedom; sigma is inf where
-            nothing is believed.
-        rates: (d,) variances that the degrees of freedom gain per second while nothing is seen, m^2
-            or rad^2.
+        skeleton: segments, degrees of freedom, joints and lengths.
+        shapes: parts of the flesh; empty for a bare skeleton.
+        prior_mean, prior_sigma: (d,) Gaussian prior of each degree of freedom; sigma is inf where
+            there is none.
+        rates: (d,) variance that each degree of freedom gains per second by itself, m^2 or rad^2.
         length_sigma: (L,) standard deviation of the lengths over people, m.
         stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra (m,
             at the default lengths; it scales with them).
-        default_lengths: (L,) of the model file, m.
+        default_lengths: (L,) lengths of the model file, m.
+        widths: factors on the x and y radii of each part.
         keypoint_aliases: other names of joints, as keypoint detectors use them.
     """
 
@@ -161,7 +162,7 @@ class Body:
 
     @property
     def scale(self) -> float:
-        """Size of the body against that of its model file."""
+        """Ratio of the size of the body to that of its model file."""
         return self._sum_of(self.skeleton.lengths) / self._sum_of(self.default_lengths)
 
     @cached_property
@@ -175,14 +176,18 @@ class Body:
 
     def joint_positions(self, poses: ArrayLike) -> Array:
         """Joint positions (N, J, 3) of poses (N, d), camera frame, m."""
-        return kinematics.joint_positions(self.skeleton, poses)
+        joints = kinematics.forward(self.skeleton, poses).joints()
+        return np.ascontiguousarray(joints.transpose(2, 0, 1))
 
     def joint_jacobians(self, poses: ArrayLike) -> Array:
         """Derivatives (N, J, 3, d) of the joint positions with respect to the poses (N, d)."""
-        return kinematics.joint_jacobians(self.skeleton, poses)
+        frames = kinematics.forward(self.skeleton, poses)
+        segments = self.skeleton.joint_segments
+        jacobian = kinematics.point_jacobians(frames, segments, frames.joints())
+        return np.ascontiguousarray(jacobian.transpose(3, 0, 2, 1))
 
     def with_segment_lengths(self, lengths: Mapping[str, float]) -> Body:
-        """The same body with some lengths replaced, m.
+        """The same body with other values (m) of some lengths.
 
         Raises:
             KeyError: a name that the body does not have.
@@ -194,7 +199,7 @@ class Body:
         """The same body, all lengths scaled so that the person is this tall, m.
 
         Raises:
-            ValueError: a stature that is not a positive number.
+            ValueError: the stature is not a positive number.
         """
         if not (np.isfinite(stature) and stature > 0):
             raise ValueError(f'stature must be a positive number of metres, saw {stature}')

@@ -20,10 +20,8 @@ Array = NDArray[np.float64]
 # Number of coefficients of each model of sensor_msgs/distortion_models.
 DISTORTION_MODELS = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,), 'equidistant': (4,)}
 
-# Points nearer than this in front of the camera plane are not projected sensibly, m.
-NEAR = 0.01
-# Tangent beyond which no ray is looked for when distortion is undone.
-STEEPEST = 1e3
+NEAR = 0.01  # least depth of a point that has an image, m
+STEEPEST = 1e3  # greatest tangent of a ray in the inversion of a distortion
 
 
 @dataclass(frozen=True)
@@ -33,14 +31,14 @@ class Camera:
     Attributes:
         fx, fy: focal lengths, px.
         cx, cy: principal point, px.
-        width, height: of the image, px.
-        distortion: coefficients in the order of CameraInfo.d; empty: none.
+        width, height: size of the image, px.
+        distortion: coefficients in the order of CameraInfo.d; empty without distortion.
         distortion_model: 'plumb_bob' (k1 k2 p1 p2 [k3]), 'rational_polynomial' (k1 k2 p1 p2 k3 k4
             k5 k6) or 'equidistant' (k1 k2 k3 k4).
 
     Raises:
-        ValueError: a focal length that is not positive, values that are not finite, an unknown
-            model, or a number of coefficients that the model does not have.
+        ValueError: a focal length is not positive, a value is not finite, the model is unknown or
+            has another number of coefficients.
     """
 
     fx: float
@@ -118,8 +116,8 @@ class Camera:
     def rays(self, pixels: ArrayLike) -> Array:
         """Unit rays (..., 3) through pixels (..., 2).
 
-        Distortion is undone by Newton's method; pixels that the model does not reach come out as
-        the best that a few iterations find.
+        Newton's method inverts the distortion. Where the model has no ray through a pixel, the
+        result is the ray after the last iteration.
         """
         uv = np.asarray(pixels, dtype=np.float64)
         target = np.stack([(uv[..., 0] - self.cx) / self.fx, (uv[..., 1] - self.cy) / self.fy])
@@ -191,12 +189,12 @@ class Viewpoint:
     """A camera over a floor.
 
     Attributes:
-        distance: horizontal, from the camera to the world's origin, m.
-        height: of the camera above the floor, m.
-        pitch: by which the camera looks down, rad.
+        distance: horizontal distance of the camera from the origin of the world, m.
+        height: height of the camera above the floor, m.
+        pitch: angle by which the camera looks down, rad.
 
     Raises:
-        ValueError: a distance or height that is not positive, or a camera that looks straight down.
+        ValueError: a value is outside its range.
     """
 
     distance: float = 5.6

@@ -37,10 +37,10 @@ class Superquadric:
     """One part of the flesh; m, in the frame of its segment.
 
     Attributes:
-        segment: index of the segment that carries it.
-        centre: of the part.
+        segment: index of the segment that carries the part.
+        centre: centre of the part.
         radii: semi-axes along x, y and z.
-        exponents: along the axis and around it; 1: elliptic, towards 0: boxy.
+        exponents: shape along the axis and around it; 1 is elliptic, towards 0 boxy.
         taper: relative change of the x and y radii from the middle to the end (s = 1).
         bend: shift in x and y of the middle against both ends, m.
     """
@@ -126,11 +126,11 @@ def rings(part: Superquadric, s: Array) -> Rings:
 
 @dataclass(frozen=True, eq=False)
 class Flesh:
-    """All parts of a body, and the rings on which its contours are taken.
+    """All parts of a body, and the rings at which their contours are sampled.
 
     Attributes:
         parts: the superquadrics.
-        ring_count: rings per part that its contour is sampled at.
+        ring_count: number of rings of each part.
     """
 
     parts: tuple[Superquadric, ...]
@@ -206,24 +206,18 @@ def _mesh(parts: Sequence[Superquadric], stacks: int, slices: int) -> Mesh:
         k = (j + 1) % slices
         body += [(first, j, k), (last, last - 2 - slices + 1 + k, last - 2 - slices + 1 + j)]
     triangles = np.array(body)
-    vertices: list[Array] = []
-    normals: list[Array] = []
-    segments: list[Index] = []
-    part_of: list[Index] = []
-    faces: list[Index] = []
+    count = stacks * slices + 2
+    vertices, normals = np.empty((2, len(parts), count, 3))
     for i, part in enumerate(parts):
-        point, normal = part.surface(grid_s, grid_w)
-        cx, cy, cz = part.centre
-        tips = np.array([[cx, cy, cz + part.radii[2]], [cx, cy, cz - part.radii[2]]])
-        faces.append(triangles + sum(len(v) for v in vertices))
-        vertices.append(np.concatenate([point, tips]))
-        normals.append(np.concatenate([normal, [[0, 0, 1.0], [0, 0, -1.0]]]))
-        segments.append(np.full(len(vertices[-1]), part.segment))
-        part_of.append(np.full(len(vertices[-1]), i))
+        vertices[i, :-2], normals[i, :-2] = part.surface(grid_s, grid_w)
+        tip = np.array([0.0, 0.0, part.radii[2]])
+        vertices[i, -2:] = part.centre + tip, part.centre - tip
+        normals[i, -2:] = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
+    which = np.arange(len(parts))
     return Mesh(
-        np.concatenate(vertices),
-        np.concatenate(normals),
-        np.concatenate(segments),
-        np.concatenate(part_of),
-        np.concatenate(faces),
+        vertices.reshape(-1, 3),
+        normals.reshape(-1, 3),
+        np.repeat(np.array([part.segment for part in parts], dtype=np.intp), count),
+        np.repeat(which, count),
+        (triangles + count * which[:, None, None]).reshape(-1, 3),
     )

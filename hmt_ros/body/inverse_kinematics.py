@@ -1,8 +1,8 @@
 """Iterative inverse kinematics: poses that put joints where they should be (KJS 3.2).
 
 Bounded damped Newton on the squared distances of the joints to their targets, with the hard limits
-and the soft prior. The fall-back where the closed form of `interpretation_tree` does not reach: a
-ray that misses its sphere, a violated limit, joints without a closed form.
+and the soft prior. It is used where the closed form of `interpretation_tree` fails: a ray misses
+its sphere, a limit is violated, or joints have no closed form.
 """
 
 from __future__ import annotations
@@ -43,15 +43,14 @@ def solve_joint_positions(
     Args:
         body: the body.
         poses: (N, d) starts.
-        targets: (N, J', 3) camera frame, m; NaN: this joint does not matter.
-        joint_names: (J',) names of the targets; all joints when None.
+        targets: (N, J', 3) camera frame, m; NaN for a joint without a target.
+        joint_names: (J',) names of the joints of the targets; None selects all joints.
         sigma: standard deviation of the targets, scalar, (J',) or (N, J'), m.
         prior_weight: weight of the body's soft prior.
-        free_dofs: degrees of freedom that may change; all when None.
-        along_rays: a target stands for its ray: only the distance of the joint to it counts, not
-            how far away it is.
-        max_iterations: at most.
-        tolerance: decrease of the energy below which it is enough.
+        free_dofs: names of the degrees of freedom that may change; None selects all.
+        along_rays: whether only the distance of a joint from the ray of its target counts.
+        max_iterations: maximum number of iterations.
+        tolerance: decrease of the energy below which the iteration ends.
     """
     skeleton = body.skeleton
     names = skeleton.joint_names if joint_names is None else tuple(joint_names)

@@ -32,12 +32,13 @@ Index = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Where the segments of N poses are; camera frame, m.
+    """Frames of the segments at N poses; camera frame, m.
 
     Attributes:
+        skeleton: the skeleton.
         poses: (N, d) whose frames they are.
         columns: (S, 3, 3, N): columns[s, i, :, n] is the i-th axis of segment s.
-        origins: (S, 3, N) of the segments.
+        origins: (S, 3, N) origins of the segments.
         axes: (d, 3, N) unit vector of each degree of freedom.
         dof_origins: (d, 3, N) a point on the axis of each rotation.
     """
@@ -59,7 +60,7 @@ class Frames:
 
         Args:
             segments: (P,) the segment of each point.
-            local: (P, 3), or (P, 3, N) where the place differs from pose to pose, m.
+            local: (P, 3), or (P, 3, N) where the points differ from pose to pose, m.
 
         Returns:
             (P, 3, N) m.
@@ -132,18 +133,6 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
         _plan(skeleton), skeleton.mounts, skeleton.offsets, q, columns, origins, axes, dof_origins
     )
     return Frames(skeleton, q, columns, origins, axes, dof_origins)
-
-
-def joint_positions(skeleton: Skeleton, poses: ArrayLike) -> Array:
-    """Joint positions (N, J, 3) of poses (N, d), camera frame, m."""
-    return np.ascontiguousarray(forward(skeleton, poses).joints().transpose(2, 0, 1))
-
-
-def joint_jacobians(skeleton: Skeleton, poses: ArrayLike) -> Array:
-    """Derivatives (N, J, 3, d) of the joint positions with respect to the poses (N, d)."""
-    frames = forward(skeleton, poses)
-    jacobian = point_jacobians(frames, skeleton.joint_segments, frames.joints())
-    return np.ascontiguousarray(jacobian.transpose(3, 0, 2, 1))
 
 
 def point_jacobians(frames: Frames, segments: Index, points: Array) -> Array:

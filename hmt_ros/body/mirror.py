@@ -1,9 +1,9 @@
-"""Mirror images of poses: left for right, and the reversal in depth that silhouettes can not see.
+"""Mirror images of poses: left for right, and the reversal in depth that silhouettes do not show.
 
 A body is its own mirror image, left for right. Mirrored in the plane through the pelvis across the
-line of sight it has, but for perspective, the same silhouette: who comes may as well go, who bends
-forwards may bend away. The joint angles of that pose are those of the mirrored body, so that limits
-that hold for the one hold for the other.
+line of sight it has, apart from perspective, the same silhouette: a person who approaches looks
+like one who walks away. The joint angles of that pose are those of the mirrored body, so that they
+lie within the limits, too.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from hmt_ros.body.skeleton import Skeleton, other_side
 
 Array = NDArray[np.float64]
 
-# What the root has to turn about, one after the other.
+# Axes of the root's rotations, in the order in which they act.
 ROOT_AXES = 'zyx'
 
 
@@ -61,7 +61,7 @@ def root_rotation_dofs(skeleton: Skeleton) -> list[int]:
     """The rotations of the root, about z, y and x in this order.
 
     Raises:
-        ValueError: it has others.
+        ValueError: the root has other rotations.
     """
     own, axes = rotations_of(skeleton, 0)
     if axes != ROOT_AXES:
@@ -70,7 +70,7 @@ def root_rotation_dofs(skeleton: Skeleton) -> list[int]:
 
 
 def rotations_of(skeleton: Skeleton, segment: int) -> tuple[list[int], str]:
-    """The rotations of a segment, and what they turn about in this order, such as 'zyx'."""
+    """The rotations of a segment, and their axes in this order, such as 'zyx'."""
     own = [j for j in skeleton.segment_dofs[segment] if skeleton.dof_is_rotation[j]]
     return own, ''.join('xyz'[skeleton.dof_axes[j]] for j in own)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from copy import deepcopy
 from functools import cache
 from importlib import resources
@@ -71,7 +70,7 @@ def _read(source: str | Path) -> dict[str, Any]:
 
 @cache
 def _shipped(name: str) -> dict[str, Any]:
-    """The content of a model that ships; read once, because that takes a twentieth of a second."""
+    """The content of a model that ships; cached, as reading takes 50 ms."""
     file = resources.files('hmt_ros.body') / 'models' / f'{name}.yaml'
     return _whole(load_plain_yaml(file.read_text('utf-8')))
 
@@ -91,17 +90,10 @@ def _whole(content: Any) -> dict[str, Any]:
     return content
 
 
-def _sides(template: str) -> list[tuple[str, bool]]:
-    """Names that a template stands for, each with whether it is the mirrored side."""
-    if '{side}' not in template:
-        return [(template, False)]
-    return [(template.format(side='left'), True), (template.format(side='right'), False)]
-
-
-def _expand(entries: list[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], str, bool]]:
-    for entry in entries:
-        for name, mirrored in _sides(entry['name']):
-            yield entry, name, mirrored
+def _sides(template: str) -> list[tuple[str, str]]:
+    """Names that a template stands for, each with its side; what has no side is as on the right."""
+    sides = ('left', 'right') if '{side}' in template else ('right',)
+    return [(template.format(side=side), side) for side in sides]
 
 
 def _linear(term: Any, names: tuple[str, ...]) -> tuple[float, Array]:
@@ -169,12 +161,11 @@ def _build(content: dict[str, Any]) -> Body:
     rates: list[float] = []
     shapes: list[PartShape] = []
     own_length: list[int | None] = []
-    for entry, name, mirrored in _expand(content['segments']):
+    sided = [(entry, *own) for entry in content['segments'] for own in _sides(entry['name'])]
+    for entry, name, side in sided:
         _check_keys(entry, SEGMENT_KEYS, f'segment {name}')
-        parent_name = entry.get('parent')
-        if parent_name is not None:
-            parent_name = parent_name.format(side='left' if mirrored else 'right')
-        parent = -1 if parent_name is None else names.index(parent_name)
+        mirrored, parent_name = side == 'left', entry.get('parent')
+        parent = -1 if parent_name is None else names.index(parent_name.format(side=side))
         sign = MIRROR if mirrored else np.ones(3)
         mount = _mount(entry) * (np.outer(MIRROR, MIRROR) if mirrored else 1.0)
         constant, coefficients = np.zeros(3), np.zeros((3, len(length_names)))
@@ -196,7 +187,7 @@ def _build(content: dict[str, Any]) -> Body:
             None if span is None else _named(span, length_names, f'segment {name}: length')
         )
         for dof in entry.get('dofs', []):
-            dof_name = dof[0].format(side='left' if mirrored else 'right')
+            dof_name = dof[0].format(side=side)
             if dof_name in fixed_dofs:
                 left_over.discard(dof_name)
                 continue
@@ -209,8 +200,8 @@ def _build(content: dict[str, Any]) -> Body:
 
     joint_names, joint_segments, joint_basis = [], [], []
     for template, (segment_template, end) in content['joints'].items():
-        for joint, mirrored in _sides(template):
-            segment = names.index(segment_template.format(side='left' if mirrored else 'right'))
+        for joint, side in _sides(template):
+            segment = names.index(segment_template.format(side=side))
             coefficients = np.zeros((3, len(length_names)))
             if end == 'end':
                 coefficients[2, own_length[segment]] = -1.0
@@ -227,8 +218,7 @@ def _build(content: dict[str, Any]) -> Body:
             aliases[alias] = joint
     chains = {}
     for template, members in content.get('chains', {}).items():
-        for chain, mirrored in _sides(template):
-            side = 'left' if mirrored else 'right'
+        for chain, side in _sides(template):
             chains[chain] = tuple(names.index(m.format(side=side)) for m in members)
 
     columns = list(zip(*dofs, strict=True))

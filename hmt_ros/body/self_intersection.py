@@ -20,8 +20,7 @@ from hmt_ros.body.kinematics import Frames, forward
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-# Overlap that is tolerated before it costs anything: flesh gives way, and ellipsoids fit roughly.
-TOLERANCE = 0.02  # m
+TOLERANCE = 0.02  # m of overlap without cost: flesh is soft, and ellipsoids fit roughly
 SMALL = 1e-9
 
 
@@ -51,9 +50,9 @@ def self_intersection_energy(
     The derivatives are those of the distance: that an elliptic cross-section turns is left out.
 
     Args:
-        body: whose parts may not overlap; neighbours along the skeleton are left out.
-        frames: of N poses.
-        sigma: overlap that costs 1/2, m.
+        body: the body; parts that are neighbours along the skeleton are left out.
+        frames: frames of N poses.
+        sigma: overlap with energy 1/2, m.
     """
     first, second = _pairs(body)
     n, d = frames.count, body.dimension
@@ -74,16 +73,15 @@ def deepest_overlaps(
     other_rows: Index,
     other_segments: Collection[int],
 ) -> Array:
-    """By how much parts on some segments of a pose overlap parts on others of another pose.
+    """Largest overlap of parts on some segments of one pose with parts on others of another pose.
 
-    Limbs whose trunks are alike are so compared without a pose for each of their combinations.
+    So limbs on the same trunk are compared without a pose for each of their combinations.
 
     Args:
-        body: whose parts; neighbours along the skeleton are left out.
+        body: the body; parts that are neighbours along the skeleton are left out.
         columns, origins: (N, S, 3, 3), (N, S, 3) of N poses, as `Frames.by_pose` gives them.
-        rows, other_rows: (M,) poses that are compared.
-        segments: of the first pose.
-        other_segments: of the second.
+        rows, other_rows: (M,) indices of the poses that are compared.
+        segments, other_segments: segments of the first and of the second pose.
 
     Returns:
         (M,) the largest overlap of two parts, m; at least 0.

@@ -107,13 +107,13 @@ class Skeleton:
 
     @cached_property
     def offsets(self) -> Array:
-        """Offsets (S, 3) of the segments in their parents' frames at the present lengths, m."""
+        """Offsets (S, 3) of the segments in their parents' frames, m."""
         result: Array = self.fixed_offsets + self.offset_basis @ self.lengths
         return result
 
     @cached_property
     def joint_offsets(self) -> Array:
-        """Places (J, 3) of the joints in the frames of their segments at the present lengths, m."""
+        """Positions (J, 3) of the joints in the frames of their segments, m."""
         result: Array = self.joint_basis @ self.lengths
         return result
 
@@ -203,7 +203,7 @@ class Skeleton:
         return _positions(names, self.joint_names, 'joint', self.name)
 
     def with_lengths(self, lengths: Mapping[str, float]) -> Skeleton:
-        """The same skeleton with some lengths replaced, m.
+        """The same skeleton with other values (m) of some lengths.
 
         Raises:
             KeyError: a name that the skeleton does not have.

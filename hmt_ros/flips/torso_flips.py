@@ -2,8 +2,8 @@
 
 The line of the hips may turn towards or away from the camera, the neck may lie before or behind the
 pelvis, and the line of the shoulders may turn either way: three binary choices, with nearly the
-same image. The torso is not a chain of links that each end in one joint, so its flips do not keep
-the image of hips and shoulders exactly; limbs are then put back onto their rays by `rehang_chain`.
+same image. The torso is not a chain of links that each end in one joint, so its flips change the
+image of hips and shoulders a little; `rehang_chain` then puts the limbs back onto their rays.
 """
 
 from __future__ import annotations
@@ -22,26 +22,25 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 JOINTS = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
-# A flip that moves no joint of the torso by more than this in depth is none, m.
-SIGNIFICANT = 0.04
+SIGNIFICANT = 0.04  # m; a flip changes the depth of some joint of the torso by more
 
 
 def flip_torso(body: Body, poses: ArrayLike) -> tuple[Array, Index]:
     """Poses whose torso is flipped in depth, up to seven for each given one.
 
     Args:
-        body: with the joints of a torso, a root that turns about z, y and x, and a segment 'trunk'
-            that turns about x, y and, if it can twist, z. Other bodies have no such flips.
+        body: body with the joints of a torso, a root that turns about z, y and x, and a segment
+            'trunk' that turns about x, y and, if it can twist, z. Others have no such flips.
         poses: (N, d).
 
     Returns:
-        poses (M, d) within the limits, limbs at their old angles, and the index (M,) of the pose
-        that each comes from.
+        poses (M, d) within the limits, with the given angles of the limbs, and the index (M,) of
+        the pose that each comes from.
     """
     skeleton = body.skeleton
     q = np.array(poses, dtype=np.float64, ndmin=2)
-    root, trunk = _root_dofs(skeleton), _trunk_dofs(skeleton)
-    if root is None or trunk is None or not set(JOINTS) <= set(skeleton.joint_names):
+    (root, axes), trunk = rotations_of(skeleton, 0), _trunk_dofs(skeleton)
+    if axes != ROOT_AXES or trunk is None or not set(JOINTS) <= set(skeleton.joint_names):
         return np.empty((0, body.dimension)), np.empty(0, dtype=np.intp)
     frames = forward(skeleton, q)
     which = skeleton.joint_index(JOINTS)
@@ -82,18 +81,11 @@ def _flips(trunk_dofs: int) -> list[tuple[bool, bool, bool]]:
     ]
 
 
-def _root_dofs(skeleton: Skeleton) -> tuple[int, ...] | None:
-    """The rotations of the root, if they are about z, y and x in this order."""
-    own, axes = rotations_of(skeleton, 0)
-    return tuple(own) if axes == ROOT_AXES else None
-
-
-def _trunk_dofs(skeleton: Skeleton) -> tuple[int, ...] | None:
+def _trunk_dofs(skeleton: Skeleton) -> list[int] | None:
     """The rotations of the trunk, if they are about x, y and z, or x and y, or none."""
     if 'trunk' not in skeleton.segment_names:
         return None
-    own = skeleton.segment_dofs[skeleton.segment_names.index('trunk')]
-    axes = ''.join('xyz'[skeleton.dof_axes[j]] for j in own)
+    own, axes = rotations_of(skeleton, skeleton.segment_names.index('trunk'))
     return own if axes in ('', 'xy', 'xyz') else None
 
 
@@ -119,7 +111,7 @@ def _leaned(start: Array, end: Array) -> Array:
 
 
 def _turn_root(
-    skeleton: Skeleton, z: Array, dofs: tuple[int, ...], hips: Array, poses: Array
+    skeleton: Skeleton, z: Array, dofs: list[int], hips: Array, poses: Array
 ) -> NDArray[np.bool_]:
     """Turns the root: its x axis follows the hips, its z axis stays as near to z as it can."""
     x = hips / np.sqrt((hips * hips).sum(0))
@@ -133,7 +125,7 @@ def _turn_root(
 
 
 def _turn_trunk(
-    skeleton: Skeleton, dofs: tuple[int, ...], up: Array, shoulders: Array, poses: Array
+    skeleton: Skeleton, dofs: list[int], up: Array, shoulders: Array, poses: Array
 ) -> NDArray[np.bool_]:
     """Turns the trunk so that it points up as wanted and its x axis follows the shoulders."""
     trunk = skeleton.segment_names.index('trunk')
@@ -153,7 +145,7 @@ def _turn_trunk(
 
 
 def _set_within_limits(
-    skeleton: Skeleton, dofs: tuple[int, ...], angles: tuple[Array, ...], poses: Array
+    skeleton: Skeleton, dofs: list[int], angles: tuple[Array, ...], poses: Array
 ) -> NDArray[np.bool_]:
     """Writes angles into poses (N, d), nearest to the old ones modulo a turn; where they fit."""
     fits = np.ones(len(poses), dtype=bool)

@@ -41,13 +41,13 @@ BONE_KEYS = (
 
 @dataclass(frozen=True, eq=False)
 class Acclaim:
-    """What an ASF says beside the rig.
+    """The content of an ASF.
 
     Attributes:
         rig: the skeleton, angles in rad.
         unit_to_m: metres per unit of length.
-        degrees: whether angles are in degrees, unless the AMC says otherwise.
-        columns: bone -> for each number of its AMC line the channel's place in the rig's order.
+        degrees: whether angles are in degrees where the AMC does not tell.
+        columns: for each bone the positions in the rig's order of the numbers of its AMC line.
         dimension: number of channels.
     """
 
@@ -76,7 +76,7 @@ def read_asf(path: Path, text: str) -> Acclaim:
     """Skeleton of an ASF.
 
     Raises:
-        MotionFileError: anything that is not a complete ASF.
+        MotionFileError: the text is not a complete ASF.
     """
     sections = _sections(path, text)
     units = dict(_units(path, sections.get('units', [])))
@@ -94,7 +94,7 @@ def read_amc(path: Path, text: str, skeleton: Acclaim) -> Array:
     """Channels (T, d) in the rig's order, rad and file units.
 
     Raises:
-        MotionFileError: bones that the skeleton does not have, or lacks a line for; wrong counts.
+        MotionFileError: a bone is unknown or missing, or has a wrong number of values.
     """
     degrees = skeleton.degrees
     lines = text.splitlines()

@@ -39,7 +39,7 @@ def read_bvh(path: Path, text: str) -> tuple[Rig, Array, float]:
     """Skeleton, channels (T, d) in the rig's order, degrees and file units, and seconds a frame.
 
     Raises:
-        MotionFileError: anything that is not a complete BVH.
+        MotionFileError: the text is not a complete BVH.
     """
     lines = text.splitlines()
     joints, at = _hierarchy(path, lines)

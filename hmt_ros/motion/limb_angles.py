@@ -19,17 +19,16 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from hmt_ros.body.kinematics import forward
+from hmt_ros.body.mirror import root_rotation_dofs, rotations_of
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.motion.rig import ARM, LEG, SIDES
 
 Array = NDArray[np.float64]
 
-# How much a foot says about the twist of its leg, and the frames around about that of any limb,
-# against a hinge bent by a right angle; and the time that counts as around.
-FOOT = 0.3
-AROUND = 0.2
-AROUND_TIME = 0.2  # s, standard deviation
-REST = 1e-3  # in favour of no twist
+# Weights of what shows the twist of a limb; a hinge bent by a right angle has weight 1.
+FOOT = 0.3  # a foot, for its leg
+AROUND, AROUND_TIME = 0.2, 0.2  # the frames around; standard deviation of their distance, s
+REST = 1e-3  # no twist
 FLEXIBLE = 0.05  # weight of neck and shoulders for the root of a body whose trunk can bend
 
 
@@ -38,11 +37,11 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float) -> A
 
     Args:
         skeleton: with the limbs of KJS fig. 3, such as those of the bodies that ship.
-        place: the joints; toes and hands may be missing.
-        fps: frames a second.
+        place: positions of the joints; toes and hands may be missing.
+        fps: frames per second.
 
     Raises:
-        ValueError: a skeleton with other limbs.
+        ValueError: the skeleton has other limbs.
     """
     count = len(place['pelvis'])
     poses = np.zeros((count, skeleton.dimension))
@@ -53,14 +52,13 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float) -> A
             turns[s] = _set_root(skeleton, place, poses)
             continue
         turn = turns[parent] @ skeleton.mounts[s]
-        own = [i for i in skeleton.segment_dofs[s] if skeleton.dof_is_rotation[i]]
-        axes = [int(skeleton.dof_axes[i]) for i in own]
+        own, axes = rotations_of(skeleton, s)
         if s in aims and axes:
             start, end, next_end = aims[s]
-            if axes not in ([0, 1, 2], [0, 1], [0]):
+            if axes not in ('xyz', 'xy', 'x'):
                 raise ValueError(
-                    f'{skeleton.name}: {skeleton.segment_names[s]} turns about {axes}, wanted Rx, '
-                    f'Rx Ry or Rx Ry Rz'
+                    f'{skeleton.name}: {skeleton.segment_names[s]} turns about {axes!r}, wanted x, '
+                    f'xy or xyz'
                 )
             if start in place and end in place:
                 along = _local(turn, place[start] - place[end])
@@ -103,10 +101,8 @@ def _aims(skeleton: Skeleton) -> dict[int, Aim]:
 
 def _set_root(skeleton: Skeleton, place: Mapping[str, Array], poses: Array) -> Array:
     """Sets the root's degrees of freedom from the joints of the trunk; returns its rotation."""
-    rotations = [i for i in skeleton.segment_dofs[0] if skeleton.dof_is_rotation[i]]
+    rotations = root_rotation_dofs(skeleton)
     shifts = skeleton.dof_index(('root_tx', 'root_ty', 'root_tz'))
-    if [int(skeleton.dof_axes[i]) for i in rotations] != [2, 1, 0]:
-        raise ValueError(f'{skeleton.name}: wanted a root that turns by Rz Ry Rx')
     flexible = bool(skeleton.moves[skeleton.chains['neck'][0]].sum() > 8)  # root and neck have 8
     names = ['pelvis', 'left_hip', 'right_hip', 'neck', 'left_shoulder', 'right_shoulder']
     weights = np.array([1.0, 1.0, 1.0, *([FLEXIBLE if flexible else 1.0] * 3)])
@@ -138,8 +134,8 @@ def _twist(
 ) -> Array:
     """The third angle of a spherical joint, from what hangs on the segment.
 
-    The hinge of a limb says it as far as it is bent; a foot says it where the leg is straight;
-    where nothing does, the frames around. For the trunk it is the line of the shoulders.
+    The hinge of a limb shows it as far as it is bent; a foot shows it where the leg is straight;
+    elsewhere the twist is that of the frames around. For the trunk it is the line of the shoulders.
     """
     if not next_end:
         line = _local(turn, place['right_shoulder'] - place['left_shoulder'])

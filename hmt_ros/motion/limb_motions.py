@@ -1,4 +1,4 @@
-"""Arms and feet of motions that are made: postures that reach, a foot that stands or walks.
+"""Arms and feet of synthetic motions: postures that reach, and a foot that stands or walks.
 
 Directions and places of arms are those of a person at rest: x to the person's right, y ahead, z up.
 Feet are in the world of a `Viewpoint`: z up, floor at z = 0, m. A heading of 0 faces the camera;
@@ -23,11 +23,8 @@ Posture = dict[str, float]  # degree of freedom -> rad
 
 SIGNS = np.array([-1.0, 1.0])  # of x, outwards
 ARM_DOFS = ('shoulder_x', 'shoulder_y', 'shoulder_z', 'elbow')
-REACHED = 0.012  # m, within which elbows and wrists must come to where they are to be
-STRETCH = (
-    0.45,
-    0.97,
-)  # least and greatest distance of a wrist from the shoulder, in lengths of an arm
+REACHED = 0.012  # largest distance of elbows and wrists from their targets, m
+STRETCH = 0.45, 0.97  # bounds of the distance of a wrist from its shoulder, in lengths of an arm
 CANDIDATES, TRIES = 24, 20
 # A stride, in shares of its time, from one strike of the heel to the next.
 BODY_ABOVE = 0.235  # the body passes the foot
@@ -46,11 +43,11 @@ def arm_posture(body: Body, upper: Sequence[ArrayLike], fore: Sequence[ArrayLike
     """Angles of both arms whose parts point in given directions.
 
     Args:
-        body: with the arms of human32.
-        upper, fore: unit vectors of the left and of the right arm.
+        body: body with the arms of human32.
+        upper, fore: unit vectors of the upper arms and forearms, left and right.
 
     Raises:
-        ValueError: the limits of the joints do not allow it.
+        ValueError: the limits of the joints do not allow the posture.
     """
     angles, error = _solve(body, np.array(upper)[None], np.array(fore)[None])
     if error[0] > REACHED:
@@ -65,18 +62,18 @@ def reaching_posture(
     bounds: ArrayLike,
     rng: np.random.Generator,
 ) -> Posture:
-    """Random posture with the wrists inside bounds, to which no part runs through another.
+    """Random posture with the wrists inside bounds, reached without self-intersection.
 
     Args:
-        body: that reaches.
-        before: the posture that it comes from, by minimum jerk in all angles; None: none.
+        body: the body.
+        before: previous posture, from which all angles move by minimum jerk; or None.
         bend: angles of other parts of the body in the posture.
-        bounds: (2, 3) lowest and highest place of the wrists from the shoulders, in lengths of an
-            arm; x outwards.
-        rng: random numbers.
+        bounds: (2, 3) lowest and highest position of the wrists from the shoulders, in lengths of
+            an arm; x outwards.
+        rng: random number generator.
 
     Raises:
-        ValueError: none was found.
+        ValueError: no posture was found.
     """
     lengths = body.segment_lengths
     upper, fore = lengths['upper_arm'], lengths['forearm']
@@ -151,11 +148,11 @@ def standing_foot(
     """Ankle and toe (T, 3) of a foot.
 
     Args:
-        body: whose foot it is.
-        place: (T, 2) of the ankle on the floor.
-        up: of the ankle, above where it is when the foot is flat, m.
-        pitch: of the foot, toe up.
-        heading: (T,) of the foot.
+        body: the body.
+        place: (T, 2) position of the ankle over the floor, m.
+        up: height of the ankle above that with a flat foot, m.
+        pitch: pitch of the foot, positive with the toe up, rad.
+        heading: (T,) heading of the foot, rad.
     """
     ankle = np.empty((len(place), 3))
     ankle[:, :2] = place
@@ -174,9 +171,9 @@ def walking_foot(
     turns about the toe.
 
     Args:
-        body: that walks.
-        phase: (T,) increasing.
-        path: place (..., 2) and heading of the body at phases.
+        body: the body.
+        phase: (T,) increasing phases of the stride.
+        path: function from phases to the position (..., 2) and heading of the body.
         aside: distance of the foot to the right of the path, m.
     """
     foot = body.segment_lengths['foot']

@@ -49,17 +49,17 @@ class Motion:
     """A recorded motion.
 
     Attributes:
-        name: stem of the file.
-        body: of the file's skeleton, without flesh; m and rad. Its joints bear the standard names
-            (`left_hip`) where the file's are known, else the file's own.
-        poses: (T, d) of that body, in the axes of the file. As recorded: they may exceed the limits
-            that an ASF states.
-        fps: frames a second.
-        world_from_file: (3, 3) rotation from the file's axes to the world: z up.
+        name: name of the file without its suffix.
+        body: body with the file's skeleton, without flesh; m and rad. Its joints have standard
+            names (`left_hip`) where those of the file are known, else the names of the file.
+        poses: (T, d) poses of that body in the axes of the file, as recorded: they may exceed the
+            limits of an ASF.
+        fps: frames per second.
+        world_from_file: (3, 3) rotation from the file's axes to the world with z up.
         unit_to_m: metres per unit of length of the file.
 
     Raises:
-        ValueError: shapes that contradict each other, or no frames.
+        ValueError: the shapes do not fit, or there are no frames.
     """
 
     name: str
@@ -91,10 +91,10 @@ class Motion:
         return result
 
     def joint_positions(self, names: Sequence[str] | None = None) -> Array:
-        """Joint positions (T, J, 3) in the world frame (z up), m; of some joints or of all.
+        """Positions (T, J, 3) of some or of all joints in the world frame (z up), m.
 
         Raises:
-            KeyError: a name that the body does not have.
+            KeyError: the body does not have a joint.
         """
         joints = self.body.joint_positions(self.poses)
         if names is not None:
@@ -103,10 +103,10 @@ class Motion:
         return result
 
     def part(self, start: int = 0, stop: int | None = None, step: int = 1) -> Motion:
-        """The frames start to stop, every step-th of them.
+        """Every step-th of the frames from start to stop.
 
         Raises:
-            ValueError: a step below 1, or no frame left.
+            ValueError: the step is below 1, or no frame is left.
         """
         if step < 1:
             raise ValueError(f'step must be at least 1, saw {step}')
@@ -124,19 +124,19 @@ def read_motion(
     """Motion of a .bvh or .amc file.
 
     Args:
-        path: of the file.
-        skeleton: ASF of an AMC; without it the .asf of the same name beside the file.
-        unit_to_m: metres per unit of length. An ASF states its own. A BVH does not: of metres,
-            centimetres, millimetres, inches and CMU's 5.6444 cm the first is taken that makes the
-            skeleton a person of 1.5 to 2.0 m, and if none does, the unit that makes it 1.7 m.
-        up_axis: 'x', 'y', 'z', '-x', '-y' or '-z'; without it the axis from the ankles to the head,
-            on average over the motion, or y where that is not clear.
-        fps: frames a second, if not what the file says; an AMC says nothing and has 120.
+        path: path of the file.
+        skeleton: ASF of an AMC; None selects the .asf of the same name beside the file.
+        unit_to_m: metres per unit of length. None selects that of the ASF; for a BVH the first of
+            metres, centimetres, millimetres, inches and CMU's 5.6444 cm that makes the skeleton a
+            person of 1.5 to 2.0 m, or else the unit that makes it 1.7 m.
+        up_axis: 'x', 'y', 'z', '-x', '-y' or '-z'. None selects the mean axis from the ankles to
+            the head, or y where that is not clear.
+        fps: frames per second. None selects those of a BVH, and 120 for an AMC.
 
     Raises:
-        FileNotFoundError: no such file, or an AMC without its ASF.
-        MotionFileError: a file that can not be read; one line with file and line number.
-        ValueError: an argument out of its range.
+        FileNotFoundError: the file, or the ASF of an AMC, does not exist.
+        MotionFileError: the file can not be read; one line with file and line number.
+        ValueError: an argument is out of its range.
     """
     path = Path(path)
     _check(unit_to_m, up_axis, fps)
@@ -167,9 +167,7 @@ def read_skeleton(path: str | Path, *, unit_to_m: float | None = None) -> Body:
     """Body of the skeleton of a .bvh, .asf or .amc file, without flesh; units as in `read_motion`.
 
     Raises:
-        FileNotFoundError: no such file, or an AMC without its ASF.
-        MotionFileError: a file that can not be read; one line with file and line number.
-        ValueError: a unit that is not a positive number.
+        FileNotFoundError, MotionFileError, ValueError: as `read_motion`.
     """
     path = Path(path)
     _check(unit_to_m, None, None)

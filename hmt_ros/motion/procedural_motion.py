@@ -1,8 +1,9 @@
-"""Motions that are made, not recorded: a walk, reaching, a dance, for the bodies that ship.
+"""Synthetic motions: a walk, reaching and a dance, for the bodies that ship.
 
 A motion is planned in the world of a `Viewpoint`: where the feet stand and step, where the pelvis
 goes above them, and angles of trunk, neck and arms that move smoothly between postures. The legs
-follow by inverse kinematics, so that a foot on the floor stays where it is. All is to scale.
+follow by inverse kinematics, so that a foot on the floor stays where it is. All lengths scale with
+the body.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ CIRCLE = 1.5  # m, radius of a longer walk
 DEGREE = np.pi / 180
 LEG_DOFS = ('hip_x', 'hip_y', 'hip_z', 'knee', 'ankle_x', 'ankle_y')
 
-# Angles that bend the body in reaching. Bounds of them, deg, and of where the wrists go: from the
-# shoulders outwards, ahead and up, in lengths of the arm. The side that is bent to is random.
+# Angles that bend the body in reaching: their bounds, deg, and the bounds of the wrists' positions
+# from the shoulders, outwards, ahead and up, in lengths of the arm. The side of bending is random.
 BENDING = ('root_x', 'root_y', 'trunk_x', 'trunk_y', 'trunk_z', 'neck_x', 'neck_y')
 SIDEWAYS = ('root_y', 'trunk_y', 'trunk_z', 'neck_y')
 REACHES: dict[str, dict[str, Array]] = {
@@ -90,16 +91,16 @@ def procedural_motion(
 
     Args:
         name: one of `PROCEDURAL_MOTIONS`.
-        body: with flesh and the degrees of freedom of human32; of others it moves what it has.
-        duration: s.
+        body: body with flesh and the degrees of freedom of human32; those of a spine move, too.
+        duration: duration, s.
         fps: poses per second. The motion as a function of time does not depend on it.
-        seed: of all that is random.
-        heading: that the person looks or walks in at first, rad; 0: towards the camera, positive:
-            to the person's left. None: one that suits the motion.
-        viewpoint: of the camera; the person moves around the origin of its world.
+        seed: seed of the random numbers.
+        heading: direction in which the person looks or walks at first, rad: 0 is towards the
+            camera, positive to the person's left. None selects one that suits the motion.
+        viewpoint: place of the camera; the person moves around the origin of its world.
 
     Raises:
-        ValueError: an unknown name, less than one pose, or a body that does not fit.
+        ValueError: the name is unknown, there is not one pose, or the body does not fit.
     """
     if name not in PROCEDURAL_MOTIONS:
         raise ValueError(f'no motion {name!r}: wanted one of {sorted(PROCEDURAL_MOTIONS)}')

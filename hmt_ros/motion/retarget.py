@@ -1,10 +1,9 @@
 """A recorded motion as poses of another body, in the frame of a camera.
 
-Motion files come with skeletons of their own; images, priors and learning want the poses of ours.
-The lengths are measured on the recorded joints, a closed-form start follows the limbs outwards (the
-descending solution of KJS 3), and all frames at once are then refined on the joint positions within
-the joint limits, at last with a pull of every frame towards its neighbours. That settles what joint
-positions leave open, the twist of a straight limb.
+Every motion file has a skeleton of its own. The lengths are measured on the recorded joints; a
+closed-form start follows the limbs outwards (the descending solution of KJS 3); then all frames at
+once are refined on the joint positions within the joint limits. Sweeps that pull every frame
+towards its neighbours determine what joint positions leave open, the twist of a straight limb.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ Index = NDArray[np.intp]
 # Poses of some frames (n, d), and the frames (n,) -> value, gradient, Hessian.
 Misfit = Callable[[Array, Index], tuple[Array, Array, Array]]
 
-# Joints a motion must have, and how closely each is followed, m.
+# Joints that a motion must have, and the standard deviation of each, m.
 SIGMA = {
     'pelvis': 0.010, 'neck': 0.005, 'head': 0.015,
     'hip': 0.005, 'knee': 0.005, 'ankle': 0.005, 'toe': 0.010,
@@ -38,23 +37,22 @@ OPTIONAL = {'toe': 'ankle', 'hand': 'wrist'}  # and the joint that each hangs on
 SHORTEST = 0.02  # m; a shorter foot or hand of a file has no direction
 FRONT = 0.1  # m before the pelvis: a point that carries the recorded rotation of the pelvis
 FRONT_SIGMA = 0.015
-BELIEF = 4.0  # the body's soft prior counts with its deviations times this
+BELIEF = 4.0  # factor on the standard deviations of the body's soft prior
 NEIGHBOURS = np.radians(4.0)  # deviation of an angle from the mean of the frames beside it
 BRANCH = np.radians(120.0)  # frames beside each other whose angles differ by more do not pull
-APART = np.radians(750.0)  # rad/s; faster changes are tried from the solution of the frame beside
+APART = np.radians(750.0)  # rad/s; after faster changes a frame starts again from its neighbour
 SWEEPS = 6  # passes in which every frame is drawn towards its neighbours
-SAME = 2.0  # a misfit this much larger is worth a continuous motion
+SAME = 2.0  # increase of the misfit that is accepted for a continuous motion
 
 
 def body_from_motion(motion: Motion, body: Body) -> Body:
     """The body with its lengths measured on the joints of a motion: medians over all frames.
 
-    Left and right are averaged. A foot or a hand that the file does not have keeps its proportion
-    to the shin or the forearm.
+    Left and right are averaged. A foot or a hand that the file lacks keeps its proportion to the
+    shin or the forearm.
 
     Raises:
-        ValueError: the motion has no standard joint names, or the body other lengths than those of
-            the bodies that ship.
+        ValueError: the motion has no standard joint names, or the body lacks some of the lengths.
     """
     place = _recorded(motion)
 
@@ -103,9 +101,9 @@ def retarget(
     """Poses of a body that follow a motion, (T, d) in the camera optical frame.
 
     Args:
-        motion: with the standard joint names.
-        body: one with the limbs of KJS fig. 3, such as those that ship; its lengths are used as
-            they are, see `body_from_motion`.
+        motion: motion with the standard joint names.
+        body: body with the limbs of KJS fig. 3, such as those that ship, and the lengths of the
+            person (see `body_from_motion`).
         camera_from_world: rotation (3, 3) and translation (3,) m that take a point of the motion's
             world (z up) to the camera optical frame (x right, y down, z forward).
 
@@ -113,8 +111,8 @@ def retarget(
         Poses within the limits of the body, continuous in time wherever the limits allow it.
 
     Raises:
-        ValueError: a motion without standard names, a body with other limbs, a rotation that is
-            none, or a person who comes nearer to the camera than the body's limits allow.
+        ValueError: the motion has no standard names, the body has other limbs, the rotation is not
+            one, or the person comes nearer to the camera than the limits of the body allow.
     """
     rotation, translation = (np.asarray(x, dtype=np.float64) for x in camera_from_world)
     _check_camera(rotation, translation)

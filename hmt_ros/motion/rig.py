@@ -1,14 +1,14 @@
-"""The skeleton of a motion file before it is a body: segments, channels and tips, in file units.
+"""The skeleton of a BVH or ASF/AMC file: segments, channels and tips, in file units.
 
-What BVH and ASF/AMC share. Each segment starts at a joint of the same name, sits at an offset in
-its parent's frame, and is turned by its channels; a tip is a named point at the far end of a
-segment that carries no other. `rig_body` turns this into a `Body` with lengths in metres, whose
-joints bear the standard names of a human body where the file's names are known.
+Each segment starts at a joint of the same name, sits at an offset in its parent's frame, and is
+turned by its channels; a tip is a named point at the far end of a segment that carries no other.
+`rig_body` turns this into a `Body` with lengths in metres, whose joints have the standard names of
+a human body where the file's names are known.
 
-Every maker of motion files names joints his own way: CMU's ASF (`lfemur`), its BVH conversions by
-cgspeed (`LeftUpLeg`, or `lThigh` for Daz), Character Creator (`CC_Base_L_Thigh`), MotionBuilder,
-Mixamo and the capture suits (`mixamorig:LeftUpLeg`, `LeftHip`), game rigs (`thigh_l`). A joint is
-named after the segment that starts at it, so `LeftUpLeg`, the thigh, is the left hip.
+Programs name joints differently: CMU's ASF (`lfemur`), its BVH conversions by cgspeed (`LeftUpLeg`,
+or `lThigh` for Daz), Character Creator (`CC_Base_L_Thigh`), MotionBuilder, Mixamo and the capture
+suits (`mixamorig:LeftUpLeg`, `LeftHip`), game rigs (`thigh_l`). A joint is named after the segment
+that starts at it, so `LeftUpLeg`, the thigh, is the left hip.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ class RigJoint:
     """A named point: the start of a segment, or the tip of one that carries no other.
 
     Attributes:
-        name: in the file.
-        parent: index of the segment that carries it, -1: the root.
+        name: name in the file.
+        parent: index of the segment that carries it; -1 for the root.
         offset: (3,) in that segment's frame, file units.
         length_name: the length that the offset runs along; siblings may share one.
     """
@@ -135,8 +135,8 @@ def read_text(path: Path) -> str:
     """Text of a motion file.
 
     Raises:
-        FileNotFoundError: no such file.
-        MotionFileError: larger than a motion file can sensibly be, or not text.
+        FileNotFoundError: the file does not exist.
+        MotionFileError: the file is larger than a motion file can be, or not text.
     """
     if not path.is_file():
         raise FileNotFoundError(f'no motion file {path}')
@@ -157,7 +157,7 @@ def numbers(path: Path, line: int, words: Sequence[str], count: int, what: str) 
     """`count` finite numbers from the words of a line.
 
     Raises:
-        MotionFileError: another count, or a word that is not a finite number.
+        MotionFileError: the count differs, or a word is not a finite number.
     """
     try:
         values = np.array([float(word) for word in words])
@@ -246,7 +246,7 @@ def _rates(rig: Rig, names: Sequence[str]) -> Array:
 
 
 def _unique(names: Sequence[str]) -> list[str]:
-    """The names, with an underscore behind those that stand before."""
+    """The names, with underscores appended to those that occurred before."""
     result: dict[str, None] = {}
     for name in names:
         while name in result:
@@ -301,16 +301,14 @@ def _chains(rig: Rig, names: Sequence[str]) -> dict[str, tuple[int, ...]]:
 
 
 def standard_names(names: Sequence[str], parents: Sequence[int]) -> list[str]:
-    """The names of a file's joints, with the standard ones where the skeleton is a human's.
+    """The names of a file's joints; standard ones (`left_hip`) where the skeleton is a human's.
+
+    It is one if pelvis, neck, head and all of hips, knees, ankles, shoulders, elbows and wrists are
+    found and lie in that order on the way outwards.
 
     Args:
-        names: (J,) of the joints in the file.
+        names: (J,) names of the joints in the file.
         parents: (J,) the joint that each bone comes from, -1 for the root.
-
-    Returns:
-        (J,) each joint once, under its standard name (`left_hip`) or else the file's. No standard
-        name is given unless pelvis, neck, head and all of hips, knees, ankles, shoulders, elbows
-        and wrists are found and lie in that order on the way outwards.
     """
     found = _matches(names, parents)
     if found is None:

@@ -35,13 +35,13 @@ CHUNK = 16  # poses whose silhouettes are drawn together
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """A person in a scene.
+    """A picture of a person in a scene.
 
     Attributes:
         image: (H, W, 3) uint8, BGR.
-        mask: (H, W) where the person is seen.
-        parts: (H, W) int8, index into `body.flesh.parts`; -1: background.
-        depth: (H, W) float32, z of the surface in the camera frame, m; inf: background.
+        mask: (H, W) true where the person is seen.
+        parts: (H, W) int8, index into `body.flesh.parts`; -1 in the background.
+        depth: (H, W) float32, z of the surface in the camera frame, m; inf in the background.
     """
 
     image: NDArray[np.uint8]
@@ -54,14 +54,14 @@ def render(body: Body, pose: ArrayLike, camera: Camera, scene: Scene, frame: int
     """Picture of a body at a pose (d,) in a scene.
 
     Args:
-        body: with flesh.
+        body: body with flesh.
         pose: (d,).
-        camera: with its distortion; the scene's viewpoint says where it stands.
+        camera: the camera; the viewpoint of the scene is its place.
         scene: place, light, clothes and noise.
-        frame: number of the picture; pictures of different numbers have different noise.
+        frame: number of the picture, which seeds its noise.
 
     Raises:
-        ValueError: a body without flesh, or a pose of wrong shape.
+        ValueError: the body has no flesh, or the pose has a wrong shape.
     """
     return _renderer(body, camera, scene).render(pose, frame)
 
@@ -74,10 +74,10 @@ def render_frames(body: Body, poses: ArrayLike, camera: Camera, scene: Scene) ->
 
 
 def render_silhouettes(body: Body, poses: ArrayLike, camera: Camera) -> Mask:
-    """Silhouettes (N, H, W) of a body at poses (N, d): the masks that `render` gives, and no more.
+    """Silhouettes (N, H, W) of a body at poses (N, d), the same as the masks of `render`.
 
     Raises:
-        ValueError: a body without flesh, or poses of wrong shape.
+        ValueError: the body has no flesh, or the poses have a wrong shape.
     """
     poses = np.asarray(poses, dtype=np.float64)
     mesh = _mesh(body)
@@ -92,20 +92,13 @@ def render_silhouettes(body: Body, poses: ArrayLike, camera: Camera) -> Mask:
 
 @dataclass(frozen=True, eq=False)
 class _Renderer:
-    """What pictures of the same body, camera and scene share.
-
-    Attributes:
-        body, camera, scene: of the pictures.
-        mesh: of the flesh.
-        places: (V, 4) of the vertices, for the clothes.
-        clothes: of the person.
-    """
+    """What pictures of the same body, camera and scene share."""
 
     body: Body
     camera: Camera
     scene: Scene
     mesh: Mesh
-    places: Array
+    places: Array  # (V, 4) of the vertices, for the clothes
     clothes: Clothes
 
     def render(self, pose: ArrayLike, frame: int = 0) -> Rendered:
@@ -176,20 +169,13 @@ class _Renderer:
 
 @dataclass(frozen=True, eq=False)
 class _Triangles:
-    """F triangles that face the camera.
+    """F triangles that face the camera."""
 
-    Attributes:
-        images: (F,) index of the image.
-        corners: (3, F) vertices.
-        u, v: (3, F) corners, px.
-        inverse_depth: (3, F) 1 / z of the corners, 1/m.
-    """
-
-    images: Index
-    corners: Index
-    u: Array
-    v: Array
-    inverse_depth: Array
+    images: Index  # (F,) index of the image
+    corners: Index  # (3, F) vertices
+    u: Array  # (3, F) px
+    v: Array  # (3, F) px
+    inverse_depth: Array  # (3, F) 1 / z of the corners, 1/m
 
     def magnified(self, factor: int, left: int, top: int) -> _Triangles:
         """The triangles in a finer raster over a window of the image."""
@@ -223,15 +209,9 @@ class _Triangles:
 
 @dataclass(frozen=True, eq=False)
 class _Filled:
-    """M times a pixel whose centre lies in a triangle.
+    """M pairs of a pixel and a triangle that contains its centre."""
 
-    Attributes:
-        pixels: (M,) index into all images, row by row.
-        rows, columns: (M,).
-        triangles: (M,).
-    """
-
-    pixels: Index
+    pixels: Index  # (M,) index into all images, row by row
     rows: Index
     columns: Index
     triangles: Index
@@ -239,13 +219,9 @@ class _Filled:
 
 @dataclass(frozen=True, eq=False)
 class _Front(_Filled):
-    """Every pixel that shows something, once.
+    """Each pixel that shows a triangle, with the nearest one."""
 
-    Attributes:
-        inverse_depth: (M,) 1 / z, 1/m.
-    """
-
-    inverse_depth: Array
+    inverse_depth: Array  # (M,) 1 / z, 1/m
 
 
 @lru_cache(maxsize=8)

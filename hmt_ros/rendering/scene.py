@@ -47,17 +47,17 @@ class Scene:
     """A still, cluttered place with a floor, seen by a still camera.
 
     Attributes:
-        viewpoint: where the camera stands.
-        seed: of the clutter, the clothes of the person, and the noise.
+        viewpoint: place of the camera.
+        seed: seed of the clutter, the clothes of the person, and the noise.
         light: direction towards the light in the world of the viewpoint, of any length.
         ambient: share of the light that comes from everywhere.
-        shadow: how much of the other light the person takes from the floor, 0 (no shadow) to 1.
+        shadow: share of the other light that a shadow removes, 0 (no shadow) to 1.
         noise: standard deviation of the noise of a pixel, grey levels of 255.
-        clear: things stand at least this far behind the world's origin, m.
+        clear: least distance of things behind the origin of the world, m.
         clutter: number of things.
 
     Raises:
-        ValueError: a number outside its range.
+        ValueError: a number is outside its range.
     """
 
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
@@ -87,7 +87,7 @@ class Scene:
         return result
 
     def lambert(self, cosine: NDArray[Real]) -> NDArray[Real]:
-        """Light that a surface sends back, by the cosine of its normal to the light; 1 at most."""
+        """Light that a surface reflects, by the cosine of its normal to the light; at most 1."""
         lit = self.ambient + (1.0 - self.ambient) * np.maximum(cosine, 0.0)
         return lit.astype(cosine.dtype, copy=False)
 
@@ -106,7 +106,7 @@ class Scene:
         return self.viewpoint.to_camera(world - world[..., 2:] / light[2] * light)
 
     def add_noise(self, image: Picture, frame: int) -> NDArray[np.uint8]:
-        """The image (H, W, 3) as a camera would give it, with the noise of this frame."""
+        """The image (H, W, 3) with the noise of a frame, rounded."""
         if self.noise > 0:
             rng = np.random.default_rng([self.seed, OF_NOISE, frame])
             index = rng.integers(0, NOISE_LEVELS, image.shape, dtype=np.uint8)
@@ -265,12 +265,12 @@ class Clothes:
     """Colours of the surface of a body's P parts, BGR from 0 to 1.
 
     Attributes:
-        body: who wears them.
+        body: the body of the person.
         kinds: (P,) 'head', 'shirt', 'sleeve', 'shorts', 'shin', 'shoe' or 'skin'.
         skin, hair, shirt, logo, shorts, shoe: colours (3,).
-        stripes: of the shirt, per metre.
-        waves: (3, 4) of the patterns, rad/m.
-        phases: (P, 4) of the pattern of each part.
+        stripes: stripes of the shirt per metre.
+        waves: (3, 4) wave vectors of the patterns, rad/m.
+        phases: (P, 4) phases of the pattern of each part.
     """
 
     body: Body
