@@ -30,12 +30,12 @@ from hmt_ros.image import likelihood as likelihood_module
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import observe
 from hmt_ros.image.texture import capture_textures
+from hmt_ros.inference import gaussian_pairs
 from hmt_ros.inference.block_tridiagonal import add_band_product
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
-from hmt_ros.smoothing import embedded_network as network_module
 from hmt_ros.smoothing.component_overlaps import add_overlaps
 from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.tracking.selection import choose_hypotheses
@@ -247,9 +247,13 @@ def _smoothing(seconds: float) -> Iterator[dict[str, Any]]:
 
 
 def _serial_links(means: Any, covariances: Any, pairs: Any) -> Any:
-    result = np.empty(len(pairs))
-    network_module._pair_log_densities(means, covariances, means, covariances, pairs, result)
-    return result
+    """On one core."""
+    ones = np.ones(len(means))
+    squares, log_determinants = np.empty((2, len(pairs)))
+    gaussian_pairs._whitened_pairs(
+        means, covariances, ones, means, covariances, ones, pairs, squares, log_determinants
+    )
+    return -0.5 * (squares + log_determinants + means.shape[1] * np.log(2 * np.pi))
 
 
 def _smoothing_case(

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.experts.conditional_density import ConditionalDensity, stored_model
-from hmt_ros.experts.density_propagation import propagate, reduced
+from hmt_ros.experts.density_propagation import propagate
 from hmt_ros.experts.descriptor.centred_view import centred_view
 from hmt_ros.experts.descriptor.contour import PersonBlob, person_blob
 from hmt_ros.experts.descriptor.silhouette_descriptor import SilhouetteDescriptor, silhouette_parts
@@ -42,6 +42,7 @@ from hmt_ros.experts.root_placement import (
     placed_gaussians,
 )
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.reduction import reduced
 
 Array = NDArray[np.float64]
 

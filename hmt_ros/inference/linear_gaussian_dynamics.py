@@ -43,6 +43,21 @@ class TrajectoryPrior:
         value = np.einsum('...ti,...ti->...', states, 0.5 * product - self.information)
         return value + self.constant, product - self.information
 
+    def between(self, first: int, last: int, states: Array) -> TrajectoryPrior:
+        """The density of the states first <= t < last given the others, of one trajectory (T, n).
+
+        Up to a factor: its constant is 0.
+        """
+        information = self.information[first:last].copy()
+        if first > 0:
+            information[0] -= self.precision.lower[first - 1] @ states[first - 1]
+        if last < len(states):
+            information[-1] -= self.precision.lower[last - 1].T @ states[last]
+        precision = BlockTridiagonal(
+            self.precision.diagonal[first:last], self.precision.lower[first : last - 1]
+        )
+        return TrajectoryPrior(precision, information, 0.0, self.dimension)
+
 
 @dataclass(frozen=True, eq=False)
 class LinearGaussianDynamics:

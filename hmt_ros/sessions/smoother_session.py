@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.session import Order, Session, SessionState, everything
 from hmt_ros.sessions.smoothed_messages import (
@@ -34,7 +35,6 @@ from hmt_ros.sessions.smoothed_messages import (
 )
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow
-from hmt_ros.smoothing.mode_sequence import merge_close_modes
 from hmt_ros.smoothing.path_smoother import PathSmoother
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
@@ -171,7 +171,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._window = self._new_window(of.body)
         used = mixture
         if p.merge_distance > 0:
-            used = merge_close_modes([mixture], p.merge_distance)[0]
+            used = merged_if_close(mixture, p.merge_distance)
         try:
             update = self._window.step(stamp, used)
         except (ValueError, ArithmeticError) as error:

@@ -145,33 +145,3 @@ def add_overlaps(
                         band_gradient[j, c, b] -= y * delta[c + b]
             inflation_gradient[j] += share * responsibility * (squares[j] - total)
             weight_gradient[j] += share * responsibility
-
-
-@njit(cache=True, nogil=True)
-def pair_distances(
-    means: Array, covariances: Array, scales: Array, pairs: NDArray[np.int64]
-) -> Array:
-    """(m_i - m_j)' (s_i C_i + s_j C_j)^-1 (m_i - m_j), shape (P,), of pairs (P, 2)."""
-    n = means.shape[1]
-    f = np.empty((n, n))
-    white = np.empty(n)
-    result = np.zeros(len(pairs))
-    for p in range(len(pairs)):
-        i, j = pairs[p]
-        for a in range(n):
-            for b in range(a + 1):
-                f[a, b] = scales[i] * covariances[i, a, b] + scales[j] * covariances[j, a, b]
-            for b in range(a):
-                total = f[a, b]
-                for k in range(b):
-                    total -= f[a, k] * f[b, k]
-                f[a, b] = total * f[b, b]
-            total = f[a, a]
-            offset = means[i, a] - means[j, a]
-            for k in range(a):
-                total -= f[a, k] * f[a, k]
-                offset -= f[a, k] * white[k]
-            f[a, a] = 1.0 / np.sqrt(total)
-            white[a] = offset * f[a, a]
-            result[p] += white[a] * white[a]
-    return result

@@ -171,6 +171,27 @@ class WindowLikelihood:
         return Energy(value, gradient, hessian)
 
 
+@dataclass(frozen=True, eq=False)
+class LikelihoodPart:
+    """The likelihood of some consecutive times.
+
+    Attributes:
+        whole: of all times.
+        first: the first of them.
+        times: how many.
+    """
+
+    whole: SequenceLikelihood
+    first: int
+    times: int
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`; the rows are times from the first on."""
+        return self.whole.energy(x, rows + self.first, derivatives=derivatives)
+
+
 def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = True) -> None:
     """Checks that the mixtures of a window can be smoothed.
 

@@ -4,7 +4,7 @@ The posterior of a sequence of Gaussian mixtures is a Gaussian mixture with a co
 path through their modes. The most probable paths that differ are found by the embedded network, and
 their components, with the weights that they have in the posterior, are the result: neither descent
 to optima nor of the free energy, which cost fifty times as much. Modes that overlap share their
-mass among many paths; they should be merged before (`mode_sequence.merge_close_modes`).
+mass among many paths; they should be merged before (`reduction.merged_if_close`).
 """
 
 from __future__ import annotations

@@ -23,6 +23,7 @@ from scipy.linalg.lapack import dpbtrs
 from hmt_ros.inference.block_tridiagonal import (
     BlockCholesky,
     NotPositiveDefiniteError,
+    add_diagonal,
     factorise_band,
 )
 from hmt_ros.inference.energy import Derivatives
@@ -353,16 +354,6 @@ def limits_of_states(
         i = int(np.argmin(low <= high))
         raise ValueError(f'limits of variable {i}: lower {low[i]} is above upper {high[i]}')
     return low, high
-
-
-@njit(cache=True, nogil=True)
-def add_diagonal(columns: Array, blocks: Array, n: int) -> None:
-    """Adds blocks (T, d, d) to the leading parts of diagonal blocks in a band (T n, width + 1)."""
-    times, d, _ = blocks.shape
-    for t in range(times):
-        for b in range(d):
-            for a in range(b, d):
-                columns[t * n + b, a - b] += blocks[t, b, a]
 
 
 @njit(cache=True, nogil=True)
