@@ -1,7 +1,6 @@
-"""What a node reports: rates and events of the middleware on /diagnostics, messages on `~/handled`.
+"""What a node reports in its diagnostics: rates of messages, and events of the middleware.
 
-Without the events of the middleware a publisher whose quality of service does not fit is silence
-without a cause.
+Without these events a publisher whose quality of service does not fit is silence without a cause.
 """
 
 from __future__ import annotations
@@ -13,11 +12,8 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.qos import qos_policy_name_from_kind
-
-from hmt_ros.sessions.handled import Handled
 
 
 class Rates:
@@ -188,22 +184,6 @@ class MiddlewareEvents:
             self._counts[what] += count
         if first:
             self._warn(f'{text} (more of the kind are counted in /diagnostics)')
-
-
-def handled_message(handled: Handled) -> DiagnosticStatus:
-    """The message on `~/handled` about a message."""
-    values = [
-        ('stamp', handled.stamp_ns),
-        *(('fault', text) for text in handled.faults),
-        *(('warning', text) for text in handled.warnings),
-        *handled.published,
-    ]
-    return DiagnosticStatus(
-        level=DiagnosticStatus.WARN if handled.faults else DiagnosticStatus.OK,
-        name=handled.source,
-        message='; '.join(handled.faults),
-        values=[KeyValue(key=key, value=str(value)) for key, value in values],
-    )
 
 
 def _policy(event: Any) -> str:

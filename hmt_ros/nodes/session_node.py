@@ -4,10 +4,8 @@ The executor's thread only puts messages into a queue and answers services; one 
 estimates. Messages pass as bytes in both directions: what a bag or a wire holds is read and written
 by the same code as offline.
 
-`~/handled` (diagnostic_msgs/DiagnosticStatus) reports on every message that was taken in, after all
-that it led to has been published: `name` is its source, `message` why it was not used, `values` its
-stamp, faults, warnings, and then the topics and stamps that were published. A player that waits for
-it feeds the node in lock step.
+`~/handled` (hmt_msgs/Handled) reports on every message that was received, after all that it led to
+has been published. A player that waits for it feeds the node in lock step.
 """
 
 from __future__ import annotations
@@ -32,7 +30,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates, handled_message
+from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates
 from hmt_ros.nodes.estimating_thread import EstimatingThread, InnerFaults
 from hmt_ros.nodes.subscribed_topic import (
     ANSWERS,
@@ -49,9 +47,11 @@ from hmt_ros.sessions.declared_parameters import (
     declared_parameters,
     with_values,
 )
-from hmt_ros.sessions.handled import Handled, Output
+from hmt_ros.sessions.handled import HANDLED, Handled, Output, handled_message
 from hmt_ros.sessions.session import SUBSCRIBERS, Session, SessionState
+from msg_tools import RosbagsMessages
 from msg_tools.files.error_line import error_line
+from msg_tools.messages.cdr import serialise
 
 AnySession = TypeVar('AnySession', bound=Session[Any, Any])
 Parameters = TypeVar('Parameters', bound=NodeParameters)
@@ -164,7 +164,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
                 event_callbacks=self._events.of_publisher(self.resolve_topic_name(topic)),
             )
         self._handled = self.create_lifecycle_publisher(
-            DiagnosticStatus,
+            message_class(HANDLED),
             '~/handled',
             ANSWERS,
             event_callbacks=self._events.of_publisher(self.resolve_topic_name('~/handled')),
@@ -318,7 +318,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         for text in handled.warnings:
             self.get_logger().warn(f'{text} (more of the kind are counted in /diagnostics)')
         if self._handled.get_subscription_count():
-            self._handled.publish(handled_message(handled))
+            self._handled.publish(serialise(handled_message(RosbagsMessages(), handled)))
 
     def _publish(self, output: Output) -> None:
         self._outputs[output.topic].publish(output.data)

@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from msg_tools import MessageFactory
 from msg_tools.files.error_line import one_line
+from msg_tools.messages.headers import time_message, time_ns
 from msg_tools.messages.message_error import MessageFault
+
+HANDLED = 'hmt_msgs/msg/Handled'
 
 
 class Fault(Enum):
@@ -122,3 +126,28 @@ class HandlingLog:
         return Handled(
             source, stamp_ns, tuple(self._told), tuple(self._warned), tuple(self._published)
         )
+
+
+def handled_message(messages: MessageFactory, handled: Handled) -> Any:
+    """hmt_msgs/Handled, which a node publishes on `~/handled`."""
+    return messages.create(
+        HANDLED,
+        source=handled.source,
+        stamp=time_message(messages, handled.stamp_ns),
+        faults=list(handled.faults),
+        warnings=list(handled.warnings),
+        published_topics=[topic for topic, _ in handled.published],
+        published_stamps=[time_message(messages, stamp) for _, stamp in handled.published],
+    )
+
+
+def handled_of(message: Any) -> Handled:
+    """The content of an hmt_msgs/Handled, of `rosbags` or of ROS."""
+    published = zip(message.published_topics, message.published_stamps, strict=True)
+    return Handled(
+        source=str(message.source),
+        stamp_ns=time_ns(message.stamp),
+        faults=tuple(map(str, message.faults)),
+        warnings=tuple(map(str, message.warnings)),
+        published=tuple((str(topic), time_ns(stamp)) for topic, stamp in published),
+    )

@@ -22,6 +22,7 @@ from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions import bme_session, track_start
 from hmt_ros.sessions.declared_parameters import EFFECTS, declared_parameters
+from hmt_ros.sessions.handled import handled_of
 from hmt_ros.sessions.parameter_file import read_parameter_file
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
 from msg_tools import RosbagsMessages
@@ -282,7 +283,8 @@ class World:
 
     def __init__(self, stderr, kind, name, inputs, **values):
         import rclpy
-        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+        from diagnostic_msgs.msg import DiagnosticArray
+        from hmt_msgs.msg import Handled
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.parameter import Parameter
         from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -305,12 +307,12 @@ class World:
         }
         self.handled, self.diagnostics = [], []
         self.stderr, self.logged = stderr, ''
-        self.listen(DiagnosticStatus, f'{self.name}/handled', self.handled)
+        self.listen(Handled, f'{self.name}/handled', self.handled, read=handled_of)
         self.listen(DiagnosticArray, '/diagnostics', self.diagnostics)
 
-    def listen(self, kind, topic, into, qos=100):
+    def listen(self, kind, topic, into, qos=100, read=None):
         def receive(message):
-            into.append(message)
+            into.append(message if read is None else read(message))
 
         return self.other.create_subscription(kind, topic, receive, qos)
 
@@ -342,10 +344,10 @@ class World:
         self.publishers[source].publish(serialise(message))
         # A latched message may be handled in between.
         self.spin_until(
-            lambda: any(handled.name == source for handled in self.handled[count:]),
+            lambda: any(handled.source == source for handled in self.handled[count:]),
             f'an answer to {source}',
         )
-        return next(handled for handled in self.handled[count:] if handled.name == source)
+        return next(handled for handled in self.handled[count:] if handled.source == source)
 
     @staticmethod
     def of_ros(message):
@@ -500,8 +502,3 @@ def executable():
     for one in started:
         one.process.kill()
         one.process.communicate()
-
-
-def values_of(handled, key):
-    """Values of a key of what a node tells of a message."""
-    return [value.value for value in handled.values if value.key == key]

@@ -7,8 +7,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from test.nodes.conftest import values_of
-
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -164,7 +162,7 @@ def test_errors_of_the_node_itself_are_in_the_diagnostics(running, small_camera,
     stub_tracker.fault = TypeError('a fault of ours')
     # Whoever waits for an answer gets one.
     handled = running.send('image', small_camera.image(1))
-    assert values_of(handled, 'fault') == ['the node itself failed: TypeError: a fault of ours']
+    assert handled.faults == ('the node itself failed: TypeError: a fault of ours',)
     values = running.diagnosis()[2]
     assert values['errors of the node itself'] == '1'
     assert values['last error of the node itself'] == 'TypeError: a fault of ours'
@@ -248,5 +246,5 @@ def test_messages_beyond_the_limit_are_not_even_read(running, small_camera, monk
     running.spin_until(lambda: len(running.handled) > count, 'an answer')
     assert re.fullmatch(
         r'message of image can not be read: it has 9\d{3} bytes, the limit is 5000',
-        running.handled[-1].message,
+        running.handled[-1].faults[0],
     )

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.track_messages import TOPICS
 from msg_tools.messages.cdr import serialise
-from test.nodes.conftest import PATIENCE, values_of
+from test.nodes.conftest import PATIENCE
 
 pytestmark = pytest.mark.ros
 
@@ -44,11 +43,11 @@ def running(world):
 
 
 def faults(handled):
-    return values_of(handled, 'fault')
+    return list(handled.faults)
 
 
 def published(handled):
-    return [value.key for value in handled.values if value.key in TOPICS]
+    return [topic for topic, _ in handled.published]
 
 
 @pytest.fixture
@@ -80,8 +79,8 @@ def test_images_become_messages(running, small_camera):
     running.spin_until(lambda: running.node._is_wanted('/tf'))
     running.send('camera_info', small_camera.info())
     first = running.send('image', small_camera.image(0))
-    assert first.name == 'image'
-    assert (first.values[0].key, first.values[0].value) == ('stamp', str(small_camera.stamp(0)))
+    assert first.source == 'image'
+    assert first.stamp_ns == small_camera.stamp(0)
     # What nobody listens to is not made.
     assert published(first) == [*STARTS, 'pose_mixture', '/tf']
     assert published(running.send('image', small_camera.image(1))) == ['pose_mixture', '/tf']

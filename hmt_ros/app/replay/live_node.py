@@ -22,7 +22,7 @@ from typing import Any
 import hmt_ros
 from hmt_ros.app.replay.player import LiveNodeError, Player, environment
 from hmt_ros.sessions.declared_parameters import values_of
-from hmt_ros.sessions.handled import Handled
+from hmt_ros.sessions.handled import HANDLED, Handled, handled_of
 from hmt_ros.sessions.parameter_file import yaml_scalar
 from hmt_ros.sessions.session import SUBSCRIBERS, PublishedTopic
 from msg_tools.messages.cdr import canonical, deserialise, serialise
@@ -101,7 +101,8 @@ class LiveNode:
             LiveNodeError: the node has ended, or does not answer.
         """
         patience = MESSAGE_SECONDS if seconds is None else seconds
-        handled = self._handled(self._next(self._answers, patience, f'an answer to a {source}'))
+        answer = self._next(self._answers, patience, f'an answer to a {source}')
+        handled = handled_of(deserialise(answer, HANDLED))
         for topic, stamp in handled.published:
             data = self._next(self._arrived[topic], START_SECONDS, f'{topic} of {stamp} ns')
             # On its way a message may get bytes behind its end, up to a multiple of four.
@@ -294,7 +295,7 @@ class LiveNode:
                 raw=True,
             )
         node.create_subscription(
-            player.classes['diagnostic_msgs/msg/DiagnosticStatus'],
+            player.classes[HANDLED],
             f'/{self.full_name}/handled',
             _into(self._answers),
             player.reliable,
@@ -328,18 +329,6 @@ class LiveNode:
         """The last line that the node has written."""
         lines = [line.strip() for line in self.output().splitlines() if line.strip()]
         return lines[-1] if lines else 'it has said nothing'
-
-    def _handled(self, data: bytes) -> Handled:
-        """What a message on ~/handled says."""
-        message = deserialise(data, 'diagnostic_msgs/msg/DiagnosticStatus')
-        pairs = [(str(value.key), str(value.value)) for value in message.values]
-        return Handled(
-            source=str(message.name),
-            stamp_ns=int(dict(pairs)['stamp']),
-            faults=tuple(text for key, text in pairs if key == 'fault'),
-            warnings=tuple(text for key, text in pairs if key == 'warning'),
-            published=tuple((key, int(text)) for key, text in pairs if key in self._topics),
-        )
 
 
 def _into(queue: deque[bytes]) -> Callable[[bytes], None]:
