@@ -1,7 +1,6 @@
-"""Rates of the messages of a node, and events of the middleware, for its diagnostics.
+"""What a node reports in its diagnostics: rates of messages, and events of the middleware.
 
-Without the events of the middleware a publisher whose quality of service does not fit is silence
-without a cause.
+Without these events a publisher whose quality of service does not fit is silence without a cause.
 """
 
 from __future__ import annotations

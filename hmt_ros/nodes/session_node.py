@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterable
 from typing import Any, ClassVar, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from hmt_msgs.msg import Handled as HandledMessage
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -48,7 +47,7 @@ from hmt_ros.sessions.declared_parameters import (
     declared_parameters,
     with_values,
 )
-from hmt_ros.sessions.handled import Handled, Output, handled_message
+from hmt_ros.sessions.handled import HANDLED, Handled, Output, handled_message
 from hmt_ros.sessions.session import SUBSCRIBERS, Session, SessionState
 from msg_tools import RosbagsMessages
 from msg_tools.files.error_line import error_line
@@ -165,7 +164,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
                 event_callbacks=self._events.of_publisher(self.resolve_topic_name(topic)),
             )
         self._handled = self.create_lifecycle_publisher(
-            HandledMessage,
+            message_class(HANDLED),
             '~/handled',
             ANSWERS,
             event_callbacks=self._events.of_publisher(self.resolve_topic_name('~/handled')),

@@ -1,4 +1,4 @@
-"""What is published of a smoothed window, as messages; as `track_messages` for tracked images."""
+"""Messages about a smoothed window, as `track_messages` makes them about a tracked image."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ DRAWN = 8
 
 @dataclass(frozen=True, eq=False)
 class SmoothedBody:
-    """Whose poses they are.
+    """The person of the poses.
 
     Attributes:
         body: at its present lengths.
@@ -77,7 +77,7 @@ def window_messages(
     Args:
         messages: factory.
         found: trajectories, with stamps.
-        of: whose poses they are.
+        of: person of the poses.
         covariances: whether they are part of the message.
         wanted: whether a topic is to be made.
         publish: takes the topic and the message, one after the other.
@@ -123,7 +123,7 @@ def final_messages(
         messages: factory.
         pose: its density.
         of: whose pose it is.
-        components: of the message at most.
+        components: maximum number of components of the message.
         wanted: whether a topic is to be made.
         publish: takes the topic and the message, one after the other.
 
@@ -163,6 +163,6 @@ def _without_covariances(found: TrajectoryMixture) -> dict[str, Any]:
 
 
 def _symmetric(covariances: Array) -> Array:
-    """What rounding has left of it is taken away."""
+    """The covariances without the asymmetry of rounding."""
     result: Array = 0.5 * (covariances + np.swapaxes(covariances, -1, -2))
     return result

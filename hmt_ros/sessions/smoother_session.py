@@ -83,7 +83,7 @@ class KeptMixtures(NamedTuple):
     """Likelihoods that have been smoothed since the window began, the newest.
 
     Attributes:
-        of: whose poses they are; None: no mixture has come.
+        of: person of the poses; None: no mixture has come.
         items: (stamp, mixture), as they were received.
     """
 

@@ -1,7 +1,7 @@
-"""What is published of a tracked image, as messages.
+"""Messages about a tracked image.
 
-`TOPICS` says the names and types; the functions here make the messages from arrays. Nothing in a
-message depends on anything but the track and the image.
+`TOPICS` holds names and types; the functions make the messages from arrays. A message depends on
+the track and the image alone.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Presentation:
     """How a track is shown.
 
     Attributes:
-        max_hypotheses: modes that a track has at most.
+        max_hypotheses: maximum number of modes of a track.
         overlay_modes: heaviest modes that are drawn on the image; 0: no overlay.
         overlay_quality: of the JPEG, 1 to 100.
         publish_tf: whether there are transforms.

@@ -1,4 +1,4 @@
-"""What a track starts from: body, background, subject or mixture, all read and checked at once."""
+"""The start of a track: body, background, subject or mixture, all read and checked at once."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from msg_tools.messages.pose_mixtures import pose_mixture_of
 
 @dataclass(frozen=True, eq=False)
 class TrackStart:
-    """All that a new tracker needs besides the camera.
+    """Everything that a new tracker needs besides the camera.
 
     Attributes:
         parameters: of the track.
         body: the model, or for a mixture the body that its poses are of.
         background: (H, W, 3) BGR image of the empty scene, or None: to be learned.
-        initial: what the first image is explained from; None: nothing is known yet.
+        initial: prior of the first image; None: a prediction has to start the track.
     """
 
     parameters: FilterParameters

@@ -212,7 +212,7 @@ def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):
     events = running.node._events.of_publisher('/tf')
     events.incompatible_qos(SimpleNamespace(total_count_change=1, last_policy_kind=2))
     page = (ROOT / 'docs' / 'nodes.md').read_text('utf-8')
-    table = page.partition('## What all nodes tell')[2].partition('| key |')[2]
+    table = page.partition('## Diagnostics')[2].partition('| key |')[2]
     cells = [line.split('|')[1] for line in table.partition('\n\n')[0].splitlines()[2:]]
     explained = {key for cell in cells for key in re.findall('`([^`]+)`', cell)}
     patterns = {

@@ -15,7 +15,7 @@ from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.track_start import prepare_start
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
-from test.nodes.conftest import Likelihoods
+from test.sessions.conftest import Likelihoods
 
 MIXTURES = ['pose_mixture', 'likelihood_mixture']
 STARTS = ['body', 'human_description']
