@@ -21,9 +21,8 @@ from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
 
-from msg_tools.bags.bag_error import BagError, reason
 from msg_tools.bags.bag_metadata import FILE_NAME, SUFFIXES, VERSION, as_yaml
-from msg_tools.bags.stored_message import Channel
+from msg_tools.bags.contents import BagError, Channel, reason
 
 LIBRARY = 'hmt_ros'
 CHUNK_BYTES = 2**20

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
 
-from msg_tools.bags.bag_error import BagError, reason
+from msg_tools.bags.contents import BagError, reason
 from msg_tools.files.bounded_file import read_bytes
 
 FILE_NAME = 'metadata.yaml'

@@ -25,8 +25,8 @@ from typing import Any
 from rosbags.typesys.store import Typestore
 
 from msg_tools.bags import sqlite_file
-from msg_tools.bags.bag_error import BagError, reason
 from msg_tools.bags.bag_metadata import read_file_names
+from msg_tools.bags.contents import BagError, Channel, Source, StoredMessage, merge, reason
 from msg_tools.bags.decompression import (
     ZSTD_MAGIC,
     DecompressionError,
@@ -35,10 +35,8 @@ from msg_tools.bags.decompression import (
 )
 from msg_tools.bags.mcap_file import McapFile
 from msg_tools.bags.sqlite_file import SqliteFile
-from msg_tools.bags.stored_message import Channel, StoredMessage
-from msg_tools.bags.time_order import Source, merge
 from msg_tools.messages.cdr import deserialise
-from msg_tools.messages.typestore import typestore_of_definition
+from msg_tools.messages.message_types import typestore_of_definition
 
 _NEVER = 2**64  # later than any log time
 

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from msg_tools.bags.bag_error import BagError, reason
 from msg_tools.bags.bag_folder import BagFolder, unfinished_folders
 from msg_tools.bags.bag_metadata import (
     DATABASE_SUFFIXES,
@@ -19,6 +18,7 @@ from msg_tools.bags.bag_metadata import (
     read_file_names,
     recorded_quality_of_service,
 )
+from msg_tools.bags.contents import BagError, Channel, reason
 from msg_tools.bags.decompression import ZSTD_MAGIC, DecompressionError, decompress_file
 from msg_tools.bags.mcap_salvage import (
     Loss,
@@ -29,7 +29,6 @@ from msg_tools.bags.mcap_salvage import (
     SavedMessage,
     SavedMetadata,
 )
-from msg_tools.bags.stored_message import Channel
 
 # Written anew.
 _OWN_METADATA = 'rosbag2'

@@ -14,12 +14,11 @@ import os
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
-from msg_tools.bags.bag_error import BagError, reason
 from msg_tools.bags.bag_folder import BagFolder
 from msg_tools.bags.bag_metadata import quality_of_service
-from msg_tools.bags.stored_message import Channel
+from msg_tools.bags.contents import BagError, Channel, reason
 from msg_tools.messages.cdr import serialise
-from msg_tools.messages.typestore import typestore
+from msg_tools.messages.message_types import typestore
 
 
 class _Topic(NamedTuple):

@@ -23,7 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from msg_tools.bags.bag_error import BagError, reason
+from msg_tools.bags.contents import BagError, Channel, Source, StoredMessage, merge, reason
 from msg_tools.bags.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -45,8 +45,6 @@ from msg_tools.bags.mcap_records import (
     record_head,
     records_in,
 )
-from msg_tools.bags.stored_message import Channel, StoredMessage
-from msg_tools.bags.time_order import Source, merge
 
 # Bare messages, outside of chunks, are read together up to this size.
 RUN_BYTES = 2**20

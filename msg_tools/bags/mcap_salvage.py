@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from msg_tools.bags.bag_error import BagError, reason
+from msg_tools.bags.contents import BagError, Channel, reason
 from msg_tools.bags.decompression import MAX_BYTES
 from msg_tools.bags.mcap_records import (
     ATTACHMENT,
@@ -43,7 +43,6 @@ from msg_tools.bags.mcap_records import (
     record_head,
     records_in,
 )
-from msg_tools.bags.stored_message import Channel
 
 # What stands before the summary.
 _DATA_RECORDS = (HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_types import MessageFactory
 
 Picture = NDArray[np.uint8]
 

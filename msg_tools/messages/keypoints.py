@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.message_error import MessageError, check_covariances, names_of, numbers
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_types import MessageFactory
 
 Array = NDArray[np.float64]
 

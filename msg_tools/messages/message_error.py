@@ -55,6 +55,31 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
     return array.reshape(shape)
 
 
+def freeze_arrays(
+    record: Any, shapes: Mapping[str, tuple[int, ...]], what: str, optional: Sequence[str] = ()
+) -> None:
+    """Makes the attributes of a frozen dataclass read-only arrays of floats, in a shape each.
+
+    Args:
+        record: the dataclass.
+        shapes: of its attributes, by name.
+        what: the record is, for messages.
+        optional: names of attributes that may be None, and stay so.
+
+    Raises:
+        MessageError: another shape.
+    """
+    for name, shape in shapes.items():
+        value = getattr(record, name)
+        if value is None and name in optional:
+            continue
+        array = np.array(value, dtype=np.float64)
+        if array.shape != shape:
+            raise MessageError(f'{what}: {name} has shape {array.shape}, wanted {shape}')
+        array.setflags(write=False)
+        object.__setattr__(record, name, array)
+
+
 def check_finite(values: Array, what: str) -> None:
     """Raises MessageError where a value is NaN or infinite."""
     if not np.isfinite(values).all():
