@@ -1,8 +1,8 @@
-"""Reading a bag: a folder of rosbag2, a single .mcap or .db3 file, also compressed with zstd.
+"""Reads a bag: a folder of rosbag2, or a single .mcap or .db3 file, also compressed with zstd.
 
-Messages come in the order of their log times, whatever the order in the files, the same every time;
-of equal times in the order of the files. Memory holds the chunks of the present time, never a whole
-file. Everything that is wrong with a bag is a `BagError` of one line.
+Messages come in the order of their log times; messages of equal times come in the order of the
+files. Memory holds the chunks of the present time, never a whole file. Every fault of a bag is a
+`BagError` of one line.
 
     with BagReader('walk') as bag:
         topic = bag.find_topic(['sensor_msgs/msg/CompressedImage'])
@@ -47,7 +47,7 @@ class Topic:
 
     Attributes:
         name: as written in the bag, with or without a leading slash.
-        msgtype: for example 'sensor_msgs/msg/Image'; '' when the bag does not tell.
+        msgtype: for example 'sensor_msgs/msg/Image'; '' if the bag does not contain it.
         encoding: of the messages; 'cdr' for ROS 2.
         message_count: how many there are, by the statistics of the bag.
     """

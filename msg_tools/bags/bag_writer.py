@@ -1,7 +1,7 @@
-"""Writing a bag of our own messages, which rosbag2 plays: whole or not at all.
+"""Writes messages into a bag that rosbag2 plays, as a whole or not at all.
 
-Time is what the caller says, the stamp of the message: log time and publish time are the same. See
-`msg_tools.bags.bag_folder` for what becomes of a bag that is not completed.
+Log time and publish time are both the stamp that the caller gives. `msg_tools.bags.bag_folder`
+describes what happens to a bag that is not completed.
 
     with BagWriter('out') as bag:
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)

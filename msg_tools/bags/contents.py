@@ -1,4 +1,4 @@
-"""What the files of a bag hold, still as bytes, in the order of time; the error of all of them."""
+"""Channels and messages of the files of a bag, their merging by time, and `BagError`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Channel(NamedTuple):
 
     Attributes:
         topic: as written, with or without a leading slash.
-        msgtype: as written; '' when the bag does not tell.
+        msgtype: as written; '' if the bag does not contain it.
         encoding: 'cdr' for ROS 2.
         definition_encoding: 'ros2msg', 'ros2idl', or '' when there is no definition.
         definition: text of the message definition.
@@ -43,7 +43,7 @@ class BagError(ValueError):
 
 
 def reason(error: BaseException) -> str:
-    """What an exception of a library says, short enough for a line of ours."""
+    """The text of a library's exception as one line of at most 160 characters."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     text = error_line(error)

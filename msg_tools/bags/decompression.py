@@ -1,4 +1,4 @@
-"""Decompression that never trusts a length field on its own."""
+"""Decompression of zstd and lz4 with limits on the size of the result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One MCAP file, read in log-time order, believing nothing that has not been checked.
+"""Reads one MCAP file in the order of log times, and checks every length and checksum.
 
 Written against the MCAP specification, version 0 (https://mcap.dev/spec). The reader of `rosbags`
 wants the profile `ros2` and an index or sorted messages, and passes some damage by; the one of

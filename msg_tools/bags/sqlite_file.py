@@ -1,4 +1,4 @@
-"""One file of a bag that rosbag2 stored with SQLite (.db3), the default before ROS 2 Iron."""
+"""Reads one SQLite file (.db3) of a bag, the default storage before ROS 2 Iron."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from msg_tools.messages.message_types import MessageFactory
 
 Array = NDArray[np.float64]
 
-# Of one person; detectors tell up to a few hundred.
+# Of one person; detectors find up to a few hundred.
 MAX_KEYPOINTS = 10_000
 
 

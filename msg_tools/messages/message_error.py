@@ -1,4 +1,4 @@
-"""The error of messages that contradict themselves, and the checks that the conversions share."""
+"""`MessageError`, raised for contradictory messages, and the checks that the conversions share."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typ
         ValueError: the type is not known and the definition can not be understood.
     """
     if not msgtype:
-        raise ValueError('the bag does not tell the type')
+        raise ValueError('the bag does not name the type')
     known = typestore()
     types: Typesdict = {}
     if encoding == 'ros2msg' and not definition.strip() and msgtype not in known.fielddefs:
@@ -142,7 +142,7 @@ class RosbagsMessages:
             try:
                 return plain[0](**fields)
             except TypeError:
-                pass  # a wrong name, which is told below
+                pass  # a wrong name: the error is raised below
         defaults = _defaults(msgtype)
         unknown = fields.keys() - defaults.keys()
         if unknown:
