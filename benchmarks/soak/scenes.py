@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -13,13 +13,11 @@ from benchmarks.clips import COMPRESSED, ROOT, index_back_and_forth, read_messag
 from benchmarks.publisher import STEP_NS
 from hmt_ros.body import load_body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
-from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
-from hmt_ros.sessions.published_topic import PublishedTopic
 from hmt_ros.sessions.session import Session
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
@@ -30,7 +28,7 @@ from msg_tools.messages.images import decode_image, image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 CLIP = ROOT / 'bags' / 'reach'
-_SMALL = TrackerSettings(max_hypotheses=2, candidates=4, combinations=16)
+_SMALL = TrackerSettings(max_hypotheses=2, candidates=4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +41,8 @@ class Scene:
         session: what stands behind its topics.
         inputs: topic and type by source.
         sensors: topics on which data may be lost unless a player asks for better.
-        topics: that it publishes.
         prelude: source and message of what has to come first.
-        counted: the source that gives the tempo.
-        pictures: messages of that source.
+        pictures: messages of the source that sets the pace.
         others: a valid message of each other source.
         start_ns: stamp of the first.
         variants: other parameters, with which more of what comes is looked at.
@@ -54,12 +50,10 @@ class Scene:
 
     node: str
     parameters: Any
-    session: Callable[..., Session]
+    session: type[Session[Any, Any]]
     inputs: Mapping[str, tuple[str, str]]
     sensors: tuple[str, ...]
-    topics: Mapping[str, PublishedTopic]
     prelude: tuple[tuple[str, Any], ...]
-    counted: str
     pictures: tuple[Any, ...]
     others: Mapping[str, Any]
     start_ns: int
@@ -82,7 +76,7 @@ class Scene:
             message = image_message(
                 RosbagsMessages(), picture, time_ns(header.stamp), str(header.frame_id)
             )
-        return {**self.others, self.counted: message}
+        return {**self.others, self.session.COUNTED: message}
 
 
 def stamped(message: Any, stamp_ns: int) -> Any:
@@ -128,9 +122,7 @@ def _filter() -> Scene:
             PREDICTION: ('pose_prediction', 'hmt_msgs/msg/PoseMixture'),
         },
         (*_CAMERA_TOPICS, '/keypoints'),
-        track_messages.TOPICS,
         ((CAMERA_INFO, info),),
-        IMAGE,
         images,
         {
             CAMERA_INFO: info,
@@ -156,9 +148,7 @@ def _bme() -> Scene:
         BmeSession,
         _CAMERA,
         _CAMERA_TOPICS,
-        bme_session.TOPICS,
         ((CAMERA_INFO, info),),
-        IMAGE,
         images,
         {CAMERA_INFO: info},
         time_ns(images[0].header.stamp),
@@ -178,9 +168,7 @@ def _smoother() -> Scene:
         SmootherSession,
         {MIXTURE: ('likelihood_mixture', 'hmt_msgs/msg/PoseMixture')},
         (),
-        smoothed_messages.TOPICS,
         (),
-        MIXTURE,
         tuple(_mixture(index, MixtureKind.LIKELIHOOD) for index in range(10)),
         {},
         10**18,

@@ -44,11 +44,11 @@ class TermSettings:
     """One term of the likelihood.
 
     Attributes:
-        weight: how many independent measurements the term counts for; 0 switches it off. For
-            joints: a factor.
-        sigma: standard deviation of one measurement, px (intensity: grey levels; joints: a factor
-            on the keypoints' own).
-        scale: of the Geman-McClure kernel, in sigmas.
+        weight: Number of independent measurements that the term counts for (a plain factor for
+            keypoints); 0 switches the term off.
+        sigma: Standard deviation of one measurement, px (grey levels for the intensity, a factor on
+            the detector's own deviation for keypoints).
+        scale: Width of the Geman-McClure kernel, in standard deviations.
     """
 
     weight: float
@@ -65,14 +65,15 @@ class LikelihoodSettings:
     """The terms of the likelihood and of the prior.
 
     Attributes:
-        joints: keypoints.
-        containment: the model's contour lies inside the silhouette.
-        coverage: the silhouette's outline lies on the model's contour.
-        edges: visible contours lie on edges.
-        intensity: the texture of the last image is found again.
-        motion: the texture moves with the optical flow.
-        prior_weight: factor on the soft prior of the joint angles.
-        self_intersection_sigma: overlap of body parts that costs 1/2, m; inf switches it off.
+        joints: Distance of the joints from the keypoints.
+        containment: Distance of the model's contour from the inside of the silhouette.
+        coverage: Distance of the silhouette's outline from the model's contour.
+        edges: Distance of the visible contours from image edges.
+        intensity: Difference of the texture from that of the last image.
+        motion: Difference of the texture's motion from the optical flow.
+        prior_weight: Factor on the soft prior of the joint angles.
+        self_intersection_sigma: Overlap of two body parts that costs an energy of 1/2, m; inf
+            switches the term off.
     """
 
     joints: TermSettings = field(default=TermSettings(1.0, 1.0, 5.0))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body import Body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions.published_topic import PublishedTopic
+from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
 from msg_tools import MessageFactory
 from msg_tools.messages.markers import trajectory_markers

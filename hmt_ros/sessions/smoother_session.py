@@ -1,35 +1,32 @@
-"""The smoother behind its topics: messages in, messages out, without ROS.
+"""The smoother behind its topics.
 
-The node and offline replay give their messages to a `SmootherSession`, one after the other; the
-same messages in the same order give the same bytes. The rules:
+The node and offline replay give their messages to a `SmootherSession`; the same messages in the
+same order give the same bytes. The rules:
 
-- Mixtures are smoothed in the order of their stamps, in a window that slides. A pose is published
-  as smoothed once `fixed_lag` later ones have been seen; those that are still open are published
+- Mixtures are smoothed in the order of their stamps, in a sliding window. A pose is published as
+  smoothed once `fixed_lag` later ones have been seen; the poses that are still open are published
   when the window ends: at the end of the stream (`finish`), where time jumps back, at a new body.
-- A mixture that is not younger than the one before is skipped, or starts a new window where
-  `reset_on_time_jump` says so.
+- A mixture that is not younger than the one before is skipped, or starts a new window with
+  `reset_on_time_jump`.
 - A mixture names its body and carries the segment lengths of the person; without lengths it is
   about the model at its own lengths. Another body, other lengths or another frame are a new track,
   and start a new window.
-- Gaps are bridged by the dynamics. One that is longer than `longest_interval` is told.
-- What can not be used is skipped. Of each kind of fault the first is told, all are counted.
+- The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
+- What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
 
-import math
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions.handled import Handled, Output
-from hmt_ros.sessions.session import Session, entropy, everything
+from hmt_ros.sessions.handled import Fault, Handled, Output
+from hmt_ros.sessions.session import Order, Session, SessionState, everything
 from hmt_ros.sessions.smoothed_messages import (
+    TOPICS,
     SmoothedBody,
     final_messages,
     trajectory_content,
@@ -42,7 +39,7 @@ from hmt_ros.smoothing.path_smoother import PathSmoother
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
-from msg_tools.messages.headers import SECOND_NS, time_ns
+from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.message_error import MessageFault
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
@@ -52,32 +49,34 @@ FINISH = 'finish'  # what `finish` calls the end of the stream
 
 
 @dataclass(frozen=True)
-class SmootherState:
-    """What is going on, for diagnostics.
+class SmootherState(SessionState):
+    """State of the smoother: its status is 'waiting' or 'smoothing'.
 
     Attributes:
-        status: 'waiting' or 'smoothing'.
-        wants: what the next step waits for, '' while smoothing.
         window: poses in the window.
         trajectories: components of the mixture over them.
-        entropy: of their weights, nats.
         gaps: intervals between mixtures that were longer than `longest_interval`.
         longest_gap: s.
-        mixtures: number of mixtures: 'received', and of these 'smoothed', 'skipped', 'dropped'.
-        faults: number of faults by kind.
-        last_fault: the newest; '' before the first.
     """
 
-    status: str
-    wants: str
     window: int = 0
     trajectories: int = 0
-    entropy: float = math.nan
     gaps: int = 0
     longest_gap: float = 0.0
-    mixtures: Counter[str] = field(default_factory=Counter)
-    faults: Counter[str] = field(default_factory=Counter)
-    last_fault: str = ''
+
+    def summary(self) -> str:
+        """The present estimate in a few words."""
+        return f'{self.trajectories} trajectories of {self.window} poses'
+
+    def values(self) -> list[tuple[str, str]]:
+        """Keys and values of the diagnostics."""
+        return [
+            ('poses in the window', str(self.window)),
+            ('trajectories', str(self.trajectories)),
+            ('entropy of the weights, nats', f'{self.entropy:.3f}'),
+            ('gaps', str(self.gaps)),
+            ('longest gap, s', f'{self.longest_gap:.3f}'),
+        ]
 
 
 class KeptMixtures(NamedTuple):
@@ -92,26 +91,21 @@ class KeptMixtures(NamedTuple):
     items: tuple[tuple[int, GaussianMixture], ...]
 
 
-class SmootherSession(Session):
-    """One person, from the first message on.
+class SmootherSession(Session[SmootherParameters, SmootherState]):
+    """Smooths the poses of one person; see `Session` for arguments and attributes.
 
-    All methods but `smooth_span` are to be called by one thread; `state`, `kept` and `parameters`
-    may be read and replaced by others.
-
-    Args:
-        parameters: of the node.
-        publish: takes what is to be published, as soon as it is there.
-        wanted: whether a topic needs to be published.
-
-    Raises:
-        ValueError: the parameters name a body that can not be used.
+    `smooth_span` may be called by any thread.
 
     Attributes:
-        parameters: a new value takes effect when `declared_parameters` says.
-        start: None, there is but one way to start.
-        state: see `SmootherState`.
         kept: for `smooth_span`.
     """
+
+    TOPICS = TOPICS
+    COUNTED = MIXTURE
+    UNIT = 'mixture'
+    DONE = 'smoothed'
+    ESTIMATE = 'the window'
+    CHECKED = ('body_model',)
 
     def __init__(
         self,
@@ -126,58 +120,42 @@ class SmootherSession(Session):
         self._resolved: tuple[Any, SmoothedBody] | None = None
         self._window: SlidingWindow | None = None
         self._newest: int | None = None
-        self._weights = np.empty(0)
         self._gaps, self._longest_gap = 0, 0.0
         self.kept = KeptMixtures(None, ())
         self.state = self._present_state()
 
-    # What comes in.
-
-    def take(self, source: str, message: Any) -> Handled:
-        """Handles a message.
-
-        Args:
-            source: `MIXTURE`.
-            message: hmt_msgs/PoseMixture.
-        """
-        self._log.begin()
-        self._log.counts['received'] += 1
-        self._take_mixture(message)
-        self.state = self._present_state()
-        return self._log.handled(source, time_ns(message.header.stamp))
+    # Inputs.
 
     def finish(self) -> Handled:
-        """The stream ends: publishes the poses that are still open; what comes begins a window."""
+        """Publishes the poses that are still open; the next mixture begins a new window."""
         self._log.begin()
         stamp = self._newest or 0
         self._end_window()
-        self.state = self._present_state()
-        return self._log.handled(FINISH, stamp)
+        return self._handled(FINISH, stamp)
 
-    def restart(self, start: None = None) -> None:
-        """Forgets the window; the next mixture is the first of a new one."""
+    def _forget(self) -> None:
         self._window = None
         self._newest = None
-        self._weights = np.empty(0)
         self.kept = KeptMixtures(self._of, ())
-        self.state = self._present_state()
 
-    def _take_mixture(self, message: Any) -> None:
-        stamp = time_ns(message.header.stamp)
+    def _take(self, source: str, message: Any, stamp: int) -> None:
         try:
             content = pose_mixture_of(message)
             mixture, of = content.mixture, self._whose(content)
         except MessageError as error:
-            self._log.skip(error.fault.value, f'mixture of {stamp} ns: {error}')
+            self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
             return
         if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
             self._log.note(
-                'kind of mixture',
+                Fault.MIXTURE_KIND,
                 f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
                 'say counts more than once',
             )
-        if not self._in_time(stamp):
+        order = self._order(stamp, self._newest)
+        if order is Order.SKIPPED:
             return
+        if order is Order.JUMP:
+            self._end_window()
         self._begin_track(of)
         p = self.parameters
         if self._newest is not None:
@@ -186,7 +164,7 @@ class SmootherSession(Session):
                 self._gaps += 1
                 self._longest_gap = max(self._longest_gap, interval)
                 self._log.note(
-                    'gap',
+                    Fault.GAP,
                     f'no mixture for {interval:.2f} s before {stamp} ns: the dynamics bridge it',
                 )
         if self._window is None:
@@ -198,7 +176,7 @@ class SmootherSession(Session):
             update = self._window.step(stamp, used)
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
-            self._log.skip('estimate', f'mixture of {stamp} ns can not be smoothed: {text}')
+            self._log.skip(Fault.ESTIMATE, f'mixture of {stamp} ns can not be smoothed: {text}')
             self._end_window()
             return
         self._newest = stamp
@@ -241,29 +219,11 @@ class SmootherSession(Session):
         if known is not None and _same(known, of):
             return
         if self._newest is not None:
-            self._log.note('new body', 'mixtures are about another body: a new window begins')
+            text = 'mixtures are about another body: a new window begins'
+            self._log.note(Fault.NEW_BODY, text)
         self._end_window()
         self._of = of
         self.kept = KeptMixtures(of, ())
-
-    def _in_time(self, stamp: int) -> bool:
-        """Whether a mixture comes after the one before, or may begin a new window."""
-        newest = self._newest
-        if newest is None or stamp > newest:
-            return True
-        text = f'mixture of {stamp} ns comes after one of {newest} ns'
-        if stamp == newest:
-            self._log.skip('time stands still', f'{text}, wanted stamps that increase')
-            return False
-        if not self.parameters.reset_on_time_jump:
-            self._log.skip(
-                'time jumps back',
-                f'{text}: skipped; with reset_on_time_jump a new window would begin',
-            )
-            return False
-        self._log.note('time jumps back', f'{text}: a new window begins')
-        self._end_window()
-        return True
 
     def _new_window(self, body: Body) -> SlidingWindow:
         p = self.parameters
@@ -289,7 +249,7 @@ class SmootherSession(Session):
                 self._publish_final(pose, self._of)
         self.restart()
 
-    # What comes out.
+    # Outputs.
 
     def _publish_final(self, pose: FinalPose, of: SmoothedBody) -> None:
         final_messages(
@@ -330,7 +290,7 @@ class SmootherSession(Session):
         content = trajectory_content(found, of, covariances=True)
         return trajectory_mixture_message(self._messages, content)
 
-    # What is told.
+    # State.
 
     def _present_state(self) -> SmootherState:
         smooths = self._newest is not None
@@ -338,14 +298,11 @@ class SmootherSession(Session):
         return SmootherState(
             status,
             wants,
+            **self._totals(),
             window=0 if self._window is None else len(self._window.stamps_ns),
             trajectories=len(self._weights),
-            entropy=entropy(self._weights),
             gaps=self._gaps,
             longest_gap=self._longest_gap,
-            mixtures=Counter(self._log.counts),
-            faults=Counter(self._log.faults),
-            last_fault=self._log.last_fault,
         )
 
 

@@ -17,7 +17,7 @@ from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.overlay import draw_modes
-from hmt_ros.sessions.published_topic import PublishedTopic
+from hmt_ros.sessions.session import PublishedTopic
 from msg_tools import MessageFactory
 from msg_tools.messages.bodies import description_message, message_of_body
 from msg_tools.messages.images import compressed_image_message

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.sessions.camera_session import read_picture
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.picture_file import read_picture
 from hmt_ros.tracking import Subject, Tracker, read_subject
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of

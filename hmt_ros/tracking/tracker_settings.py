@@ -19,45 +19,52 @@ class TrackerSettings:
     """How poses are tracked.
 
     Attributes:
-        max_hypotheses: modes that are kept, K.
-        hypothesis_merge_distance: mean distance of the joints below which two modes are one, m.
-        proposals: 'kjs' (covariance-scaled samples and kinematic jumps), 'css' or 'ss' (samples
-            alone).
-        candidates: hypotheses that are optimised fully an image.
-        combinations: combinations of chain alternatives that are rated an image.
-        alternatives: configurations of a chain that are rated.
-        samples: samples an image of 'css' and 'ss'.
-        sample_scale: their stretch; 0: Cauchy tails.
-        reweighting: what the images before say of a new mode: 'ancestry', the weight of the mode it
-            comes from and of its jumps, or 'bhattacharyya', the weight of the nearest mode before
-            (KJS 5.1).
-        exploration: power of the weights when candidates are chosen; below 1 favours unlikely ones.
-        vote: how chains are chosen for search: 'trace', 'eigenvalue', 'uniform', 'depth' or
+        max_hypotheses: Maximum number of modes that are kept, K.
+        hypothesis_merge_distance: Mean distance of the joints below which two modes are merged, m.
+        proposals: Proposal distribution: 'kjs' (kinematic jumps and covariance-scaled samples),
+            'css' (covariance-scaled samples alone) or 'ss' (spherical samples alone).
+        candidates: Maximum number of hypotheses that are fully optimised in an image.
+        combinations: Maximum number of combinations of chain configurations rated in an image.
+        alternatives: Maximum number of configurations of a chain that are rated.
+        samples: Number of samples drawn in an image by the proposals 'css' and 'ss'.
+        sample_scale: Scale of the proposal covariance; 0 selects Cauchy tails.
+        reweighting: Prior weight of a mode: 'ancestry' takes it from the mode that it descends from
+            and the jumps on the way, 'bhattacharyya' from the nearest mode of the image before
+            (KJS, figure 4, step 5).
+        exploration: Power of the weights in the choice of candidates; values below 1 favour
+            unlikely ones.
+        vote: Rule that chooses the chains to search: 'trace', 'eigenvalue', 'uniform', 'depth' or
             'minima'.
-        searched_chains: chains searched in an image.
-        edge_jumps: other image edges that are looked for in an image that is searched again, for a
-            limb whose contour costs more than usual; 0: none.
-        voted_swaps: whether arms, and legs, are only exchanged where they lie over each other or
-            cost more than usual, and otherwise with jump_probability; else in every image.
-        surprise: an image whose least energy exceeds the usual one by this is searched again.
-        rounds: of search in such an image at most.
-        jump_probability: of a flip of one chain from one image to the next.
-        edge_probability: of a limb on another image edge than in the image before.
-        prediction_probability: of a pose that a regression predicts from the image, and not the
-            images before.
-        facing_trial: seconds that both ways to face are followed at most, where a track starts from
-            silhouettes or predictions alone; 0: the better one at once. It costs twice the time.
-        base_iterations, iterations: Newton steps on the predictions and on the candidates.
-        temperature: factor on the image's energy in a mode's weight; below 1 because neighbouring
-            measurements err together.
-        image_trust: factor on the curvature of the image's energy, keypoints apart, in a mode's
-            covariance; below 1 because shapes, shadows and clothes are not the model's.
-        tails: degrees of freedom of the Student distribution around a prediction.
-        least_log_weight: no kept mode's weight falls below this.
-        flesh_images: images from which the widths of the flesh are estimated; 0: the model's.
-        lost_misfit: share of the outline, or of the keypoints, that no mode explains, above which
-            an image counts as lost.
-        lost_images: so many in a row start the track anew.
+        searched_chains: Number of chains searched in an image.
+        edge_jumps: Number of other image edges tried for a limb whose contour costs more than
+            usual, in an image that is searched again; 0 switches the search off.
+        voted_swaps: If true, arms, and legs, are only exchanged where they overlap or cost more
+            than usual, and otherwise with jump_probability; if false, in every image.
+        surprise: Excess of the least energy of an image over the usual one above which the image is
+            searched again.
+        rounds: Maximum number of search rounds in a surprising image.
+        jump_probability: Prior probability that a limb flips between two images.
+        edge_probability: Prior probability that a limb moves to another image edge between two
+            images.
+        prediction_probability: Prior probability that a pose comes from the single-image predictor
+            and not from the images before.
+        facing_trial: Maximum time for which both facing directions are followed after a start from
+            silhouettes or predictions alone, s; 0 keeps the better one at once. The trial doubles
+            the cost of an image.
+        base_iterations: Number of Newton steps on the predicted modes.
+        iterations: Number of Newton steps on the candidates.
+        temperature: Factor on the image energy in the weight of a mode; values below 1 allow for
+            correlated errors of neighbouring measurements.
+        image_trust: Factor on the curvature of the image energy, without keypoints, in the
+            covariance of a mode; values below 1 allow for shapes, shadows and clothes that the
+            model lacks.
+        tails: Degrees of freedom of the Student distribution around a prediction.
+        least_log_weight: Lower bound of the log weight of a kept mode.
+        flesh_images: Number of images from which the widths of the body parts are estimated; 0
+            keeps those of the model.
+        lost_misfit: Fraction of the outline, or of the keypoints, left unexplained by every mode
+            above which an image counts as lost.
+        lost_images: Number of consecutive lost images after which the track starts anew.
         dynamics, likelihood, observation, search: settings of the parts.
     """
 

@@ -49,7 +49,7 @@ def test_every_image_has_a_prediction(session, outputs, somebody, stub_predictor
     assert state.support == 0.5
     assert state.height == 24
     assert np.isclose(state.entropy, -(0.7 * np.log(0.7) + 0.3 * np.log(0.3)))
-    assert state.images == {'received': 1, 'predicted': 1}
+    assert state.counts == {'received': 1, 'predicted': 1}
     ((mask, *_),) = stub_predictor.asked
     assert mask.shape == (48, 64)
     assert mask.sum() == pytest.approx(24 * 10, rel=0.1)
@@ -73,7 +73,7 @@ def test_nobody_is_a_prediction_without_components(session, outputs, somebody, s
     assert len(message.components) == 0
     assert (message.kind, message.body_model) == (MixtureKind.PREDICTION, 'human37')
     assert one.state.status == 'nobody'
-    assert one.state.images == {'received': 1, 'predicted': 1, 'empty': 1}
+    assert one.state.counts == {'received': 1, 'predicted': 1, 'empty': 1}
     assert stub_predictor.asked == []
 
 
@@ -146,7 +146,7 @@ def test_images_wait_for_the_camera(session, outputs, somebody):
     assert 'waited for a calibrated camera_info' in handled[2].faults[0]
     assert one.state.wants == 'a calibrated camera_info'
     assert len(one.take(CAMERA_INFO, somebody.info()).published) == 2
-    assert one.state.images == {'received': 3, 'predicted': 2, 'dropped': 1}
+    assert one.state.counts == {'received': 3, 'predicted': 2, 'dropped': 1}
 
 
 def test_time(session, outputs, somebody, stub_predictor):
@@ -192,7 +192,7 @@ def test_bad_input_is_told_once_and_skipped(session, outputs, somebody):
     assert outputs == []
     one.take(IMAGE, somebody.image(2))
     assert len(outputs) == 1
-    assert one.state.images == {'received': 3, 'skipped': 2, 'predicted': 1}
+    assert one.state.counts == {'received': 3, 'skipped': 2, 'predicted': 1}
 
 
 def test_failed_prediction_skips_the_image(session, outputs, somebody, stub_predictor):
@@ -210,7 +210,7 @@ def test_what_nobody_wants_is_not_made(session, outputs, somebody):
     one = session(wanted=lambda topic: False)
     one.take(CAMERA_INFO, somebody.info())
     assert one.take(IMAGE, somebody.image(0)).published == ()
-    assert one.state.images['predicted'] == 1
+    assert one.state.counts['predicted'] == 1
 
 
 @pytest.mark.parametrize('made', [image_message, compressed_image_message])
@@ -225,7 +225,7 @@ def test_one_image_is_predicted_on_demand(session, somebody, stub_predictor, mad
     assert (content.kind, content.stamp_ns) == (MixtureKind.PREDICTION, somebody.stamp(7))
     # It is not part of the sequence.
     assert stub_predictor.asked[-1][1] is None
-    assert one.state.images == {'received': 1, 'predicted': 1}
+    assert one.state.counts == {'received': 1, 'predicted': 1}
     with pytest.raises(ValueError, match='nobody is seen: the silhouette is 0 px high'):
         one.predict_once(somebody.empty(8))
     with pytest.raises(ValueError, match='image has 32x24 pixels, wanted the 64x48'):

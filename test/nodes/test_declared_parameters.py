@@ -3,21 +3,25 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
+from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import (
+    AT_LAUNCH,
     AT_ONCE,
-    EFFECT,
     EFFECTS,
-    FLAT,
-    LIMITS,
     NEXT_TRACK,
+    NOT_NEGATIVE,
     ParameterError,
     declared_parameters,
     described_fields,
+    nested_parameters,
+    parameter_field,
     values_of,
     with_values,
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.tracking import TrackerSettings
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
+
+ALL = (FilterParameters(), SmootherParameters(), BmeParameters())
 
 
 @dataclass(frozen=True)
@@ -25,8 +29,8 @@ class Term:
     """A term.
 
     Attributes:
-        weight: of the term.
-        low, high: thresholds, of which
+        weight: Weight of the term.
+        low, high: Thresholds, of which
             the first is the lower.
     """
 
@@ -44,54 +48,73 @@ class Inner:
     """Settings.
 
     Attributes:
-        method: 'a' or 'b'.
-        edges: contours lie on edges.
+        method: Method, 'a' or 'b'.
+        edges: Contours on edges.
+        flow: Flow of the texture.
     """
 
     method: str = 'a'
     edges: Term = field(default_factory=Term)
+    flow: Term = field(default_factory=Term)
 
 
 @dataclass(frozen=True)
-class Outer:
+class Base:
+    """What all have.
+
+    Attributes:
+        shared: Shared by all.
+    """
+
+    shared: bool = parameter_field(True, AT_LAUNCH)
+
+
+@dataclass(frozen=True)
+class Outer(Base):
     """All.
 
     Attributes:
-        on: whether.
+        on: More: with a colon.
         inner: settings of the part.
-        own: more: with a colon.
+        own: Another term.
 
     Raises:
         ValueError: never.
     """
 
-    on: bool = field(default=True, metadata={EFFECT: AT_ONCE})
+    on: bool = parameter_field(True, AT_ONCE)
     inner: Inner = field(
-        default_factory=Inner, metadata={FLAT: True, LIMITS: {'edges.weight': (0.5, 9.0)}}
+        default_factory=Inner,
+        metadata=nested_parameters(
+            NEXT_TRACK,
+            {'method': None, 'edges.weight': (0.5, 9.0), 'edges.low': (-math.inf, math.inf)},
+        ),
     )
-    own: Term = field(default_factory=Term)
+    own: Term = field(
+        default_factory=Term,
+        metadata=nested_parameters(AT_ONCE, {'high': (0, 9), 'weight': NOT_NEGATIVE}, 'own.'),
+    )
+    apart: Term = field(default_factory=Term)
 
 
-def test_fields_of_dataclasses_are_parameters():
+def test_fields_that_are_listed_are_parameters():
     found = {p.name: p for p in declared_parameters(Outer())}
     assert list(found) == [
-        'on', 'method', 'edges.weight', 'edges.low', 'edges.high', 'own.weight', 'own.low',
-        'own.high',
+        'on', 'method', 'edges.weight', 'edges.low', 'own.high', 'own.weight', 'shared',
     ]  # fmt: skip
     assert {name: p.default for name, p in found.items()} == values_of(Outer())
-    assert found['method'].description == "'a' or 'b'."
-    assert found['edges.weight'].description == 'contours lie on edges: of the term.'
+    assert found['on'].description == 'More: with a colon.'
+    assert found['method'].description == "Method, 'a' or 'b'."
+    assert found['edges.weight'].description == 'Contours on edges: weight of the term.'
     assert found['own.high'].description == (
-        'more: with a colon: thresholds, of which the first is the lower.'
+        'Another term: thresholds, of which the first is the lower.'
     )
-    assert found['on'].effect == AT_ONCE
+    assert found['shared'].description == 'Shared by all.'
+    assert found['on'].effect == found['own.high'].effect == AT_ONCE
     assert found['edges.low'].effect == NEXT_TRACK
     assert found['on'].limits is None
     assert found['edges.weight'].limits == (0.5, 9.0)
-    # Otherwise numbers keep the sign of their defaults.
-    assert found['own.weight'].limits == (0.0, math.inf)
-    assert found['own.low'].limits == (-math.inf, math.inf)
-    assert found['own.high'].limits == (0.0, 2**31 - 1)
+    assert found['edges.low'].path == ('inner', 'edges', 'low')
 
 
 def test_values_replace_defaults():
@@ -103,6 +126,13 @@ def test_values_replace_defaults():
     assert with_values(Outer(), {}) == Outer()
 
 
+def test_settings_that_are_no_parameters_stay():
+    settings = Outer(apart=replace(Term(), high=7), inner=Inner(flow=replace(Term(), high=8)))
+    changed = with_values(settings, {'method': 'b'})
+    assert changed.apart.high == 7
+    assert changed.inner == Inner('b', flow=replace(Term(), high=8))
+
+
 @pytest.mark.parametrize(
     ('values', 'message'),
     [
@@ -111,7 +141,8 @@ def test_values_replace_defaults():
         ({'on': 1}, 'on must be a truth value, saw 1'),
         ({'own.high': 2.5}, 'own.high must be a whole number, saw 2.5'),
         ({'own.high': True}, 'own.high must be a whole number, saw True'),
-        ({'own.low': 'x'}, "own.low must be a number, saw 'x'"),
+        ({'edges.low': 'x'}, "edges.low must be a number, saw 'x'"),
+        ({'own.low': 1.0}, 'no parameter own.low$'),
         ({'method': None}, 'method must be a text, saw None'),
         ({'edges.weight': 9.5}, 'edges.weight must lie between 0.5 and 9, saw 9.5'),
         ({'own.weight': math.nan}, 'own.weight must lie between 0 and inf, saw nan'),
@@ -125,26 +156,8 @@ def test_wrong_values_are_refused(values, message):
 def test_values_that_do_not_go_together_are_refused():
     with pytest.raises(ValueError, match=r'low 4.0 must be below high 3'):
         with_values(Outer(), {'edges.low': 4.0})
-    assert with_values(Outer(), {'edges.low': 4.0, 'edges.high': 5}).inner.edges.high == 5
-
-
-def test_types_that_no_parameter_has_are_refused():
-    @dataclass(frozen=True)
-    class Wrong:
-        pair: tuple[int, int] = (1, 2)
-
-    with pytest.raises(TypeError, match=r'Wrong.pair is a tuple'):
-        declared_parameters(Wrong())
-
-
-def test_names_that_two_parts_share_are_refused():
-    @dataclass(frozen=True)
-    class Twice:
-        weight: float = 1.0
-        term: Term = field(default_factory=Term, metadata={FLAT: True})
-
-    with pytest.raises(TypeError, match=r"\['weight'\] twice"):
-        declared_parameters(Twice())
+    both = with_values(Outer(own=Term(low=2.0)), {'own.high': 5, 'own.weight': 1.0})
+    assert both.own == Term(1.0, 2.0, 5)
 
 
 def test_docstrings_without_attributes_describe_nothing():
@@ -153,41 +166,42 @@ def test_docstrings_without_attributes_describe_nothing():
 
     assert described_fields(Bare) == {}
     assert described_fields(Outer) == {
-        'on': 'whether.',
+        'shared': 'Shared by all.',
+        'on': 'More: with a colon.',
         'inner': 'settings of the part.',
-        'own': 'more: with a colon.',
+        'own': 'Another term.',
     }
 
 
-def test_every_setting_of_the_tracker_is_a_parameter_of_the_node():
+def test_nodes_have_few_parameters():
+    counts = [len(declared_parameters(settings)) for settings in ALL]
+    assert counts[0] <= 55
+    assert sum(counts) <= 90
     names = {p.name for p in declared_parameters(FilterParameters())}
-    assert set(values_of(TrackerSettings())) < names
-    for name in ('max_hypotheses', 'hypothesis_merge_distance', 'random_seed', 'proposals'):
-        assert name in names
+    assert {'max_hypotheses', 'hypothesis_merge_distance', 'random_seed', 'proposals'} < names
     parameters = with_values(FilterParameters(), {'likelihood.edges.weight': 7, 'candidates': 20})
     assert parameters.tracker.likelihood.edges.weight == 7.0
     assert parameters.tracker.candidates == 20
 
 
-def test_every_parameter_of_the_node_is_described():
-    parameters = declared_parameters(FilterParameters())
-    assert [p.name for p in parameters if not p.description] == []
-    assert {p.effect for p in parameters} <= EFFECTS.keys()
-    outside = [
-        p.name
-        for p in parameters
-        if p.limits is not None and not p.limits[0] <= p.default <= p.limits[1]
-    ]
-    assert outside == []
+@pytest.mark.parametrize('settings', ALL, ids=lambda settings: type(settings).__name__)
+def test_descriptions_are_sentences_that_stand_alone(settings):
+    parameters = declared_parameters(settings)
+    names = [p.name for p in parameters]
+    assert len(set(names)) == len(names)
+    for parameter in parameters:
+        text = parameter.description
+        assert text[0].isupper(), parameter
+        assert text.endswith('.'), parameter
+        assert not text.lower().startswith(('of ', 'whether ', 'so many ', 'their ')), parameter
 
 
-def test_limits_belong_to_parameters_that_exist():
-    names = {p.name for p in declared_parameters(FilterParameters())}
-    for entry in FilterParameters.__dataclass_fields__.values():
-        limits = entry.metadata.get(LIMITS)
-        if isinstance(limits, dict):
-            prefix = '' if entry.metadata.get(FLAT) else f'{entry.name}.'
-            assert {f'{prefix}{name}' for name in limits} <= names
+@pytest.mark.parametrize('settings', ALL, ids=lambda settings: type(settings).__name__)
+def test_defaults_lie_between_limits(settings):
+    for parameter in declared_parameters(settings):
+        assert parameter.effect in EFFECTS
+        assert (parameter.limits is None) == (type(parameter.default) in (bool, str)), parameter
+        assert parameter.checked(parameter.default) == parameter.default
 
 
 @pytest.mark.parametrize(
@@ -196,11 +210,13 @@ def test_limits_belong_to_parameters_that_exist():
         ({'max_hypotheses': 0}, 'max_hypotheses must lie between 1 and 64, saw 0'),
         ({'max_hypotheses': 50}, 'max_hypotheses <= candidates'),
         ({'proposals': 'guess'}, "proposals must be one of .* saw 'guess'"),
-        ({'dynamics.model': 'guess'}, "saw 'guess'"),
+        ({'likelihood.edges.wieght': 2.0}, 'is likelihood.edges.weight meant'),
+        ({'surprise': 2.0}, 'there is no parameter surprise'),
         ({'background.method': 'guess'}, "saw 'guess'"),
         ({'image_transport': 'theora'}, "image_transport must be one of .* saw 'theora'"),
         ({'body_model': ''}, 'body_model must be a name or a file'),
-        ({'likelihood.edges.sigma': 0.0}, 'sigma > 0'),
+        ({'sample_scale': -1.0}, 'sample_scale must lie between 0 and inf'),
+        ({'jump_probability': 0.0}, 'jump_probability must lie in'),
     ],
 )
 def test_wrong_parameters_of_the_node(values, message):

@@ -81,7 +81,7 @@ def test_subscription_that_does_not_fit_is_one_warning(smoother):
 
 
 def test_lost_messages_are_told_once_and_counted():
-    from hmt_ros.nodes.middleware_events import MiddlewareEvents
+    from hmt_ros.nodes.diagnostics import MiddlewareEvents
 
     texts = []
     events = MiddlewareEvents(texts.append)
@@ -102,7 +102,7 @@ def test_lost_messages_are_told_once_and_counted():
 
 
 def test_other_types_and_unknown_policies_are_told():
-    from hmt_ros.nodes.middleware_events import MiddlewareEvents
+    from hmt_ros.nodes.diagnostics import MiddlewareEvents
 
     texts = []
     events = MiddlewareEvents(texts.append)

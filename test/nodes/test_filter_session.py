@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera, load_body
-from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
@@ -49,7 +49,7 @@ def test_images_become_messages_in_their_order(session, outputs, small_camera):
     assert second.published == tuple((topic, small_camera.stamp(1)) for topic in ONE_IMAGE)
     assert (first.source, first.stamp_ns) == (IMAGE, small_camera.stamp(0))
     assert first.faults == first.warnings == ()
-    assert one.state.images == {'received': 2, 'tracked': 2}
+    assert one.state.counts == {'received': 2, 'tracked': 2}
     assert (one.state.status, one.state.modes, one.state.wants) == ('tracking', 2, '')
     assert np.isclose(one.state.entropy, -(0.75 * np.log(0.75) + 0.25 * np.log(0.25)))
     assert (one.state.misfit, one.state.evaluations) == (0.125, 7)
@@ -77,7 +77,7 @@ def test_what_nobody_wants_is_not_made(session, outputs, small_camera):
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
     assert [output.topic for output in outputs] == [*STARTS, 'markers']
-    assert one.state.images['tracked'] == 1
+    assert one.state.counts['tracked'] == 1
 
 
 def test_images_wait_for_the_camera(session, outputs, small_camera):
@@ -99,7 +99,7 @@ def test_oldest_images_that_wait_are_dropped(session, outputs, small_camera):
     assert 'waited for a calibrated camera_info' in handled[2].warnings[0]
     one.take(CAMERA_INFO, small_camera.info())
     assert tracked(outputs) == [small_camera.stamp(3), small_camera.stamp(4)]
-    assert one.state.images == {'received': 5, 'tracked': 2, 'dropped': 3}
+    assert one.state.counts == {'received': 5, 'tracked': 2, 'dropped': 3}
     assert one.state.faults['camera_info'] == 3
 
 
@@ -162,7 +162,7 @@ def test_images_that_wait_are_tracked_before_time_jumps(session, outputs, small_
     one = session(reset_on_time_jump=True, use_keypoints=True)
     one.take(IMAGE, small_camera.image(5))
     one.take(IMAGE, small_camera.image(4))
-    assert one.state.images == {'received': 2, 'dropped': 1}
+    assert one.state.counts == {'received': 2, 'dropped': 1}
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(3))
     assert tracked(outputs) == [small_camera.stamp(4)]
@@ -205,7 +205,7 @@ def test_bad_images_are_skipped(session, outputs, small_camera, spoil, message):
     assert [len(h.warnings) for h in handled] == [1, 0, 0]
     assert message in handled[0].warnings[0]
     assert tracked(outputs) == [small_camera.stamp(2)]
-    assert one.state.images == {'received': 3, 'tracked': 1, 'skipped': 2}
+    assert one.state.counts == {'received': 3, 'tracked': 1, 'skipped': 2}
 
 
 def test_damaged_pictures_are_skipped(session, outputs, small_camera):
@@ -609,7 +609,7 @@ def test_dropped_images_are_counted(session, small_camera):
     one = session()
     one.count_dropped(3)
     one.take(CAMERA_INFO, small_camera.info())
-    assert one.state.images == {'received': 3, 'dropped': 3}
+    assert one.state.counts == {'received': 3, 'dropped': 3}
 
 
 def test_topics_are_those_of_the_architecture():

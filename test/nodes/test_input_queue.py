@@ -1,6 +1,6 @@
 import threading
 
-from hmt_ros.nodes.input_queue import InputQueue, Waiting
+from hmt_ros.nodes.estimating_thread import InputQueue, Waiting
 
 
 def test_first_in_first_out():

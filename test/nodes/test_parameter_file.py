@@ -23,7 +23,7 @@ def test_file_of_the_node_is_what_it_declares():
 def test_other_values_survive(tmp_path):
     changed = with_values(
         FilterParameters(),
-        {'subject_file': "it's: #1", 'dynamics.velocity_kept': 1e-5, 'publish_tf': False,
+        {'subject_file': "it's: #1", 'jump_probability': 1e-5, 'publish_tf': False,
          'likelihood.self_intersection_sigma': float('inf')},
     )  # fmt: skip
     path = tmp_path / 'changed.yaml'
@@ -42,13 +42,14 @@ def test_sections_are_chosen_by_the_name_of_the_node(tmp_path):
     path = tmp_path / 'launch.yaml'
     path.write_text(
         '/camera:\n  ros__parameters: {rate: 30}\n'
-        'filter_node:\n  ros__parameters:\n    max_hypotheses: 4\n    dynamics: {root: 0.5}\n'
+        'filter_node:\n  ros__parameters:\n    max_hypotheses: 4\n'
+        '    background: {threshold: 0.5}\n'
         '/**:\n  ros__parameters: {max_hypotheses: 6, likelihood.edges.weight: 3.0}\n'
     )
     assert read_parameter_file(path, 'filter_node') == {
         'max_hypotheses': 4,
         'likelihood.edges.weight': 3.0,
-        'dynamics.root': 0.5,
+        'background.threshold': 0.5,
     }
     assert read_parameter_file(path, 'other') == {
         'max_hypotheses': 6,
@@ -58,8 +59,11 @@ def test_sections_are_chosen_by_the_name_of_the_node(tmp_path):
 
 def test_files_without_sections(tmp_path):
     path = tmp_path / 'plain.yaml'
-    path.write_text('max_hypotheses: 4\ndynamics:\n  root: 0.5\n')
-    assert read_parameter_file(path, 'filter_node') == {'max_hypotheses': 4, 'dynamics.root': 0.5}
+    path.write_text('max_hypotheses: 4\nbackground:\n  threshold: 0.5\n')
+    assert read_parameter_file(path, 'filter_node') == {
+        'max_hypotheses': 4,
+        'background.threshold': 0.5,
+    }
     path.write_text('')
     assert read_parameter_file(path, 'filter_node') == {}
 

@@ -92,7 +92,6 @@ def test_parameters_are_those_of_the_file(running):
         ({'fixed_lag': -1}, 'out of range'),
         ({'method': 'guess'}, "saw 'guess'"),
         ({'body_model': 'nobody'}, "no body 'nobody'"),
-        ({'dynamics__knee': 0.0}, 'dynamics.knee must be positive'),
         ({'autostart': False}, 'read-only'),
     )
     assert running.set(queue_size=3, max_hypotheses=2) == (True, '')

@@ -24,7 +24,7 @@ from hmt_ros.app.replay.player import LiveNodeError, Player, environment
 from hmt_ros.sessions.declared_parameters import values_of
 from hmt_ros.sessions.handled import HANDLED, Handled, handled_of
 from hmt_ros.sessions.parameter_file import yaml_scalar
-from hmt_ros.sessions.published_topic import SUBSCRIBERS, PublishedTopic
+from hmt_ros.sessions.session import SUBSCRIBERS, PublishedTopic
 from msg_tools.messages.cdr import canonical, deserialise, serialise
 
 # Generous: they end a replay that hangs. A node that ends is noticed at once.

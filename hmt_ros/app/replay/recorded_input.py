@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from dataclasses import dataclass
 
-from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.filter_session import KEYPOINTS
 from msg_tools import BagError, BagMessage, BagReader, Topic
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE

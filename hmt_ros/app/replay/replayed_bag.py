@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from hmt_ros.app.replay.recorded_input import (
 from hmt_ros.app.replay.write_behind import WriteBehind
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS
@@ -172,16 +172,12 @@ def _bme_parameters(
 ) -> BmeParameters:
     values = {
         'background_file': tracking.background_file,
-        **{
-            f'background.{field.name}': getattr(tracking.background, field.name)
-            for field in fields(tracking.background)
-        },
         **_given_values(options, BME),
         'image_transport': recorded.transport,
     }
     if options.bme:
         values['model_file'] = options.bme
-    return with_values(BmeParameters(), values)
+    return with_values(BmeParameters(background=tracking.background), values)
 
 
 def _given_values(options: argparse.Namespace, node: str) -> dict[str, Any]:
