@@ -14,9 +14,9 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
 from msg_tools import MessageFactory
-from msg_tools.messages.joint_states import heaviest_joint_state
 from msg_tools.messages.markers import trajectory_markers
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.states import heaviest_joint_state
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture as TrajectoryContent
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 

@@ -21,10 +21,9 @@ from hmt_ros.sessions.session import PublishedTopic
 from msg_tools import MessageFactory
 from msg_tools.messages.bodies import description_message, message_of_body
 from msg_tools.messages.images import compressed_image_message
-from msg_tools.messages.joint_states import heaviest_joint_state
 from msg_tools.messages.markers import skeleton_markers
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
-from msg_tools.messages.transforms import transforms_message
+from msg_tools.messages.states import heaviest_joint_state, transforms_message
 from msg_tools.messages.urdf import link_frames
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""`metadata.yaml`, the file that makes a folder a rosbag2 bag."""
+"""`metadata.yaml`, which makes a folder a bag of rosbag2: reads and writes it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
 
-from msg_tools.bags.bag_error import BagError, reason
+from msg_tools.bags.contents import BagError, reason
 from msg_tools.files.bounded_file import read_bytes
 
 FILE_NAME = 'metadata.yaml'
@@ -89,7 +89,7 @@ def recorded_quality_of_service(text: str) -> list[dict[str, Any]]:
         text: YAML, with numbers in bags of ROS 2 Iron and before.
 
     Returns:
-        Nothing where the text can not be understood: players then offer what is usual.
+        An empty list if the text can not be understood: players then offer the usual QoS.
     """
     try:
         profiles = yaml.safe_load(text)

@@ -1,7 +1,7 @@
-"""Archives of plain arrays (.npz) from outside: data alone, and no more of it than is agreed.
+"""Reads archives of plain arrays (.npz) from outside, up to an agreed size.
 
-Nothing is unpickled. An archive is compressed and could unfold to any size, and the head of an
-array could claim one: both are looked at before memory is spent.
+Nothing is unpickled. A compressed archive could expand to any size, and the header of an array
+could claim any size: both are checked before memory is allocated.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""YAML that people write by hand: data alone, without aliases, not deep.
+"""Reads YAML that people write by hand: plain data without aliases, of limited depth.
 
-Tags of Python are unknown to the loader. Aliases, which ROS does not read in its parameter files
-either, could make a short file stand for more data than any memory holds.
+The loader knows no tags of Python. Aliases could expand a short file to more data than memory
+holds; ROS does not accept them in its parameter files either.
 """
 
 from __future__ import annotations

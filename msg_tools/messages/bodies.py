@@ -10,7 +10,7 @@ import numpy as np
 from hmt_ros.body import Body
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_error import MessageError, MessageFault, check_names
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_types import MessageFactory
 from msg_tools.messages.pose_mixtures import PoseMixture
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture
 from msg_tools.messages.urdf import body_urdf, segments_of

@@ -14,8 +14,7 @@ from typing import Any
 
 from rosbags.typesys.store import Typestore
 
-from msg_tools.messages.message_factory import RosbagsMessages
-from msg_tools.messages.typestore import typestore
+from msg_tools.messages.message_types import RosbagsMessages, typestore
 
 _HEADER_BYTES = 4
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_error import MessageError, check_covariances, names_of, numbers
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_types import MessageFactory
 
 Array = NDArray[np.float64]
 
-# Of one person; detectors tell up to a few hundred.
+# Of one person; detectors find up to a few hundred.
 MAX_KEYPOINTS = 10_000
 
 

@@ -1,4 +1,4 @@
-"""The error of messages that contradict themselves, and the checks that the conversions share."""
+"""`MessageError`, raised for contradictory messages, and the checks that the conversions share."""
 
 from __future__ import annotations
 
@@ -53,6 +53,31 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
     if array.shape != (count,):
         raise MessageError(f'{what} has {array.size} values, wanted {count}')
     return array.reshape(shape)
+
+
+def freeze_arrays(
+    record: Any, shapes: Mapping[str, tuple[int, ...]], what: str, optional: Sequence[str] = ()
+) -> None:
+    """Makes the attributes of a frozen dataclass read-only arrays of floats, in a shape each.
+
+    Args:
+        record: the dataclass.
+        shapes: of its attributes, by name.
+        what: the record is, for messages.
+        optional: names of attributes that may be None, and stay so.
+
+    Raises:
+        MessageError: another shape.
+    """
+    for name, shape in shapes.items():
+        value = getattr(record, name)
+        if value is None and name in optional:
+            continue
+        array = np.array(value, dtype=np.float64)
+        if array.shape != shape:
+            raise MessageError(f'{what}: {name} has shape {array.shape}, wanted {shape}')
+        array.setflags(write=False)
+        object.__setattr__(record, name, array)
 
 
 def check_finite(values: Array, what: str) -> None:

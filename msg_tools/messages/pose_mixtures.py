@@ -25,11 +25,12 @@ from msg_tools.messages.message_error import (
     check_lengths,
     check_names,
     check_weights,
+    freeze_arrays,
     lengths_of,
     names_of,
     numbers,
 )
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_types import MessageFactory
 
 Array = NDArray[np.float64]
 
@@ -100,19 +101,11 @@ class PoseMixture:
             'log_likelihoods': (components,),
             'degrees_of_freedom': (components,),
         }
-        unknown = {
-            'log_likelihoods': np.full(components, np.nan),
-            'degrees_of_freedom': np.zeros(components),
-        }
-        for name, shape in shapes.items():
-            value = getattr(self, name)
-            if value is None and name == 'covariances':
-                continue
-            array = np.array(unknown[name] if value is None else value, dtype=np.float64)
-            if array.shape != shape:
-                raise MessageError(f'mixture: {name} has shape {array.shape}, wanted {shape}')
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        if self.log_likelihoods is None:
+            object.__setattr__(self, 'log_likelihoods', np.full(components, np.nan))
+        if self.degrees_of_freedom is None:
+            object.__setattr__(self, 'degrees_of_freedom', np.zeros(components))
+        freeze_arrays(self, shapes, 'mixture', optional=('covariances',))
         check_finite(self.means, 'mixture: mean')
         check_finite(self.joint_positions, 'mixture: joint_positions')
         if components:

@@ -17,11 +17,12 @@ from msg_tools.messages.message_error import (
     check_lengths,
     check_names,
     check_weights,
+    freeze_arrays,
     lengths_of,
     names_of,
     numbers,
 )
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_types import MessageFactory
 
 Array = NDArray[np.float64]
 
@@ -78,15 +79,7 @@ class TrajectoryMixture:
             'inflation': (m,),
             'free_energy': (len(self.free_energy),),
         }
-        for name, shape in shapes.items():
-            value = getattr(self, name)
-            if value is None:
-                continue
-            array = np.array(value, dtype=np.float64)
-            if array.shape != shape:
-                raise MessageError(f'trajectories: {name} has shape {array.shape}, wanted {shape}')
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        freeze_arrays(self, shapes, 'trajectories', optional=('marginal_covariances',))
         if any(b <= a for a, b in zip(self.stamps_ns, self.stamps_ns[1:], strict=False)):
             raise MessageError('trajectories: stamps do not increase')
         check_weights(self.weights, 'trajectories')

@@ -24,7 +24,7 @@ from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.images import decode_image
-from msg_tools.messages.typestore import typestore
+from msg_tools.messages.message_types import typestore
 
 STRING = 'std_msgs/msg/String'
 

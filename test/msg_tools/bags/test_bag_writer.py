@@ -24,7 +24,7 @@ from rosbags.rosbag2 import Reader
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.bags import bag_folder
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.typestore import typestore
+from msg_tools.messages.message_types import typestore
 from test.msg_tools.conftest import limited_file_size
 
 STRING = 'std_msgs/msg/String'

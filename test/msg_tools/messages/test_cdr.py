@@ -19,12 +19,11 @@ from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.cdr import canonical, deserialise, serialise
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.images import compressed_image_message, image_message
-from msg_tools.messages.joint_states import heaviest_joint_state
 from msg_tools.messages.keypoints import keypoints_message
 from msg_tools.messages.markers import skeleton_markers
 from msg_tools.messages.pose_mixtures import PoseMixture, pose_mixture_message
+from msg_tools.messages.states import heaviest_joint_state, transforms_message
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
-from msg_tools.messages.transforms import transforms_message
 
 STAMP = 1_700_000_000_987_654_321
 RNG = np.random.default_rng(11)

@@ -15,6 +15,7 @@ from msg_tools import MessageError, RosbagsMessages, typestore
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.cdr import deserialise, serialise
 from msg_tools.messages.message_error import MessageFault
+from msg_tools.messages.message_types import typestore_of_definition
 from msg_tools.messages.pose_mixtures import (
     POSE_MIXTURE,
     MixtureKind,
@@ -22,7 +23,6 @@ from msg_tools.messages.pose_mixtures import (
     pose_mixture_message,
     pose_mixture_of,
 )
-from msg_tools.messages.typestore import typestore_of_definition
 
 
 def test_kinds_are_those_of_the_message() -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from msg_tools.bags.time_order import Source, Timed, merge
+from msg_tools.bags.contents import Source, Timed, merge
 
 
 def test_merge_sorts_by_time_then_source_then_position() -> None:

@@ -1,4 +1,4 @@
-"""Merging streams of messages into one, in the order of their times."""
+"""Channels and messages of the files of a bag, their merging by time, and `BagError`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,49 @@ import heapq
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
+
+from msg_tools.files.error_line import error_line
+
+
+class Channel(NamedTuple):
+    """What a bag says about the messages of one topic.
+
+    Attributes:
+        topic: as written, with or without a leading slash.
+        msgtype: as written; '' if the bag does not contain it.
+        encoding: 'cdr' for ROS 2.
+        definition_encoding: 'ros2msg', 'ros2idl', or '' when there is no definition.
+        definition: text of the message definition.
+    """
+
+    topic: str
+    msgtype: str
+    encoding: str
+    definition_encoding: str
+    definition: bytes
+
+
+class StoredMessage(NamedTuple):
+    """A message as it lies in the file."""
+
+    channel: Channel
+    data: memoryview
+
+
+class BagError(ValueError):
+    """A bag that can not be read or written, in one line: what was seen, wanted, and what to do."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(' '.join(text.split()))
+
+
+def reason(error: BaseException) -> str:
+    """The text of a library's exception as one line of at most 160 characters."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    text = error_line(error)
+    return text if len(text) <= 160 else f'{text[:157]}...'
+
 
 Timed = tuple[int, Any]
 

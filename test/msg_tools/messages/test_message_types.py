@@ -8,7 +8,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import msg_tools
-from msg_tools.messages.typestore import typestore, typestore_of_definition
+from msg_tools.messages.message_types import typestore, typestore_of_definition
 
 DEFINITIONS = Path(msg_tools.__file__).parent / 'hmt_msgs' / 'msg'
 

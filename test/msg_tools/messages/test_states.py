@@ -12,10 +12,14 @@ from hmt_ros.body import load_body
 from msg_tools import MessageError, RosbagsMessages
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.headers import header_message, time_message, time_ns
-from msg_tools.messages.joint_states import heaviest_joint_state, joint_state_message
 from msg_tools.messages.message_error import lengths_of
 from msg_tools.messages.pose_mixtures import PoseMixture
-from msg_tools.messages.transforms import quaternions, transforms_message
+from msg_tools.messages.states import (
+    heaviest_joint_state,
+    joint_state_message,
+    quaternions,
+    transforms_message,
+)
 
 
 @pytest.mark.parametrize('stamp', [0, 1, 999_999_999, 10**9, 1_700_000_000_123_456_789])
