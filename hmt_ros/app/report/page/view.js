@@ -52,7 +52,7 @@ class Space {
     this.listen();
   }
 
-  /** Where the person is on the whole, and how much room all modes take, there and about the pelvis. */
+  /** The centre of all modes, and the room that they take, in space and around the pelvis. */
   measure() {
     const low = [Infinity, Infinity, Infinity];
     const high = [-Infinity, -Infinity, -Infinity];
@@ -61,7 +61,7 @@ class Space {
     const figure = layers[0] || truth;
     this.roots = TIMES.map((_, t) => {
       const offset = this.heaviest(figure, t);
-      return offset < 0 ? null : this.joint(figure, offset, figure.root);
+      return offset < 0 ? null : this.origin(figure, offset);
     });
     const include = (point) => point.forEach((x, axis) => {
       low[axis] = Math.min(low[axis], x);
@@ -105,6 +105,12 @@ class Space {
   joint(figure, offset, joint) {
     const i = (offset * figure.joints.length + joint) * 3;
     return [...figure.positions.slice(i, i + 3)];
+  }
+
+  /** The middle of the joints on which skeletons are aligned: the pelvis, or the hips. */
+  origin(figure, offset) {
+    const points = figure.roots.map((joint) => this.joint(figure, offset, joint));
+    return [0, 1, 2].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
   }
 
   heaviest(figure, t) {
@@ -209,8 +215,8 @@ class Space {
       const { figure, offset } = mode;
       const joints = figure.joints.length;
       const points = [];
-      const first = (offset * joints + figure.root) * 3;
-      const shift = root.map((x, axis) => (this.together ? x - figure.positions[first + axis] : 0));
+      const own = this.origin(figure, offset);
+      const shift = root.map((x, axis) => (this.together ? x - own[axis] : 0));
       for (let joint = 0; joint < joints; joint += 1) {
         const i = (offset * joints + joint) * 3;
         points.push(project(...shift.map((x, axis) => x + figure.positions[i + axis])));
