@@ -209,8 +209,9 @@ class TrackScorer:
             return
         body = estimates[0].body
         mixtures = [one.mixture for one in estimates if one.mixture is not None]
-        if body is None or len(mixtures) < len(estimates):
-            self._note = self._note or 'no covariances, or no body that they are of'
+        if len(mixtures) < len(estimates) or body is None:
+            why = 'its body is unknown' if len(mixtures) == len(estimates) else 'no covariances'
+            self._note = self._note or why
             body = None
         elif _is_elsewhere(body, estimates[0]):
             self._note = f'joint positions are not those of the body {body.name} of the bag'

@@ -213,7 +213,7 @@ def test_a_bag_without_body(capsys, tmp_path, body, mixtures, bag, truth_file):
     assert 'body' in found['note']
     code, out, _ = run(capsys, path, '--truth', truth_file)
     assert code == 0
-    assert out.splitlines()[-1].startswith('pose_mixture: no covariances')
+    assert out.splitlines()[-1].startswith('pose_mixture: its body is unknown')
 
 
 def test_unknown_covariances(capsys, tmp_path, body, mixtures, truth_file):

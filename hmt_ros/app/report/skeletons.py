@@ -147,9 +147,9 @@ def _draw_sheet(
     columns = min(4, len(moments))
     rows = -(-len(moments) // columns)
     cell = 2.4
-    height = rows * (cell * ratio + 0.25) + 0.7
+    width, height = columns * cell + 0.5, rows * (cell * ratio + 0.25) + 0.7
     with mpl.rc_context(STYLE):
-        figure = Figure((columns * cell + 0.4, height), dpi=110)
+        figure = Figure((width, height), dpi=110)
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes in grid.flat:
             axes.set_axis_off()
@@ -164,7 +164,7 @@ def _draw_sheet(
         figure.text(0.02, 1 - 0.1 / height, title, va='top', fontsize=10)
         _add_legend(figure, truth)
         figure.subplots_adjust(
-            left=0.04, right=0.99, top=1 - 0.5 / height, bottom=0.4 / height, wspace=0.08,
+            left=0.5 / width, right=0.99, top=1 - 0.5 / height, bottom=0.4 / height, wspace=0.08,
             hspace=0.25 / (cell * ratio),
         )  # fmt: skip
         save_picture(figure, path)

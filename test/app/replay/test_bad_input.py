@@ -261,7 +261,7 @@ def test_without_a_subject_somebody_must_be_seen(tmp_path, capsys):
         (['--set', 'bme.image_transport=raw'], 'is decided by replay'),
         (
             ['--set', 'bme.stature=1.8', '--subject', str(REACH / 'subject.yaml')],
-            '--set bme.stature=1.8: nothing is predicted; --bme does',
+            '--set bme.stature=1.8: nothing is predicted without --bme',
         ),
     ],
 )

@@ -1,7 +1,7 @@
-// What is drawn of the person: skeletons in space, which turn, and skeletons on the image.
+// Skeletons in a 3D view that turns, and skeletons on the image.
 
 const FAINTEST = 0.12;
-// How far away one looks from, in radii of what is in sight.
+// Distance of the viewer, in radii of the visible room.
 const DISTANCE = 5;
 const DASHES = { likelihood: [5, 3], prediction: [2, 3] };
 
@@ -119,7 +119,7 @@ class Space {
     return figure.weights[t].length ? figure.starts[t] : -1;
   }
 
-  /** Half of what is in sight at zoom 1, m. */
+  /** Half of the visible room at zoom 1, m. */
   get radius() {
     return 1.12 * (this.follow && this.lastRoot() ? this.ownRoom : this.room);
   }
@@ -196,7 +196,7 @@ class Space {
     };
   }
 
-  /** Where the person is now, or was last seen. */
+  /** The present or last known origin of the person. */
   lastRoot() {
     for (let t = shown.time; t >= 0; t -= 1) if (this.roots[t]) return this.roots[t];
     return this.roots.find(Boolean) || null;
@@ -282,7 +282,7 @@ class Space {
     context.fillText('to the camera', u, v);
   }
 
-  /** The ways of hands, feet, head and pelvis along the trajectories of the present window. */
+  /** The paths of hands, feet, head and pelvis along the trajectories of the current window. */
   drawWays(context, project) {
     context.strokeStyle = colour('trajectories');
     context.fillStyle = colour('trajectories');
@@ -324,7 +324,7 @@ class Film {
     this.last = null;
   }
 
-  /** A picture, which may still be on its way; those that follow are fetched too. */
+  /** A picture, which may still be decoding; the following ones are prepared too. */
   picture(index) {
     const known = this.pictures.get(index);
     if (known) return known;
