@@ -7,6 +7,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NoReturn
 
 from msg_tools.files.error_line import error_line
@@ -29,6 +30,49 @@ class CommandParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raises ValueError."""
         raise ValueError(f'{message}; see --help')
+
+    def add_output(self, metavar: str, what: str, text: str) -> None:
+        """Adds --output, --overwrite and --quiet of a command that writes a folder.
+
+        Args:
+            metavar: name of the folder in the help.
+            what: what it is, 'bag' for example.
+            text: help text of --output.
+        """
+        self.add_argument('-o', '--output', type=Path, required=True, metavar=metavar, help=text)
+        self.add_argument('--overwrite', action='store_true', help=f'replace an existing {what}')
+        self.add_argument('--quiet', action='store_true', help='print only warnings and errors')
+
+    def add_mixtures(self, verb: str) -> None:
+        """Adds the bag, --truth, --topic and --body of a command that reads mixtures.
+
+        Args:
+            verb: what it does with them, 'evaluate' for example.
+        """
+        self.add_argument(
+            'bag', type=Path, metavar='OUT', help='bag with mixtures: a folder or a file'
+        )
+        self.add_argument(
+            '--truth',
+            type=Path,
+            metavar='FILE',
+            help='true joint positions: a .npz file with stamps, joint_names and joints, or a bag '
+            'with ground truth (default: the ground truth in OUT)',
+        )
+        self.add_argument(
+            '--topic',
+            action='append',
+            default=[],
+            dest='topics',
+            metavar='NAME',
+            help=f'{verb} only this topic; may be repeated (default: all topics with mixtures)',
+        )
+        self.add_argument(
+            '--body',
+            metavar='MODEL',
+            help='body model of the poses: a name or a YAML file (default: the model that OUT '
+            'names)',
+        )
 
 
 def run_command(

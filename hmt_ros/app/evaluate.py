@@ -6,7 +6,6 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -45,24 +44,7 @@ def _parser() -> CommandParser:
         'Compares the mixtures in a bag with ground truth: errors and calibration.',
         EPILOG,
     )
-    parser.add_argument(
-        'bag', type=Path, metavar='OUT', help='bag with mixtures: a folder or a file'
-    )
-    parser.add_argument(
-        '--truth',
-        type=Path,
-        metavar='FILE',
-        help='true joint positions: a .npz file with stamps, joint_names and joints, or a bag with '
-        'ground truth (default: OUT itself)',
-    )
-    parser.add_argument(
-        '--topic',
-        action='append',
-        default=[],
-        dest='topics',
-        metavar='NAME',
-        help='evaluate only this topic; may be repeated (default: all topics with mixtures)',
-    )
+    parser.add_mixtures('evaluate')
     parser.add_argument(
         '--model-sigma',
         type=number(1e-4, 1, what='a length', unit=' m'),
@@ -71,11 +53,6 @@ def _parser() -> CommandParser:
         help='standard deviation, in m, by which the body model errs in each coordinate of a joint '
         'in every pose, since its lengths are not exactly those of the person; added to the '
         f'covariances of the mixture (default: {MODEL_SIGMA:g})',
-    )
-    parser.add_argument(
-        '--body',
-        metavar='MODEL',
-        help='body model of the poses: a name or a YAML file (default: the model that OUT names)',
     )
     parser.add_argument(
         '--seed',

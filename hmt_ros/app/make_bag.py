@@ -56,11 +56,7 @@ def _parser() -> CommandParser:
         'name',
         help=f'a procedural motion ({", ".join(PROCEDURAL_MOTIONS)}), or any name with --mocap',
     )
-    parser.add_argument(
-        '-o', '--output', type=Path, required=True, metavar='DIR', help='folder of the bag'
-    )
-    parser.add_argument('--overwrite', action='store_true', help='replace an existing bag')
-    parser.add_argument('--quiet', action='store_true', help='show no progress bar')
+    parser.add_output('DIR', 'bag', 'folder of the bag')
     parser.add_argument(
         '--seed', type=whole_number(0), default=0, help='seed of all random numbers (default: 0)'
     )

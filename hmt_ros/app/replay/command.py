@@ -74,18 +74,7 @@ def _parser() -> CommandParser:
         metavar='IN',
         help='bag: a folder, or a file such as .mcap; several bags or a folder of bags, see below',
     )
-    parser.add_argument(
-        '-o',
-        '--output',
-        type=Path,
-        required=True,
-        metavar='OUT',
-        help='folder of the new bag, or of the new bags',
-    )
-    parser.add_argument('--overwrite', action='store_true', help='replace an existing bag')
-    parser.add_argument(
-        '--quiet', action='store_true', help='show neither progress bar nor summary'
-    )
+    parser.add_output('OUT', 'bag', 'folder of the new bag, or of the new bags')
     parser.add_argument(
         '--live',
         action='store_true',

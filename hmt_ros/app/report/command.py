@@ -78,33 +78,10 @@ def _parser() -> CommandParser:
         'Shows the mixtures in a bag: pictures, and one page with a 3D view of the modes.',
         EPILOG,
     )
-    parser.add_argument(
-        'bag', type=Path, metavar='OUT', help='bag with mixtures: a folder or a file'
-    )
-    parser.add_argument(
-        '-o', '--output', type=Path, required=True, metavar='DIR', help='folder of the report'
-    )
-    parser.add_argument('--overwrite', action='store_true', help='replace an existing report')
-    parser.add_argument(
-        '--quiet', action='store_true', help='show neither progress bar nor summary'
-    )
+    parser.add_mixtures('show')
+    parser.add_output('DIR', 'report', 'folder of the report')
     parser.add_argument(
         '--images', type=Path, metavar='IN', help='bag of the images that were tracked'
-    )
-    parser.add_argument(
-        '--truth',
-        type=Path,
-        metavar='FILE',
-        help='true joint positions: a .npz file with stamps, joint_names and joints, or a bag with '
-        'ground truth (default: the ground truth in OUT, if any)',
-    )
-    parser.add_argument(
-        '--topic',
-        action='append',
-        default=[],
-        dest='topics',
-        metavar='NAME',
-        help='show only this topic of mixtures; may be repeated (default: all topics)',
     )
     parser.add_argument(
         '--times',
@@ -116,11 +93,6 @@ def _parser() -> CommandParser:
     parser.add_argument('--image-topic', metavar='NAME', help='topic of the images, as for replay')
     parser.add_argument(
         '--camera-info-topic', metavar='NAME', help='topic of the calibration, as for replay'
-    )
-    parser.add_argument(
-        '--body',
-        metavar='MODEL',
-        help='body model of the poses: a name or a YAML file (default: the model that OUT names)',
     )
     return parser
 
