@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from benchmarks.clips import Clip, find_clips, read_clip
 from benchmarks.experts_motion import BEST_OF, learn_from, predictor_of, recorded
 from benchmarks.smoothing_clips import NAMES, true_joints
-from hmt_ros.app.truth import Truth
 from hmt_ros.evaluation.pose_scores import ORIGIN, joint_mixtures, score
+from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.image.background import BackgroundModel

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hmt_ros.app.report.pictures import STYLE
+from hmt_ros.app.report.skeletons import STYLE
 from hmt_ros.body import Body
 from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
 from hmt_ros.experts.pose_encoding import AXES

@@ -1,13 +1,13 @@
-"""True joint positions, from a file of arrays or from the ground truth that a bag carries."""
+"""Readers of true joint positions: from a file of arrays or from the ground truth in a bag."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.evaluation.track_scores import Truth
 from msg_tools import BagReader, MessageError
 from msg_tools.files.array_file import read_archive
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mixture_of
@@ -17,51 +17,14 @@ Array = NDArray[np.float64]
 FIELDS = ('stamps', 'joint_names', 'joints')
 
 
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """Where the joints of a person were.
-
-    Attributes:
-        source: where this comes from, for messages.
-        joint_names: (J,).
-        joints: stamp in ns -> (J, 3) m, camera optical frame.
-        frame_id: of the positions; '': not told.
-
-    Raises:
-        ValueError: no frames, or positions that do not fit the names or are not finite.
-    """
-
-    source: str
-    joint_names: tuple[str, ...]
-    joints: dict[int, Array]
-    frame_id: str = ''
-
-    def __post_init__(self) -> None:
-        if not self.joints:
-            raise ValueError(f'{self.source} has no frames')
-        wanted = (len(self.joint_names), 3)
-        for stamp, positions in self.joints.items():
-            if positions.shape != wanted:
-                raise ValueError(
-                    f'{self.source}: joints at {stamp} ns have shape {positions.shape}, '
-                    f'wanted {wanted}'
-                )
-            if not np.isfinite(positions).all():
-                raise ValueError(f'{self.source}: joints at {stamp} ns are not finite')
-
-    def span(self) -> str:
-        """First and last stamp, for messages."""
-        return f'{min(self.joints)} to {max(self.joints)} ns'
-
-
 def read_truth(path: Path) -> Truth:
-    """Truth of a file of arrays (.npz) or of a bag.
+    """Truth from a file of arrays (.npz) or from a bag.
 
     The file has `stamps` (T,) ns, `joint_names` (J,) and `joints` (T, J, 3) m in the camera optical
     frame.
 
     Raises:
-        ValueError: neither, or arrays that are missing or do not fit each other.
+        ValueError: another file, arrays that are missing or do not fit each other.
     """
     if path.suffix == '.npz':
         return _from_arrays(path)
@@ -75,7 +38,7 @@ def read_truth(path: Path) -> Truth:
 
 
 def recorded_truth(path: Path) -> Truth | None:
-    """The truth that a bag carries, None when it has none.
+    """The ground truth in a bag; None if it has none.
 
     Raises:
         ValueError: there are several, or messages that can not be understood.
@@ -107,7 +70,7 @@ def _from_arrays(path: Path) -> Truth:
 
 
 def _truth_topic(bag: BagReader) -> str | None:
-    """The topic of a bag that carries the ground truth, None when it has none.
+    """The topic of the ground truth in a bag; None if it has none.
 
     Raises:
         ValueError: there are several.
@@ -128,13 +91,13 @@ def mixture_topics(bag: BagReader) -> list[str]:
 
 
 def is_truth(bag: BagReader, topic: str) -> bool:
-    """Whether the mixtures of a topic are known poses."""
+    """Whether the mixtures on a topic are ground truth."""
     first = next(bag.messages([topic]), None)
     return first is not None and int(first.message.kind) == MixtureKind.GROUND_TRUTH
 
 
 def _truth_of(bag: BagReader, topic: str) -> Truth:
-    """The truth that a topic of a bag carries.
+    """The ground truth on a topic of a bag.
 
     Raises:
         ValueError: messages that contradict each other or have no component.

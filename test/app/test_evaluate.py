@@ -10,7 +10,7 @@ import pytest
 from hmt_ros.app.evaluate import main
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS, ground_truth
 from hmt_ros.body import load_body
-from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, joint_mixtures, score
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, HIPS, joint_mixtures, score
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.bodies import message_of_body
@@ -133,6 +133,21 @@ def test_truth_from_the_bag_itself_and_from_another_bag(capsys, bag, truth_file)
     assert report(capsys, bag, '--truth', bag)['topics'] == from_file['topics']
 
 
+def test_truth_without_pelvis_is_aligned_at_the_hips(capsys, tmp_path, bag, body, poses, mixtures):
+    names = [name for name in body.joint_names if name != 'pelvis']
+    joints = body.joint_positions(poses)[:, body.skeleton.joint_index(names)]
+    path = tmp_path / 'truth.npz'
+    np.savez(path, stamps=STAMPS, joint_names=names, joints=joints + 0.7)
+    found = report(capsys, bag, '--truth', path)['topics']['pose_mixture']
+    where = [names.index(name) for name in EVALUATED_JOINTS]
+    hips = [names.index('left_hip'), names.index('right_hip')]
+    truth = joints[:, where] - joints[:, hips].mean(1, keepdims=True)
+    wanted = score(joint_mixtures(body, mixtures, origin=HIPS), truth, seed=0).summary()
+    for key, value in without_names(wanted).items():
+        assert found[key] == pytest.approx(value, rel=1e-9), key
+    assert found['note'] == ''
+
+
 def test_model_sigma_and_seed(capsys, bag):
     usual, wide, seeded = (
         report(capsys, bag, *more)['topics']['pose_mixture']
@@ -189,7 +204,7 @@ def test_a_bag_without_body(capsys, tmp_path, body, mixtures, bag, truth_file):
     assert 'body' in found['note']
     code, out, _ = run(capsys, path, '--truth', truth_file)
     assert code == 0
-    assert out.splitlines()[-1].startswith('pose_mixture: no covariances')
+    assert out.splitlines()[-1].startswith('pose_mixture: its body is unknown')
 
 
 def test_unknown_covariances(capsys, tmp_path, body, mixtures, truth_file):
@@ -380,10 +395,10 @@ def test_truth_that_can_not_be_used(capsys, tmp_path, bag, body):
         '5 stamps': save(tmp_path / 'b.npz', **{**good, 'stamps': good['stamps'][:5]}),
         'whole nanoseconds': save(tmp_path / 'c.npz', **{**good, 'stamps': good['stamps'] * 1e-9}),
         'not finite': save(tmp_path / 'd.npz', **{**good, 'joints': infinite}),
-        'no joint pelvis': save(
+        'neither a pelvis nor left_hip and right_hip': save(
             tmp_path / 'e.npz', **{**good, 'joint_names': np.char.add(good['joint_names'], '_')}
         ),
-        'wanted 4 at least': save(
+        'wanted at least 4': save(
             tmp_path / 'f.npz',
             stamps=good['stamps'],
             joint_names=['pelvis', 'neck'],

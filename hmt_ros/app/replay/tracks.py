@@ -1,63 +1,52 @@
-"""BME, filter and smoother that take the messages of a bag, offline or as real nodes.
+"""BME, filter and smoother take the messages of a bag, offline or as real nodes.
 
-The BME takes an image before the filter does, and the filter what it publishes on
-`pose_prediction`; the smoother takes what the filter publishes on `likelihood_mixture`; then the
-next message follows. At the end of the bag the smoother is told that
-there is no more: the node, to which no message says so, is deactivated.
+The BME takes each image before the filter, which takes the `pose_prediction` of the BME; the
+smoother takes the `likelihood_mixture` of the filter; then the next message follows. At the end of
+the bag the smoother finishes: no message tells the node, so it is deactivated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
-from typing import Any, NamedTuple, Protocol
+from functools import partial
+from typing import Any, Protocol
 
 from hmt_ros.app.replay.live_node import LiveNode
+from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER, NodeParameters
 from hmt_ros.app.replay.player import Player
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
-from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
 from hmt_ros.sessions.handled import Handled, Output
-from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
 from msg_tools.messages.cdr import deserialise
 
-FILTER, SMOOTHER, BME = 'filter_node', 'smoother_node', 'bme_node'
-# What the smoother takes of the filter: a topic, which it calls by the same name.
+# Topics of the filter that the smoother takes, as sources of the same names.
 HANDED_ON = (MIXTURE,)
-# What the BME takes of the bag.
+# Sources in the bag that the BME takes.
 SEEN_BY_BME = (CAMERA_INFO, IMAGE)
 
 Write = Callable[[str, int, bytes], None]
 
 
-class NodeParameters(NamedTuple):
-    """Parameters of the nodes that play; None: the node does not."""
-
-    filter: FilterParameters
-    smoother: SmootherParameters | None = None
-    bme: BmeParameters | None = None
-
-
 class PlayedTrack(AbstractContextManager['PlayedTrack'], Protocol):
-    """Takes the messages of a bag, one after the other; a context manager."""
+    """Takes the messages of a bag one after the other; a context manager."""
 
     def take(self, source: str, message: Any) -> Handled:
-        """Hands a message over and returns when all that it leads to is written."""
+        """Hands a message over and returns when all its results are written."""
 
     def finish(self) -> Handled:
-        """Returns when all is written that waited for more messages."""
+        """Returns when the results that waited for more messages are written."""
 
 
 class OfflineTrack(PlayedTrack):
     """Without ROS.
 
     Args:
-        parameters: of the nodes.
-        write: takes topic, stamp and bytes of all that is published.
+        parameters: parameters of the nodes.
+        write: takes topic, stamp and bytes of each published message.
 
     Raises:
         ValueError: the parameters name a file that can not be used.
@@ -114,8 +103,8 @@ class LiveTrack(PlayedTrack):
     """The real nodes, over DDS in lock step.
 
     Args:
-        parameters: of the nodes.
-        write: takes topic, stamp and bytes of all that is published, in the order of the nodes.
+        parameters: parameters of the nodes.
+        write: takes topic, stamp and bytes of each published message, in the order of the nodes.
 
     Raises:
         LiveNodeError: there is no ROS, or a node does not start, answer or end.
@@ -137,36 +126,22 @@ class LiveTrack(PlayedTrack):
                 KEYPOINTS: ('keypoints', 'hmt_msgs/msg/Keypoints2D'),
                 IMAGE: (topic, f'sensor_msgs/msg/{kind}'),
             }
+            live = partial(LiveNode, player, opened, write=self._write)
+            sensors = (f'/{topic}', '/camera_info')
             if self._parameters.bme is not None:
-                self._bme = LiveNode(
-                    player,
-                    opened,
-                    BME,
-                    self._parameters.bme,
-                    inputs={},
-                    topics=bme_session.TOPICS,
-                    sensors=(f'/{topic}', '/camera_info'),
-                    write=self._write,
+                self._bme = live(
+                    BME, self._parameters.bme, inputs={}, topics=bme_session.TOPICS, sensors=sensors
                 )
-            self._filter = LiveNode(
-                player,
-                opened,
+            self._filter = live(
                 FILTER,
                 self._parameters.filter,
                 inputs=inputs,
                 topics=track_messages.TOPICS,
-                sensors=(f'/{topic}', '/camera_info', '/keypoints'),
-                write=self._write,
+                sensors=(*sensors, '/keypoints'),
             )
             if self._parameters.smoother is not None:
-                self._smoother = LiveNode(
-                    player,
-                    opened,
-                    SMOOTHER,
-                    self._parameters.smoother,
-                    inputs={},
-                    topics=smoothed_messages.TOPICS,
-                    write=self._write,
+                self._smoother = live(
+                    SMOOTHER, self._parameters.smoother, inputs={}, topics=smoothed_messages.TOPICS
                 )
             self._filter.wait_until_active()
             if self._bme is not None:
@@ -196,7 +171,7 @@ class LiveTrack(PlayedTrack):
         result = None
         if self._bme is not None and source in SEEN_BY_BME:
             result = self._bme.answer(source)
-            # The filter gets the prediction as well, before or after what it is from.
+            # The filter gets the prediction as well, before or after its image.
             for topic, _ in result.published:
                 result = _together(result, self._filter.answer(topic))
         result = _together(result, self._filter.answer(source))
@@ -215,7 +190,7 @@ class LiveTrack(PlayedTrack):
 
 
 def _together(one: Handled | None, other: Handled) -> Handled:
-    """What became of a message, and of one that it led to."""
+    """The handling of a message and of one that it led to, in one record."""
     if one is None:
         return other
     return Handled(

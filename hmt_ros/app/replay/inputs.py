@@ -1,4 +1,4 @@
-"""What a bag gives the filter: images, their calibration, keypoints, in the order of the bag."""
+"""The input of the filter in a bag: images, their calibration, keypoints."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ RAW, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 _KEYPOINTS = 'hmt_msgs/msg/Keypoints2D'
 
-# Topics of these names are taken before all others.
+# Names of topics that are preferred to all others.
 _USUAL = ('image/compressed', 'image')
 GROUND_TRUTH = 'ground_truth'
 
 
 @dataclass(frozen=True)
 class RecordedInput:
-    """The topics of a bag that matter.
+    """The topics of a bag that a replay reads.
 
     Attributes:
-        image, camera_info: topics.
-        keypoints, ground_truth: topics, None where the bag has none.
+        image: topic of the images.
+        camera_info: topic of their calibration.
+        keypoints: topic of 2D keypoints; None if the bag has none.
+        ground_truth: topic of the ground truth; None if the bag has none.
     """
 
     image: Topic
@@ -35,14 +37,14 @@ class RecordedInput:
 
     @property
     def transport(self) -> str:
-        """Value of the parameter image_transport."""
+        """Value of the parameter `image_transport`."""
         return 'compressed' if self.image.msgtype == COMPRESSED else 'raw'
 
     def messages(self, bag: BagReader) -> Generator[tuple[str, BagMessage], None, None]:
-        """(source, message) by log time; the source is one of the filter's or `GROUND_TRUTH`.
+        """(source, message) by log time; the source is one of the filter or `GROUND_TRUTH`.
 
         Raises:
-            BagError: where the bag is damaged, after the messages before the damage.
+            BagError: the bag is damaged here; the messages before the damage were yielded.
         """
         sources = {self.image.name: IMAGE, self.camera_info.name: CAMERA_INFO}
         if self.keypoints is not None:
@@ -58,12 +60,12 @@ def recorded_input(
 ) -> RecordedInput:
     """Finds the topics.
 
-    Images are those of `image/compressed`, else of `image`, else of the only topic of images.
-    camera_info is the topic of that name beside the images, else the only one.
+    Images come from `image/compressed`, else from `image`, else from the only topic of images.
+    Calibration comes from `camera_info` beside the images, else from the only topic of its type.
 
     Args:
-        bag: open.
-        image_topic, camera_info_topic: names, where the choice is not the right one.
+        bag: an open bag.
+        image_topic, camera_info_topic: names that replace the automatic choice.
 
     Raises:
         BagError: there are no images, no camera_info, or several topics to choose from.
@@ -103,7 +105,7 @@ def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
     if bag.damage is None and not _with_messages(bag, kinds):
         raise BagError(
             f'{bag.path} has images on {image.name}, but no camera_info: without the calibration '
-            'of the camera they tell nothing about space'
+            'of the camera images do not determine positions in space'
         )
     return _the_only(bag, kinds, '--camera-info-topic')
 
@@ -115,7 +117,7 @@ def _with_messages(bag: BagReader, kinds: tuple[str, ...]) -> list[Topic]:
 
 
 def _named(bag: BagReader, name: str, kinds: tuple[str, ...]) -> Topic | None:
-    """The topic of a name, with messages of one of some types."""
+    """The topic with a name and with messages of one of the types."""
     for topic in _with_messages(bag, kinds):
         if topic.name.lstrip('/') == name:
             return topic

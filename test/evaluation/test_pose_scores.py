@@ -7,9 +7,12 @@ from scipy.stats import multivariate_normal
 from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import (
     EVALUATED_JOINTS,
+    HIPS,
     JointMixture,
     Scores,
     joint_mixtures,
+    origin_joints,
+    relative_positions,
     score,
 )
 from hmt_ros.inference import GaussianMixture
@@ -66,19 +69,33 @@ def test_frames_whose_best_component_is_far_off_are_lost():
     assert summary['fraction_tracked'] == pytest.approx(2 / 3)
 
 
-def test_linearisation_agrees_with_sampling(body):
+@pytest.mark.parametrize('origin', [('pelvis',), HIPS])
+def test_linearisation_agrees_with_sampling(body, origin):
     (mixture,) = pose_mixtures(body, 1, k=1, spread=0.02)
-    (result,) = joint_mixtures(body, [mixture], model_sigma=0.03)
+    (result,) = joint_mixtures(body, [mixture], model_sigma=0.03, origin=origin)
     poses = mixture.sample(40_000, np.random.default_rng(1))
     joints = body.joint_positions(poses)
-    which = body.skeleton.joint_index(EVALUATED_JOINTS)
-    pelvis = body.joint_names.index('pelvis')
-    relative = (joints[:, which] - joints[:, [pelvis]]).reshape(len(poses), -1)
+    which, centre = (body.skeleton.joint_index(names) for names in (EVALUATED_JOINTS, origin))
+    relative = joints[:, which] - joints[:, centre].sum(1, keepdims=True) / len(origin)
+    relative = relative.reshape(len(poses), -1)
     seen = np.cov(relative.T) + 0.03**2 * np.eye(relative.shape[1])
     assert result.covariances.shape == (1, 39, 39)
     scale = np.sqrt(np.outer(np.diag(seen), np.diag(seen)))
     assert np.abs(result.covariances[0] - seen).max() < 0.02 * scale.max()
     assert np.allclose(result.joints[0].ravel(), relative.mean(0), atol=1e-3)
+
+
+def test_origin_is_the_pelvis_or_the_middle_of_the_hips():
+    names = ('neck', *HIPS, 'left_knee')
+    assert origin_joints((*names, 'pelvis')) == ('pelvis',)
+    assert origin_joints(names) == HIPS
+    with pytest.raises(ValueError, match='clip has neither a pelvis nor left_hip and right_hip'):
+        origin_joints(('neck', 'left_hip'), 'clip')
+    positions = np.array([[0.0, 0, 0], [2, 4, 6], [4, 0, 0], [1, 1, 1]])
+    found = relative_positions(positions, names, ('neck', 'left_knee'), HIPS)
+    assert np.array_equal(found, [[-3, -2, -3], [-2, -1, -2]])
+    with pytest.raises(ValueError, match="no joints \\['pelvis', 'tail'\\]"):
+        relative_positions(positions, names, ['tail'])
 
 
 def test_translation_and_a_known_pelvis_change_nothing(body):

@@ -13,7 +13,7 @@ from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.images import compressed_image_message, image_message
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 SHARED = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared'))
 REACH = ROOT / 'bags' / 'reach'
 MESSAGES = RosbagsMessages()
@@ -247,7 +247,7 @@ def test_without_a_subject_somebody_must_be_seen(tmp_path, capsys):
     assert main([str(bag), '-o', str(out)]) == 1
     told, line = capsys.readouterr().err.splitlines()
     assert told == 'replay: no --subject: the track starts from a prediction'
-    assert 'nobody is seen in its 1 images: give the empty scene by --background FILE' in line
+    assert 'nobody is seen in its 1 images: give an image of the empty scene by' in line
     assert not out.exists()
 
 
@@ -261,7 +261,7 @@ def test_without_a_subject_somebody_must_be_seen(tmp_path, capsys):
         (['--set', 'bme.image_transport=raw'], 'is decided by replay'),
         (
             ['--set', 'bme.stature=1.8', '--subject', str(REACH / 'subject.yaml')],
-            '--set bme.stature=1.8: nothing is predicted; --bme does',
+            '--set bme.stature=1.8: nothing is predicted without --bme',
         ),
     ],
 )
@@ -302,7 +302,7 @@ def test_start_that_nothing_explains(good, tmp_path, capsys):
         (['--image-topic', 'imag'], 'has no topic imag; it has camera_info, image'),
         (['--image-topic', 'camera_info'], 'CameraInfo, wanted CompressedImage or Image'),
         (['--camera-info-topic', 'image'], 'wanted CameraInfo'),
-        (['--liev'], 'unrecognized arguments: --liev; --help tells more'),
+        (['--liev'], 'unrecognized arguments: --liev; see --help'),
     ],
 )
 def test_options(good, options, message, tmp_path, capsys):
@@ -335,7 +335,7 @@ def test_going_on_nevertheless(tmp_path, capsys):
     command = ['-o', str(out), '--subject', str(REACH / 'subject.yaml')]
     assert main([str(bag), *command]) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith('(--keep-going skips what can not be used)')
+    assert line.endswith('(--keep-going skips such messages)')
     # Nothing that follows the last messages: the bag breaks off.
     (bag / 'bag.mcap').write_bytes(whole[:-2000])
     assert main([str(bag), *command, '--keep-going']) == 0

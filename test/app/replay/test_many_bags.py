@@ -6,7 +6,8 @@ import sys
 import pytest
 
 from hmt_ros.app.make_bag import main as make_bag
-from hmt_ros.app.replay.command import main, replay_many
+from hmt_ros.app.replay import many_bags
+from hmt_ros.app.replay.command import main
 from msg_tools import BagReader
 
 TINY = ['--fps', '10', '--size', '240x180', '--fov', '40']
@@ -57,11 +58,11 @@ def test_every_bag_gets_one_of_its_name(archive, tracked, tmp_path):
 
 
 def test_bags_that_are_done_are_skipped(archive, tracked, monkeypatch, capsys):
-    def never(options, tell):
+    def never(source, target, options, tell):
         raise AssertionError
 
     before = {path: path.stat().st_mtime_ns for path in tracked.rglob('*')}
-    monkeypatch.setattr(replay_many, 'replay_bag', never)
+    monkeypatch.setattr(many_bags, 'replay_bag', never)
     # Named one by one they are the same bags.
     one_by_one = [str(archive / 'a'), str(archive / 'day')]
     assert main([str(archive), '-o', str(tracked), *PERSON]) == 0
@@ -77,7 +78,7 @@ def test_bags_that_are_done_are_skipped(archive, tracked, monkeypatch, capsys):
     assert streams.out == ''
     failed, other = streams.err.splitlines()
     assert failed.startswith('replay: a: ')
-    assert 'made from something else or with other parameters' in failed
+    assert 'made from other input or with other parameters' in failed
     # In `day` this one is b.
     assert other == 'replay: b: AssertionError: AssertionError'
     (tracked / 'b.replay.json').unlink()
@@ -86,24 +87,24 @@ def test_bags_that_are_done_are_skipped(archive, tracked, monkeypatch, capsys):
 def test_what_was_left_half_done_is_done_anew(archive, tracked, tmp_path, monkeypatch, capsys):
     wanted = content(tracked)
     command = [str(archive), '-o', str(tmp_path / 'out'), *PERSON]
-    usual = replay_many.replay_bag
+    usual = many_bags.replay_bag
     begun = []
 
-    def killed(options, tell):
-        """As a process that is killed in its second bag leaves it."""
+    def killed(source, target, options, tell):
+        """Leaves what a process leaves that is killed in its second bag."""
         if begun:
-            folder = options.output.with_name(f'.{options.output.name}.0123abcd.partial')
+            folder = target.with_name(f'.{target.name}.0123abcd.partial')
             folder.mkdir(parents=True)
             (folder / 'b.mcap').write_bytes(b'half')
             raise KeyboardInterrupt
-        begun.append(options.name)
-        return usual(options, tell)
+        begun.append(target.name)
+        return usual(source, target, options, tell)
 
-    monkeypatch.setattr(replay_many, 'replay_bag', killed)
+    monkeypatch.setattr(many_bags, 'replay_bag', killed)
     assert main(command) == 130
     assert 'interrupted, 1 of 2 bags are done' in capsys.readouterr().err
     assert list((tmp_path / 'out' / 'day').glob('.b.*.partial'))
-    monkeypatch.setattr(replay_many, 'replay_bag', usual)
+    monkeypatch.setattr(many_bags, 'replay_bag', usual)
     assert main(command) == 0
     assert capsys.readouterr().out.splitlines()[:2] == [
         'a: done before',
@@ -155,19 +156,19 @@ def test_what_can_not_be_begun(archive, tmp_path, monkeypatch, capsys):
     assert f'would both become {out / "x"}' in fails(*copies, '-o', out)
     monkeypatch.setitem(sys.modules, 'distributed', None)
     assert 'pip install distributed' in fails(a, b, '-o', out, '--scheduler', 'local')
-    with replay_many._alone_in(out):
+    with many_bags._alone_in(out):
         assert 'another replay writes into' in fails(a, b, '-o', out)
 
 
 def test_bags_in_a_folder(archive, tmp_path):
-    found = dict(replay_many._bags_in(archive, None))
+    found = dict(many_bags._bags_in(archive, None))
     assert found == {'a': archive / 'a', 'day/b': archive / 'day' / 'b'}
-    assert list(replay_many._bags_in(archive, archive / 'day')) == [('a', archive / 'a')]
+    assert list(many_bags._bags_in(archive, archive / 'day')) == [('a', archive / 'a')]
     for name in ('x.mcap', 'y.db3.zstd', '.hidden.mcap', 'z.txt'):
         (tmp_path / name).write_bytes(b'')
     (tmp_path / '.partial').mkdir()
     (tmp_path / '.partial' / 'metadata.yaml').write_text('')
-    assert [name for name, _ in replay_many._bags_in(tmp_path, None)] == ['x', 'y']
+    assert [name for name, _ in many_bags._bags_in(tmp_path, None)] == ['x', 'y']
 
 
 def test_through_dask_the_bags_are_the_same(archive, tracked, tmp_path, capfd):
@@ -191,7 +192,7 @@ def test_through_dask_the_bags_are_the_same(archive, tracked, tmp_path, capfd):
 
 def test_a_scheduler_that_does_not_answer(archive, tmp_path, monkeypatch, capfd):
     pytest.importorskip('distributed', reason='Dask is not installed (pip install distributed)')
-    monkeypatch.setattr('hmt_ros.app.replay.dask_cluster._PATIENCE', 0.2)
+    monkeypatch.setattr('hmt_ros.app.replay.many_bags._PATIENCE', 0.2)
     command = [str(archive), '-o', str(tmp_path / 'out'), *PERSON]
     for address in ('tcp://127.0.0.1:1', 'nonsense://x'):
         assert main([*command, '--scheduler', address]) == 1

@@ -1,17 +1,16 @@
-"""Images of a bag as JPEGs that are small enough, all together, to be carried in a page."""
+"""Images of a bag as JPEGs that together are small enough for a page."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.app.replay.recorded_input import CAMERA_INFO_TYPE, COMPRESSED, RAW, recorded_input
+from hmt_ros.app.replay.inputs import CAMERA_INFO_TYPE, COMPRESSED, RAW, recorded_input
 from hmt_ros.body import Camera
 from msg_tools import BagReader
 from msg_tools.messages.camera_info import camera_from_info
@@ -20,7 +19,7 @@ from msg_tools.messages.images import decode_image, encode_jpeg
 
 Image = NDArray[np.uint8]
 
-# What the tracker draws into; the name that its topic ends with.
+# The end of the name of the topic on which the tracker publishes its drawings.
 OVERLAY = 'overlay/compressed'
 # Width in px and quality, from the best to the smallest.
 _LEVELS = (
@@ -30,12 +29,12 @@ _LEVELS = (
 
 @dataclass(frozen=True)
 class ImageSource:
-    """Where images are.
+    """The place of the images of a report.
 
     Attributes:
-        bag: its path.
-        topic: of the images.
-        camera_info: topic of their calibration; None: the modes are drawn on them already.
+        bag: path of their bag.
+        topic: topic of the images.
+        camera_info: topic of their calibration; None: the modes are already drawn on them.
     """
 
     bag: Path
@@ -48,10 +47,10 @@ class FilmStrip:
     """Images by stamp.
 
     Attributes:
-        camera: that took them; None: not known.
-        size: (width, height) of the images in the bag, px; (0, 0): there are none.
+        camera: camera of the images; None if unknown.
+        size: (width, height) of the images in the bag, px; (0, 0) without images.
         jpegs: JPEG files, scaled down.
-        kept: some of them as they were, (H, W, 3) BGR.
+        kept: some of the images at their full size, (H, W, 3) BGR.
     """
 
     camera: Camera | None = None
@@ -63,18 +62,18 @@ class FilmStrip:
 def image_source(
     out: Path, images: Path | None, image_topic: str | None, camera_info_topic: str | None
 ) -> ImageSource | None:
-    """Where the images are that a bag of mixtures is of; None: there are none.
+    """The place of the images that belong to a bag of mixtures; None: there are none.
 
-    Those of `images`; else those that `out` has itself, with calibration; else what the tracker
-    drew there.
+    The images in the bag `images`; else those in `out`, with calibration; else the drawings of the
+    tracker in `out`.
 
     Args:
         out: bag of the mixtures.
-        images: bag of the images, where it is known.
-        image_topic, camera_info_topic: names, where the choice is not the right one.
+        images: bag of the images; None if unknown.
+        image_topic, camera_info_topic: names that replace the automatic choice.
 
     Raises:
-        BagError: no images or no calibration where they are wanted, or several to choose from.
+        BagError: wanted images or calibration are missing, or there are several to choose from.
     """
     path = out if images is None else images
     with BagReader(path) as bag:
@@ -109,13 +108,14 @@ def film_strip(
 ) -> FilmStrip:
     """The images at some stamps.
 
-    Each has an equal part of the bytes; the first that does not fit makes all later ones smaller.
+    Each gets an equal part of the bytes; the first one that does not fit makes all later ones
+    smaller.
 
     Args:
-        source: where they are.
-        stamps: of those that are wanted.
-        allowed: for all JPEGs together, bytes.
-        keep: stamps of those that are wanted as they are, too.
+        source: place of the images.
+        stamps: stamps of the wanted images.
+        allowed: size of all JPEGs together, bytes.
+        keep: stamps of the images that are also wanted at full size.
         progress: called with the number of images that were read.
 
     Raises:
@@ -134,7 +134,11 @@ def film_strip(
             seen.append(stamp)
             if stamp not in wanted or stamp in result.jpegs:
                 continue
-            image = _decoded(message, f'{source.bag}: {source.topic} at {stored.log_time_ns} ns')
+            try:
+                image = decode_image(message)
+            except ValueError as error:
+                where = f'{source.bag}: {source.topic} at {stored.log_time_ns} ns'
+                raise ValueError(f'{where}: {error}') from error
             size = image.shape[1], image.shape[0]
             if result.size not in ((0, 0), size):
                 raise ValueError(
@@ -152,7 +156,7 @@ def film_strip(
             raise ValueError(
                 f'{source.bag}: none of the images on {source.topic}, '
                 f'{min(seen)} to {max(seen)} ns, has the stamp of a mixture, '
-                f'{min(wanted)} to {max(wanted)} ns: is it the bag that was tracked?'
+                f'{min(wanted)} to {max(wanted)} ns: is this the bag that was tracked?'
             )
         if source.camera_info is not None:
             info = next(bag.messages([source.camera_info])).message
@@ -163,15 +167,8 @@ def film_strip(
     return result
 
 
-def _decoded(message: Any, where: str) -> Image:
-    try:
-        return decode_image(message)
-    except ValueError as error:
-        raise ValueError(f'{where}: {error}') from error
-
-
 def _small(image: Image, allowed: int, level: int) -> tuple[bytes, int]:
-    """A JPEG of an image that is not too large, if there is one, and the level of its making."""
+    """The best JPEG of an image within the bytes, or else the smallest, and its level."""
     while True:
         width, quality = _LEVELS[level]
         scaled = image

@@ -4,8 +4,7 @@ import threading
 
 import pytest
 
-from hmt_ros.app.replay.read_ahead import ReadAhead
-from hmt_ros.app.replay.write_behind import WriteBehind
+from hmt_ros.app.replay.background import ReadAhead, WriteBehind
 
 
 def made(items):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.app.replay.command import main
-from hmt_ros.app.replay.recorded_input import recorded_input
+from hmt_ros.app.replay.inputs import recorded_input
 from hmt_ros.experts import load_predictor
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions import track_start
@@ -20,7 +20,7 @@ from msg_tools.messages.images import decode_image, image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 from test.msg_tools.conftest import limited_file_size
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 REACH = ROOT / 'bags' / 'reach'
 IMAGES = 2
 STARTS = ('body', 'human_description')

@@ -10,10 +10,10 @@ import pytest
 from hmt_ros.app.bag_scores import score_bag
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
 from hmt_ros.app.report import command as report
-from hmt_ros.app.report.film_strip import ImageSource, film_strip
+from hmt_ros.app.report.images import ImageSource, film_strip
+from hmt_ros.app.report.mixtures import ENDS, KEPT_TRAJECTORIES, read_mixtures
 from hmt_ros.app.report.page import data_size
-from hmt_ros.app.report.pictures import BONES
-from hmt_ros.app.report.recorded_mixtures import ENDS, KEPT_TRAJECTORIES, read_mixtures
+from hmt_ros.app.report.skeletons import BONES
 from hmt_ros.app.truth import read_truth
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader, BagWriter
@@ -112,6 +112,23 @@ def test_truth_errors_and_calibration(made, data, body, poses):
     trajectories = data['scores']['topics']['trajectory_mixture']
     assert trajectories['calibration'] == {'together': None, 'each': None}
     assert any(note.startswith('trajectory_mixture') for note in data['notes'])
+
+
+def test_truth_without_pelvis_is_aligned_at_the_hips(made, body, poses, tmp_path):
+    names = body.joint_names[1:]
+    joints = body.joint_positions(poses)[:, 1:]
+    np.savez(tmp_path / 'truth.npz', stamps=STAMPS, joint_names=names, joints=joints)
+    found = data_of(make(made.out, tmp_path / 'report', '--truth', tmp_path / 'truth.npz'))
+    scores = score_bag(made.out, read_truth(tmp_path / 'truth.npz'))
+    for layer in found['layers']:
+        assert [layer['joints'][i] for i in layer['roots']] == ['left_hip', 'right_hip']
+        own = scores[layer['topic']].scores
+        assert np.allclose([e[0] for e in layer['errors_mm']], 1e3 * own.heaviest.mean(1), atol=0.1)
+    truth = found['truth']
+    assert [truth['joints'][i] for i in truth['roots']] == ['left_hip', 'right_hip']
+    drawn = {(truth['joints'][a], truth['joints'][b]) for a, b, _ in truth['bones']}
+    assert {('left_hip', 'right_hip'), ('neck', 'left_hip'), ('left_hip', 'left_knee')} <= drawn
+    assert (tmp_path / 'report' / 'side_views.png').stat().st_size > 10_000
 
 
 def test_images_are_those_of_the_bag(data):
@@ -369,7 +386,7 @@ def test_truth_that_does_not_fit(made, body, poses, tmp_path, capsys):
 def test_images_that_do_not_fit(made, tmp_path, capsys):
     other = write_images(tmp_path / 'other', [stamp + 1 for stamp in STAMPS])
     line = fails(tmp_path, capsys, made.out, '--images', other)
-    assert 'is it the bag that was tracked?' in line
+    assert 'is this the bag that was tracked?' in line
     cut = tmp_path / 'cut.mcap'
     cut.write_bytes((made.images / 'in.mcap').read_bytes()[:-200])
     assert str(cut) in fails(tmp_path, capsys, made.out, '--images', cut)

@@ -10,13 +10,14 @@ import pytest
 
 from hmt_ros.app.replay import live_node
 from hmt_ros.app.replay.command import main
-from hmt_ros.app.replay.played_track import LiveTrack, NodeParameters
+from hmt_ros.app.replay.options import NodeParameters
 from hmt_ros.app.replay.player import (
     LiveNodeError,
     changed_environment,
     environment,
     reserved_domain,
 )
+from hmt_ros.app.replay.tracks import LiveTrack
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
@@ -28,7 +29,7 @@ from msg_tools.messages.images import decode_image, image_message
 
 pytestmark = pytest.mark.ros
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 REACH = ROOT / 'bags' / 'reach'
 PERSON = ['--subject', str(REACH / 'subject.yaml'), '--background', str(REACH / 'background.png')]
 MESSAGES = RosbagsMessages()
@@ -186,7 +187,7 @@ def test_node_that_is_silent_or_dies_is_told(parameters, monkeypatch):
 def test_node_that_does_not_start_is_told(parameters, monkeypatch):
     monkeypatch.setattr(sys, 'executable', '/bin/false')
     with (
-        pytest.raises(LiveNodeError, match='ended with code 1: it has said nothing'),
+        pytest.raises(LiveNodeError, match='ended with code 1: it has written nothing'),
         LiveTrack(NodeParameters(parameters, SmootherParameters()), lambda *output: None),
     ):
         raise AssertionError('it has started')
