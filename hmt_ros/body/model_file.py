@@ -212,8 +212,8 @@ def _build(content: dict[str, Any]) -> Body:
             joint_basis.append(coefficients)
     aliases = {}
     for template, joint_template in content.get('keypoint_aliases', {}).items():
-        for alias, mirrored in _sides(template):
-            joint = joint_template.format(side='left' if mirrored else 'right')
+        for alias, side in _sides(template):
+            joint = joint_template.format(side=side)
             _named(joint, tuple(joint_names), f'keypoint_aliases: {alias}:')
             aliases[alias] = joint
     chains = {}
