@@ -125,7 +125,7 @@ def test_same_of_raw_images_with_keypoints_and_faults(tmp_path, capsys):
     bag = write(tmp_path / 'bag', sorted(entries, key=lambda entry: entry[1]))
     options = ['--keep-going', '--set', 'reset_on_time_jump=true', '--set', 'frame_prefix=x']
     options += ['--set', 'smoother.reset_on_time_jump=true', '--set', 'smoother.fixed_lag=1']
-    options += ['--set', 'max_hypotheses=2', '--set', 'candidates=3', '--set', 'combinations=4']
+    options += ['--set', 'max_hypotheses=2', '--set', 'candidates=3']
     (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
     assert one == other
     assert one[0] == 0
