@@ -1,17 +1,17 @@
 # make demo   tracks the person of a bag in bags/      make lint   ruff and mypy
 # make test   all tests                                make bench  the benchmarks
-# make setup  the workspace alone                      make soak   nodes under load and fault
-# make clean  back to the state of a clone
+# make setup  the workspace alone                      make soak   nodes under load and faults
+# make clean  restores the state of a clone
 #
-# Each works as the first command after a clone: what it needs is installed into .venv and built
-# once. See CONTRIBUTING.md.
+# Each works as the first command after a clone: it installs its requirements into .venv and builds
+# the packages once. See CONTRIBUTING.md.
 
 SHELL := /bin/bash
 .SHELLFLAGS := -e -o pipefail -c
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test lint bench soak clean lock
 
-# Small matrices: a second BLAS thread costs more than it brings.
+# Small matrices: a second BLAS thread costs more than it saves.
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
@@ -55,7 +55,7 @@ clean:
 	rm -rf .venv build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# Newest versions that fit each other on every supported Python; without it nothing ever changes.
+# The newest versions that fit together on every supported Python. Only this target changes them.
 lock:
 	@$(WORKSPACE) ros
 	@$(PYTHON_IN_VENV) -m pip install -qq uv

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from benchmarks import BENCHMARKS, benchmark
-from hmt_ros.app.printing import until_nobody_reads
+from hmt_ros.app.command_line import until_nobody_reads
 
 HELP = """\
 usage: python -m benchmarks [NAME [options]]

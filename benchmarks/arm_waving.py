@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.smoothing import LinearGaussianDynamics
+from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
 
 Array = NDArray[np.float64]
 
@@ -90,3 +90,10 @@ def waving(
     return Waving(
         truth, mixtures, LinearGaussianDynamics.random_walk(rates, step=STEP), -limit, limit
     )
+
+
+def smooth_waving(times: int) -> None:
+    """Smooths the sequence; here, so that a process that measures it imports nothing else."""
+    sequence = waving(times)
+    smoother = MixtureSmoother(sequence.dynamics, sequence.lower, sequence.upper)
+    smoother.smooth(sequence.mixtures).marginal(0)

@@ -37,7 +37,7 @@ PICTURE_BYTES = 100_000
 ESTIMATE = 'estimate'
 ESTIMATORS: Stages = (
     (Tracker, 'step', ESTIMATE),
-    (smoother_session, 'merge_close_modes', ESTIMATE),
+    (smoother_session, 'merged_if_close', ESTIMATE),
     (SlidingWindow, 'step', ESTIMATE),
     (SlidingWindow, 'finish', ESTIMATE),
     (TrajectoryMixture, 'marginal', ESTIMATE),

@@ -13,8 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.app.truth import Truth, read_truth
+from hmt_ros.app.truth import read_truth
 from hmt_ros.body import Camera
+from hmt_ros.evaluation.track_scores import Truth
 from msg_tools import BagReader
 from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.headers import time_ns

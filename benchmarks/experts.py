@@ -28,7 +28,7 @@ def main(argv: list[str]) -> int:
     add_choice(parser, STAGES)
     parser.add_argument(
         '--propagate', nargs='*', choices=COLUMNS, default=PROPAGATED, metavar='MODEL',
-        help=f'models that learn dynamics too, minutes for the experts, of {", ".join(COLUMNS)}',
+        help=f'models that also learn dynamics (minutes for experts): {", ".join(COLUMNS)}',
     )  # fmt: skip
     options = parser.parse_args(argv)
     result = measure(quick=options.quick, only=options.only, propagated=options.propagate)
@@ -38,7 +38,7 @@ def main(argv: list[str]) -> int:
 def measure(
     *, quick: bool = False, only: Sequence[str] = STAGES, propagated: Sequence[str] = PROPAGATED
 ) -> dict[str, Any]:
-    """What was asked for."""
+    """Runs the stages asked for."""
     stages: dict[str, Callable[[], Any]] = {
         'toy': lambda: experts_toy.toy_scores(*((2, (3,), 150, 500) if quick else ())),
         'oracle': experts_toy.gaussian_mixture_oracle,
@@ -55,7 +55,7 @@ def measure(
 
 
 def motion(quick: bool = False, propagated: Sequence[str] = PROPAGATED) -> dict[str, Any] | str:
-    """Recorded motions of people apart, or why there are none."""
+    """Scores on recorded motions of other people, or the reason why there are none."""
     try:
         train, test = (experts_motion.recorded(part) for part in ('train', 'dev'))
     except ValueError as error:
@@ -66,7 +66,7 @@ def motion(quick: bool = False, propagated: Sequence[str] = PROPAGATED) -> dict[
 
 
 def made_up(samples: int, frames: int = 6) -> tuple[Learned, list[SeenMotion]]:
-    """Procedural motions to learn from, and others to be tested with."""
+    """Procedural motions for learning, and others for tests."""
     body = load_body('human37')
     train = [procedural_sequence(name, body, 4.0, seed) for name in ('walk', 'dance')
              for seed in (0, 1)]  # fmt: skip
@@ -76,7 +76,7 @@ def made_up(samples: int, frames: int = 6) -> tuple[Learned, list[SeenMotion]]:
 
 
 def speed(seconds: float, samples: int) -> dict[str, Any]:
-    """Milliseconds for an image of 640 x 480: the descriptor, each model alone, and all of it."""
+    """Time per image of 640 x 480 for the descriptor, each model, and the whole prediction, ms."""
     learned, _ = made_up(samples)
     body = learned.body
     sequence = procedural_sequence('walk', body, 1.0, 9)
@@ -181,7 +181,7 @@ def _summary_rows(result: dict[str, Any]) -> list[list[str]]:
 
 
 def _motion_tables(found: dict[str, Any], markdown: bool) -> list[str]:
-    """Errors by activity, calibration by model, and what was wanted."""
+    """Errors by activity, calibration by model, and verdicts."""
     names = [name for name in COLUMNS if name in found]
     activities = [*found['ambiguous_share'], 'all']
     parts = []

@@ -1,7 +1,7 @@
-"""What a predictor says of the images of clips with known truth.
+"""Predictions for the images of clips with known truth.
 
-The masks are the true ones, and those that subtraction of the empty scene leaves. The second row is
-of a predictor that has not seen the motions that the clips were made from.
+Masks are the true ones, and those of background subtraction with the empty scene. A second
+predictor has not learned from the motions that the clips were made from.
 """
 
 from __future__ import annotations
@@ -15,23 +15,24 @@ from numpy.typing import NDArray
 from benchmarks.clips import Clip, find_clips, read_clip
 from benchmarks.experts_motion import BEST_OF, learn_from, predictor_of, recorded
 from benchmarks.smoothing_clips import NAMES, true_joints
-from hmt_ros.app.truth import Truth
 from hmt_ros.evaluation.pose_scores import ORIGIN, joint_mixtures, score
+from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
+from msg_tools.files.array_file import read_archive
 
 Mask = NDArray[np.uint8]
 
 # Recorded motions that the clips were made from.
 SOURCES = ('cmu_07_05_slowwalk', 'cmu_13_29_exercise')
 WANTED_MM, WANTED_WORSE = 110.0, 1.15
-STEP = 2  # every so many images, without propagation
+STEP = 2  # interval of the images that are predicted without propagation
 
 
 def clips(name: str = 'local', samples: int = 6000, *, quick: bool = False) -> dict[str, Any] | str:
-    """Scores by clip of predictors that know the motions and that do not, or why there are none."""
+    """Scores by clip, with and without the clips' motions in training, or why there are none."""
     try:
         folders, source = find_clips(None)
         folders = [folder for folder in folders if folder.name in NAMES]
@@ -54,7 +55,7 @@ def clips(name: str = 'local', samples: int = 6000, *, quick: bool = False) -> d
 
 
 def of_predictor(predictor: PosePredictor, seen: Sequence[Clip]) -> dict[str, Any]:
-    """Scores of a predictor by clip and kind of mask, and over the clips."""
+    """Scores of a predictor by clip and kind of mask, and their means over clips."""
     result: dict[str, Any] = {'clips': {}}
     for clip in seen:
         background = BackgroundModel.from_image(clip.background)
@@ -77,7 +78,7 @@ def of_predictor(predictor: PosePredictor, seen: Sequence[Clip]) -> dict[str, An
 
 
 def wanted(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """What is wanted of the means over clips, and whether it is met."""
+    """Targets for the means over clips, and whether they are met."""
     if not result['true']:
         return []
     best = result['true']['best_mm']
@@ -95,12 +96,12 @@ def wanted(result: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def true_masks(clip: Clip) -> list[Mask] | None:
-    """The true silhouettes of a clip where its truth has them."""
-    with np.load(clip.folder / 'truth.npz') as content:
-        if 'masks' not in content:
-            return None
-        width = clip.images[0].shape[1]
-        packed = dict(zip(content['stamps'].tolist(), content['masks'], strict=True))
+    """The true silhouettes of a clip; None if its truth has none."""
+    content = read_archive(clip.folder / 'truth.npz')
+    if 'masks' not in content:
+        return None
+    width = clip.images[0].shape[1]
+    packed = dict(zip(content['stamps'].tolist(), content['masks'], strict=True))
     return [np.unpackbits(packed[stamp], axis=1)[:, :width] for stamp in clip.stamps]
 
 
@@ -127,7 +128,7 @@ def of_masks(predictor: PosePredictor, clip: Clip, masks: Sequence[Mask]) -> dic
 def predictions(
     predictor: PosePredictor, clip: Clip, masks: Sequence[Mask], *, propagated: bool
 ) -> list[GaussianMixture]:
-    """Mixtures over poses; where nobody is seen, the one before."""
+    """Mixtures over poses; where nobody is seen, the previous one."""
     result: list[GaussianMixture] = []
     for number, mask in enumerate(masks):
         before = result[-1] if result and propagated else None

@@ -1,9 +1,9 @@
-"""Poses from silhouettes of motions and people that were not learned from.
+"""Poses from silhouettes of motions and people that were not in training.
 
-Recorded motions are seen from a few headings by a person of random build, and drawn as silhouettes
-with an uneven outline. What is compared is the posture, on the body of the predictor: angles of
-all rotations, root and joints, and joints relative to the pelvis. All models learn from the same
-pairs and are calibrated alike.
+Recorded motions are seen from a few headings with a random build of the person, and drawn as
+silhouettes with an uneven outline. Postures are compared on the body of the predictor: the angles
+of all rotations of root and joints, and the joints relative to the pelvis. All models learn from
+the same pairs and are calibrated alike.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from benchmarks.clips import ROOT
 from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score
-from hmt_ros.experts.descriptor.shape_context import cluster_centres, squared_distances
 from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
-from hmt_ros.experts.learned_models import KINDS, new_model
 from hmt_ros.experts.pose_encoding import PoseEncoding
 from hmt_ros.experts.pose_predictor import JITTER, PosePredictor
 from hmt_ros.experts.predictor_learning import (
+    KINDS,
     Described,
     described,
     learned_predictor,
+    new_model,
     target_basis,
 )
 from hmt_ros.experts.training_set import (
@@ -44,6 +44,7 @@ from hmt_ros.experts.training_set import (
 )
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.calibration import coverage
+from hmt_ros.inference.clustering import k_means, squared_distances
 
 Array = NDArray[np.float64]
 
@@ -57,27 +58,27 @@ COLUMNS = {
 BASELINES = ('nearest', 'relevance-vector')
 EXPERTS = ('conditional', 'joint')
 BEST_OF = 5
-# Headings and elevations that each test motion is seen from, degrees; and the part of it.
+# Heading and elevation of each view of a test motion, degrees; start as a share of the motion.
 VIEWS = ((20.0, 5.0, 0.15), (140.0, 10.0, 0.5), (-100.0, 0.0, 0.85))
-FRAMES = 40  # in a row, of each view
-SAMPLES = 200  # of a density that a level is estimated with
+FRAMES = 40  # consecutive frames of each view
+SAMPLES = 200  # of a density, for the estimate of a level
 # Of the frames of an ambiguous activity, more than AMBIGUOUS_SHARE are ambiguous: among the
 # NEIGHBOURS training silhouettes most alike there are two groups of postures, each with MINORITY
 # of them or more, whose means are further apart than APART times the spread within them.
 NEIGHBOURS, MINORITY, APART, AMBIGUOUS_SHARE = 30, 0.15, 2.0, 0.25
-# What is wanted of experts against one regression, and of regions.
+# Targets for experts over one regression, and for the coverage of regions.
 BEST_SHARE = 0.60
 COVERED = (0.80, 0.97)
 
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """What all models learn from.
+    """Training data of all models.
 
     Attributes:
-        body: of typical lengths.
-        sequences: the motions.
-        training: described.
+        body: Body with typical lengths.
+        sequences: Motions.
+        training: Descriptors and targets.
     """
 
     body: Body
@@ -90,9 +91,9 @@ class SeenMotion:
     """One view of a test motion.
 
     Attributes:
-        activity: what is done.
-        poses: (n, d) true.
-        descriptors: (n, p) of its silhouettes.
+        activity: Activity of the motion.
+        poses: (n, d) true poses.
+        descriptors: (n, p) of the silhouettes.
     """
 
     activity: str
@@ -104,7 +105,7 @@ def mocap_folder(part: str) -> Path:
     """Folder of recorded motions, `train` or `dev`.
 
     Raises:
-        ValueError: it is absent.
+        ValueError: the folder is absent.
     """
     folder = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'mocap' / part
     if not folder.is_dir():
@@ -113,14 +114,14 @@ def mocap_folder(part: str) -> Path:
 
 
 def recorded(part: str, without: Sequence[str] = ()) -> list[PoseSequence]:
-    """Motions of a folder, without those whose file is named."""
+    """Motions of a folder, without the named files."""
     body = load_body('human37')
     files = [path for path in motion_files(mocap_folder(part)) if path.stem not in without]
     return [recorded_sequence(path, body) for path in files]
 
 
 def learn_from(sequences: list[PoseSequence], samples: int, seed: int = 0) -> Learned:
-    """Silhouettes of motions, described."""
+    """Descriptors and targets of the silhouettes of motions."""
     body = typical_body(load_body('human37'), sequences)
     pairs = training_set(body, sequences, TrainingSettings(samples=samples, seed=seed))
     return Learned(body, sequences, described(body, pairs))
@@ -129,7 +130,7 @@ def learn_from(sequences: list[PoseSequence], samples: int, seed: int = 0) -> Le
 def predictor_of(
     learned: Learned, name: str, *, dynamics: bool = True
 ) -> tuple[PosePredictor, float]:
-    """A predictor with the model of a name, and the seconds that it learned for."""
+    """A predictor with a model by name, and the time of learning, s."""
     kind = KINDS[name]
     training = learned.training.with_components(kind.components)
     count = len(training.targets)
@@ -144,7 +145,7 @@ def predictor_of(
 def seen_motions(
     learned: Learned, sequences: Sequence[PoseSequence], frames: int = FRAMES, seed: int = 5
 ) -> list[SeenMotion]:
-    """Test motions from all views, by persons of random build, with uneven outlines."""
+    """Test motions from all views, with persons of random build and uneven outlines."""
     rng = np.random.default_rng(seed)
     descriptor = learned.training.descriptor
     result = []
@@ -153,19 +154,17 @@ def seen_motions(
         for heading, elevation, at in VIEWS:
             first = int(at * (len(sequence.poses) - count))
             person = random_build(learned.body, TrainingSettings(), rng)
-            seen = seen_from(
+            poses, masks = seen_from(
                 person, sequence, heading, elevation, frames=slice(first, first + count),
                 boundary_noise=1.0, seed=int(rng.integers(2**31)),
             )  # fmt: skip
-            parts = [silhouette_parts(mask, descriptor.points) for mask in seen.masks]
-            result.append(
-                SeenMotion(sequence.activity, seen.poses, descriptor.describe_parts(parts))
-            )
+            parts = [silhouette_parts(mask, descriptor.points) for mask in masks]
+            result.append(SeenMotion(sequence.activity, poses, descriptor.describe(parts)))
     return result
 
 
 def ambiguous_share(learned: Learned, motions: Sequence[SeenMotion]) -> dict[str, float]:
-    """Share of the frames of each activity whose silhouette is ambiguous, see above."""
+    """Share of the frames of each activity whose silhouette is ambiguous; see `AMBIGUOUS_SHARE`."""
     training = learned.training
     basis = target_basis(PoseEncoding(learned.body), training.targets)
     states = training.targets @ basis
@@ -179,8 +178,7 @@ def ambiguous_share(learned: Learned, motions: Sequence[SeenMotion]) -> dict[str
 
 def two_groups(states: Array) -> bool:
     """Whether states (n, D) fall into two groups that are apart."""
-    centres = cluster_centres(states, 2, 0)
-    own = squared_distances(states, centres).argmin(1)
+    centres, own = k_means(states, 2, np.random.default_rng(0))
     if min(np.bincount(own, minlength=2)) < MINORITY * len(states):
         return False
     spread = np.sqrt(((states - centres[own]) ** 2).sum(1).mean())
@@ -194,7 +192,7 @@ def compared(
     *,
     propagated: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Scores of models by activity, of some also propagated, and what was wanted of them."""
+    """Scores of models by activity, of some also propagated, and verdicts."""
     shares = ambiguous_share(learned, motions)
     result: dict[str, Any] = {
         'samples': len(learned.training.targets),
@@ -217,7 +215,7 @@ def compared(
 
 
 def followed_views(motions: Sequence[SeenMotion]) -> list[SeenMotion]:
-    """One view of each motion, another for the next."""
+    """One view of each motion, in rotation."""
     count = len(VIEWS)
     return [motions[i + (i // count) % count] for i in range(0, len(motions), count)]
 
@@ -237,7 +235,7 @@ def scores(
 def sequence_mixtures(
     predictor: PosePredictor, motion: SeenMotion, *, propagated: bool
 ) -> list[GaussianMixture]:
-    """Mixtures over poses (d,), of BEST_OF components at most; the root is where it is."""
+    """Mixtures over poses (d,) with at most BEST_OF components; the root is the true one."""
     encoding = predictor.encoding
     inputs = motion.descriptors[:, : predictor.descriptor.size]
     found: list[GaussianMixture] = []
@@ -302,7 +300,7 @@ def summary(parts: Sequence[dict[str, Array]]) -> dict[str, float]:
 
 
 def verdicts(result: dict[str, Any], names: Sequence[str]) -> list[dict[str, Any]]:
-    """What is wanted, with the number found and whether it is met; where it is not, in what."""
+    """Targets, the numbers found, whether they are met, and the activities that miss them."""
     found = []
     both = [name for name in BASELINES if name in result]
     for name in names:
@@ -337,7 +335,7 @@ def verdicts(result: dict[str, Any], names: Sequence[str]) -> list[dict[str, Any
 
 
 def _verdict(name: str, what: str, ratio: dict[str, float], wanted: float) -> dict[str, Any]:
-    """Whether a ratio is below what is wanted for every activity."""
+    """Whether a ratio is at most the wanted one for every activity."""
     missed = sorted(activity for activity, value in ratio.items() if value > wanted)
     return {
         'model': name,

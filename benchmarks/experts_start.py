@@ -1,7 +1,7 @@
-"""The tracker when it starts from predictions, beside the one that starts from a subject file.
+"""Tracks that start from predictions, compared with tracks that start from a subject file.
 
-The subject file tells where joints are in one image, and the person's lengths. Predictions know
-neither: lengths are those of the motions that were learned from.
+A subject file has the joints in one image and the person's segment lengths. Predictions have
+neither: their lengths are those of the training motions.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.tracking import PosePrediction, TrackerSettings
 
-WANTED = 1.20  # error over that of the track from a subject file
+WANTED = 1.20  # ratio to the error of the track from a subject file
 KEPT = ('best_mm', 'heaviest_mm', 'frames_lost', 'coverage_90', 'joint_coverage_90')
 
 
 def starts(
     name: str = 'local', samples: int = 6000, *, quick: bool = False
 ) -> dict[str, Any] | str:
-    """Scores by clip of both ways to start, or why there are none."""
+    """Scores by clip of both kinds of start, or the reason why there are none."""
     try:
         folders = [folder for folder in find_clips(None)[0] if folder.name in NAMES]
         sequences = recorded('train')
@@ -67,8 +67,8 @@ class Predicting:
     """Predictions from the images of a clip.
 
     Args:
-        predictor: that has learned.
-        clip: of whose empty scene the background is.
+        predictor: Predictor that has learned.
+        clip: Clip whose empty scene is the background.
     """
 
     def __init__(self, predictor: PosePredictor, clip: Clip) -> None:
@@ -76,7 +76,7 @@ class Predicting:
         self._background = BackgroundModel.from_image(clip.background)
 
     def __call__(self, image: NDArray[np.uint8]) -> PosePrediction:
-        """Of the person in an image (H, W, 3)."""
+        """Prediction from an image (H, W, 3)."""
         mask = self._background.silhouette(image)
         found = self._predictor.observe(mask, self._camera, max_components=BEST_OF)
         return PosePrediction(found.mixture, self._predictor.body)

@@ -1,6 +1,6 @@
-"""Mixtures of experts where the truth is known: BME fig. 2, oracles, speed of learning, peers.
+"""Mixtures of experts with known truth: the toy of BME fig. 2, an oracle, learning speed, a peer.
 
-Functions return plain dicts of numbers with the value wanted next to each.
+Functions return dicts of numbers with their targets.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 NOISE = 0.05
 MODELS = {'conditional': ConditionalExperts, 'joint': JointExperts}
-# Mean test log p(y | x) in nats: wanted of M experts, and of one regression (about).
+# Targets for the mean test log p(y | x) of M experts, and about that of one regression, nats.
 WANTED = {3: 1.0, 5: 1.1, 7: 1.1}
 WANTED_REGRESSION = 0.18
 
@@ -94,9 +94,9 @@ def toy_scores(
 
 
 def gate_extremes(model: ConditionalDensity) -> float:
-    """Heaviest weight of a branch where the toy has one, 1 at best: gates near 0 and 1.
+    """Mean weight of the heaviest branch where the toy has one branch; at best 1.
 
-    Experts that say the same there count as one branch.
+    Experts with nearly equal means count as one branch.
     """
     inputs = np.array([[-0.05], [0.0], [1.0], [1.05]])
     weights, means, _ = model.predict_arrays(inputs)
@@ -106,7 +106,7 @@ def gate_extremes(model: ConditionalDensity) -> float:
 
 
 def branching(count: int, seed: int, inputs: int = 20, outputs: int = 32) -> tuple[Array, Array]:
-    """A made-up motion: two styles that the inputs (N, p) hardly tell apart, targets (N, D)."""
+    """A synthetic motion: inputs (N, p) that hardly distinguish two styles, and targets (N, D)."""
     shape = np.random.default_rng(0)
     into = shape.normal(size=(6, inputs))
     out = shape.normal(size=(8, outputs))
@@ -130,7 +130,7 @@ def branching(count: int, seed: int, inputs: int = 20, outputs: int = 32) -> tup
 def learning(
     samples: int = 3000, experts: int = 5, outputs: int = 32, seconds: float = 1.0
 ) -> dict[str, Any]:
-    """Time to learn and to predict one input."""
+    """Time of learning, and of the prediction from one input."""
     train, test = branching(samples, 1, outputs=outputs), branching(1000, 2, outputs=outputs)
     result: dict[str, Any] = {'samples': samples, 'experts': experts, 'outputs': outputs}
     for name, model in MODELS.items():
@@ -163,7 +163,7 @@ def gaussian_mixture_oracle(
         inputs, targets = branching(400, seed, inputs=4, outputs=3)
         points = np.hstack([inputs, targets])
         peer = Peer(experts, reg_covar=0.0, tol=0.0, max_iter=1, random_state=seed, warm_start=True)
-        # Both go on from the peer's first iteration, by as many.
+        # Both continue from the peer's first iteration, with equally many iterations.
         with warnings.catch_warnings():
             warnings.simplefilter('ignore')
             peer.fit(points)
@@ -183,10 +183,10 @@ def gaussian_mixture_oracle(
 
 
 def regression_peer(samples: int = 2000, outputs: int = 32) -> dict[str, Any]:
-    """One regression against sklearn-rvm, with the same kernel: time per output and likelihood.
+    """One regression and sklearn-rvm with the same kernel: time per output and likelihood.
 
-    Ours learns all outputs at once and chooses the kernel's width; the peer gets that width and
-    learns the first output.
+    Ours learns all outputs at once and chooses the width of the kernel; the peer learns the first
+    output with that width.
     """
     rng = np.random.default_rng(0)
     mixing = rng.normal(size=(4, outputs))

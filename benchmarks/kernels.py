@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -28,20 +27,18 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image import likelihood as likelihood_module
-from hmt_ros.image.likelihood import ImageLikelihood, TermSettings
+from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import observe
 from hmt_ros.image.texture import capture_textures
+from hmt_ros.inference import gaussian_pairs
 from hmt_ros.inference.block_tridiagonal import add_band_product
+from hmt_ros.inference.energy import Derivatives
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
-from hmt_ros.smoothing import embedded_network as network_module
 from hmt_ros.smoothing.component_overlaps import add_overlaps
-from hmt_ros.smoothing.likelihood import Curvature
 from hmt_ros.smoothing.trajectory_refinement import refine
-from hmt_ros.tracking.pruning import choose_hypotheses
-
-OFF = TermSettings(0.0, 1.0, 1.0)
+from hmt_ros.tracking.selection import choose_hypotheses
 
 
 def main(argv: list[str]) -> int:
@@ -96,7 +93,6 @@ def _likelihoods(seconds: float) -> Iterator[dict[str, Any]]:
     assert intensity is not None
     textures = capture_textures(body, camera, forward(body.skeleton, shown[:1]), intensity)
     likelihood = ImageLikelihood(body, camera)
-    likelihood = replace(likelihood, settings=replace(likelihood.settings, joints=OFF))
     rng = np.random.default_rng(0)
     for batch in (8, 32, 128):
         poses = shown[1] + 0.1 * rng.normal(size=(batch, body.dimension))
@@ -105,7 +101,7 @@ def _likelihoods(seconds: float) -> Iterator[dict[str, Any]]:
         which = np.zeros(batch, dtype=np.intp)
 
         def compiled(x: Any = poses, w: Any = which) -> Any:
-            return likelihood.image_energy(forward(body.skeleton, x), observation, textures, w)
+            return likelihood.energies(forward(body.skeleton, x), observation, textures, w)
 
         def vectorised(x: Any = poses, w: Any = which) -> Any:
             return numpy_likelihood.image_energy(likelihood, x, observation, textures, w)
@@ -200,7 +196,7 @@ def _smoothing(seconds: float) -> Iterator[dict[str, Any]]:
     ends = likelihood.first[1:-1]  # type: ignore[union-attr]
     yield _smoothing_case(
         'mixtures, gradient, Hessian', len(poses), seconds,
-        partial(likelihood.energy, poses, times, Curvature.EXACT),
+        partial(likelihood.energy, poses, times, derivatives=Derivatives.EXACT),
         partial(
             numpy_smoothing.mixture_energy, list(layers.mixtures),
             np.split(likelihood.whiteners, ends),  # type: ignore[union-attr]
@@ -251,9 +247,13 @@ def _smoothing(seconds: float) -> Iterator[dict[str, Any]]:
 
 
 def _serial_links(means: Any, covariances: Any, pairs: Any) -> Any:
-    result = np.empty(len(pairs))
-    network_module._pair_log_densities(means, covariances, means, covariances, pairs, result)
-    return result
+    """On one core."""
+    ones = np.ones(len(means))
+    squares, log_determinants = np.empty((2, len(pairs)))
+    gaussian_pairs._whitened_pairs(
+        means, covariances, ones, means, covariances, ones, pairs, squares, log_determinants
+    )
+    return -0.5 * (squares + log_determinants + means.shape[1] * np.log(2 * np.pi))
 
 
 def _smoothing_case(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -21,10 +21,12 @@ from hmt_ros.flips import enumerate_flips
 from hmt_ros.flips.best_combinations import distinct_poses
 from hmt_ros.flips.interpretation_tree import flip_counts
 from hmt_ros.flips.whole_body_flips import full_body_flips
-from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
-from hmt_ros.image.observation import Keypoints, Observation
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import Minimum, Status, minimise
-from hmt_ros.tracking.proposals import covariance_scaled_samples, spherical_samples
+from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples, spherical_samples
 
 Array = NDArray[np.float64]
 
@@ -308,13 +310,9 @@ def setting_of(body: Body, pose: Array) -> Setting:
     keypoints = Keypoints(
         body.joint_names, pixels, np.tile(SIGMA**2 * np.eye(2), (n, 1, 1)), np.ones(n)
     )
-    settings = LikelihoodSettings(joints=TermSettings(1.0, 1.0, np.inf), prior_weight=PRIOR_WEIGHT)
-    likelihood = ImageLikelihood(body, CAMERA, settings)
-    observation = Observation(keypoints=keypoints)
-
-    def energy(x: Array, _: Any) -> tuple[Array, Array, Array]:
-        return likelihood.energy(x, observation)
-
+    least_squares = LikelihoodSettings.of_terms(keypoints=TermSettings(1.0, 1.0, np.inf))
+    settings = replace(least_squares, prior_weight=PRIOR_WEIGHT)
+    energy = ImageLikelihood(body, CAMERA, settings).given(Observation(keypoints=keypoints))
     start = optimise(body, energy, pose[None])
     return Setting(body, energy, start, np.linalg.inv(start.hessian[0]))
 

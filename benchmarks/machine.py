@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import scipy
 
@@ -42,6 +41,9 @@ def description() -> dict[str, Any]:
     if info.is_file():
         lines = info.read_text('utf-8').splitlines()
         model = next((x.partition(':')[2].strip() for x in lines if x.startswith('model name')), '')
+    # Here, so that a process whose memory is measured does not hold it.
+    import cv2
+
     return {
         'processor': model or platform.machine(),
         'cores': len(os.sched_getaffinity(0)),

@@ -11,7 +11,7 @@ from hypothesis.strategies import SearchStrategy
 from rosbags.interfaces import Nodetype
 
 from msg_tools import RosbagsMessages
-from msg_tools.messages.typestore import typestore
+from msg_tools.messages.message_types import typestore
 
 # Numbers at which code breaks, as they stand in CDR.
 _INTEGERS = (0, 1, 2, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1)

@@ -21,9 +21,9 @@ from hmt_ros.app.replay.live_node import LiveNode
 from hmt_ros.app.replay.player import LiveNodeError, Player, changed_environment
 from hmt_ros.sessions import bme_session, track_messages
 from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.published_topic import PublishedTopic
+from hmt_ros.sessions.session import PublishedTopic
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import Frames, assemble, forward, segment_sums
-from hmt_ros.image.likelihood import ImageLikelihood, TermSettings
-from hmt_ros.image.observation import Observation, Outline
+from hmt_ros.image.likelihood import ImageLikelihood
+from hmt_ros.image.observation import Observation
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface import COVER, HIDDEN
 from hmt_ros.image.terms.edges import FEWEST
-from hmt_ros.image.terms.silhouette import SPACING, TURN
-from hmt_ros.image.terms.texture_terms import FLOW_ERROR
+from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.silhouette import SPACING, TURN, Outline
+from hmt_ros.image.terms.texture import FLOW_ERROR
 from hmt_ros.image.texture import FACING, Textures, coarse_mesh
 
 Array = NDArray[np.float64]
@@ -93,20 +94,15 @@ def _terms(
     body, camera, s = likelihood.body, likelihood.camera, likelihood.settings
     result: dict[str, Residuals] = {}
     surface = project_surface(body, camera, frames)
-    if observation.distance is not None and s.containment.weight > 0:
-        result['containment'] = containment(surface, observation.distance, s.containment)
-    if observation.outline is not None and s.coverage.weight > 0:
-        result['coverage'] = coverage(surface, observation.outline, s.coverage)
-    if observation.edges is not None and s.edges.weight > 0:
-        result['edges'] = edges(surface, observation.edges, s.edges)
+    seen = {k: v for k, v in observation.evidence.items() if getattr(s, k).weight > 0}
+    for name, term in (('containment', containment), ('coverage', coverage), ('edges', edges)):
+        if name in seen:
+            result[name] = term(surface, seen[name], getattr(s, name))
     if textures is None or which is None:
         return result
-    if observation.intensity is not None and s.intensity.weight > 0:
-        result['intensity'] = intensity(
-            frames, camera, textures, which, observation.intensity, s.intensity
-        )
-    if observation.flow is not None and s.motion.weight > 0:
-        result['motion'] = motion(frames, camera, textures, which, observation.flow, s.motion)
+    for name, textured in (('intensity', intensity), ('motion', motion)):
+        if name in seen:
+            result[name] = textured(frames, camera, textures, which, seen[name], getattr(s, name))
     return result
 
 

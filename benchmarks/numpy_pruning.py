@@ -12,7 +12,7 @@ Index = NDArray[np.intp]
 def choose(
     joints: Array, weights: Array, count: int, same: float = 0.02, cap: float = 0.3
 ) -> tuple[Index, Index]:
-    """Chosen hypotheses (K,) and who stands for each (N,); see `hmt_ros.tracking.pruning`."""
+    """Chosen hypotheses (K,) and who stands for each (N,); see `hmt_ros.tracking.selection`."""
     offsets = joints[:, None] - joints[None]
     lengths = np.sqrt(np.einsum('abjx,abjx->abj', offsets, offsets))
     distance = np.maximum(np.minimum(lengths, cap).mean(2) - same, 0.0)

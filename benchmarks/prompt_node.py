@@ -9,18 +9,16 @@ image, and the message of a mixture of the usual size.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from hmt_ros.body import Camera
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.nodes.bme_node import NAME, BmeNode
+from hmt_ros.nodes.bme_node import BmeNode
 from hmt_ros.nodes.run_node import run
 from hmt_ros.sessions.bme_session import BmeSession
-from hmt_ros.sessions.camera_input import WaitingImage
-from hmt_ros.sessions.handled import Output
+from hmt_ros.sessions.camera_session import WaitingImage
 
 
 class PromptSession(BmeSession):
@@ -41,11 +39,8 @@ class PromptSession(BmeSession):
 class PromptNode(BmeNode):
     """The node."""
 
-    def _new_session(
-        self, publish: Callable[[Output], None], wanted: Callable[[str], bool]
-    ) -> BmeSession:
-        return PromptSession(self._settings, publish, wanted)
+    SESSION = PromptSession
 
 
 if __name__ == '__main__':
-    sys.exit(run(NAME, PromptNode))
+    sys.exit(run(PromptNode))

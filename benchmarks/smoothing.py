@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.arm_waving import STEP, waving
+from benchmarks.arm_waving import STEP, smooth_waving, waving
 from benchmarks.clips import table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.exact_smoothing import (
@@ -57,7 +57,7 @@ def measure(*, quick: bool = False, only: Sequence[str] = PARTS) -> dict[str, An
     """What was asked for; memory first, in a process of its own."""
     times = 12 if quick else TIMES
     parts: dict[str, Callable[[], Any]] = {
-        'memory': lambda: {'peak_mb': peak_memory_apart(smooth_one, times) / 1e6},
+        'memory': lambda: {'peak_mb': peak_memory_apart(smooth_waving, times) / 1e6},
         'exactness': lambda: exactness(1 if quick else 4, WALKS[1:2] if quick else WALKS),
         'grid': lambda: grid(1 if quick else 3, 20 if quick else 40),
         'stages': lambda: stages(times, 0.0 if quick else 3.0),
@@ -169,13 +169,6 @@ def stages(times: int, seconds: float) -> dict[str, Any]:
         'free_energy': found.free_energy.tolist(),
         'free_energy_fresh': list(found.fresh),
     }
-
-
-def smooth_one(times: int) -> None:
-    """Smooths one sequence."""
-    sequence = waving(times)
-    smoother = MixtureSmoother(sequence.dynamics, sequence.lower, sequence.upper)
-    smoother.smooth(sequence.mixtures).marginal(0)
 
 
 def robust_problem(times: int, seed: int = 0) -> tuple[RobustSequence, Array, Array]:

@@ -28,7 +28,7 @@ from hmt_ros.evaluation.pose_scores import (
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
 from hmt_ros.tracking import TrackerSettings
-from hmt_ros.tracking.pruning import choose_hypotheses
+from hmt_ros.tracking.selection import choose_hypotheses
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from hmt_ros.smoothing.likelihood import Curvature
+from hmt_ros.inference.energy import Derivatives, Energy
 
 Array = NDArray[np.float64]
 
@@ -43,21 +43,23 @@ class RobustSequence:
         return len(self.means)
 
     def energy(
-        self, poses: Array, times: NDArray[np.intp], curvature: Curvature
-    ) -> tuple[Array, Array, Array | None]:
-        """Value, gradient and Hessian at poses (N, d) of times (N,)."""
-        w = self.whiteners[times]
-        white = (w @ (poses - self.means[times])[:, :, None])[:, :, 0]
+        self,
+        x: Array,
+        rows: NDArray[np.intp],
+        *,
+        derivatives: Derivatives = Derivatives.POSITIVE,
+    ) -> Energy:
+        """Value, gradient and Hessian at poses x (N, d) of times (N,)."""
+        w = self.whiteners[rows]
+        white = (w @ (x - self.means[rows])[:, :, None])[:, :, 0]
         s = (white * white).sum(1)
         soft = 1.0 / (1.0 + s / self.kernel**2)
         pull = (w.swapaxes(1, 2) @ white[:, :, None])[:, :, 0]
-        hessian = None
-        if curvature:
-            hessian = soft[:, None, None] ** 2 * (w.swapaxes(1, 2) @ w)
-            if curvature == Curvature.EXACT:
-                factor = 4.0 * soft**3 / self.kernel**2
-                hessian = hessian - factor[:, None, None] * pull[:, :, None] * pull[:, None, :]
-        return 0.5 * s * soft, soft[:, None] ** 2 * pull, hessian
+        hessian = soft[:, None, None] ** 2 * (w.swapaxes(1, 2) @ w)
+        if derivatives == Derivatives.EXACT:
+            factor = 4.0 * soft**3 / self.kernel**2
+            hessian = hessian - factor[:, None, None] * pull[:, :, None] * pull[:, None, :]
+        return Energy(0.5 * s * soft, soft[:, None] ** 2 * pull, hessian)
 
 
 def scipy_trajectory(
@@ -96,7 +98,7 @@ def scipy_trajectory(
 def gtsam_missing() -> str | None:
     """Why GTSAM can not be compared with, or None."""
     if importlib.util.find_spec('gtsam') is None:
-        return 'gtsam is not installed (pip install gtsam)'
+        return 'gtsam is not installed (on Python 3.10 its wheels need numpy 1)'
     return None
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.arm_waving import STEP, Waving, waving
-from hmt_ros.smoothing.likelihood import Curvature, MixtureLikelihood
+from hmt_ros.inference.energy import Derivatives
+from hmt_ros.smoothing.likelihood import MixtureLikelihood
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.paths import Paths, most_probable_paths, visiting_probabilities
 from hmt_ros.smoothing.trajectory_refinement import RefinedTrajectories, refine
@@ -58,9 +59,12 @@ def analysis(times: int) -> Analysis:
     refined = refine(starts, layers.prior, layers.likelihood, sequence.lower, sequence.upper)
     at = np.tile(np.arange(times), len(starts))
     flat = starts.reshape(-1, starts.shape[2])
-    energies = layers.likelihood.energy(flat, at, Curvature.NONE)[0].reshape(len(starts), -1)
+    observed = layers.likelihood.energy(flat, at, derivatives=Derivatives.NONE)
+    energies = observed.value.reshape(len(starts), -1).sum(1)
     visiting = visiting_probabilities(layers.network, paths)
-    return Analysis(sequence, paths, starts, refined, visiting, energies.sum(1))
+    return Analysis(
+        sequence, paths, starts, refined, visiting, energies.reshape(len(starts), -1).sum(1)
+    )
 
 
 def layers_of(sequence: Waving) -> ModeSequence:
@@ -116,8 +120,7 @@ def eigenvalues(sequence: Waving, states: Array, frames: int) -> Array:
     """Of the Hessian of the first frames at an optimum, the largest first."""
     likelihood = MixtureLikelihood.of(sequence.mixtures[:frames])
     poses = states[:frames]
-    hessian = likelihood.energy(poses, np.arange(frames), Curvature.POSITIVE)[2]
-    assert hessian is not None
+    _, hessian = likelihood.energy(poses, np.arange(frames)).derivatives()
     d = poses.shape[1]
     precision = sequence.dynamics.prior(np.full(frames - 1, STEP)).precision
     dense = np.zeros((frames, d, frames, d))

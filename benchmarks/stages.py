@@ -8,25 +8,28 @@ from contextlib import contextmanager
 from typing import Any
 
 from hmt_ros.image.background import BackgroundModel
+from hmt_ros.tracking import filter as filter_module
 from hmt_ros.tracking import tracker as tracker_module
-from hmt_ros.tracking.kinematic_jumps import KinematicJumps
-from hmt_ros.tracking.mixture_filter import MixtureFilter
-from hmt_ros.tracking.pose_energy import PoseEnergy
-from hmt_ros.tracking.tracker import Tracker
+from hmt_ros.tracking.facing import Track
+from hmt_ros.tracking.filter import MixtureFilter
+from hmt_ros.tracking.posterior import Posterior
+from hmt_ros.tracking.proposals.kinematic_jumps import KinematicJumps
+from hmt_ros.tracking.proposals.limb_search import LimbSearch
+from hmt_ros.tracking.proposals.sampling import CovarianceScaledSamples
 
 # Part of the tracker -> name of the stage; time in a part that another part calls is its own.
 Stages = Sequence[tuple[Any, str, str]]
 STAGES: Stages = (
     (BackgroundModel, 'silhouette', 'background'),
     (tracker_module, 'observe', 'observation'),
-    (Tracker, '_begin', 'start of the track'),
-    (PoseEnergy, 'follow_motion', 'motion'),
+    (Track, 'begin', 'start of the track'),
+    (filter_module, 'follow_flow', 'motion'),
     (KinematicJumps, 'propose', 'combinations'),
-    (MixtureFilter, '_samples', 'samples'),
-    (KinematicJumps, '_search', 'chain search'),
+    (CovarianceScaledSamples, 'propose', 'samples'),
+    (LimbSearch, 'find', 'chain search'),
     (KinematicJumps, '_rate', 'rating'),
-    (PoseEnergy, 'minimise', 'candidates'),
-    (MixtureFilter, '_keep', 'keeping'),
+    (Posterior, 'minimise', 'candidates'),
+    (MixtureFilter, '_weigh_and_select', 'keeping'),
     (MixtureFilter, '_fit_flesh', 'flesh'),
     (MixtureFilter, 'likelihood_mixture', 'likelihood modes'),
 )

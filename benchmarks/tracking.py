@@ -29,8 +29,9 @@ from hmt_ros.body import Body, load_body
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, Scores, joint_mixtures, score
 from hmt_ros.image.background import BackgroundModel
-from hmt_ros.image.likelihood import TermSettings
-from hmt_ros.image.observation import Keypoints
+from hmt_ros.image.likelihood import OFF
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings, read_subject
 from hmt_ros.tracking.initialisation import start_from_keypoints
@@ -41,7 +42,6 @@ TRACKER, SPHERICAL, KEYPOINTS = 'tracker', 'SS samples', '2D keypoints'
 KEYPOINT_SIGMA = 3.0  # px
 OF_KEYPOINTS = 3  # stream of random numbers of a seed
 CALIBRATION_FRAMES = 12
-OFF = TermSettings(0.0, 1.0, 1.0)
 
 # Mean error of MediaPipe's 3D pose, which gives one answer a frame, as measured on the development
 # clips; on `exercise` it swaps left and right.
@@ -249,7 +249,7 @@ def keypoints_only(settings: TrackerSettings) -> TrackerSettings:
     """The same tracker with the terms of the image off."""
     likelihood = replace(
         settings.likelihood,
-        containment=OFF, coverage=OFF, edges=OFF, intensity=OFF, motion=OFF,
+        **{term.name: OFF for term in TERMS},
     )  # fmt: skip
     return replace(settings, likelihood=likelihood)
 

@@ -1,4 +1,4 @@
-"""votes: which chain of the body to flip, or to search, by the vote that chooses it (KJS 5).
+"""votes: which chain of the body to flip, or to search, by the vote that chooses it (KJS figure 5).
 
 New minima: from the optimum of the joints' likelihood at a random pose, a mode that is known, a
 chain by vote, a covariance-scaled sample and all leaves of its tree, each optimised; again, until
@@ -31,14 +31,15 @@ from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, joint_mixtu
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood
-from hmt_ros.image.observation import Keypoints, Observation
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.chain_votes import VOTES, chain_votes
-from hmt_ros.tracking.proposals import covariance_scaled_samples
+from hmt_ros.tracking.proposals.chain_votes import VOTES, chain_votes
+from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples
 
 Array = NDArray[np.float64]
 
@@ -204,7 +205,7 @@ def new_minima(name: str, vote: str, seed: int, count: int, budget: int) -> dict
 def _optimised(likelihood: ImageLikelihood, poses: Array, observation: Observation) -> Minimum:
     body = likelihood.body
     return minimise(
-        lambda x, _: likelihood.energy(x, observation),
+        likelihood.given(observation),
         poses, body.lower, body.upper, step_scale=0.3, max_iterations=40, tolerance=1e-3,
     )  # fmt: skip
 

@@ -33,7 +33,7 @@ LIGHTEST = 0.02  # weight below which a branch is not drawn
 
 
 def main() -> int:
-    """Draws it."""
+    """Draws the figure."""
     plt.switch_backend('Agg')
     plt.rcParams.update({'font.size': 8, 'axes.spines.top': False, 'axes.spines.right': False})
     inputs, targets = toy(250, 0)
@@ -63,7 +63,7 @@ def main() -> int:
 
 
 def draw(branches: Axes, gates: Axes, at: np.ndarray, model: ConditionalDensity) -> None:
-    """Means and deviations of the experts where they count, and their weights."""
+    """Draws means and standard deviations of experts with weight, and the weights."""
     weights, means, covariances = model.predict_arrays(at)
     deviations = np.sqrt(covariances[..., 0, 0])
     for i in range(weights.shape[1]):

@@ -1,10 +1,10 @@
-"""Writes the parts of the pages that are made by programs.
+"""Writes the generated parts of the pages.
 
     python docs/generate.py NAME [NAME ...]
 
-A name of a node, as filter_node, is that of the table of its parameters; one of a benchmark is
-that of what it measures (minutes; soak ten, experts a quarter of an hour). Such a part stands
-between `<!-- begin NAME -->` and `<!-- end -->`.
+The name of a node, such as filter_node, writes the table of its parameters. The name of a benchmark
+runs it and writes its results (minutes; soak ten, experts fifteen). Such a part stands between
+`<!-- begin NAME -->` and `<!-- end -->`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent))
 
-# Part: the page that it stands in.
+# Page of each part.
 PAGES = {
     'filter_node': 'nodes.md',
     'smoother_node': 'nodes.md',

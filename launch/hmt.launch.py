@@ -1,12 +1,12 @@
-"""Starts the nodes for one person, all in a namespace of that person's own (REP 155).
+"""Starts the nodes for one person, in a namespace of its own (REP 155).
 
     ros2 launch hmt_ros hmt.launch.py image:=/camera/image_raw
     ros2 launch hmt_ros hmt.launch.py body_id:=anna image:=/left/image image_transport:=compressed
     ros2 launch hmt_ros hmt.launch.py bag:=my_recording rviz:=true
     ros2 launch hmt_ros hmt.launch.py --show-args
 
-Parameters come, the later before the earlier, from the files in config/, from the arguments here,
-and from the file that params_file names.
+Parameters come from the files in config/, from the arguments here, and from the file that
+params_file names; the later ones take precedence.
 """
 
 from __future__ import annotations
@@ -27,48 +27,48 @@ from launch_ros.actions import Node
 
 PACKAGE = 'hmt_ros'
 NODES = ('filter_node', 'smoother_node', 'bme_node')
-# Where nothing says what the frame of the images is the nodes take the first; views want z up.
+# Default frame of images in the nodes; and the frame for views, which need z up.
 OPTICAL, UPRIGHT = 'camera_optical_frame', 'camera_upright'
-# x forward, y left, z up, seen from a frame with x right, y down, z forward.
+# Rotation from (x right, y down, z forward) to (x forward, y left, z up).
 TURN = {'qx': 0.5, 'qy': -0.5, 'qz': 0.5, 'qw': 0.5}
 TRUTH = {'true': True, 'false': False}
-# What names a file with the settings of Fast DDS.
+# Environment variables that name a file with settings of Fast DDS.
 PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 
-# Name, default, and what it is.
+# Name, default, description.
 ARGUMENTS = (
     (
         'body_id',
         'p1',
-        'who is tracked: topics lie in /humans/bodies/<body_id>/, frames are body_<body_id>/...; '
-        'letters, digits and underscores, a letter first',
+        'identity of the person: letters, digits and underscores, starting with a letter; the '
+        'topics are /humans/bodies/<body_id>/..., the frames body_<body_id>/...',
     ),
-    ('namespace', '', 'topics lie here instead of /humans/bodies/<body_id>'),
-    ('nodes', 'filter_node smoother_node bme_node', 'which nodes are started, with blanks between'),
+    ('namespace', '', 'namespace of the topics; empty: /humans/bodies/<body_id>'),
+    ('nodes', 'filter_node smoother_node bme_node', 'nodes to start, separated by blanks'),
     ('image', '/camera/image_raw', 'topic of the images, without /compressed'),
     ('camera_info', '', 'topic of the calibration; empty: camera_info beside the images'),
     ('image_transport', 'raw', "'raw', or 'compressed' for images on <image>/compressed"),
-    ('keypoints', '', 'topic of joints that a 2D detector has found; empty: none'),
+    ('keypoints', '', 'topic of the keypoints of a 2D detector; empty: none'),
     ('subject_file', '', 'file with the joints in one image; empty: a prediction starts the track'),
-    ('background_file', '', 'picture of the empty scene; empty: learned from the first images'),
-    ('model_file', '', 'model that train has written; empty: the one that comes with the package'),
-    ('params_file', '', 'parameter file, for one node or several, that goes before all else'),
-    ('bag', '', 'bag that is played, once the nodes are there; empty: none'),
+    ('background_file', '', 'image of the empty scene; empty: learned from the first images'),
+    ('model_file', '', 'model written by train; empty: the one that comes with the package'),
+    ('params_file', '', 'parameter file for one or several nodes, with precedence over all else'),
+    ('bag', '', 'bag to play once the nodes run; empty: none'),
     ('use_sim_time', '', "'true' or 'false'; empty: true while a bag is played"),
     ('autostart', 'true', "'false': the nodes wait for their lifecycle services"),
     (
         'camera_frame',
         '',
-        f'optical frame of the images; given, or with rviz: a frame {UPRIGHT} that looks the same '
-        'way with z up is published, for views',
+        f'optical frame of the images; if given, or with rviz, a frame {UPRIGHT} for views is '
+        'published, which has the same direction of view, and z up',
     ),
-    ('rviz', 'false', "'true': RViz is started too"),
-    ('log_level', 'info', 'of the nodes: debug, info, warn, error or fatal'),
+    ('rviz', 'false', "'true': also start RViz"),
+    ('log_level', 'info', 'log level of the nodes: debug, info, warn, error or fatal'),
 )
 
 
 def generate_launch_description() -> LaunchDescription:
-    """What `ros2 launch` asks for."""
+    """The entry point of `ros2 launch`."""
     return LaunchDescription(
         [
             *(
@@ -81,7 +81,7 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _actions(context: Any) -> list[Any]:
-    """The processes, now that the arguments are known."""
+    """The processes for the arguments of a launch."""
     given = {name: LaunchConfiguration(name).perform(context) for name, _, _ in ARGUMENTS}
     return actions_of(given, Path(get_package_share_directory(PACKAGE)))
 
@@ -91,7 +91,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
 
     Args:
         given: all arguments, by name.
-        share: folder in which config/ and rviz/ are.
+        share: folder with config/ and rviz/.
 
     Raises:
         ValueError: an argument that can not be used.
@@ -157,7 +157,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
             )
         )
     if rviz:
-        # Its topics are relative: the namespace says whose they are.
+        # Its topics are relative: the namespace selects the person.
         actions.append(
             Node(
                 package=_installed('rviz2', 'rviz'),
@@ -170,28 +170,28 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
             )
         )
     if bag:
-        # Who subscribes late must not miss the first images: the bag waits for the nodes.
+        # The bag waits for the nodes: late subscribers would miss the first images.
         command = ['ros2', 'bag', 'play', bag, '--clock', '--delay', '5']
         actions.append(ExecuteProcess(cmd=command, output='both', additional_env=env))
     return actions
 
 
 def _room_for_images(share: Path) -> dict[str, str]:
-    """Environment in which raw images are not lost on their way; empty: it has settings already."""
+    """Settings of Fast DDS with buffers for raw images; empty if there are settings already."""
     if any(name in os.environ for name in PROFILES):
         return {}
     return {PROFILES[0]: str(share / 'config' / 'fastdds.xml')}
 
 
 def _namespace(given: Mapping[str, str]) -> str:
-    """Namespace of the person, absolute."""
+    """Absolute namespace of the person."""
     body_id = given['body_id']
     if not re.fullmatch(r'[A-Za-z][A-Za-z0-9_]*', body_id):
         raise ValueError(
             f'body_id: wanted letters, digits and underscores, a letter first, saw {body_id!r}'
         )
     namespace = given['namespace'] or f'/humans/bodies/{body_id}'
-    # The URDF of a person must not come near that of a robot.
+    # The URDF of a person must not replace that of a robot.
     if not re.fullmatch(r'(/[A-Za-z_][A-Za-z0-9_]*)+', namespace):
         raise ValueError(
             f'namespace: wanted a name such as /humans/bodies/anna, saw {given["namespace"]!r}'
@@ -200,30 +200,30 @@ def _namespace(given: Mapping[str, str]) -> str:
 
 
 def _named(given: Mapping[str, str], name: str) -> dict[str, str]:
-    """The file that an argument names, as a parameter; none where it is empty."""
+    """The file that an argument names, as a parameter; empty without a name."""
     return {name: given[name]} if given[name] else {}
 
 
 def _file(name: str, values: Mapping[str, Any]) -> str:
-    """Values for a node as a parameter file, with the section that the files in config/ have.
+    """Writes values for a node into a parameter file, in the same section as the files in config/.
 
-    launch_ros would name the node in full, and no section of params_file but such a one would go
-    before that: ROS merges sections of one name where the first of them is.
+    launch_ros would write a section with the full name of the node, over which only such a section
+    of params_file would take precedence: ROS merges sections of one name at the first of them.
     """
     prefix, section = f'{name}_', {f'/**/{name}': {'ros__parameters': values}}
     with NamedTemporaryFile(
         'w', encoding='utf-8', prefix=prefix, suffix='.yaml', delete=False
     ) as file:
-        # JSON is YAML in which all text is quoted: a file named 12 is not a number.
+        # JSON is YAML in which all text is quoted: a file named 12 stays text.
         json.dump(section, file, ensure_ascii=False)
     return file.name
 
 
 def _installed(package: str, argument: str) -> str:
-    """Name of a package, which is there.
+    """The name of an installed package.
 
     Raises:
-        ValueError: it is not. launch would see that after it has started nodes, and leave those.
+        ValueError: it is not installed. launch itself would notice only after it has started nodes.
     """
     try:
         get_package_share_directory(package)
@@ -233,7 +233,7 @@ def _installed(package: str, argument: str) -> str:
 
 
 def _frame(namespace: str) -> str:
-    """What the frames of a person begin with, by the last part of its namespace."""
+    """Prefix of the frames of a person, from the last part of its namespace."""
     return f'body_{namespace.rpartition("/")[2]}'
 
 

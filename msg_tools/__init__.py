@@ -4,12 +4,16 @@ Nothing here needs ROS: the message types come from `rosbags` and from the .msg 
 `hmt_msgs/`. The same functions serve nodes, which hand over the classes that ROS generates.
 """
 
-from msg_tools.bags.bag_error import BagError
 from msg_tools.bags.bag_reader import BagMessage, BagReader, Topic
 from msg_tools.bags.bag_writer import BagWriter
+from msg_tools.bags.contents import BagError
 from msg_tools.messages.message_error import MessageError
-from msg_tools.messages.message_factory import GeneratedMessages, MessageFactory, RosbagsMessages
-from msg_tools.messages.typestore import typestore
+from msg_tools.messages.message_types import (
+    GeneratedMessages,
+    MessageFactory,
+    RosbagsMessages,
+    typestore,
+)
 
 __all__ = [
     'BagError',

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import pkgutil
 import re
 import runpy
 import shlex
@@ -145,8 +146,8 @@ def test_marked_commands_run(workplace, capsys):
     assert (workplace / 'reach_report' / 'report.html').is_file()
 
 
-def test_subject_file_of_the_readme():
-    (text,) = (code for code, _ in blocks(ROOT / 'README.md', 'yaml'))
+def test_subject_file_of_the_page_on_bags():
+    (text,) = (code for code, _ in blocks(ROOT / 'docs' / 'bags.md', 'yaml'))
     subject = parse_subject(yaml.safe_load(text), load_body('human37'))
     assert len(subject.keypoints.names) == 14
     assert subject.stature == 1.7
@@ -190,9 +191,20 @@ def test_topics_of_a_node(node):
     wanted = {topic: kind.msgtype.replace('/msg/', '/') for topic, kind in NODES[node][1].items()}
     assert {topic: published[topic] for topic in wanted} == wanted
     assert set(published) - set(wanted) == {'/diagnostics', '~/handled'}
-    readme = rows((ROOT / 'README.md').read_text('utf-8'), '## The nodes and their topics')
-    named = {name for row in readme for name in re.findall(r'`([^`]+)`', row[0])}
-    assert set(wanted) <= named
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / 'README.md').read_text('utf-8').splitlines()) <= 180
+
+
+@pytest.mark.parametrize('page', PAGES, ids=PAGE_IDS)
+def test_modules_exist(page):
+    """Dotted names and paths of the two packages lead to a module, a folder or a name in one."""
+    text = page.read_text('utf-8')
+    for name in re.findall(r'`((?:hmt_ros|msg_tools)(?:\.\w+)+)`', text):
+        assert pkgutil.resolve_name(name), name
+    for name in re.findall(r'`((?:hmt_ros|msg_tools|test|benchmarks)/[\w/.*]*)`', text):
+        assert list(ROOT.glob(name.rstrip('/'))), name
 
 
 def test_numbers_of_evaluate_are_explained():

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_tools.messages.typestore import typestore
+from msg_tools.messages.message_types import typestore
 
 pytestmark = pytest.mark.ros
 

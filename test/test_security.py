@@ -10,7 +10,7 @@ import pytest
 
 from hmt_ros.body import model_file
 from hmt_ros.motion import rig
-from hmt_ros.sessions import parameter_file, picture_file
+from hmt_ros.sessions import camera_session, parameter_file
 from hmt_ros.tracking import subject
 from msg_tools.bags import bag_metadata, decompression
 from msg_tools.files import array_file
@@ -98,7 +98,7 @@ def test_limits_are_those_of_the_page() -> None:
     limits = {
         images.MAX_PIXELS,
         images.MAX_JPEG_SCANS,
-        picture_file._LARGEST_FILE,
+        camera_session._LARGEST_PICTURE_FILE,
         pose_mixtures.MAX_COMPONENTS,
         keypoints.MAX_KEYPOINTS,
         model_file.LARGEST_FILE,

@@ -3,7 +3,7 @@
 #     source tools/environment.bash
 #
 # It does for .venv what /opt/ros/jazzy/setup.bash does for a ROS installation, and then sources
-# install/. What another ROS installation has put into this shell is set aside.
+# install/. It removes the settings of another ROS installation from this shell.
 
 _root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 unset PYTHONPATH PYTHONHOME LD_LIBRARY_PATH COLCON_PREFIX_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
@@ -12,6 +12,6 @@ export AMENT_PREFIX_PATH=$VIRTUAL_ENV CMAKE_PREFIX_PATH=$VIRTUAL_ENV
 export PATH=$VIRTUAL_ENV/bin:$PATH
 export ROS_DISTRO=jazzy ROS_VERSION=2 ROS_PYTHON_VERSION=3
 source "$_root/install/local_setup.bash"
-# Nothing leaves this machine unless it is wanted.
+# DDS communicates on this machine only, unless the variable is set already.
 export ROS_AUTOMATIC_DISCOVERY_RANGE=${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}
 unset _root

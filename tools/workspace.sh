@@ -5,14 +5,14 @@
 #     tools/workspace.sh STAGE...
 #
 #     ros     .venv with ROS 2, the build tools and what hmt_ros imports
-#     test    what the tests import besides
+#     test    what the tests import in addition
 #     lint    ruff, mypy, pre-commit
 #     build   both packages, in build/ and install/
 #
-# A stage that is done is recognised by a checksum of all that it was made from and is passed over.
-# A stage that was interrupted or whose sources have changed is done again.
+# A checksum of its inputs identifies a completed stage, which is skipped. A stage that was
+# interrupted or whose inputs have changed runs again.
 #
-# PYTHON=/path/to/python chooses the interpreter; otherwise the first fitting one in PATH is taken.
+# PYTHON=/path/to/python selects the interpreter; the default is the first suitable one in PATH.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 root=$PWD
@@ -21,13 +21,13 @@ stamps=$venv/stamps
 unfinished=$venv/unfinished
 headers=$venv/python-headers
 
-# What another ROS installation or virtual environment has put into this shell has no say here.
+# Ignores what another ROS installation or virtual environment has set in this shell.
 unset PYTHONPATH PYTHONHOME LD_LIBRARY_PATH COLCON_PREFIX_PATH ROS_DISTRO
 unset _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 say() { printf 'hmt_ros: %s\n' "$*" >&2; }
 
-# Ends with one line that says what is wrong; its exit code marks the fault as explained.
+# Prints one line that explains the fault, and exits with a code that marks it as explained.
 explained=78
 fail() {
   say "$*"
@@ -37,11 +37,11 @@ fail() {
 explain_exit() {
   local code=$?
   [ $code -eq 0 ] || [ $code -eq $explained ] ||
-    say 'the set-up stopped before its end; the next call takes it up again'
+    say 'the set-up was interrupted; the next call resumes it'
 }
 trap explain_exit EXIT
 
-# ---- What has to be there already: each is asked for before anything long starts ----
+# ---- Prerequisites, checked before any long step ----
 
 fits='import sys; sys.exit(not ((3, 10) <= sys.version_info[:2] <= (3, 13)))'
 
@@ -81,9 +81,9 @@ check_prerequisites() {
 
 python_include() { "$1" -c 'import sysconfig; print(sysconfig.get_path("include"))'; }
 
-# The message generators compile against Python.h, which Debian and Ubuntu keep in a package of its
-# own. Where that is not installed its content goes into the virtual environment; the system stays
-# as it is, and no root is needed.
+# The message generators compile against Python.h, which Debian and Ubuntu ship in a separate
+# package. If it is not installed, its files are unpacked into the virtual environment, without root
+# and without changes to the system.
 unpack_python_headers() {
   local include package
   include=$(python_include "$python")
@@ -94,7 +94,7 @@ unpack_python_headers() {
   (
     cd "$headers"
     apt-get -qq download "$package" 2>/dev/null ||
-      { # No list of packages yet, or an old one: fetch it, into a place of our own.
+      { # No list of packages yet, or an old one: fetch it into a private folder.
         private=(-o "Dir::State::Lists=$headers/lists" -o "Dir::Cache=$headers" -o APT::Sandbox::User=)
         apt-get -qq "${private[@]}" update && apt-get -qq "${private[@]}" download "$package"
       }
@@ -106,17 +106,17 @@ unpack_python_headers() {
 
 # ---- Stages ----
 
-# Checksum of the arguments and of the content of the files named on standard input.
+# Checksum of the arguments and of the contents of the files named on standard input.
 checksum() { { printf '%s\n' "$@" && xargs -r -d '\n' sha256sum; } | sha256sum | cut -d ' ' -f 1; }
 
 done_already() { [ "$(cat "$stamps/$1" 2>/dev/null)" = "$2" ] && [ ! -e "$unfinished" ]; }
 
-# Without byte-compiling what is never imported: a third of the time.
+# Without byte-compiling files that are never imported: a third of the time.
 install() {
   "$venv/bin/python" -m pip -qq --disable-pip-version-check --no-input install --no-compile "$@"
 }
 
-# Whether .venv works and, where PYTHON names an interpreter, was made with that one.
+# Whether .venv works and, if PYTHON names an interpreter, was made with it.
 venv_is_usable() {
   local identity='import sys; print(sys.version, sys.base_prefix)' own
   own=$("$venv/bin/python" -c "$identity" 2>/dev/null) || return
@@ -129,9 +129,9 @@ stage_ros() {
     tools/tf2_msgs/{package.xml,CMakeLists.txt,msg/*} | checksum "$root")
   done_already ros "$key" && venv_is_usable && return
   check_prerequisites
-  # From scratch: a package that was half installed, or is not asked for any more, can not stay.
+  # From scratch: no package remains that was half installed or is no longer required.
   rm -rf "$venv" build install log
-  say "making .venv with $("$python" --version), ROS 2 Jazzy and all it needs, once (minutes, 1 GB)"
+  say "creating .venv with $("$python" --version) and ROS 2 Jazzy, once (minutes, 1 GB)"
   "$python" -m venv "$venv"
   touch "$unfinished"
   unpack_python_headers
@@ -143,7 +143,7 @@ stage_ros() {
   rm "$unfinished"
 }
 
-# The CMake files in the wheels name the include folders of the machine that built them.
+# The CMake files in the wheels contain the include folders of the machine that built them.
 repair_exported_include_paths() {
   local include numpy
   include=$(python_include "$venv/bin/python")
@@ -154,7 +154,7 @@ repair_exported_include_paths() {
     -e "s#/opt/python/[^;\"]*/include/python3\.[0-9]+#$include#g"
 }
 
-# The wheels have no tf2_msgs, which every ROS installation has: it becomes part of .venv.
+# There is no wheel of tf2_msgs, which every ROS installation has: it is built into .venv.
 build_tf2_msgs() {
   colcon_build .venv/build --base-paths tools/tf2_msgs --merge-install --install-base "$venv"
   rm -r .venv/build .venv/log
@@ -167,7 +167,7 @@ stage_requirements() {
   local key
   key=$(printf '%s\n' "requirements/$1.txt" | checksum "$(cat "$stamps/ros")")
   done_already "$1" "$key" && return
-  say "installing what requirements/$1.txt names, once"
+  say "installing requirements/$1.txt, once"
   touch "$unfinished"
   install -r "requirements/$1.txt"
   echo "$key" >"$stamps/$1"
@@ -184,7 +184,7 @@ stage_build() {
   echo "$key" >"$stamps/build"
 }
 
-# Runs "colcon build" quietly with .venv as the ROS installation; what it said is shown if it fails.
+# Runs "colcon build" quietly with .venv as the ROS installation; shows its output if it fails.
 colcon_build() {
   local build_base=$1 output
   shift
@@ -202,7 +202,7 @@ colcon_build() {
   ) || fail "colcon build failed:"$'\n'"$output"
 }
 
-# One at a time: a second call waits for the first and then finds its work done.
+# One at a time: a second call waits for the first and then skips the completed stages.
 exec 9<"$root/tools/workspace.sh"
 flock 9
 

@@ -15,14 +15,14 @@ from benchmarks.soak.outcome import Amount, Outcome
 from benchmarks.soak.scenes import CLIP
 from hmt_ros.app import make_bag
 from hmt_ros.app.replay import command as replay
+from hmt_ros.experts import load_predictor
 from hmt_ros.experts.model_file import read_arrays, write_arrays
-from hmt_ros.experts.shipped_models import load_predictor
 from msg_tools import BagReader
 
 _MODEL = ROOT / 'hmt_ros' / 'experts' / 'models' / 'procedural.npz'
 _CHEAP = (
-    '--set', 'max_hypotheses=1', '--set', 'candidates=1', '--set', 'combinations=1',
-    '--set', 'searched_chains=0', '--set', 'search.samples=3', '--set', 'overlay_modes=0',
+    '--set', 'max_hypotheses=1', '--set', 'candidates=1',
+    '--set', 'searched_chains=0', '--set', 'overlay_modes=0',
 )  # fmt: skip
 
 

@@ -69,7 +69,7 @@ class _Fed:
     @property
     def asked(self) -> str:
         """The source whose type its service takes."""
-        return PREDICTION if PREDICTION in self.valid else self.scene.counted
+        return PREDICTION if PREDICTION in self.valid else self.scene.session.COUNTED
 
     def take(self, source: str, data: bytes) -> None:
         """Gives it bytes as its node would."""
@@ -117,7 +117,7 @@ class _Fed:
             for source, message in self.scene.prelude:
                 self.session.take(source, message)
             self._next += 1
-            handled = self.session.take(self.scene.counted, self.scene.message(self._next))
+            handled = self.session.take(self.scene.session.COUNTED, self.scene.message(self._next))
             self._published.clear()
             if not handled.faults:
                 return
@@ -129,7 +129,7 @@ class _Fed:
         self._next = 0
         self.valid = self.scene.valid(changes.get('image_transport', ''))
         parameters = replace(self.scene.parameters, **changes)
-        self.session: Session = self.scene.session(parameters, self._published.append)
+        self.session: Session[Any, Any] = self.scene.session(parameters, self._published.append)
 
     def _compare(self, told: tuple[tuple[str, int], ...]) -> None:
         """What is said to be published is, and can be read."""
@@ -137,7 +137,7 @@ class _Fed:
         if told != made:
             self.outcome.lost += len(set(told) - set(made)) or 1
         for output in self._published:
-            deserialise(output.data, self.scene.topics[output.topic].msgtype)
+            deserialise(output.data, self.scene.session.TOPICS[output.topic].msgtype)
         self._published.clear()
 
 

@@ -76,7 +76,7 @@ def killed(watched: Watched, amount: Amount, outcome: Outcome) -> None:
         for _ in range(3):
             watched.next()
         one = (time.monotonic() - begin) / 3
-        watched.node.publish(watched.scene.counted, watched.scene.message(watched.index))
+        watched.node.publish(watched.scene.session.COUNTED, watched.scene.message(watched.index))
         watched.spin(float(rng.uniform(0.0, 1.5)) * one)
         watched.node.process.send_signal(signal.SIGKILL)
         watched.node.process.wait()

@@ -23,12 +23,6 @@ from msg_tools.messages.cdr import serialise
 OVERLOAD = 5.0
 # Messages of a publisher before it is killed.
 _FROM_ANOTHER = 3
-# What the diagnostics of a node call its messages, and those that were used.
-_COUNTED = {
-    'filter_node': ('images', 'tracked'),
-    'smoother_node': ('mixtures', 'smoothed'),
-    'bme_node': ('images', 'predicted'),
-}
 
 
 def jumping_clock(watched: Watched, amount: Amount, outcome: Outcome) -> None:
@@ -49,7 +43,9 @@ def jumping_clock(watched: Watched, amount: Amount, outcome: Outcome) -> None:
         time_message.clock.sec = seconds
         clock.publish(time_message)
         stamp = seconds * 10**9 + int(rng.integers(0, 10)) * STEP_NS
-        handled = watched.send(watched.scene.counted, stamped(watched.scene.message(0), stamp))
+        handled = watched.send(
+            watched.scene.session.COUNTED, stamped(watched.scene.message(0), stamp)
+        )
         outcome.times += 1
         outcome.refused += bool(handled.faults)
         if handled.stamp_ns != stamp:
@@ -63,7 +59,7 @@ def jumping_clock(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 def two_publishers(watched: Watched, amount: Amount, outcome: Outcome) -> None:
     """A second publisher an hour behind: its messages are skipped, none of the first is."""
     scene, player = watched.scene, watched.player
-    topic, msgtype = scene.inputs[scene.counted]
+    topic, msgtype = scene.inputs[scene.session.COUNTED]
     other = player.node.create_publisher(player.classes[msgtype], topic, player.reliable)
     watched.set(reset_on_time_jump=False)
     end = time.monotonic() + PATIENCE
@@ -85,7 +81,7 @@ def two_publishers(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 
 def publisher_killed(watched: Watched, amount: Amount, outcome: Outcome) -> None:
     """A publisher dies in the middle of a stream, and another takes its place."""
-    scene, counted = watched.scene, watched.scene.counted
+    scene, counted = watched.scene, watched.scene.session.COUNTED
     topic, msgtype = scene.inputs[counted]
     file = watched.player.folder / 'messages'
     file.write_bytes(as_file([serialise(scene.message(i)) for i in range(20)]))
@@ -128,7 +124,7 @@ def overload(watched: Watched, amount: Amount, outcome: Outcome) -> None:
     heard: list[Handled] = []
     due = time.monotonic()
     for _ in amount.counted():
-        watched.node.publish(watched.scene.counted, watched.scene.message(watched.index))
+        watched.node.publish(watched.scene.session.COUNTED, watched.scene.message(watched.index))
         watched.index += 1
         outcome.times += 1
         due += interval
@@ -157,6 +153,11 @@ def overload(watched: Watched, amount: Amount, outcome: Outcome) -> None:
 
 def _counts(watched: Watched) -> dict[str, int]:
     values = watched.values()
-    counted, done = _COUNTED[watched.scene.node]
-    names = {'received': 'received', 'used': done, 'skipped': 'skipped', 'dropped': 'dropped'}
-    return {what: int(values[f'{counted} {name}']) for what, name in names.items()}
+    session = watched.scene.session
+    names = {
+        'received': 'received',
+        'used': session.DONE,
+        'skipped': 'skipped',
+        'dropped': 'dropped',
+    }
+    return {what: int(values[f'{session.UNIT}s {name}']) for what, name in names.items()}

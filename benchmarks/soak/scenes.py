@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -13,25 +13,22 @@ from benchmarks.clips import COMPRESSED, ROOT, index_back_and_forth, read_messag
 from benchmarks.publisher import STEP_NS
 from hmt_ros.body import load_body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
-from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
-from hmt_ros.sessions.published_topic import PublishedTopic
 from hmt_ros.sessions.session import Session
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
-from hmt_ros.sessions.smoother_session import BODY, MIXTURE, SmootherSession
+from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.tracking import TrackerSettings
 from msg_tools import RosbagsMessages
-from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.images import decode_image, image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 CLIP = ROOT / 'bags' / 'reach'
-_SMALL = TrackerSettings(max_hypotheses=2, candidates=4, combinations=16)
+_SMALL = TrackerSettings(max_hypotheses=2, candidates=4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +41,8 @@ class Scene:
         session: what stands behind its topics.
         inputs: topic and type by source.
         sensors: topics on which data may be lost unless a player asks for better.
-        topics: that it publishes.
         prelude: source and message of what has to come first.
-        counted: the source that gives the tempo.
-        pictures: messages of that source.
+        pictures: messages of the source that sets the pace.
         others: a valid message of each other source.
         start_ns: stamp of the first.
         variants: other parameters, with which more of what comes is looked at.
@@ -55,12 +50,10 @@ class Scene:
 
     node: str
     parameters: Any
-    session: Callable[..., Session]
+    session: type[Session[Any, Any]]
     inputs: Mapping[str, tuple[str, str]]
     sensors: tuple[str, ...]
-    topics: Mapping[str, PublishedTopic]
     prelude: tuple[tuple[str, Any], ...]
-    counted: str
     pictures: tuple[Any, ...]
     others: Mapping[str, Any]
     start_ns: int
@@ -83,7 +76,7 @@ class Scene:
             message = image_message(
                 RosbagsMessages(), picture, time_ns(header.stamp), str(header.frame_id)
             )
-        return {**self.others, self.counted: message}
+        return {**self.others, self.session.COUNTED: message}
 
 
 def stamped(message: Any, stamp_ns: int) -> Any:
@@ -129,9 +122,7 @@ def _filter() -> Scene:
             PREDICTION: ('pose_prediction', 'hmt_msgs/msg/PoseMixture'),
         },
         (*_CAMERA_TOPICS, '/keypoints'),
-        track_messages.TOPICS,
         ((CAMERA_INFO, info),),
-        IMAGE,
         images,
         {
             CAMERA_INFO: info,
@@ -157,9 +148,7 @@ def _bme() -> Scene:
         BmeSession,
         _CAMERA,
         _CAMERA_TOPICS,
-        bme_session.TOPICS,
         ((CAMERA_INFO, info),),
-        IMAGE,
         images,
         {CAMERA_INFO: info},
         time_ns(images[0].header.stamp),
@@ -173,21 +162,15 @@ def _bme() -> Scene:
 
 
 def _smoother() -> Scene:
-    body = message_of_body(RosbagsMessages(), load_body('human37'), 10**18, 'lens')
     return Scene(
         'smoother_node',
         SmootherParameters(max_trajectories=4, window_length=8, queue_size=5),
         SmootherSession,
-        {
-            BODY: ('body', 'hmt_msgs/msg/Body'),
-            MIXTURE: ('likelihood_mixture', 'hmt_msgs/msg/PoseMixture'),
-        },
+        {MIXTURE: ('likelihood_mixture', 'hmt_msgs/msg/PoseMixture')},
         (),
-        smoothed_messages.TOPICS,
-        ((BODY, body),),
-        MIXTURE,
+        (),
         tuple(_mixture(index, MixtureKind.LIKELIHOOD) for index in range(10)),
-        {BODY: body},
+        {},
         10**18,
         ({}, {'reset_on_time_jump': True}, {'body_model': 'human37', 'fixed_lag': 0}),
     )
@@ -202,16 +185,7 @@ def _mixture(index: int, kind: MixtureKind) -> Any:
     means[:, elbow] = (0.5 + 0.05 * index, 1.3 + 0.05 * index)
     covariances = np.tile(1e-3 * np.eye(body.dimension), (2, 1, 1))
     mixture = GaussianMixture(np.array([0.6, 0.4]), means, covariances)
-    content = PoseMixture(
-        mixture=mixture,
-        body_model=body.name,
-        dof_names=body.dof_names,
-        joint_names=body.joint_names,
-        joint_positions=body.joint_positions(means),
-        kind=kind,
-        stamp_ns=10**18,
-        frame_id='lens',
-    )
+    content = PoseMixture.of_body(body, mixture, kind, 10**18, 'lens')
     return pose_mixture_message(RosbagsMessages(), content)
 
 

@@ -11,7 +11,6 @@ from benchmarks.soak.scenes import Scene
 from hmt_ros.app.replay.live_node import LiveNode
 from hmt_ros.app.replay.player import LiveNodeError, Player
 from hmt_ros.sessions.handled import Handled
-from hmt_ros.sessions.smoother_session import BODY
 
 # How long one message may take, s.
 PATIENCE = 60.0
@@ -50,13 +49,12 @@ class Watched:
                 scene.node,
                 replace(scene.parameters, reset_on_time_jump=True),
                 inputs=scene.inputs,
-                topics=scene.topics,
+                topics=scene.session.TOPICS,
                 sensors=scene.sensors,
-                latched=(BODY,),
                 write=_ignored,
             )
             self.node.wait_until_active()
-            self.node.wait_for_subscribers(tuple(scene.topics), 1)
+            self.node.wait_for_subscribers(tuple(scene.session.TOPICS), 1)
             self._opened = opened.pop_all()
 
     def __enter__(self) -> Watched:
@@ -80,7 +78,7 @@ class Watched:
     def next(self) -> Handled:
         """The next valid message in lock step."""
         self.index += 1
-        return self.send(self.scene.counted, self.scene.message(self.index - 1))
+        return self.send(self.scene.session.COUNTED, self.scene.message(self.index - 1))
 
     def anew(self) -> None:
         """Valid messages from the first on, until one is used: a session has begun."""
@@ -89,12 +87,12 @@ class Watched:
         while time.monotonic() < end:
             for source, message in self.scene.prelude:
                 self.node.publish(source, message)
-            self.node.publish(self.scene.counted, self.scene.message(self.index))
+            self.node.publish(self.scene.session.COUNTED, self.scene.message(self.index))
             self.index += 1
             with suppress(Silent):
                 while True:
                     handled = self.answer(SHORT)
-                    if handled.source == self.scene.counted and not handled.faults:
+                    if handled.source == self.scene.session.COUNTED and not handled.faults:
                         self.settle()
                         return
         raise LiveNodeError(f'the {self.node.title} uses no message any more')

@@ -1,4 +1,4 @@
-"""What a person starts: `python -m hmt_ros <command>`, or each as an executable of its own."""
+"""The commands: `python -m hmt_ros <command>`, or each as an executable of its own."""
 
 from __future__ import annotations
 
@@ -6,19 +6,25 @@ import importlib
 import sys
 
 import hmt_ros
-from hmt_ros.app.printing import until_nobody_reads
+from hmt_ros.app.command_line import until_nobody_reads
 
-# Command: (module, what it does). A module is imported when its command is given.
+# Command: (module, what it does). A module is imported when its command runs.
 COMMANDS = {
-    'replay': ('hmt_ros.app.replay.command', 'track the person in a bag, into a new bag'),
-    'recover': ('hmt_ros.app.recover', 'save what is whole in a damaged bag'),
+    'replay': (
+        'hmt_ros.app.replay.command',
+        'track the person in a bag and write the poses into a new bag',
+    ),
+    'recover': (
+        'hmt_ros.app.recover',
+        'copy the undamaged messages of a damaged bag into a new bag',
+    ),
     'make-bag': ('hmt_ros.app.make_bag', 'render a motion into a bag with ground truth'),
-    'train': ('hmt_ros.app.train', 'learn to predict poses from silhouettes'),
+    'train': ('hmt_ros.app.train', 'learn a predictor of poses from silhouettes'),
     'report': (
         'hmt_ros.app.report.command',
-        'pictures and a page with a 3D view of the mixtures in a bag',
+        'show the mixtures in a bag: pictures, and a page with a 3D view',
     ),
-    'evaluate': ('hmt_ros.app.evaluate', 'errors and calibration of mixtures against ground truth'),
+    'evaluate': ('hmt_ros.app.evaluate', 'compare the mixtures in a bag with ground truth'),
 }
 
 HELP = """\
@@ -29,17 +35,17 @@ Monocular 3D human motion tracking with mixtures.
 commands:
 {commands}
 
-python -m hmt_ros <command> --help tells what a command takes. Each is an executable of ROS 2 as
-well, ros2 run hmt_ros <command>, and so are the nodes: filter_node, smoother_node, bme_node.
+python -m hmt_ros <command> --help lists the arguments of a command. ROS 2 runs the same commands,
+ros2 run hmt_ros <command>, and the nodes filter_node, smoother_node and bme_node.
 
 options:
-  -h, --help  show this
+  -h, --help  show this help
   --version   show the version
 """
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs a command; 0: done, 1: bad input, and one line on stderr says which."""
+    """Runs a command; 0: done, 1: bad input, which one line on stderr explains."""
     return until_nobody_reads(lambda: _run(sys.argv[1:] if argv is None else argv))
 
 

@@ -1,4 +1,4 @@
-"""The demonstration that `make demo` runs: a bag through the tracker, a table of errors, a report.
+"""The demonstration of `make demo`: tracks the person in a bag, prints errors, writes a report.
 
 `python -m hmt_ros.app.demo bags/reach -o build/demo --live`
 """
@@ -14,8 +14,10 @@ import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.evaluate import as_text
-from hmt_ros.app.replay import command as replay
-from hmt_ros.app.report.command import write_report
+from hmt_ros.app.replay.command import tell
+from hmt_ros.app.replay.one_bag import replay_bag
+from hmt_ros.app.replay.options import ReplayOptions
+from hmt_ros.app.report.command import ReportOptions, write_report
 from hmt_ros.app.report.page import Content
 from hmt_ros.app.truth import recorded_truth
 from msg_tools import BagReader
@@ -24,63 +26,69 @@ REPORT = 'report'
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the demonstration; 0: done, 1: bad input, and one line on stderr says which."""
+    """Runs the demonstration; 0: done, 1: bad input, which one line on stderr explains."""
     return run_command(_parser(), _demonstrate, argv)
 
 
 def _parser() -> CommandParser:
     parser = CommandParser(
-        prog='demo',
-        description='Tracks the person of a bag, prints errors, where the truth is known, and '
-        'leaves pictures and a page for a browser.',
+        'demo',
+        'Tracks the person in a bag, prints errors if the truth is known, and writes a report.',
     )
     parser.add_argument(
         'bag',
         type=Path,
-        help='folder of a bag with subject.yaml and, if there is one, background.png in it',
+        help='folder of a bag, with subject.yaml and, if available, background.png in it',
     )
     parser.add_argument(
         '-o', '--output', type=Path, required=True, metavar='DIR',
-        help='folder for the bag of the track and the report',
+        help='folder for the new bag and the report',
     )  # fmt: skip
-    parser.add_argument('--live', action='store_true', help='through the real node, over DDS')
+    parser.add_argument('--live', action='store_true', help='run the real nodes, over DDS')
     return parser
 
 
-def _demonstrate(options: argparse.Namespace) -> int:
-    source, folder = options.bag, options.output
+def _demonstrate(arguments: argparse.Namespace) -> int:
+    source, folder = arguments.bag, arguments.output
     target = folder / source.resolve().name
-    how = 'the real nodes' if options.live else 'the tracker'
-    print(f'{source} through {how}', flush=True)
-    arguments = [str(source), '-o', str(target), '--overwrite']
-    for option, name in (('--subject', 'subject.yaml'), ('--background', 'background.png')):
-        if (source / name).is_file():
-            arguments += [option, str(source / name)]
+    print(
+        f'tracking {source} with {"the real nodes" if arguments.live else "the tracker"}',
+        flush=True,
+    )
+
+    def beside(name: str) -> Path | None:
+        return source / name if (source / name).is_file() else None
+
+    options = ReplayOptions(
+        overwrite=True,
+        live=arguments.live,
+        subject=beside('subject.yaml'),
+        background=beside('background.png'),
+    )
     start = time.monotonic()
-    code = replay.main([*arguments, *(['--live'] if options.live else [])])
-    if code != 0:
-        return code
+    replayed = replay_bag(source, target, options, tell)
     spent = time.monotonic() - start
-    beside = source / 'truth.npz'
-    arguments = [str(target), '-o', str(folder / REPORT), '--overwrite', '--images', str(source)]
-    if beside.is_file() and recorded_truth(target) is None:
-        arguments += ['--truth', str(beside)]
-    shown, made = write_report(arguments)
-    print(_summary(shown, spent))
+    print(f'{replayed} in {spent:.1f} s')
+    truth = beside('truth.npz') if recorded_truth(target) is None else None
+    shown, written = write_report(
+        ReportOptions(target, folder / REPORT, overwrite=True, images=source, truth=truth)
+    )
+    print(_modes(shown))
     if shown.truth is not None:
         print(as_text(shown.scores, shown.truth, by_joint=False))
-        print('docs/evaluation.md tells what the numbers mean\n')
-    print(f'what came out\n{target}: bag of {", ".join(_topics(target))}\n{made}')
+        print('docs/evaluation.md explains the numbers\n')
+    print(f'results\n{target}: bag with {", ".join(_topics(target))}\n{written}')
     return 0
 
 
-def _summary(shown: Content, spent: float) -> str:
-    (track,) = (x.track for x in shown.mixtures.layers if x.topic == 'pose_mixture')
-    modes = np.mean([len(moment.weights) for moment in track.moments])
-    heaviest = np.mean([moment.weights[0] for moment in track.moments])
+def _modes(shown: Content) -> str:
+    (layer,) = (layer for layer in shown.mixtures.layers if layer.topic == 'pose_mixture')
+    moments = layer.mixtures.values()
+    modes = np.mean([len(moment.weights) for moment in moments])
+    heaviest = np.mean([moment.weights[0] for moment in moments])
     return (
-        f'{spent:.1f} s; {modes:.1f} modes an image, the heaviest with {100 * heaviest:.0f} % of '
-        'the weight on average\n'
+        f'{modes:.1f} modes per image; the heaviest has {100 * heaviest:.0f} % of the weight on '
+        'average\n'
     )
 
 

@@ -1,4 +1,4 @@
-"""evaluate: errors and calibration of the mixtures in a bag, against ground truth."""
+"""evaluate: errors and calibration of the mixtures in a bag against ground truth."""
 
 from __future__ import annotations
 
@@ -6,121 +6,93 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
-from hmt_ros.app.bag_scores import TopicScores, score_bag
-from hmt_ros.app.command_line import CommandParser, number, run_command
-from hmt_ros.app.truth import Truth, read_truth, recorded_truth
+from hmt_ros.app.bag_scores import score_bag
+from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
+from hmt_ros.app.truth import read_truth, recorded_truth
 from hmt_ros.evaluation.pose_scores import MODEL_SIGMA
+from hmt_ros.evaluation.track_scores import TrackScores, Truth
 
 EPILOG = """\
-Errors are mean distances of hips, knees, ankles, shoulders, elbows, wrists and neck from where
-they were, after the pelvis was brought to its true place: of the heaviest component, of the best
-of all, and the mean over the components by weight. A frame is lost when even the best is 150 mm
-off. The negative log-likelihood is that of the true joint positions (m), in nats; lower is better.
-Coverage is how often the truth lies in the smallest region that holds 50 or 90 percent of the
-mixture's probability, for all joints together and for each joint alone: honest mixtures cover 50
-and 90 percent.
+Errors are mean distances of hips, knees, ankles, shoulders, elbows, wrists and neck from their true
+positions, after the pelvis was moved to its true position (or, if the truth has no pelvis, the
+middle of the hips): of the heaviest component, of the best of all components, and the weighted mean
+over all components. A frame is lost when even the best component has an error of 150 mm or more.
+The negative log-likelihood is that of the true joint positions (m), in nats; lower is better.
+Coverage is the fraction of frames in which the truth lies in the smallest region that holds 50 or
+90 percent of the probability of the mixture, for all joints together and for each joint alone: the
+regions of a calibrated mixture cover 50 and 90 percent of the frames.
 
 examples:
-  evaluate out --truth truth.npz             a table
-  evaluate out                               against the ground truth that the bag itself carries
-  evaluate out --truth bags/reach --json     for programs
+  evaluate out --truth truth.npz             print a table
+  evaluate out                               use the ground truth in the bag itself
+  evaluate out --truth bags/reach --json     print JSON for programs
 """
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; 0: done, 1: bad input, and one line on stderr says which."""
+    """Runs the command; 0: done, 1: bad input, which one line on stderr explains."""
     return run_command(_parser(), _evaluate, argv)
 
 
 def _parser() -> CommandParser:
     parser = CommandParser(
-        prog='evaluate',
-        description='Errors and calibration of the mixtures in a bag, against ground truth.',
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        'evaluate',
+        'Compares the mixtures in a bag with ground truth: errors and calibration.',
+        EPILOG,
     )
-    parser.add_argument(
-        'bag', type=Path, metavar='OUT', help='bag with mixtures: a folder, or a file'
-    )
-    parser.add_argument(
-        '--truth',
-        type=Path,
-        metavar='FILE',
-        help='true joint positions: a .npz file with stamps, joint_names and joints, or a bag with '
-        'ground truth (OUT itself)',
-    )
-    parser.add_argument(
-        '--topic',
-        action='append',
-        default=[],
-        metavar='NAME',
-        help='evaluate this topic only; may be given several times (all topics with mixtures)',
-    )
+    parser.add_mixtures('evaluate')
     parser.add_argument(
         '--model-sigma',
         type=number(1e-4, 1, what='a length', unit=' m'),
         default=MODEL_SIGMA,
         metavar='M',
-        help='standard deviation, in m, that every coordinate of a joint has besides what the '
-        f"mixture says, because the body's lengths are not exactly the person's ({MODEL_SIGMA:g})",
+        help='standard deviation, in m, by which the body model errs in each coordinate of a joint '
+        'in every pose, since its lengths are not exactly those of the person; added to the '
+        f'covariances of the mixture (default: {MODEL_SIGMA:g})',
     )
     parser.add_argument(
-        '--body',
-        metavar='MODEL',
-        help='body model whose poses they are: a name or a YAML file (the one that OUT names)',
+        '--seed',
+        type=whole_number(0),
+        default=0,
+        help='seed of the samples from which coverage is estimated (default: 0)',
     )
-    parser.add_argument('--seed', type=int, default=0, help='of the samples for coverage (0)')
     parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument('--quiet', action='store_true', help='no progress bar')
+    parser.add_argument('--quiet', action='store_true', help='show no progress bar')
     return parser
 
 
-def _evaluate(options: argparse.Namespace) -> int:
-    truth = _truth(options)
-    found = _scores(options, truth)
-    if options.json:
-        print(json.dumps(as_json(found, truth, options.model_sigma), indent=1))
-    else:
-        print(as_text(found, truth))
+def _evaluate(arguments: argparse.Namespace) -> int:
+    bag, model_sigma = arguments.bag, arguments.model_sigma
+    truth = recorded_truth(bag) if arguments.truth is None else read_truth(arguments.truth)
+    if truth is None:
+        raise ValueError(f'{bag} has no ground truth: name a .npz file or a bag with --truth')
+    # None: shown where stderr is a terminal.
+    with tqdm(unit='message', desc='evaluate', disable=arguments.quiet or None) as bar:
+        found = score_bag(
+            bag,
+            truth,
+            topics=arguments.topics,
+            model_sigma=model_sigma,
+            body_model=arguments.body,
+            seed=arguments.seed,
+            progress=bar.update,
+        )
+    print(
+        json.dumps(as_json(found, truth, model_sigma), indent=1)
+        if arguments.json
+        else as_text(found, truth)
+    )
     return 0
 
 
-def _truth(options: argparse.Namespace) -> Truth:
-    if options.truth is not None:
-        return read_truth(options.truth)
-    truth = recorded_truth(options.bag)
-    if truth is None:
-        raise ValueError(
-            f'{options.bag} has no ground truth: name a .npz file or a bag with --truth'
-        )
-    return truth
-
-
-def _scores(options: argparse.Namespace, truth: Truth) -> dict[str, TopicScores]:
-    if options.seed < 0:
-        raise ValueError(f'--seed must not be negative, saw {options.seed}')
-    # None: shown where stderr is a terminal.
-    with tqdm(unit='message', desc='evaluate', disable=options.quiet or None) as bar:
-        return score_bag(
-            options.bag,
-            truth,
-            topics=options.topic,
-            model_sigma=options.model_sigma,
-            body_model=options.body,
-            seed=options.seed,
-            progress=bar.update,
-        )
-
-
 def as_json(
-    found: dict[str, TopicScores], truth: Truth, model_sigma: float = MODEL_SIGMA
+    found: dict[str, TrackScores], truth: Truth, model_sigma: float = MODEL_SIGMA
 ) -> dict[str, Any]:
-    """What `--json` prints."""
+    """The object that `--json` prints."""
     return {
         'truth': truth.source,
         'truth_frames': len(truth.joints),
@@ -138,8 +110,8 @@ def as_json(
     }
 
 
-def as_text(found: dict[str, TopicScores], truth: Truth, *, by_joint: bool = True) -> str:
-    """Tables for people: one row a topic, and the errors joint by joint."""
+def as_text(found: dict[str, TrackScores], truth: Truth, *, by_joint: bool = True) -> str:
+    """Tables for people: one row per topic, and the errors joint by joint."""
     rows: list[tuple[str, ...]] = [
         (
             '', 'frames', 'missing', 'modes', 'heaviest', 'best of K', 'expected', 'under',
@@ -186,7 +158,7 @@ def _percent(value: float | None) -> str:
 
 
 def table(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a table, the first column to the left and all others to the right."""
+    """Lines of a table; the first column is aligned left, all others right."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [
         '  '.join(

@@ -1,6 +1,6 @@
 """make-bag: renders a motion, procedural or recorded, into a bag with ground truth.
 
-What is written is described in `hmt_ros.app.rendered_bag`.
+`hmt_ros.app.rendered_bag` describes the files.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -25,95 +26,128 @@ from hmt_ros.rendering.scene import Scene
 
 Array = NDArray[np.float64]
 
-DURATION, HEADING = 4.0, 30.0  # s, and deg of recorded motions
-LARGEST = 10_000  # px, of a side of the image
+DURATION, HEADING = 4.0, 30.0  # s; degrees, of recorded motions
+LARGEST = 10_000  # largest side of an image, px
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """Arguments of the command that choose the motion, see its help."""
+
+    name: str
+    mocap: Path | None
+    body: str
+    stature: float | None
+    duration: float | None
+    start: float
+    fps: float
+    heading: float | None
+    seed: int
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; 0: the bag is there, 1: bad input, and one line on stderr says which."""
+    """Runs the command; 0: the bag is there, 1: bad input, which one line on stderr explains."""
     return run_command(_parser(), _make_bag, argv)
 
 
 def _parser() -> CommandParser:
-    parser = CommandParser(
-        prog='make-bag',
-        description='Renders a motion into a bag with ground truth.',
-    )
+    parser = CommandParser('make-bag', 'Renders a motion into a bag with ground truth.')
     parser.add_argument(
         'name',
-        help=f'a procedural motion ({", ".join(PROCEDURAL_MOTIONS)}), or with --mocap any name',
+        help=f'a procedural motion ({", ".join(PROCEDURAL_MOTIONS)}), or any name with --mocap',
     )
+    parser.add_output('DIR', 'bag', 'folder of the bag')
     parser.add_argument(
-        '-o', '--output', type=Path, required=True, metavar='DIR', help='folder of the bag'
+        '--seed', type=whole_number(0), default=0, help='seed of all random numbers (default: 0)'
     )
-    parser.add_argument('--overwrite', action='store_true', help='replace the bag that is there')
-    parser.add_argument('--quiet', action='store_true', help='no progress bar')
-    parser.add_argument('--seed', type=whole_number(0), default=0, help='of all that is random (0)')
 
     motion = parser.add_argument_group('motion')
     motion.add_argument(
         '--mocap', type=Path, metavar='FILE', help='recorded motion (.bvh, or .amc beside its .asf)'
     )
     motion.add_argument(
-        '--body', default='human37', help='body model: a name or a YAML file (human37)'
+        '--body', default='human37', help='body model: a name or a YAML file (default: human37)'
     )
     motion.add_argument(
         '--stature',
         type=number(0.3, 3),
-        help="of the person, m; not with --mocap (the model's)",
+        help='stature of the person, m; not with --mocap (default: that of the body model)',
     )
     motion.add_argument(
-        '--duration', type=number(0.001, 1e5), help=f's ({DURATION:g}, or all of --mocap)'
+        '--duration',
+        type=number(0.001, 1e5),
+        help=f'duration, s (default: {DURATION:g}, or all of --mocap)',
     )
     motion.add_argument(
-        '--start', type=number(0, 1e6), default=0.0, help='where in --mocap to begin, s (0)'
+        '--start',
+        type=number(0, 1e6),
+        default=0.0,
+        help='time in --mocap at which the bag begins, s (default: 0)',
     )
     motion.add_argument(
         '--fps',
         type=number(0.01, 1000),
         default=30.0,
-        help='images per second; with --mocap the nearest that every n-th frame gives (30)',
+        help='images per second; with --mocap the nearest rate that every n-th frame gives '
+        '(default: 30)',
     )
     motion.add_argument(
         '--heading',
         type=number(-3600, 3600),
-        help='of the person at first, degrees; 0: to the camera, 90: to the right of the image '
-        f'(one that suits the motion; {HEADING:g} with --mocap)',
+        help='heading of the person at the beginning, degrees; 0: towards the camera, 90: to the '
+        f'right of the image (default: chosen for the motion, {HEADING:g} with --mocap)',
     )
 
     camera = parser.add_argument_group('camera and scene')
     camera.add_argument(
-        '--size', type=_size, default=(640, 480), metavar='WxH', help='of the images, px (640x480)'
+        '--size',
+        type=_size,
+        default=(640, 480),
+        metavar='WxH',
+        help='size of the images, px (default: 640x480)',
     )
     camera.add_argument(
-        '--fov', type=number(1, 150), default=51.7, help='horizontal field of view, degrees (51.7)'
+        '--fov',
+        type=number(1, 150),
+        default=51.7,
+        help='horizontal field of view, degrees (default: 51.7)',
     )
     camera.add_argument(
         '--distance',
         type=number(0.3, 1000),
         default=5.6,
-        help='of the camera to the middle of the motion, m (5.6)',
+        help='distance of the camera from the middle of the motion, m (default: 5.6)',
     )
     camera.add_argument(
-        '--camera-height', type=number(0.01, 100), default=1.2, help='over the floor, m (1.2)'
+        '--camera-height',
+        type=number(0.01, 100),
+        default=1.2,
+        help='height of the camera above the floor, m (default: 1.2)',
     )
     camera.add_argument(
         '--pitch',
         type=number(-80, 80),
         default=0.0,
-        help='by which the camera looks down, degrees (0)',
+        help='angle by which the camera looks down, degrees (default: 0)',
     )
     camera.add_argument(
-        '--noise', type=number(0, 100), default=2.5, help='of a pixel, grey levels of 255 (2.5)'
+        '--noise',
+        type=number(0, 100),
+        default=2.5,
+        help='standard deviation of the noise of a pixel, grey levels of 255 (default: 2.5)',
     )
     camera.add_argument(
         '--shadow',
         action=argparse.BooleanOptionalAction,
         default=True,
-        help='of the person, on the floor (yes)',
+        help='draw the shadow of the person on the floor (default: yes)',
     )
     camera.add_argument(
-        '--jpeg-quality', type=whole_number(1, 100), default=90, metavar='Q', help='1 to 100 (90)'
+        '--jpeg-quality',
+        type=whole_number(1, 100),
+        default=90,
+        metavar='Q',
+        help='JPEG quality, 1 to 100 (default: 90)',
     )
     return parser
 
@@ -127,24 +161,28 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _make_bag(options: argparse.Namespace) -> int:
-    viewpoint = Viewpoint(options.distance, options.camera_height, math.radians(options.pitch))
+def _make_bag(arguments: argparse.Namespace) -> int:
+    options = MotionOptions(
+        **{field.name: getattr(arguments, field.name) for field in fields(MotionOptions)}
+    )
+    viewpoint = Viewpoint(
+        arguments.distance, arguments.camera_height, math.radians(arguments.pitch)
+    )
     scene = Scene(
         viewpoint=viewpoint,
-        seed=options.seed,
-        noise=options.noise,
-        shadow=Scene.shadow if options.shadow else 0.0,
+        seed=arguments.seed,
+        noise=arguments.noise,
+        shadow=Scene.shadow if arguments.shadow else 0.0,
     )
-    camera = _camera(options.size, options.fov)
-    with new_bag_folder(options.output, overwrite=options.overwrite) as folder:
-        take = _take(options, viewpoint)
+    camera = _camera(arguments.size, arguments.fov)
+    with new_bag_folder(arguments.output, overwrite=arguments.overwrite) as folder:
         write_bag(
             folder,
-            take,
+            _take(options, viewpoint),
             camera,
             scene,
-            quality=options.jpeg_quality,
-            progress=not options.quiet,
+            quality=arguments.jpeg_quality,
+            progress=not arguments.quiet,
         )
     return 0
 
@@ -155,7 +193,7 @@ def _camera(size: tuple[int, int], fov: float) -> Camera:
     return Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
-def _take(options: argparse.Namespace, viewpoint: Viewpoint) -> Take:
+def _take(options: MotionOptions, viewpoint: Viewpoint) -> Take:
     body = load_body(options.body)
     missing = sorted(set(MEASURED) - set(body.segment_lengths))
     if missing or not body.shapes:
@@ -164,8 +202,10 @@ def _take(options: argparse.Namespace, viewpoint: Viewpoint) -> Take:
     heading = None if options.heading is None else math.radians(options.heading)
     if options.mocap is not None:
         if options.stature is not None:
-            raise ValueError('--stature does not go with --mocap: the file says how tall one is')
-        return _recorded(options, body, heading, viewpoint)
+            raise ValueError(
+                '--stature does not go with --mocap, whose file determines the stature'
+            )
+        return _recorded(options.mocap, options, body, heading, viewpoint)
     if options.start:
         raise ValueError('--start goes with --mocap only')
     if options.stature is not None:
@@ -184,14 +224,14 @@ def _take(options: argparse.Namespace, viewpoint: Viewpoint) -> Take:
 
 
 def _recorded(
-    options: argparse.Namespace, body: Body, heading: float | None, viewpoint: Viewpoint
+    file: Path, options: MotionOptions, body: Body, heading: float | None, viewpoint: Viewpoint
 ) -> Take:
-    motion = read_motion(options.mocap)
+    motion = read_motion(file)
     step = max(round(motion.fps / options.fps), 1)
     first = round(options.start * motion.fps)
     if first >= len(motion):
         raise ValueError(
-            f'--start {options.start:g} is after the end of {options.mocap}, which has '
+            f'--start {options.start:g} is after the end of {file}, which has '
             f'{len(motion) / motion.fps:.2f} s'
         )
     stop = (
@@ -202,7 +242,7 @@ def _recorded(
     if heading is None:
         heading = math.radians(HEADING)
     poses = retarget(part, body, _placed(part, heading, sole(body), viewpoint))
-    return Take(options.mocap.name, body, poses, part.fps)
+    return Take(file.name, body, poses, part.fps)
 
 
 def _placed(
@@ -210,8 +250,7 @@ def _placed(
 ) -> tuple[Array, Array]:
     """Rotation and translation from the world of a motion to the camera.
 
-    The middle of the motion comes to the origin of the viewpoint; at first the person faces
-    `heading`.
+    The middle of the motion moves to the origin of the viewpoint; the person first faces `heading`.
     """
     hips = motion.joint_positions(['left_hip', 'right_hip'])[0]
     x, y = (hips[1] - hips[0])[:2]  # to the right of the person, who looks to (-y, x)

@@ -1,4 +1,4 @@
-"""recover: a bag anew from what is whole in one whose writing was cut off, or which is damaged."""
+"""recover: copies the undamaged messages of a damaged or unfinished bag into a new bag."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from pathlib import Path
 from hmt_ros.app.command_line import CommandParser, run_command
 from msg_tools.bags.bag_recovery import recover_bag
 
-# More lines about losses than this tell nothing more.
+# Maximum number of lines about losses.
 _MOST_LINES = 10
 
 EPILOG = """\
-BROKEN may be the .mcap file or its folder, with or without metadata.yaml, of any recorder. Where
-replay, or another command that writes a bag, was killed, the bag is not in its place: give the name
-that it would have had, and the hidden folder .NAME.*.partial beside it is found.
+BROKEN is a .mcap file or its folder, with or without metadata.yaml, from any recorder. If replay or
+another command was killed while it wrote a bag, give the name that the bag would have had: the
+hidden folder .NAME.*.partial beside it is found.
 
-A bag that this package writes loses at most the messages of its last chunk, a mebibyte. Saved is
-what is whole by the checksums of the file, whole chunks and whole messages outside of chunks, with
-topics, definitions and quality of service. BROKEN stays as it is.
+A bag written by this package loses at most the messages of its last chunk, one mebibyte. All whole
+chunks and whole messages outside of chunks, according to the checksums of the file, are saved, with
+their topics, definitions and quality of service. BROKEN is not changed.
 
 examples:
   recover out -o recovered
@@ -30,28 +30,26 @@ exit code: 0 something was saved, 1 nothing could be saved or bad input (one lin
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; 0: the new bag is there, 1: it is not, and one line on stderr says why."""
+    """Runs the command; 0: the new bag is there, 1: it is not, as one line explains."""
     return run_command(_parser(), _recover, argv)
 
 
 def _parser() -> CommandParser:
     parser = CommandParser(
-        prog='recover',
-        description='Makes a bag of what is whole in one whose writing was cut off, or which is '
-        'damaged.',
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        'recover',
+        'Copies the undamaged messages of a damaged or unfinished bag into a new bag.',
+        EPILOG,
     )
-    parser.add_argument('bag', type=Path, metavar='BROKEN', help='folder or file')
+    parser.add_argument('bag', type=Path, metavar='BROKEN', help='damaged bag: a folder or a file')
     parser.add_argument(
         '-o', '--output', type=Path, required=True, metavar='OUT', help='folder of the new bag'
     )
     return parser
 
 
-def _recover(options: argparse.Namespace) -> int:
-    found = recover_bag(options.bag, options.output)
-    print(f'{options.output}: {found.messages} messages of {found.topics} topics saved')
+def _recover(arguments: argparse.Namespace) -> int:
+    found = recover_bag(arguments.bag, arguments.output)
+    print(f'{arguments.output}: {found.messages} messages of {found.topics} topics saved')
     if found.lost_messages is None:
         print('lost: the bag does not tell how many messages')
     elif found.lost_messages:

@@ -1,14 +1,13 @@
 """Rendered bags: images of a moving person, with ground truth, as a bag and files beside it.
 
 The bag has the topics `image/compressed`, `camera_info`, `ground_truth` (hmt_msgs/PoseMixture) and
-`body` (hmt_msgs/Body, latched). Beside it, in its folder, lies what replaying and evaluating it
-need: `background.png` (the empty scene), `subject.yaml` (joints as clicked in the first image) and
+`body` (hmt_msgs/Body, latched). Its folder also has the files that replay and evaluate need:
+`background.png` (the empty scene), `subject.yaml` (joints as clicked in the first image) and
 `truth.npz` (joints, pixels and silhouettes).
 """
 
 from __future__ import annotations
 
-import math
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,9 +25,9 @@ from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.files.new_folder import FolderKind
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.camera_info import camera_info_message
-from msg_tools.messages.headers import SECOND_NS, header_message
+from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.images import compressed_image_message
-from msg_tools.messages.pose_mixtures import MixtureKind
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 Array = NDArray[np.float64]
 
@@ -36,8 +35,8 @@ FRAME_ID = 'camera_optical_frame'
 START_NS = 1_700_000_000 * SECOND_NS  # stamp of the first image
 FILES_BESIDE = ('background.png', 'subject.yaml', 'truth.npz')
 CLICK_SIGMA = 2.0  # px
-OF_CLICKS = 5  # stream of random numbers of a seed; `hmt_ros.image` has others
-TAPE = 0.005  # m, to which a subject is measured
+OF_CLICKS = 5  # stream of random numbers of a seed; `hmt_ros.image` uses others
+TAPE = 0.005  # resolution of the measured lengths of a subject, m
 MEASURED = (
     'thigh', 'shin', 'foot', 'upper_arm', 'forearm', 'hand', 'hip_width', 'shoulder_width', 'trunk',
     'neck_to_head',
@@ -46,11 +45,11 @@ MEASURED = (
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """What is to be seen.
+    """The motion that is rendered.
 
     Attributes:
-        source: where the motion comes from.
-        body: whose poses they are.
+        source: name of the motion or of its file.
+        body: body of the poses.
         poses: (T, d) camera optical frame.
         fps: poses per second.
     """
@@ -77,12 +76,12 @@ def write_bag(
     """Renders a motion into a new bag folder, with its files beside.
 
     Args:
-        folder: to be created; its name is that of the bag.
+        folder: new folder; its name becomes that of the bag.
         take: the motion.
-        camera: that sees it.
-        scene: around it; its seed is that of the clicks, too.
-        quality: of the JPEG images, 1 to 100.
-        progress: whether a bar is shown on stderr, where that is a terminal.
+        camera: camera of the images.
+        scene: surroundings of the person; its seed is also that of the clicks.
+        quality: JPEG quality of the images, 1 to 100.
+        progress: whether to show a progress bar on stderr, if that is a terminal.
 
     Raises:
         ValueError: the first image does not show the person.
@@ -133,28 +132,25 @@ def write_bag(
 def ground_truth(
     messages: RosbagsMessages, body: Body, pose: Array, joints: Array, stamp_ns: int
 ) -> Any:
-    """hmt_msgs/PoseMixture of a known pose: one component, whose covariance is empty."""
-    component = messages.create(
-        'hmt_msgs/msg/PoseComponent',
-        weight=1.0,
-        mean=pose,
-        covariance=np.empty(0),
-        log_likelihood=math.nan,
-        joint_positions=messages.points(joints),
-    )
-    return messages.create(
-        'hmt_msgs/msg/PoseMixture',
-        header=header_message(messages, stamp_ns, FRAME_ID),
+    """hmt_msgs/PoseMixture of a known pose: one component with an empty covariance."""
+    content = PoseMixture(
+        weights=np.ones(1),
+        means=pose[None],
+        covariances=None,
         body_model=body.name,
-        dof_names=list(body.dof_names),
-        joint_names=list(body.joint_names),
-        kind=int(MixtureKind.GROUND_TRUTH),
-        components=[component],
+        dof_names=body.dof_names,
+        joint_names=body.joint_names,
+        joint_positions=joints[None],
+        kind=MixtureKind.GROUND_TRUTH,
+        stamp_ns=stamp_ns,
+        frame_id=FRAME_ID,
+        segment_lengths=body.segment_lengths,
     )
+    return pose_mixture_message(messages, content)
 
 
 def subject_text(take: Take, camera: Camera, pixels: Array, seed: int) -> str:
-    """Subject file: the joints (J, 2) of the first image as one would click them, and the lengths.
+    """Subject file: joints (J, 2) of the first image as a person would click them, and lengths.
 
     Raises:
         ValueError: fewer than four joints lie in the image.
@@ -184,6 +180,6 @@ def subject_text(take: Take, camera: Camera, pixels: Array, seed: int) -> str:
 
 
 def new_bag_folder(target: Path, *, overwrite: bool) -> AbstractContextManager[Path]:
-    """Where to write the bag to; it comes to its place when all is written, or not at all."""
+    """A folder for the bag, which replaces the target when all is written, or never."""
     files = (f'{target.absolute().name}.mcap', *FILES_BESIDE)
     return FolderKind('a bag', 'metadata.yaml', files).new(target, overwrite=overwrite)

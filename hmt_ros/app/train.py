@@ -1,9 +1,9 @@
-"""train: learns to predict poses from silhouettes, from recorded or procedural motions.
+"""train: learns to predict poses from silhouettes of recorded or procedural motions.
 
     train --mocap DIR -o MODEL.npz
     train --motions procedural -o MODEL.npz
 
-Beside the model lies a report: affinity matrices, multimodality, and what was learned from.
+A report beside the model shows affinities, multimodality and silhouettes of the training set.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,8 +21,7 @@ from tqdm import tqdm
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
 from hmt_ros.app.training_report import write_report
 from hmt_ros.body import Body, load_body
-from hmt_ros.experts.learned_models import KINDS, new_model
-from hmt_ros.experts.predictor_learning import described, learned_predictor
+from hmt_ros.experts.predictor_learning import KINDS, described, learned_predictor, new_model
 from hmt_ros.experts.training_set import (
     PoseSequence,
     TrainingSettings,
@@ -39,33 +39,70 @@ Item = TypeVar('Item')
 PROCEDURAL_SEEDS, PROCEDURAL_SECONDS = 5, 12.0
 
 
+@dataclass(frozen=True)
+class TrainingOptions:
+    """Options of the command.
+
+    Attributes:
+        output: File of the model; '.npz' is appended where it is missing.
+        overwrite: Whether an existing file is replaced.
+        quiet: Whether progress and summary are suppressed.
+        seed: Seed of all random choices.
+        report: Folder of the figures; None takes MODEL_report.
+        mocap: Folder of recorded motions, or None.
+        motions: 'procedural' for all procedural motions, names with commas, or None.
+        body: Body model: a name or a YAML file.
+        model: Name of the model that learns.
+        experts: Number of experts; None takes the default of the model.
+        samples: Number of silhouettes.
+        dynamics: Whether p(x_t | x_t-1, r_t) is learned as well.
+    """
+
+    output: Path
+    overwrite: bool
+    quiet: bool
+    seed: int
+    report: Path | None
+    mocap: Path | None
+    motions: str | None
+    body: str
+    model: str
+    experts: int | None
+    samples: int
+    dynamics: bool
+
+
 def main(argv: list[str] | None = None) -> int:
-    """Runs the command; 0: the model is there, 1: bad input, and one line on stderr says which."""
-    return run_command(_parser(), _train, argv)
+    """Runs the command; returns 0, or 1 after bad input, which one line on stderr explains."""
+    return run_command(
+        _parser(), lambda arguments: _train(TrainingOptions(**vars(arguments))), argv
+    )
 
 
 def _parser() -> CommandParser:
     parser = CommandParser(
-        prog='train', description='Learns to predict poses from silhouettes, from motions.'
+        prog='train', description='Learns to predict poses from silhouettes of motions.'
     )
     parser.add_argument(
         '-o', '--output', type=Path, required=True, metavar='MODEL.npz', help='file of the model'
     )
-    parser.add_argument('--overwrite', action='store_true', help='replace the file that is there')
+    parser.add_argument('--overwrite', action='store_true', help='replace an existing file')
     parser.add_argument('--quiet', action='store_true', help='no progress bar, no summary')
-    parser.add_argument('--seed', type=whole_number(0), default=0, help='of all that is random (0)')
     parser.add_argument(
-        '--report', type=Path, metavar='DIR', help='folder of the figures (MODEL_report)'
+        '--seed', type=whole_number(0), default=0, help='seed of all random choices (0)'
+    )
+    parser.add_argument(
+        '--report', type=Path, metavar='DIR', help='folder for the figures (MODEL_report)'
     )
 
     motion = parser.add_argument_group('motions')
     motion.add_argument(
         '--mocap', type=Path, metavar='DIR',
-        help='folder of recorded motions (.bvh, or .amc beside its .asf), searched in depth',
+        help='folder of recorded motions (.bvh, or .amc beside its .asf) with its subfolders',
     )  # fmt: skip
     motion.add_argument(
         '--motions', metavar='NAMES',
-        help=f'procedural, for all, or names with commas ({", ".join(PROCEDURAL_MOTIONS)})',
+        help=f'"procedural" for all, or names with commas ({", ".join(PROCEDURAL_MOTIONS)})',
     )  # fmt: skip
     motion.add_argument(
         '--body', default='human37', help='body model: a name or a YAML file (human37)'
@@ -73,16 +110,17 @@ def _parser() -> CommandParser:
 
     learning = parser.add_argument_group('learning')
     learning.add_argument(
-        '--model', choices=sorted(KINDS), default='local', help='what learns (local)'
+        '--model', choices=sorted(KINDS), default='local', help='model that learns (local)'
     )
     learning.add_argument(
         '--experts',
         type=whole_number(1, 1000),
-        help='of the model; modes at most of the local one (5)',
+        help='number of experts; maximum number of modes of the local model (5)',
     )
     learning.add_argument(
-        '--samples', type=whole_number(50, 1_000_000), default=6000, help='silhouettes (6000)'
-    )
+        '--samples', type=whole_number(50, 1_000_000), default=6000,
+        help='number of silhouettes (6000)',
+    )  # fmt: skip
     learning.add_argument(
         '--dynamics', action=argparse.BooleanOptionalAction, default=True,
         help='learn p(x_t | x_t-1, r_t) as well (yes)',
@@ -90,7 +128,7 @@ def _parser() -> CommandParser:
     return parser
 
 
-def _train(options: argparse.Namespace) -> int:
+def _train(options: TrainingOptions) -> int:
     output = options.output
     if output.suffix != '.npz':
         output = output.with_name(output.name + '.npz')
@@ -142,7 +180,7 @@ GROUPS, SILHOUETTES = 'groups', 'silhouettes'
 def _bars(quiet: bool) -> Callable[[str, str], Callable[[Iterable[Item], int], Iterable[Item]]]:
     def bar(what: str, unit: str) -> Callable[[Iterable[Item], int], Iterable[Item]]:
         def through(items: Iterable[Item], count: int) -> Iterable[Item]:
-            # None: shown where stderr is a terminal.
+            # None shows the bar where stderr is a terminal.
             return tqdm(items, what, count, unit=f' {unit}', disable=True if quiet else None)
 
         return through
@@ -150,13 +188,13 @@ def _bars(quiet: bool) -> Callable[[str, str], Callable[[Iterable[Item], int], I
     return bar
 
 
-def _say(options: argparse.Namespace, text: str) -> None:
+def _say(options: TrainingOptions, text: str) -> None:
     if not options.quiet:
         print(text, flush=True)
 
 
-def _sequences(options: argparse.Namespace, body: Body) -> tuple[list[PoseSequence], int]:
-    """Motions to learn from, and how many files could not be read."""
+def _sequences(options: TrainingOptions, body: Body) -> tuple[list[PoseSequence], int]:
+    """Motions to learn from, and the number of files that cannot be used."""
     if options.mocap is None and options.motions is None:
         raise ValueError('nothing to learn from: give --mocap DIR or --motions procedural')
     sequences: list[PoseSequence] = []
@@ -183,7 +221,7 @@ def _sequences(options: argparse.Namespace, body: Body) -> tuple[list[PoseSequen
 
 
 def _sequence_or_warning(path: Path, body: Body) -> PoseSequence | None:
-    """The motion of a file, or None and one line on stderr that says why not."""
+    """The motion of a file; None, with one line on stderr, if the file cannot be used."""
     try:
         return recorded_sequence(path, body)
     except (ValueError, OSError, np.linalg.LinAlgError) as error:

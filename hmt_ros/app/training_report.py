@@ -1,4 +1,4 @@
-"""Figures of what was learned from: affinities, multimodality, examples (BME fig. 6 and 7)."""
+"""Figures of a training set: affinities (BME fig. 7), multimodality (BME fig. 6), examples."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hmt_ros.app.report.pictures import STYLE
+from hmt_ros.app.report.skeletons import STYLE
 from hmt_ros.body import Body
 from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
 from hmt_ros.experts.pose_encoding import AXES
 from hmt_ros.experts.predictor_learning import Described, affinities, multimodality
-from hmt_ros.experts.training_set import PoseSequence, TrainingSet, side_view
+from hmt_ros.experts.training_set import PoseSequence, TrainingSet, seen_from
 
 Array = NDArray[np.float64]
 
-ACTIVITIES = 3  # whose affinities are drawn
-FRAMES = 120  # of each
-ANALYSED = 2000  # samples whose multimodality is counted
-FINE, COARSE = 0.956, 0.70  # clusters a sample, as in the paper: 1912 and 1409 of 2000
+ACTIVITIES = 3  # maximum number of activities whose affinities are drawn
+FRAMES = 120  # maximum number of frames of each
+ANALYSED = 2000  # maximum number of samples whose multimodality is counted
+FINE, COARSE = 0.956, 0.70  # clusters per sample, as in the paper: 1912 and 1409 of 2000
 EXAMPLES = (4, 12)  # rows and columns of silhouettes
 
 
@@ -34,14 +34,17 @@ def write_report(
     pairs: TrainingSet,
     training: Described,
 ) -> list[tuple[Path, str]]:
-    """Draws the figures into a folder; each with what it shows.
+    """Draws the figures into a folder.
 
     Args:
-        folder: that exists.
-        body: of the poses.
-        sequences: the motions.
-        pairs: what was rendered of them.
-        training: what was learned from.
+        folder: Folder that exists.
+        body: Body of the poses.
+        sequences: Motions.
+        pairs: Silhouettes and poses.
+        training: Descriptors and targets.
+
+    Returns:
+        The path of each figure, and a description.
     """
     figures = [
         (
@@ -54,7 +57,7 @@ def write_report(
             'multimodality.png',
             'clusters of poses under one cluster of descriptors',
         ),
-        (_example_figure(pairs), 'silhouettes.png', 'silhouettes that were learned from'),
+        (_example_figure(pairs), 'silhouettes.png', 'silhouettes of the training set'),
     ]
     result = []
     for figure, name, what in figures:
@@ -71,14 +74,16 @@ def _affinity_figure(body: Body, sequences: Sequence[PoseSequence], training: De
         axes = figure.subplots(len(chosen), len(columns), squeeze=False)
         for number, sequence in enumerate(chosen):
             row = axes[number]
-            seen = side_view(body, sequence, FRAMES)
-            parts = [silhouette_parts(mask, training.descriptor.points) for mask in seen.masks]
-            histograms = [training.descriptor.context_histogram(part) for part in parts]
+            # The person on average looks across the image; long motions have half the rate.
+            step = 2 if len(sequence.poses) >= 2 * FRAMES else 1
+            poses, masks = seen_from(body, sequence, 90.0, frames=slice(0, FRAMES * step, step))
+            parts = [silhouette_parts(mask, training.descriptor.points) for mask in masks]
+            histograms = [training.descriptor.codebook_.histogram(part.contexts) for part in parts]
             vectors = (
-                seen.poses[:, AXES:],
+                poses[:, AXES:],
                 np.sqrt(np.array(histograms)),
                 np.sqrt(np.array([part.edge_pairs for part in parts])),
-                training.descriptor.describe_parts(parts),
+                training.descriptor.describe(parts),
             )
             for one, title, values in zip(row, columns, vectors, strict=True):
                 one.imshow(affinities(values), cmap='viridis', vmin=0.0, vmax=1.0)
@@ -86,7 +91,7 @@ def _affinity_figure(body: Body, sequences: Sequence[PoseSequence], training: De
                 one.set_yticks([])
                 if number == 0:
                     one.set_title(title)
-            row[0].set_ylabel(f'{sequence.activity}, {len(seen.masks)} frames')
+            row[0].set_ylabel(f'{sequence.activity}, {len(masks)} frames')
         figure.tight_layout()
     return figure
 

@@ -1,69 +1,30 @@
-"""True joint positions, from a file of arrays or from the ground truth that a bag carries."""
+"""Readers of true joint positions: from a file of arrays or from the ground truth in a bag."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from msg_tools import BagReader
+from hmt_ros.evaluation.track_scores import Truth
+from msg_tools import BagReader, MessageError
 from msg_tools.files.array_file import read_archive
-from msg_tools.messages.headers import time_ns
-from msg_tools.messages.pose_mixtures import MixtureKind
+from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mixture_of
 
 Array = NDArray[np.float64]
 
-POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
 FIELDS = ('stamps', 'joint_names', 'joints')
 
 
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """Where the joints of a person were.
-
-    Attributes:
-        source: where this comes from, for messages.
-        joint_names: (J,).
-        joints: stamp in ns -> (J, 3) m, camera optical frame.
-        frame_id: of the positions; '': not told.
-
-    Raises:
-        ValueError: no frames, or positions that do not fit the names or are not finite.
-    """
-
-    source: str
-    joint_names: tuple[str, ...]
-    joints: dict[int, Array]
-    frame_id: str = ''
-
-    def __post_init__(self) -> None:
-        if not self.joints:
-            raise ValueError(f'{self.source} has no frames')
-        wanted = (len(self.joint_names), 3)
-        for stamp, positions in self.joints.items():
-            if positions.shape != wanted:
-                raise ValueError(
-                    f'{self.source}: joints at {stamp} ns have shape {positions.shape}, '
-                    f'wanted {wanted}'
-                )
-            if not np.isfinite(positions).all():
-                raise ValueError(f'{self.source}: joints at {stamp} ns are not finite')
-
-    def span(self) -> str:
-        """First and last stamp, for messages."""
-        return f'{min(self.joints)} to {max(self.joints)} ns'
-
-
 def read_truth(path: Path) -> Truth:
-    """Truth of a file of arrays (.npz) or of a bag.
+    """Truth from a file of arrays (.npz) or from a bag.
 
     The file has `stamps` (T,) ns, `joint_names` (J,) and `joints` (T, J, 3) m in the camera optical
     frame.
 
     Raises:
-        ValueError: neither, or arrays that are missing or do not fit each other.
+        ValueError: another file, arrays that are missing or do not fit each other.
     """
     if path.suffix == '.npz':
         return _from_arrays(path)
@@ -77,7 +38,7 @@ def read_truth(path: Path) -> Truth:
 
 
 def recorded_truth(path: Path) -> Truth | None:
-    """The truth that a bag carries, None when it has none.
+    """The ground truth in a bag; None if it has none.
 
     Raises:
         ValueError: there are several, or messages that can not be understood.
@@ -109,7 +70,7 @@ def _from_arrays(path: Path) -> Truth:
 
 
 def _truth_topic(bag: BagReader) -> str | None:
-    """The topic of a bag that carries the ground truth, None when it has none.
+    """The topic of the ground truth in a bag; None if it has none.
 
     Raises:
         ValueError: there are several.
@@ -130,13 +91,13 @@ def mixture_topics(bag: BagReader) -> list[str]:
 
 
 def is_truth(bag: BagReader, topic: str) -> bool:
-    """Whether the mixtures of a topic are known poses."""
+    """Whether the mixtures on a topic are ground truth."""
     first = next(bag.messages([topic]), None)
     return first is not None and int(first.message.kind) == MixtureKind.GROUND_TRUTH
 
 
 def _truth_of(bag: BagReader, topic: str) -> Truth:
-    """The truth that a topic of a bag carries.
+    """The ground truth on a topic of a bag.
 
     Raises:
         ValueError: messages that contradict each other or have no component.
@@ -146,12 +107,12 @@ def _truth_of(bag: BagReader, topic: str) -> Truth:
     names: tuple[str, ...] | None = None
     frame_id = ''
     for stored in bag.messages([topic]):
-        message = stored.message
-        own = tuple(str(name) for name in message.joint_names)
-        names, frame_id = names or own, frame_id or str(message.header.frame_id)
-        if own != names or not message.components:
-            what = 'other joints' if message.components else 'no component'
-            raise ValueError(f'{source}: message at {stored.log_time_ns} ns has {what}')
-        points = message.components[0].joint_positions
-        joints[time_ns(message.header.stamp)] = np.array([(p.x, p.y, p.z) for p in points])
+        try:
+            content = pose_mixture_of(stored.message, None, names)
+            if not len(content.weights):
+                raise MessageError('mixture has no components')
+        except MessageError as error:
+            raise ValueError(f'{source}: message at {stored.log_time_ns} ns: {error}') from error
+        names, frame_id = content.joint_names, frame_id or content.frame_id
+        joints[content.stamp_ns] = content.joint_positions[0]
     return Truth(source, names or (), joints, frame_id)

@@ -75,6 +75,7 @@ class Body:
             at the default lengths; it scales with them).
         default_lengths: (L,) lengths of the model file, m.
         widths: factors on the x and y radii of each part.
+        keypoint_aliases: other names of joints, as keypoint detectors use them.
     """
 
     skeleton: Skeleton
@@ -87,6 +88,7 @@ class Body:
     stature_extra: float
     default_lengths: Array
     widths: tuple[float, ...] = field(default=())
+    keypoint_aliases: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.widths and self.shapes:
@@ -204,37 +206,6 @@ class Body:
         factor = stature / self.stature
         skeleton = replace(self.skeleton, lengths=self.skeleton.lengths * factor)
         return replace(self, skeleton=skeleton)
-
-    def with_joints_at(
-        self, poses: ArrayLike, joint_names: Sequence[str], joints: ArrayLike
-    ) -> Body:
-        """The same body with the lengths that give its joints known positions.
-
-        Args:
-            poses: (N, d).
-            joint_names: (J,) names of some joints of the body.
-            joints: (N, J, 3) positions of these joints at the poses, m.
-
-        Raises:
-            ValueError: no lengths reach the positions within 1 mm, or a name is unknown.
-        """
-        try:
-            which = self.skeleton.joint_index(tuple(joint_names))
-        except KeyError as error:
-            raise ValueError(error.args[0]) from error
-        wanted = np.asarray(joints, dtype=np.float64) - self.joint_positions(poses)[:, which]
-        # Joints are linear in the lengths.
-        slopes = kinematics.joint_length_jacobians(self.skeleton, poses)[:, which]
-        columns = slopes.reshape(wanted.size, -1)
-        change = np.linalg.lstsq(columns, wanted.reshape(-1), rcond=1e-9)[0]
-        gap = float(np.abs(columns @ change - wanted.reshape(-1)).max())
-        if not gap < 1e-3:
-            raise ValueError(
-                f'joints are {1e3 * gap:.0f} mm from where {self.name} of whatever lengths has them'
-            )
-        lengths = self.skeleton.lengths + change
-        names = self.skeleton.length_names
-        return self.with_segment_lengths(dict(zip(names, lengths.tolist(), strict=True)))
 
     def with_widths(self, widths: Sequence[float]) -> Body:
         """The same body with other factors on the x and y radii of its parts."""

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.inference.bounded_newton import Minimum, minimise
+from hmt_ros.inference.energy import EnergyFunction, Quadratic, Sum
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -75,17 +76,13 @@ def solve_joint_positions(
         rays = goal / np.maximum(np.linalg.norm(goal, axis=2, keepdims=True), 1e-12)
         across = np.eye(3) - rays[..., :, None] * rays[..., None, :]
 
-    def energy(x: Array, problem: Index) -> tuple[Array, Array, Array]:
-        value, gradient, hessian = point_energy(
+    def distances(x: Array, problem: Index) -> tuple[Array, Array, Array]:
+        return point_energy(
             forward(skeleton, x), segments, offsets, goal[problem].transpose(1, 2, 0),
             weight[problem].T, None if across is None else across[problem].transpose(1, 2, 3, 0),
         )  # fmt: skip
-        offset = x - body.prior_mean
-        value += 0.5 * (offset * offset) @ precision
-        gradient += offset * precision
-        hessian += np.diag(precision)
-        return value, gradient, hessian
 
+    energy = Sum((EnergyFunction(distances), Quadratic(body.prior_mean, precision)))
     return minimise(
         energy, start, limits_low, limits_high,
         step_scale=np.where(skeleton.dof_is_rotation, 0.5, 0.3),

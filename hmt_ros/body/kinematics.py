@@ -36,6 +36,7 @@ class Frames:
 
     Attributes:
         skeleton: the skeleton.
+        poses: (N, d) whose frames they are.
         columns: (S, 3, 3, N): columns[s, i, :, n] is the i-th axis of segment s.
         origins: (S, 3, N) origins of the segments.
         axes: (d, 3, N) unit vector of each degree of freedom.
@@ -43,6 +44,7 @@ class Frames:
     """
 
     skeleton: Skeleton
+    poses: Array
     columns: Array
     origins: Array
     axes: Array
@@ -130,7 +132,7 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
     _place_segments(
         _plan(skeleton), skeleton.mounts, skeleton.offsets, q, columns, origins, axes, dof_origins
     )
-    return Frames(skeleton, columns, origins, axes, dof_origins)
+    return Frames(skeleton, q, columns, origins, axes, dof_origins)
 
 
 def point_jacobians(frames: Frames, segments: Index, points: Array) -> Array:

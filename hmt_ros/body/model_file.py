@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body, PartShape
 from hmt_ros.body.skeleton import Skeleton
-from msg_tools.files.plain_yaml import load_plain_yaml
+from msg_tools.files.plain_yaml import load_plain_yaml, read_plain_yaml
 
 Array = NDArray[np.float64]
 
@@ -65,9 +65,7 @@ def _read(source: str | Path) -> dict[str, Any]:
             f'no body {str(source)!r}: wanted one of {model_names()}, a YAML file, or a motion '
             f'file (.bvh, .asf, .amc)'
         )
-    if path.stat().st_size > LARGEST_FILE:
-        raise ValueError(f'the file has {path.stat().st_size} bytes, wanted {LARGEST_FILE}')
-    return _whole(load_plain_yaml(path.read_text('utf-8')))
+    return _whole(read_plain_yaml(path, LARGEST_FILE))
 
 
 @cache
@@ -122,7 +120,10 @@ def _mount(entry: dict[str, Any]) -> Array:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-KEYS = {'name', 'lengths', 'stature', 'stature_extra', 'segments', 'joints', 'chains', 'fixed'}
+KEYS = {
+    'name', 'lengths', 'stature', 'stature_extra', 'segments', 'joints', 'keypoint_aliases',
+    'chains', 'fixed',
+}  # fmt: skip
 SEGMENT_KEYS = {
     'name', 'parent', 'offset', 'points', 'x_axis', 'length', 'diffusion', 'dofs', 'flesh',
 }  # fmt: skip
@@ -209,6 +210,12 @@ def _build(content: dict[str, Any]) -> Body:
             joint_names.append(joint)
             joint_segments.append(segment)
             joint_basis.append(coefficients)
+    aliases = {}
+    for template, joint_template in content.get('keypoint_aliases', {}).items():
+        for alias, side in _sides(template):
+            joint = joint_template.format(side=side)
+            _named(joint, tuple(joint_names), f'keypoint_aliases: {alias}:')
+            aliases[alias] = joint
     chains = {}
     for template, members in content.get('chains', {}).items():
         for chain, side in _sides(template):
@@ -245,6 +252,7 @@ def _build(content: dict[str, Any]) -> Body:
         stature_lengths=tuple(content['stature']),
         stature_extra=float(content['stature_extra']),
         default_lengths=lengths,
+        keypoint_aliases=aliases,
     )
 
 

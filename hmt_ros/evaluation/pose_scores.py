@@ -1,13 +1,14 @@
 """Errors and calibration of mixtures over poses, against the true joint positions.
 
-All is measured on the joints, relative to the pelvis, so that bodies with other degrees of freedom
-can be compared: a component N(m, S) over poses becomes one over joint positions by linearisation,
+Joint positions relative to an origin are compared, so that bodies with different degrees of freedom
+have comparable scores. The origin is the pelvis, or the middle of the hips where the truth has no
+pelvis. A component N(m, S) over poses becomes one over joint positions by linearisation,
 
-    N(f(m), J S J^T + s^2 I),   f: joints minus pelvis,   J = df/dx at m.
+    N(f(m), J S J^T + s^2 I),   f: joints minus origin,   J = df/dx at m.
 
-The isotropic part s stands for what no pose of the body can meet, because lengths and joint centres
-of the model are not exactly those of the person. Without it the density would be confined to a
-surface: 13 joints have 39 coordinates, and a body has fewer degrees of freedom that move them.
+The isotropic part s stands for the error that every pose of the body has, because the lengths and
+joint centres of the model are not exactly those of the person. Without it the density would be
+confined to a surface: 13 joints have 39 coordinates, and fewer degrees of freedom move them.
 """
 
 from __future__ import annotations
@@ -36,27 +37,69 @@ EVALUATED_JOINTS = (
     'right_wrist', 'left_hip', 'right_hip', 'left_knee', 'right_knee', 'left_ankle', 'right_ankle',
 )  # fmt: skip
 ORIGIN = 'pelvis'
-# Standard deviation of a coordinate that the body model gets wrong whatever the pose, m.
+# Their middle is the origin where the truth has no pelvis.
+HIPS = ('left_hip', 'right_hip')
+# Standard deviation of a coordinate that the body model gets wrong in every pose, m.
 MODEL_SIGMA = 0.02
-# A frame whose best hypothesis is further off than this on average is lost, m.
+# A frame is lost when the mean joint error of its best hypothesis reaches this, m.
 LOST = 0.15
-# Samples of a density that a level is estimated with.
+# Number of samples of a density from which a level is estimated.
 SAMPLES = 500
-# Mixtures whose kinematics is computed together.
+# Number of mixtures whose kinematics is computed together.
 BATCH = 32
+
+
+def origin_joints(names: Sequence[str], source: str = 'truth') -> tuple[str, ...]:
+    """Joints whose mean position is the origin: the pelvis or, without one, both hips.
+
+    Args:
+        names: of the joints whose true positions are known.
+        source: of the truth, for the message of the error.
+
+    Raises:
+        ValueError: neither is known.
+    """
+    for origin in ((ORIGIN,), HIPS):
+        if set(origin) <= set(names):
+            return origin
+    raise ValueError(
+        f'{source} has neither a {ORIGIN} nor {" and ".join(HIPS)}; it has {list(names)}'
+    )
+
+
+def relative_positions(
+    positions: Array, names: Sequence[str], joints: Sequence[str], origin: Sequence[str] = (ORIGIN,)
+) -> Array:
+    """Positions (..., J, 3) of some joints relative to the origin.
+
+    Args:
+        positions: (..., J', 3) of all joints.
+        names: (J',) of all joints.
+        joints: names of the J joints.
+        origin: joints whose mean position is the origin.
+
+    Raises:
+        ValueError: joints that are not among the names.
+    """
+    missing = [name for name in (*origin, *joints) if name not in names]
+    if missing:
+        raise ValueError(f'a skeleton of {list(names)} has no joints {missing}')
+    centre = positions[..., [names.index(name) for name in origin], :].mean(-2, keepdims=True)
+    result: Array = positions[..., [names.index(name) for name in joints], :] - centre
+    return result
 
 
 @dataclass(frozen=True, eq=False)
 class JointMixture:
-    """Hypotheses about joint positions at one time, relative to the pelvis.
+    """Hypotheses about joint positions at one time, relative to the origin.
 
     Attributes:
         weights: (K,) sum to 1.
         joints: (K, J, 3) m.
-        covariances: (K, 3J, 3J) m^2, or None: not known.
+        covariances: (K, 3J, 3J) m^2; None if unknown.
 
     Raises:
-        ValueError: shapes that do not fit, values that are not finite.
+        ValueError: shapes that do not fit, or values that are not finite.
     """
 
     weights: Array
@@ -77,7 +120,7 @@ class JointMixture:
         """The mixture over 3J coordinates.
 
         Raises:
-            ValueError: the covariances are not known.
+            ValueError: the covariances are unknown.
         """
         if self.covariances is None:
             raise ValueError('joint positions without covariances have no density')
@@ -92,35 +135,38 @@ def joint_mixtures(
     *,
     model_sigma: float = MODEL_SIGMA,
     positions: Sequence[Array] | None = None,
+    origin: Sequence[str] = (ORIGIN,),
 ) -> list[JointMixture]:
-    """Joint positions relative to the pelvis that mixtures over poses say, by linearisation.
+    """Mixtures over joint positions relative to the origin, by linearisation.
 
     Args:
-        body: whose poses they are.
+        body: the body of the poses.
         mixtures: (T,) over poses (d,).
-        names: joints, J of them.
-        model_sigma: standard deviation of what the body itself gets wrong, a coordinate, m.
-        positions: for each mixture (K, J', 3) of all joints of the body at the means, where they
-            are known, m; None: computed.
+        names: (J,) of the joints.
+        model_sigma: standard deviation of a coordinate that the body model gets wrong, m.
+        positions: for each mixture (K, J', 3) of all joints of the body at the means, m; None:
+            computed from the means.
+        origin: joints whose mean position is the origin.
 
     Raises:
         KeyError: a joint that the body does not have.
         ValueError: a mixture over poses of another body.
     """
-    which = body.skeleton.joint_index([ORIGIN, *names])
+    which, centre = (body.skeleton.joint_index([*some]) for some in (names, origin))
     own = model_sigma**2 * np.eye(3 * len(names))
     result = []
     # Kinematics in batches: one frame alone would cost ten times as much a pose.
     for first in range(0, len(mixtures), BATCH):
         batch = mixtures[first : first + BATCH]
         means = np.concatenate([mixture.means for mixture in batch])
-        jacobians = body.joint_jacobians(means)[:, which]
-        jacobians = (jacobians[:, 1:] - jacobians[:, :1]).reshape(len(means), -1, body.dimension)
+        jacobians = body.joint_jacobians(means)
+        jacobians = jacobians[:, which] - jacobians[:, centre].mean(1, keepdims=True)
+        jacobians = jacobians.reshape(len(means), -1, body.dimension)
         if positions is None:
             joints = body.joint_positions(means)
         else:
             joints = np.concatenate(positions[first : first + BATCH])
-        joints = joints[:, which[1:]] - joints[:, which[:1]]
+        joints = joints[:, which] - joints[:, centre].mean(1, keepdims=True)
         ends = np.cumsum([len(mixture) for mixture in batch])
         for mixture, end in zip(batch, ends, strict=True):
             mine = slice(int(end) - len(mixture), int(end))
@@ -132,16 +178,16 @@ def joint_mixtures(
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """How far mixtures are from the truth, frame by frame: T frames, J joints.
+    """Distances of mixtures from the truth, frame by frame: T frames, J joints.
 
     Attributes:
-        names: (J,) joints.
-        heaviest: (T, J) distances of the joints of the heaviest component, m.
-        best: (T, J) of the component whose joints are nearest on average.
-        expected: (T, J) mean over the components, by weight.
+        names: (J,) of the joints.
+        heaviest: (T, J) errors of the joints of the heaviest component, m.
+        best: (T, J) errors of the component whose mean joint error is least, m.
+        expected: (T, J) weighted mean of the errors of all components, m.
         modes: (T,) number of components.
-        perplexity: (T,) exp of the entropy of the weights: how many components share the weight.
-        log_densities: (T,) log p(true joint positions), positions in m; None: covariances unknown.
+        perplexity: (T,) exp of the entropy of the weights: the effective number of components.
+        log_densities: (T,) log p(true joint positions), positions in m; None without covariances.
         levels: (T,) of the true positions of all joints together, see `inference.calibration`.
         joint_levels: (T, J) of the true position of each joint alone.
     """
@@ -161,7 +207,7 @@ class Scores:
 
     @staticmethod
     def concatenate(parts: Sequence[Scores]) -> Scores:
-        """Scores of stretches of time in turn; densities are known where those of all parts are."""
+        """Scores of consecutive parts; densities are known if those of all parts are."""
 
         def joined(name: str) -> Any:
             values = [getattr(part, name) for part in parts]
@@ -170,7 +216,7 @@ class Scores:
         return Scores(parts[0].names, *(joined(field.name) for field in fields(Scores)[1:]))
 
     def summary(self) -> dict[str, Any]:
-        """Means over the frames; errors in mm, None where covariances are not known."""
+        """Means over the frames, errors in mm; None for what needs unknown covariances."""
         errors = {
             key: 1e3 * value.mean(1)
             for key, value in (
@@ -226,11 +272,11 @@ def score(
     """Scores of mixtures at T times.
 
     Args:
-        mixtures: (T,) of the same joints, relative to the pelvis.
-        truth: (T, J, 3) true positions relative to the true pelvis, m.
+        mixtures: (T,) of the same joints, relative to the origin.
+        truth: (T, J, 3) true positions relative to the true origin, m.
         names: (J,) of the joints.
-        seed: of the samples that levels are estimated with, or their generator.
-        samples: how many of them a frame.
+        seed: of the samples from which levels are estimated, or their generator.
+        samples: number of samples per frame.
 
     Raises:
         ValueError: no frames, or shapes that do not fit.

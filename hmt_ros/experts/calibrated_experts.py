@@ -1,11 +1,11 @@
-"""Experts that know how wrong they are of motions that they have not learned from.
+"""Experts whose gates and covariances are calibrated on motions that they have not learned from.
 
     p(x | r) ~ sum_i g_i(r)^(1 / T) N(x; f_i(r), c_i(r) s (O_i + E))
 
-Frames of one motion are alike, so that a model is too sure of any other: its gates decide too
-sharply in many dimensions, and its covariances are those of motions it knows. Whole motions are
-left out in turn, and the temperature T of the gates and the covariance E that is added are those
-under which these are most probable. The factor s then makes regions as wide as they claim to be.
+The frames of one motion are alike, so a model is too certain about any other motion: in many
+dimensions its gates decide too sharply, and its covariances are those of the motions it knows. Each
+motion is left out once. The temperature T of the gates and the added covariance E maximise the
+likelihood of the motions left out; the factor s then makes regions as wide as they claim to be.
 """
 
 from __future__ import annotations
@@ -18,20 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv
 
-from hmt_ros.experts.conditional_density import Components, ConditionalDensity
+from hmt_ros.experts.conditional_density import Components, ConditionalDensity, stored_model
 from hmt_ros.experts.gates import log_softmax
-from hmt_ros.experts.model_file import (
-    FAULTS,
-    Arrays,
-    check_header,
-    damaged,
-    header,
-    nested,
-    parameters_of,
-    part,
-    shape_of,
-)
-from hmt_ros.experts.stored_models import stored_model
+from hmt_ros.experts.model_file import Arrays, nested, parameters_of, part
 from hmt_ros.experts.training_pairs import checked_pairs
 
 if TYPE_CHECKING:
@@ -41,28 +30,25 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 FOLDS = 3
-# Samples of each fold that are left out, at most.
-LEFT_OUT = 500
+LEFT_OUT = 500  # maximum number of samples of a fold that are left out
 TEMPERATURES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)
 ITERATIONS = 6
-# What a region of this probability should cover of the samples left out.
-COVERED = 0.9
-# A component with less weight says nothing of where a region is.
-LIGHT = 0.02
+COVERED = 0.9  # probability of the region that should cover that share of the samples left out
+LIGHT = 0.02  # components with less weight than this do not count for a region
 LARGEST_FACTOR = 4.0
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What changes the mixtures of a model.
+    """Changes the mixtures of a model.
 
     Attributes:
-        temperature: T of the gates, at least 1.
-        added: (D, D) E, positive semidefinite.
-        factor: s, at least 1.
+        temperature: Temperature T of the gates, at least 1.
+        added: (D, D) added covariance E, positive semidefinite.
+        factor: Factor s of the covariances, at least 1.
 
     Raises:
-        ValueError: values out of their range.
+        ValueError: a value is out of its range.
     """
 
     temperature: float
@@ -78,7 +64,7 @@ class Calibration:
                 raise ValueError(f'{name} must be at least 1, saw {getattr(self, name)}')
 
     def of(self, found: Components) -> Components:
-        """The mixtures changed."""
+        """The calibrated mixtures."""
         return replace(
             found,
             log_weights=log_softmax(found.log_weights / self.temperature),
@@ -90,11 +76,11 @@ class CalibratedExperts(ConditionalDensity):
     """A model whose gates and covariances are calibrated on motions left out.
 
     Args:
-        model: that learns; its parameters are those of this one.
-        folds: parts that the motions are split into, of which each is left out once.
+        model: Model that learns.
+        folds: Number of parts of the motions; each part is left out once.
 
     Attributes:
-        calibration_: what was learned of motions left out.
+        calibration_: Calibration learned from the motions left out.
     """
 
     kind = 'calibrated_experts'
@@ -119,11 +105,11 @@ class CalibratedExperts(ConditionalDensity):
             inputs: (N, p).
             targets: (N, D).
             sample_weight: (N,) or None.
-            groups: (N,) which samples belong together: the motion, say, as a number. Neighbouring
-                numbers are left out together. None: the samples are in such an order.
+            groups: (N,) number of the group of each sample, such as its motion. Neighbouring
+                numbers are left out together. None takes the order of the samples.
 
         Raises:
-            ValueError: wrong shapes, values that are not finite, too few samples.
+            ValueError: shapes are wrong, values are not finite, or there are too few samples.
         """
         pairs = checked_pairs(inputs, targets, sample_weight, at_least=2, what='to leave one out')
         if self.folds < 2:
@@ -159,33 +145,23 @@ class CalibratedExperts(ConditionalDensity):
         return self.calibration_.of(self.model.components(inputs))
 
     def jacobians(self, inputs: ArrayLike) -> Array:
-        """Derivatives (n, M, D, p) of the components' means by the input."""
+        """Derivatives (n, M, D, p) of the components' means with respect to the input."""
         return self.model.jacobians(inputs)
 
     def support(self, inputs: ArrayLike) -> Array:
-        """How far the inputs (n, p) are supported by training data, (n,)."""
+        """Support (n,) of the inputs (n, p) by training data; that of the model."""
         return self.model.support(inputs)
 
-    def to_arrays(self) -> Arrays:
-        """The whole model as arrays; see `ConditionalDensity.to_arrays`."""
-        self._check_learned()
-        shape = np.array([self.n_inputs_, self.n_outputs_])
-        arrays = header(self.kind, {'folds': self.folds}) | {'shape': shape}
-        return arrays | self._learned() | nested('model', self.model.to_arrays())
+    def _stored_parameters(self) -> dict[str, Any]:
+        return {'folds': self.folds}
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], where: str = 'model') -> Self:
-        """The model that `to_arrays` gave; see `ConditionalDensity.from_arrays`."""
-        check_header(arrays, cls.kind, where)
-        try:
-            own = part('model', arrays)
-            result = cls(stored_model(own, where), **parameters_of(arrays))
-            result.n_inputs_, result.n_outputs_ = shape_of(arrays)
-            result._set_learned(arrays)
-            result.components(np.zeros((1, result.n_inputs_)))
-        except FAULTS as fault:
-            raise damaged(where, fault) from fault
-        return result
+    def _constructed(cls, arrays: Mapping[str, NDArray[Any]], where: str) -> Self:
+        own = part('model', arrays)
+        # Files could nest models without end.
+        if str(own['kind']) == cls.kind:
+            raise ValueError('a calibrated model inside a calibrated model')
+        return cls(stored_model(own, where), **parameters_of(arrays))
 
     def _learned(self) -> Arrays:
         found = self.calibration_
@@ -193,7 +169,7 @@ class CalibratedExperts(ConditionalDensity):
             'temperature': np.array(found.temperature),
             'added': found.added,
             'factor': np.array(found.factor),
-        }
+        } | nested('model', self.model.to_arrays())
 
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         self.calibration_ = Calibration(
@@ -204,7 +180,7 @@ class CalibratedExperts(ConditionalDensity):
 
 
 def folds_of(groups: NDArray[Any], folds: int) -> Index:
-    """Fold (N,) of each sample: groups in order, two runs of neighbours to each fold."""
+    """Fold (N,) of each sample: each fold gets two runs of neighbouring groups."""
     names, which = np.unique(groups, return_inverse=True)
     runs = np.arange(len(names)) * min(2 * folds, len(names)) // len(names)
     result: Index = (runs % folds)[which].astype(np.intp)
@@ -212,15 +188,15 @@ def folds_of(groups: NDArray[Any], folds: int) -> Index:
 
 
 def calibration(left_out: list[tuple[Components, Array]]) -> Calibration:
-    """The calibration under which samples that were left out are most probable.
+    """The calibration with the highest likelihood of samples that were left out.
 
     Args:
-        left_out: mixtures at inputs, and the targets (n, D), of one model after the other.
+        left_out: Mixtures and targets (n, D) of the samples left out, for each fold.
     """
     candidates = [_added_noise(left_out, temperature) for temperature in TEMPERATURES]
     found = max(candidates, key=lambda one: one[0])[1]
     squares = np.concatenate([_squared_distances(found.of(c), z) for c, z in left_out])
-    # The quantile of a chi square distribution with a degree of freedom for each dimension.
+    # Quantile of the chi-squared distribution with D degrees of freedom.
     wanted = float(2.0 * gammaincinv(left_out[0][1].shape[1] / 2.0, COVERED))
     factor = float(np.clip(np.quantile(squares, COVERED) / wanted, 1.0, LARGEST_FACTOR))
     return replace(found, factor=factor)
@@ -229,12 +205,12 @@ def calibration(left_out: list[tuple[Components, Array]]) -> Calibration:
 def _added_noise(
     left_out: list[tuple[Components, Array]], temperature: float
 ) -> tuple[float, Calibration]:
-    """E for a temperature, by expectation maximisation, and the log likelihood with it."""
+    """The log likelihood, and E by expectation maximisation for a temperature."""
     size = left_out[0][1].shape[1]
     found = Calibration(temperature, np.zeros((size, size)), 1.0)
     likelihood = -np.inf
     for _ in range(ITERATIONS):
-        lack, own, total, count = np.zeros((size, size)), np.zeros((size, size)), 0.0, 0
+        scatter, own, total, count = np.zeros((size, size)), np.zeros((size, size)), 0.0, 0
         for components, targets in left_out:
             changed = found.of(components)
             log = changed.log_weights + changed.component_log_densities(targets)
@@ -243,17 +219,17 @@ def _added_noise(
             shares = np.exp(log_softmax(log))
             for i in np.flatnonzero(shares.sum(0) > 1e-6).tolist():
                 offsets = targets - changed.means[:, i]
-                lack += (shares[:, i] / changed.inflation[:, i] * offsets.T) @ offsets
+                scatter += (shares[:, i] / changed.inflation[:, i] * offsets.T) @ offsets
                 own += shares[:, i].sum() * components.noise[i]
         likelihood = total / count
-        values, vectors = np.linalg.eigh((lack - own) / count)
+        values, vectors = np.linalg.eigh((scatter - own) / count)
         latest, found = found, replace(found, added=(vectors * np.maximum(values, 0)) @ vectors.T)
-    # The likelihood is that of what the last iteration began with.
+    # The likelihood is that of the state before the last iteration.
     return likelihood, latest
 
 
 def _squared_distances(found: Components, targets: Array) -> Array:
-    """Squared Mahalanobis distance (n,) of each target to the nearest component with weight."""
+    """Squared Mahalanobis distance (n,) of each target to the nearest component that counts."""
     squares = np.empty_like(found.log_weights)
     for i, noise in enumerate(found.noise):
         offsets = targets - found.means[:, i]

@@ -1,9 +1,10 @@
-"""Conditional densities that are mixtures of Gaussians, whatever learned them.
+"""Conditional densities that are mixtures of Gaussians: the base of all models (BME 2.2).
 
-    p(x | r) = sum_i g_i(r) N(x; f_i(r), c_i(r) O_i)
+    p(x | r) = sum_i g_i(r) p_i(x | r)                                              (BME 10)
+    p_i(x | r) = N(x; f_i(r), c_i(r) O_i)                                           (BME 12)
 
-What every model here predicts, how it is evaluated, and how it is kept in a file. The scalar
-c_i(r) >= 1 is what the uncertainty of an expert's weights adds to its noise O_i at the input r.
+with gates g_i that are positive and sum to 1. The scalar c_i(r) >= 1 inflates the noise O_i of an
+expert by the uncertainty of its weights at the input r; in the paper it is 1.
 """
 
 from __future__ import annotations
@@ -22,16 +23,16 @@ from scipy.special import logsumexp
 
 from hmt_ros.experts.model_file import (
     FAULTS,
+    MOST_NUMBERS,
     Arrays,
     check_header,
     damaged,
     header,
     parameters_of,
     read_arrays,
-    shape_of,
     write_arrays,
 )
-from hmt_ros.experts.training_pairs import checked_inputs, finite_matrix
+from hmt_ros.experts.training_pairs import finite_matrix
 from hmt_ros.inference import GaussianMixture
 
 if TYPE_CHECKING:
@@ -45,10 +46,10 @@ class Components:
     """The mixtures at n inputs.
 
     Attributes:
-        log_weights: (n, M) of weights that sum to 1.
-        means: (n, M, D).
-        inflation: (n, M) c.
-        noise: (M, D, D) O.
+        log_weights: (n, M) logarithms of the gates g, which sum to 1.
+        means: (n, M, D) means f.
+        inflation: (n, M) factors c.
+        noise: (M, D, D) covariances O.
     """
 
     log_weights: Array
@@ -57,7 +58,7 @@ class Components:
     noise: Array
 
     def log_density(self, targets: Array) -> Array:
-        """log p(x | r), (n,), of one target (n, D) per input."""
+        """log p(x | r), (n,), of one target per input, (n, D)."""
         result: Array = logsumexp(self.log_weights + self.component_log_densities(targets), axis=1)
         return result
 
@@ -77,47 +78,57 @@ class Components:
 class ConditionalDensity(ABC):
     """A model of p(x | r) with inputs r (p,) and targets x (D,).
 
-    Constructor arguments are kept as they are and learned attributes end in an underscore, as
-    scikit-learn does; `get_params` and `set_params` are those of its estimators.
+    The conventions are those of scikit-learn's estimators: the constructor stores its arguments
+    unchanged, learned attributes end in an underscore, `get_params` and `set_params` exist.
+
+    Attributes:
+        kind: Name of the model in files.
+        kinds: All models by their names in files.
     """
 
     kind: ClassVar[str]
+    kinds: ClassVar[dict[str, type[ConditionalDensity]]] = {}
 
     n_inputs_: int
     n_outputs_: int
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if 'kind' in cls.__dict__:
+            cls.kinds[cls.kind] = cls
 
     @abstractmethod
     def fit(
         self, inputs: ArrayLike, targets: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> Self:
-        """Learns from inputs (N, p) and targets (N, D), with weights (N,) or without.
+        """Learns from inputs (N, p) and targets (N, D), optionally with weights (N,).
 
         Raises:
-            ValueError: wrong shapes, values that are not finite, too few samples.
+            ValueError: shapes are wrong, values are not finite, or there are too few samples.
         """
 
     @abstractmethod
     def components(self, inputs: ArrayLike) -> Components:
-        """The mixtures at inputs (n, p), without their covariances multiplied out."""
+        """The mixtures at inputs (n, p)."""
 
     @abstractmethod
     def jacobians(self, inputs: ArrayLike) -> Array:
-        """Derivatives (n, M, D, p) of the components' means by the input."""
+        """Derivatives (n, M, D, p) of the components' means with respect to the input."""
 
     @abstractmethod
     def support(self, inputs: ArrayLike) -> Array:
-        """How far the inputs (n, p) are supported by training data: (n,) from 0 to 1.
+        """Support (n,) of the inputs (n, p) by training data, from 0 to 1.
 
-        The value of the kernel that fires most; near 0 the means are no better than a constant.
+        The largest kernel value at the input; near 0 the means are no better than a constant.
         """
 
     @abstractmethod
     def _learned(self) -> Arrays:
-        """Learned arrays, for a file."""
+        """The learned arrays, for a file."""
 
     @abstractmethod
     def _set_learned(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Takes the arrays of `_learned` back."""
+        """Restores the model from the arrays of `_learned`."""
 
     def predict_arrays(self, inputs: ArrayLike) -> tuple[Array, Array, Array]:
         """The mixtures at inputs (n, p).
@@ -130,7 +141,7 @@ class ConditionalDensity(ABC):
         return np.exp(found.log_weights), found.means, covariances
 
     def predict(self, inputs: ArrayLike) -> list[GaussianMixture]:
-        """A mixture for each of the inputs (n, p); components keep their order."""
+        """A mixture for each of the inputs (n, p); the order of components is kept."""
         return [GaussianMixture(*one) for one in zip(*self.predict_arrays(inputs), strict=True)]
 
     def log_density(self, inputs: ArrayLike, targets: ArrayLike) -> Array:
@@ -145,14 +156,14 @@ class ConditionalDensity(ABC):
         return found.log_density(targets)
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """The constructor's arguments; no model here holds another, so `deep` changes nothing."""
+        """The constructor's arguments; `deep` is accepted for scikit-learn and ignored."""
         return {name: getattr(self, name) for name in self._parameter_names()}
 
     def set_params(self, **parameters: Any) -> Self:
         """Changes some of the constructor's arguments.
 
         Raises:
-            ValueError: an argument that does not exist.
+            ValueError: an argument does not exist.
         """
         known = self._parameter_names()
         for name, value in parameters.items():
@@ -168,23 +179,28 @@ class ConditionalDensity(ABC):
         """The whole model as arrays, for a file of its own or as part of another.
 
         Raises:
-            ValueError: it has not learned yet.
+            ValueError: the model has not learned yet.
         """
         self._check_learned()
         shape = np.array([self.n_inputs_, self.n_outputs_])
-        return header(self.kind, self.get_params()) | {'shape': shape} | self._learned()
+        return header(self.kind, self._stored_parameters()) | {'shape': shape} | self._learned()
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], where: str = 'model') -> Self:
-        """The model that `to_arrays` gave.
+        """The model that `to_arrays` stored.
 
         Raises:
-            ValueError: arrays of another kind or version, or arrays that are missing or wrong.
+            ValueError: the kind or the version is another one, or arrays are missing or wrong.
         """
         check_header(arrays, cls.kind, where)
         try:
-            model = cls(**parameters_of(arrays))
-            model.n_inputs_, model.n_outputs_ = shape_of(arrays)
+            inputs, outputs = (int(n) for n in arrays['shape'])
+            if not (1 <= inputs <= MOST_NUMBERS and 1 <= outputs <= MOST_NUMBERS):
+                raise ValueError(
+                    f'{inputs} inputs and {outputs} outputs, wanted 1 to {MOST_NUMBERS}'
+                )
+            model = cls._constructed(arrays, where)
+            model.n_inputs_, model.n_outputs_ = inputs, outputs
             model._set_learned(arrays)
             model.components(np.zeros((1, model.n_inputs_)))
         except FAULTS as fault:
@@ -200,19 +216,54 @@ class ConditionalDensity(ABC):
         """Reads a model that `save` wrote.
 
         Raises:
-            FileNotFoundError: no such file.
-            ValueError: not such a file, another version, another kind of model.
+            FileNotFoundError: there is no such file.
+            ValueError: the file is no model, or one of another version or kind.
         """
         return cls.from_arrays(read_arrays(path, cls.kind), str(path))
+
+    def _stored_parameters(self) -> dict[str, Any]:
+        """The constructor's arguments that JSON can hold."""
+        return self.get_params()
+
+    @classmethod
+    def _constructed(cls, arrays: Mapping[str, NDArray[Any]], where: str) -> Self:
+        """The model of a file before its learned arrays are set."""
+        return cls(**parameters_of(arrays))
 
     def _check_learned(self) -> None:
         if not hasattr(self, 'n_inputs_'):
             raise ValueError(f'this {type(self).__name__} has not learned yet; call fit first')
 
     def _checked(self, inputs: ArrayLike) -> Array:
+        """Inputs as a matrix (n, p) with as many columns as in training."""
         self._check_learned()
-        return checked_inputs(inputs, self.n_inputs_)
+        inputs = finite_matrix(inputs, 'inputs', f'(n, {self.n_inputs_})')
+        if inputs.shape[1] != self.n_inputs_:
+            raise ValueError(
+                f'inputs have {inputs.shape[1]} columns, wanted {self.n_inputs_} as in training; '
+                'describe them as the training data were'
+            )
+        return inputs
 
     @classmethod
     def _parameter_names(cls) -> list[str]:
         return [name for name in inspect.signature(cls.__init__).parameters if name != 'self']
+
+
+def stored_model(arrays: Mapping[str, NDArray[Any]], where: str) -> ConditionalDensity:
+    """The model that `ConditionalDensity.to_arrays` stored, of the kind that the arrays name.
+
+    Args:
+        arrays: Arrays of the model.
+        where: Name of the file, for messages.
+
+    Raises:
+        KeyError: no kind is named.
+        ValueError: the kind is unknown, or arrays are missing or wrong.
+    """
+    kind = str(arrays['kind'])
+    if kind not in ConditionalDensity.kinds:
+        raise ValueError(
+            f'a model of kind {kind!r}, wanted one of {sorted(ConditionalDensity.kinds)}'
+        )
+    return ConditionalDensity.kinds[kind].from_arrays(arrays, where)

@@ -1,19 +1,19 @@
 """Discriminative density propagation: mixtures through conditional densities (BME 2.1).
 
-Rule (1), with a model of p(x_t | x_{t-1}, r_t) whose input is the state, then the observation:
+Rule (1) needs a model of p(x_t | x_{t-1}, r_t), whose input is the state, then the observation:
 
-    p(x_t | R_t) = integral p(x_t | x_{t-1}, r_t) p(x_{t-1} | R_{t-1}) dx_{t-1}
+    p(x_t | R_t) = integral p(x_t | x_{t-1}, r_t) p(x_{t-1} | R_{t-1}) dx_{t-1}         (BME 1)
 
-Each expert i is linearised at the mean m_j of each component before, which leaves
+Each expert i is linearised at the mean m_j of each previous component. The integral becomes
 
     sum_ij g_i(m_j, r) w_j N(x; f_i(m_j, r), F_ij S_j F_ij' + c_i O_i),    F = df / dx_{t-1}
 
-Rule (9), with models of p(x_t | r_t), of the dynamics p(x_t | x_{t-1}), and the equilibrium p(x_t):
+Rule (9) needs models of p(x_t | r_t), of the dynamics p(x_t | x_{t-1}), and the equilibrium p(x_t):
 
-    p(x_t | R_t) ~ p(x_t | r_t) / p(x_t) integral p(x_t | x_{t-1}) p(x_{t-1} | R_{t-1}) dx_{t-1}
+    p(x_t | R_t) ~ p(x_t | r_t) / p(x_t)                                                (BME 9)
+                   integral p(x_t | x_{t-1}) p(x_{t-1} | R_{t-1}) dx_{t-1}
 
-The M^2 components are reduced to M: clusters of means first, which then descend a bound on the
-Kullback-Leibler divergence from the large mixture to the small one.
+The M^2 components are reduced to M (`hmt_ros.inference.reduction`).
 """
 
 from __future__ import annotations
@@ -24,14 +24,13 @@ from scipy.special import logsumexp
 
 from hmt_ros.experts.conditional_density import ConditionalDensity
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.reduction import reduced
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 # Below it no kernel fires: the experts have seen nothing like the input.
 LEAST_SUPPORT = 1e-3
-# Components with a smaller share than this of the weight are dropped before the reduction.
-NEGLIGIBLE = 1e-8
 
 
 def propagate(
@@ -45,19 +44,19 @@ def propagate(
 ) -> GaussianMixture:
     """p(x_t | R_t) by rule (1).
 
-    Components before in whose place the model has no support give their weight to the prediction
-    from the observation alone; where none has support, that prediction is the result.
+    Previous components without support of the model give their weight to the prediction from the
+    observation alone; without any support, that prediction is the result.
 
     Args:
-        model: of p(x_t | x_{t-1}, r_t) with inputs (x_{t-1}, r_t), states first.
+        model: Model of p(x_t | x_{t-1}, r_t) with inputs (x_{t-1}, r_t), states first.
         previous: p(x_{t-1} | R_{t-1}) over states (d,).
-        observation: r_t (q,), perhaps with q = 0.
-        n_components: M of the result; None for as many as the model has experts.
+        observation: r_t (q,); q may be 0.
+        n_components: Number of components M of the result; None takes the number of experts.
         without_past: p(x_t | r_t); None trusts the model everywhere.
-        least_support: of `ConditionalDensity.support`.
+        least_support: Minimum of `ConditionalDensity.support`.
 
     Raises:
-        ValueError: dimensions that do not fit, an observation that is not finite.
+        ValueError: dimensions do not fit, or the observation is not finite.
     """
     previous = previous.normalised()
     inputs = _inputs(model, previous, observation)
@@ -95,15 +94,15 @@ def propagate_by_dynamics(
     """p(x_t | R_t) by rule (9).
 
     Args:
-        dynamics: model of p(x_t | x_{t-1}).
+        dynamics: Model of p(x_t | x_{t-1}).
         previous: p(x_{t-1} | R_{t-1}).
         predicted: p(x_t | r_t).
-        equilibrium: p(x_t). A single Gaussian is divided out exactly, as long as it is wider than
-            what it divides; else each product is weighted by 1 / p at its mean.
-        n_components: of the result; None for as many as `predicted` has.
+        equilibrium: p(x_t). The division by a single Gaussian is exact where that is wider than the
+            product; else each product is weighted by 1 / p at its mean.
+        n_components: Number of components of the result; None takes that of `predicted`.
 
     Raises:
-        ValueError: dimensions that do not fit.
+        ValueError: dimensions do not fit.
     """
     count = n_components or len(predicted)
     prior = reduced(linearised_products(dynamics, previous, np.zeros(0)), count)
@@ -118,11 +117,11 @@ def propagate_by_dynamics(
 def linearised_products(
     model: ConditionalDensity, previous: GaussianMixture, observation: ArrayLike
 ) -> GaussianMixture:
-    """The integral of rule (1) with experts linearised at each mean, all products kept.
+    """The integral of rule (1) with experts linearised at each mean; all products are kept.
 
     Args:
-        model: with inputs (x_{t-1}, r_t).
-        previous: J components over states (d,); their weights are kept as they are.
+        model: Model with inputs (x_{t-1}, r_t).
+        previous: J components over states (d,); their weights need not sum to 1.
         observation: r_t (q,).
     """
     inputs = _inputs(model, previous, observation)
@@ -152,7 +151,7 @@ def divided_product(
         divisor = divisor.normalised()
         precision_d, shift_d, constant_d = _canonical(divisor)
         less = precision - precision_d
-        # A divisor that is nearly as narrow leaves next to no Gaussian.
+        # A divisor that is nearly as narrow as the product leaves no proper Gaussian.
         exact = np.linalg.eigvalsh(less)[:, 0] > 1e-3 * np.linalg.eigvalsh(precision)[:, 0]
         precision = np.where(exact[:, None, None], less, precision)
         shift = np.where(exact[:, None], shift - shift_d, shift)
@@ -162,112 +161,10 @@ def divided_product(
     means = np.einsum('nij,nj->ni', covariances, shift)
     log_det = np.linalg.slogdet(covariances)[1]
     log = constant + 0.5 * ((shift * means).sum(1) + log_det)
-    # Without the division there is one factor of 2 pi more in the denominator.
+    # Without exact division, one factor (2 pi)^(d/2) more is in the denominator.
     at_mean = 0.5 * d * np.log(2.0 * np.pi) + divisor.log_density(means)
     log = np.where(exact, log, log - at_mean)
     return GaussianMixture(np.exp(log - logsumexp(log)), means, covariances)
-
-
-def reduced(mixture: GaussianMixture, count: int, iterations: int = 10) -> GaussianMixture:
-    """At most `count` components: clusters of means, then descent of `divergence_bound`.
-
-    Where pairwise merging (`GaussianMixture.reduce`) opens with a lower bound than the clusters,
-    it is what descends. The mixture's mean and covariance are kept, as every step matches moments.
-
-    Raises:
-        ValueError: count < 1.
-    """
-    if count < 1:
-        raise ValueError(f'{count} components asked for, wanted at least 1')
-    mixture = mixture.normalised()
-    if len(mixture) <= count:
-        return mixture
-    large = mixture[mixture.weights > NEGLIGIBLE].normalised()
-    if len(large) <= count:
-        return large
-    starts = clustered(large, count), large.reduce(count)
-    bound, share, small = min(
-        ((*_assignment(large, start), start) for start in starts), key=lambda one: one[0]
-    )
-    for _ in range(iterations):
-        better = _moments(large, share)
-        new_bound, share = _assignment(large, better)
-        if bound - new_bound < 1e-4:
-            break
-        bound, small = new_bound, better
-    return small
-
-
-def clustered(mixture: GaussianMixture, count: int, iterations: int = 20) -> GaussianMixture:
-    """Components merged by clusters of their means, in the metric of the mean covariance."""
-    average = np.einsum('k,kij->ij', mixture.weights / mixture.weights.sum(), mixture.covariances)
-    points = np.linalg.solve(np.linalg.cholesky(average), mixture.means.T).T
-    chosen = [int(np.argmax(mixture.weights))]
-    for _ in range(count - 1):
-        distance = ((points[:, None] - points[chosen]) ** 2).sum(2).min(1)
-        chosen.append(int(np.argmax(mixture.weights * distance)))
-    centres = points[chosen]
-    labels: Index = np.full(len(points), -1)
-    for _ in range(iterations):
-        new = np.argmin(((points[:, None] - centres) ** 2).sum(2), axis=1)
-        if (new == labels).all():
-            break
-        labels = new
-        member = (labels[:, None] == np.arange(len(centres))) * mixture.weights[:, None]
-        total = member.sum(0)
-        full = total > 0
-        centres[full] = (member.T @ points)[full] / total[full, None]
-    share = (labels[:, None] == np.arange(len(centres))).astype(np.float64)
-    return _moments(mixture, share)
-
-
-def divergence_bound(large: GaussianMixture, small: GaussianMixture) -> float:
-    """sum_a w_a min_b KL(large_a || small_b) >= KL(large || small), nats.
-
-    It bounds the divergence where the weight of each small component is the sum of the weights that
-    it stands for, as `refined` leaves them [Goldberger & Roweis, NIPS 2004].
-    """
-    return _assignment(large, small)[0]
-
-
-def refined(large: GaussianMixture, small: GaussianMixture) -> GaussianMixture:
-    """One descent of `divergence_bound`: components to the closest, then their moments."""
-    return _moments(large, _assignment(large, small)[1])
-
-
-def _assignment(large: GaussianMixture, small: GaussianMixture) -> tuple[float, Array]:
-    """The bound, and which large component goes to which small one, (A, B) of 0 and 1."""
-    divergences = gaussian_divergences(large, small)
-    share = np.zeros_like(divergences)
-    share[np.arange(len(large)), np.argmin(divergences, axis=1)] = 1.0
-    return float(large.weights @ divergences.min(axis=1)), share
-
-
-def gaussian_divergences(a: GaussianMixture, b: GaussianMixture) -> Array:
-    """KL(a_i || b_j), (A, B), between components."""
-    inverse = np.linalg.inv(b.covariances)
-    trace = a.covariances.reshape(len(a), -1) @ inverse.reshape(len(b), -1).T
-    offsets = a.means - b.means[:, None]
-    square = ((offsets @ inverse) * offsets).sum(2).T
-    log_det = np.linalg.slogdet(b.covariances)[1] - np.linalg.slogdet(a.covariances)[1][:, None]
-    result: Array = 0.5 * (trace + square + log_det - a.dimension)
-    return result
-
-
-def _moments(mixture: GaussianMixture, share: Array) -> GaussianMixture:
-    """Components of the moments of what the shares (K, B) assign to them; empty ones are left."""
-    mass = share * mixture.weights[:, None]
-    total = mass.sum(0)
-    mass, total = mass[:, total > 0], total[total > 0]
-    mass = mass / total
-    means = mass.T @ mixture.means
-    offsets = mixture.means[:, None] - means
-    covariances = (mass.T @ mixture.covariances.reshape(len(mixture), -1)).reshape(
-        -1, mixture.dimension, mixture.dimension
-    )
-    offsets = np.swapaxes(offsets, 0, 1)
-    covariances += np.swapaxes(offsets * mass.T[:, :, None], 1, 2) @ offsets
-    return GaussianMixture(total, means, 0.5 * (covariances + np.swapaxes(covariances, 1, 2)))
 
 
 def _canonical(mixture: GaussianMixture) -> tuple[Array, Array, Array]:
@@ -282,7 +179,7 @@ def _canonical(mixture: GaussianMixture) -> tuple[Array, Array, Array]:
 
 
 def _inputs(model: ConditionalDensity, previous: GaussianMixture, observation: ArrayLike) -> Array:
-    """Inputs (J, d + q) at the means of the components before."""
+    """Inputs (J, d + q) at the means of the previous components."""
     observation = np.asarray(observation, dtype=np.float64)
     if observation.ndim != 1 or previous.dimension + len(observation) != model.n_inputs_:
         raise ValueError(

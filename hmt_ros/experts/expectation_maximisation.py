@@ -1,13 +1,16 @@
 """Expectation maximisation of experts and gates (BME 2.2).
 
-The bound that every iteration raises is
+Every iteration raises the bound
 
     F = sum_i E_i(h) + G(h) - sum_n s_n sum_i h_ni log h_ni
 
-E_i is the evidence of expert i for responsibilities h (`sparse_bayes`), G what the gates say of h
-(`gates`), s the weights of the samples. The E-step is h_ni proportional to g_i(r_n) exp E_W log
-N(x_n; W_i' phi, O_i), where the expectation over weights lowers the logarithm by D/2 phi' S_i phi.
-The M-steps climb E_i and G.
+minus the variational free energy (BME 24). E_i is the evidence of expert i for responsibilities h
+(`sparse_bayes`), G the share of the gates (`gates`), s are the weights of the samples. The E-step
+takes an expectation over the weights W of the experts,
+
+    h_ni ~ g_i(r_n) exp E_W log N(x_n; W_i' phi, O_i)                               (BME 13)
+
+which lowers the logarithm by D/2 phi' S_i phi. The M-steps raise E_i and G.
 """
 
 from __future__ import annotations
@@ -19,43 +22,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from hmt_ros.experts.gates import GaussianGates, SoftmaxGates, log_softmax
+from hmt_ros.experts.gates import Gates, log_softmax
 from hmt_ros.experts.sparse_bayes import SparseRegression, WeightedSums
+from hmt_ros.experts.training_pairs import TrainingPairs
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-Gates = SoftmaxGates | GaussianGates
-# An expert from its weighted sums and from what it was before.
+# An expert from its weighted sums and its previous state.
 Learner = Callable[[WeightedSums, SparseRegression | None], SparseRegression]
 
-# An expert with fewer samples than this is empty; the largest never is.
+# An expert with fewer samples than this is empty; the largest one never is.
 LEAST_SAMPLES = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class EMData:
-    """What every iteration needs, computed once.
-
-    Attributes:
-        features: (N, K) of the experts' candidates.
-        targets: (N, D) standardised.
-        weights: (N,) of samples.
-    """
-
-    features: Array
-    targets: Array
-    weights: Array
-
-
-@dataclass(frozen=True, eq=False)
 class EMState:
-    """Where the iterations are.
+    """State of the iterations.
 
     Attributes:
-        experts: M of them, none before the first M-step.
-        gates: of M experts.
-        gate_features: (N, K') that the gates want.
-        bound: F for the responsibilities that the M-step was given, nats.
+        experts: M experts; none before the first M-step.
+        gates: Gates of M experts.
+        gate_features: (N, K') features for the gates.
+        bound: F for the responsibilities of the last M-step, nats.
     """
 
     experts: tuple[SparseRegression, ...]
@@ -64,36 +52,41 @@ class EMState:
     bound: float
 
     def without_others(self, kept: Index) -> EMState:
-        """The state of some of the experts."""
+        """The state with some of the experts."""
         experts = tuple(self.experts[int(i)] for i in kept)
         return EMState(experts, self.gates.of_experts(kept), self.gate_features, -np.inf)
 
 
-def e_step(data: EMData, state: EMState) -> Array:
-    """The E-step: h (N, M), rows sum to 1."""
+def e_step(features: TrainingPairs, state: EMState) -> Array:
+    """The E-step: responsibilities h (N, M), whose rows sum to 1.
+
+    Args:
+        features: Features phi of the samples with standardised targets.
+        state: State after an M-step.
+    """
     log = state.gates.log_scores(state.gate_features)
     for i, one in enumerate(state.experts):
         factor = np.linalg.cholesky(one.noise)
         z = solve_triangular(
-            factor, (data.targets - one.mean(data.features)).T, lower=True, check_finite=False
+            factor, (features.targets - one.mean(features.inputs)).T, lower=True, check_finite=False
         )
         log_det = 2.0 * np.log(np.diagonal(factor)).sum()
-        size = len(factor) * (np.log(2.0 * np.pi) + one.spread(data.features))
+        size = len(factor) * (np.log(2.0 * np.pi) + one.spread(features.inputs))
         log[:, i] -= 0.5 * ((z * z).sum(0) + log_det + size)
     result: Array = np.exp(log_softmax(log))
     return result
 
 
-def m_step(data: EMData, state: EMState, shares: Array, learn: Learner) -> EMState:
+def m_step(features: TrainingPairs, state: EMState, shares: Array, learn: Learner) -> EMState:
     """The M-step for responsibilities (N, M)."""
-    weighted = shares * data.weights[:, None]
+    weighted = shares * features.weights[:, None]
     count = shares.shape[1]
     old: tuple[SparseRegression | None, ...] = state.experts or (None,) * count
     experts = tuple(
-        learn(WeightedSums.of(data.features, data.targets, weighted[:, i]), old[i])
+        learn(WeightedSums.of(features.inputs, features.targets, weighted[:, i]), old[i])
         for i in range(count)
     )
-    gates, gate_features = state.gates.learned(state.gate_features, shares, data.weights)
+    gates, gate_features = state.gates.learned(state.gate_features, shares, features.weights)
     scores = gates.log_scores(gate_features)
     choice = float((weighted * (scores - np.log(np.maximum(shares, np.finfo(float).tiny)))).sum())
     bound = sum(one.evidence for one in experts) + choice + gates.penalty
@@ -101,33 +94,33 @@ def m_step(data: EMData, state: EMState, shares: Array, learn: Learner) -> EMSta
 
 
 def climb(
-    data: EMData, state: EMState, learn: Learner, iterations: int, tolerance: float
+    features: TrainingPairs, state: EMState, learn: Learner, iterations: int, tolerance: float
 ) -> tuple[EMState, list[float], Array]:
-    """E-steps and M-steps in turn; experts that are left without samples are pruned.
+    """Alternates E-steps and M-steps; prunes experts that have lost their samples.
 
     Args:
-        data: the samples.
-        state: after an M-step.
-        learn: the M-step of an expert.
-        iterations: at most.
-        tolerance: ends when an iteration gains less, nats per sample.
+        features: Features phi of the samples with standardised targets.
+        state: State after an M-step.
+        learn: M-step of an expert.
+        iterations: Maximum number of iterations.
+        tolerance: Gain of an iteration below which the iterations end, nats per sample.
 
     Returns:
-        The last state, the bounds since an expert was pruned, the last responsibilities (N, M).
+        The last state, the bounds since the last pruning, the last responsibilities (N, M).
     """
     bounds = [state.bound]
-    total = float(data.weights.sum())
-    shares = e_step(data, state)
+    total = float(features.weights.sum())
+    shares = e_step(features, state)
     for _ in range(iterations):
-        samples = data.weights @ shares
+        samples = features.weights @ shares
         kept = np.flatnonzero(samples >= min(LEAST_SAMPLES, float(samples.max())))
         if len(kept) < shares.shape[1]:
             state = state.without_others(kept)
-            shares = e_step(data, state)
+            shares = e_step(features, state)
             bounds = []
-        state = m_step(data, state, shares, learn)
+        state = m_step(features, state, shares, learn)
         bounds.append(state.bound)
         if len(bounds) > 1 and bounds[-1] - bounds[-2] < tolerance * total:
             break
-        shares = e_step(data, state)
+        shares = e_step(features, state)
     return state, bounds, shares

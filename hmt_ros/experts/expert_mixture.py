@@ -1,24 +1,22 @@
-"""A mixture of sparse Bayesian experts as a model: starts, predictions, files (BME 2.2).
+"""Mixtures of sparse Bayesian experts: the conditional and the joint BME, and one regression.
 
-    p(x | r) = sum_i g_i(r) N(x; M_i' phi(r), O_i (1 + phi' S_i phi))
+    p(x | r) = sum_i g_i(r) N(x; M_i' phi(r), O_i (1 + phi' S_i phi))           (BME 14 and 31)
 
-Learned by `expectation_maximisation`. What differs between the conditional and the joint model are
-the gates.
+`ConditionalExperts` have softmax gates (BME 16), `JointExperts` Gaussian gates (BME 32), and
+`RelevanceVectorRegression` has one expert. All are learned by `expectation_maximisation`.
 
-Several starts, with the candidate kernel widths in turn, run for a few iterations on some of the
-samples; the one with the highest bound goes on with all of them.
+Several starts, each with all candidate kernel widths, run for a few iterations on some of the
+samples; the one with the highest bound continues with all samples.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize_scalar
 
 from hmt_ros.experts.basis import (
     BASES,
@@ -26,21 +24,11 @@ from hmt_ros.experts.basis import (
     LinearBasis,
     RadialBasis,
     basis_of,
-    clusters,
-    spread_centres,
-    squared_distances,
     typical_distance,
 )
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
-from hmt_ros.experts.expectation_maximisation import (
-    EMData,
-    EMState,
-    Gates,
-    climb,
-    e_step,
-    m_step,
-)
-from hmt_ros.experts.gates import log_softmax
+from hmt_ros.experts.expectation_maximisation import EMState, climb, e_step, m_step
+from hmt_ros.experts.gates import Gates, GaussianGates, SoftmaxGates, log_softmax
 from hmt_ros.experts.model_file import Arrays, nested, part
 from hmt_ros.experts.sparse_bayes import (
     RegressionPrior,
@@ -49,12 +37,8 @@ from hmt_ros.experts.sparse_bayes import (
     maximise_evidence,
     maximum_likelihood,
 )
-from hmt_ros.experts.training_pairs import (
-    Standardisation,
-    TrainingPairs,
-    checked_pairs,
-    checked_scaling,
-)
+from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs, checked_pairs
+from hmt_ros.inference.clustering import k_means, spread_points, squared_distances
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -63,39 +47,38 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 LEARNING = ('bayesian', 'maximum_likelihood')
-# Kernel widths that are tried, in typical distances between inputs.
+# Candidate kernel widths, in typical distances between inputs.
 WIDTHS = (0.5, 1.0, 2.0)
 # Iterations of a start in each round of the choice, and samples that it sees.
 TRIAL_ITERATIONS = (2, 4, 8)
 TRIAL_SAMPLES = 1000
-# Part of the targets' variance that the prior of the noise pulls to.
+# Share of the targets' variance that the prior of the noise pulls to.
 NOISE_FLOOR = 1e-2
 
 
 class ExpertMixture(ConditionalDensity):
-    """What the conditional and the joint mixture of experts share.
+    """M sparse Bayesian regressions and their gates.
 
     Args:
-        n_experts: M at the start; empty ones are pruned.
-        basis: of the experts, 'rbf' or 'linear'.
-        width: of the kernels in standard deviations of the inputs; None tries several.
-        max_kernels: candidates at most, spread over the training inputs.
-        n_starts: of the iterations, per width.
-        max_iterations: of EM.
-        tolerance: ends when an iteration gains less, nats per sample.
-        scaling: of inputs before distances are taken, 'each' column or one 'common' scale.
+        n_experts: Number of experts M at the start; experts without samples are pruned.
+        basis: Basis functions of experts and gates: 'linear' or 'rbf' (Gaussian kernels).
+        seed: Seed of the starts.
+        width: Width of the kernels, in scaled inputs; None chooses among candidates.
+        max_kernels: Maximum number of candidate kernels, spread over the training inputs.
+        n_starts: Number of starts of the iterations, for each width.
+        max_iterations: Maximum number of EM iterations.
+        tolerance: Gain of an iteration below which EM ends, nats per sample.
+        scaling: Scaling of inputs before distances are taken; see `Standardisation.of`.
         learning: 'bayesian', or 'maximum_likelihood' without priors (linear experts only).
-        seed: of the starts.
 
     Attributes:
-        n_experts_: M that are left.
-        basis_: candidates phi.
-        experts_: M regressions, in units of standardised targets.
-        gates_: which expert is responsible.
+        n_experts_: Number of experts that remain.
+        basis_: Candidate basis functions phi that an expert uses.
+        experts_: Regressions of the experts, in units of standardised targets.
+        gates_: Gates of the experts.
         bound_: F after each iteration since the last expert was pruned, nats, standardised targets.
         responsibilities_: (N, M) of the training samples.
-        width_: of the kernels.
-        inflation_: factor of all covariances, 1 unless `calibrate` has changed it.
+        width_: Width of the kernels.
     """
 
     n_experts_: int
@@ -104,7 +87,7 @@ class ExpertMixture(ConditionalDensity):
     gates_: Gates
     bound_: Array
     responsibilities_: Array
-    inflation_: float
+    _gates: ClassVar[type[Gates]]
 
     def __init__(
         self,
@@ -131,14 +114,6 @@ class ExpertMixture(ConditionalDensity):
         self.scaling = scaling
         self.learning = learning
 
-    @abstractmethod
-    def _first_gates(self, basis: Basis, pairs: TrainingPairs, scaling: Standardisation) -> Gates:
-        """Gates before they have learned anything."""
-
-    @abstractmethod
-    def _gates_of(self, arrays: Mapping[str, NDArray[Any]]) -> Gates:
-        """Gates out of a file."""
-
     def fit(
         self,
         inputs: ArrayLike,
@@ -152,12 +127,12 @@ class ExpertMixture(ConditionalDensity):
         Args:
             inputs: (N, p).
             targets: (N, D).
-            sample_weight: (N,) not negative; 2 counts like the sample twice.
-            responsibilities: (N, M) to start from, in place of starts of its own.
+            sample_weight: (N,) not negative; a sample of weight 2 counts like two equal samples.
+            responsibilities: (N, M) to start from, instead of several starts.
 
         Raises:
-            ValueError: wrong shapes, values that are not finite, fewer samples than experts,
-                parameters out of their range.
+            ValueError: shapes are wrong, values are not finite, there are fewer samples than
+                experts, or parameters are out of their range.
         """
         self._check_parameters()
         pairs = checked_pairs(
@@ -166,7 +141,8 @@ class ExpertMixture(ConditionalDensity):
         self.n_inputs_, self.n_outputs_ = pairs.inputs.shape[1], pairs.targets.shape[1]
         self._scaling = Standardisation.of(pairs.inputs, pairs.weights, self.scaling)
         self._target_scaling = Standardisation.of(pairs.targets, pairs.weights)
-        self._prior = self._regression_prior()
+        strength = 0.0 if self.learning == 'maximum_likelihood' else self.n_outputs_ + 3.0
+        self._prior = RegressionPrior(strength, strength * NOISE_FLOOR * np.eye(self.n_outputs_))
         if responsibilities is not None:
             given = np.asarray(responsibilities, dtype=np.float64)
             wanted = (len(np.atleast_1d(np.asarray(inputs))), self.n_experts)
@@ -178,16 +154,15 @@ class ExpertMixture(ConditionalDensity):
                 given = given[np.asarray(sample_weight) > 0]
             basis = self._bases(pairs)[0]
             start = given / np.maximum(given.sum(1, keepdims=True), 1e-300)
-            data, state = self._begin(pairs, basis, start)
+            features, state = self._begin(pairs, basis, start)
         else:
-            basis, data, state = self._best_start(pairs)
+            basis, features, state = self._best_start(pairs)
         self.basis_ = basis
         state, bounds, self.responsibilities_ = climb(
-            data, state, self._expert, self.max_iterations, self.tolerance
+            features, state, self._expert, self.max_iterations, self.tolerance
         )
         self.experts_, self.gates_ = state.experts, state.gates
         self.bound_ = np.array(bounds)
-        self.inflation_ = 1.0
         self._keep_used()
         return self
 
@@ -200,11 +175,10 @@ class ExpertMixture(ConditionalDensity):
         means = (features @ self._stacked).reshape(len(points), self.n_experts_, self.n_outputs_)
         means = means * self._target_scaling.scale + self._target_scaling.centre
         inflation = np.stack([1.0 + one.spread(features) for one in self.experts_], axis=1)
-        inflation *= self.inflation_
         return Components(log_weights, means, inflation, self._noise)
 
     def jacobians(self, inputs: ArrayLike) -> Array:
-        """Derivatives (n, M, D, p) of the experts' means by the input."""
+        """Derivatives (n, M, D, p) of the experts' means with respect to the input."""
         points = self._checked(inputs)
         flat = self.basis_.jacobians(points, self._stacked)
         shape = (len(points), self.n_experts_, self.n_outputs_, self.n_inputs_)
@@ -220,43 +194,12 @@ class ExpertMixture(ConditionalDensity):
         result: Array = np.exp(-0.5 * squares)
         return result
 
-    def calibrate(self, inputs: ArrayLike, targets: ArrayLike) -> Self:
-        """Scales all covariances by one factor, which makes samples not learned from most probable.
-
-        Samples of one motion are alike, so that what was learned from some is too sure of others:
-        these should come from motions, or people, apart.
-
-        Args:
-            inputs: (n, p).
-            targets: (n, D).
-
-        Raises:
-            ValueError: wrong shapes, values that are not finite.
-        """
-        self.inflation_ = 1.0
-        found = self.components(inputs)
-        targets = checked_pairs(inputs, targets).targets
-
-        def loss(log_factor: float) -> float:
-            inflation = np.exp(log_factor) * found.inflation
-            return -float(replace(found, inflation=inflation).log_density(targets).mean())
-
-        best = minimize_scalar(loss, bounds=(-2.0, 5.0), method='bounded')
-        self.inflation_ = float(np.exp(best.x))
-        return self
-
-    # ---- learning
+    # Learning.
 
     def _check_parameters(self) -> None:
-        checked_scaling(self.scaling)
-        for name, value, least in (
-            ('n_experts', self.n_experts, 1),
-            ('max_kernels', self.max_kernels, 1),
-            ('n_starts', self.n_starts, 1),
-            ('max_iterations', self.max_iterations, 1),
-        ):
-            if value < least:
-                raise ValueError(f'{name} is {value}, wanted at least {least}')
+        for name in ('n_experts', 'max_kernels', 'n_starts', 'max_iterations'):
+            if getattr(self, name) < 1:
+                raise ValueError(f'{name} is {getattr(self, name)}, wanted at least 1')
         if self.basis not in BASES:
             raise ValueError(f'basis is {self.basis!r}, wanted one of {", ".join(BASES)}')
         if self.learning not in LEARNING:
@@ -269,32 +212,33 @@ class ExpertMixture(ConditionalDensity):
         if self.width is not None and not self.width > 0:
             raise ValueError(f'width is {self.width}, wanted a positive number or None')
 
-    def _regression_prior(self) -> RegressionPrior:
-        strength = 0.0 if self.learning == 'maximum_likelihood' else self.n_outputs_ + 3.0
-        return RegressionPrior(strength, strength * NOISE_FLOOR * np.eye(self.n_outputs_))
-
     def _bases(self, pairs: TrainingPairs) -> list[Basis]:
-        """Candidates with each width that is to be tried."""
+        """The candidate basis functions, for each candidate width."""
         if self.basis == 'linear':
             return [LinearBasis(self._scaling)]
         rng = np.random.default_rng(self.seed)
         points = self._scaling.apply(pairs.inputs)
         distance = typical_distance(points, rng)
-        centres = points[spread_centres(points, self.max_kernels, rng)]
+        centres = points[spread_points(points, self.max_kernels, rng)]
         widths = [share * distance for share in WIDTHS] if self.width is None else [self.width]
         return [RadialBasis(self._scaling, centres, width) for width in widths]
 
-    def _begin(self, pairs: TrainingPairs, basis: Basis, first: Array) -> tuple[EMData, EMState]:
-        gates = self._first_gates(basis, pairs, self._scaling)
-        data = EMData(
-            basis.evaluate(pairs.inputs),
-            self._target_scaling.apply(pairs.targets),
-            pairs.weights,
-        )
-        state = EMState((), gates, gates.features(pairs.inputs), -np.inf)
-        return data, m_step(data, state, first, self._expert)
+    def _features(self, pairs: TrainingPairs, basis: Basis) -> TrainingPairs:
+        """Features of the inputs with standardised targets."""
+        targets = self._target_scaling.apply(pairs.targets)
+        return TrainingPairs(basis.evaluate(pairs.inputs), targets, pairs.weights)
 
-    def _best_start(self, pairs: TrainingPairs) -> tuple[Basis, EMData, EMState]:
+    def _begin(
+        self, pairs: TrainingPairs, basis: Basis, first: Array
+    ) -> tuple[TrainingPairs, EMState]:
+        """The features, and the state after an M-step from the first responsibilities."""
+        prior = self.learning != 'maximum_likelihood'
+        gates = self._gates.first(self.n_experts, basis, pairs, self._scaling, prior)
+        features = self._features(pairs, basis)
+        state = EMState((), gates, gates.features(pairs.inputs), -np.inf)
+        return features, m_step(features, state, first, self._expert)
+
+    def _best_start(self, pairs: TrainingPairs) -> tuple[Basis, TrainingPairs, EMState]:
         """The start with the highest bound after a few iterations."""
         rng = np.random.default_rng(self.seed)
         some = pairs
@@ -306,7 +250,7 @@ class ExpertMixture(ConditionalDensity):
             for basis in self._bases(pairs)
             for start in starts
         ]
-        # Half of them are given up after each round.
+        # Each round drops half of the starts.
         for iterations in TRIAL_ITERATIONS:
             trials = [
                 (basis, data, climb(data, state, self._expert, iterations, self.tolerance)[0])
@@ -315,19 +259,15 @@ class ExpertMixture(ConditionalDensity):
             trials.sort(key=lambda trial: -trial[2].bound)
             trials = trials[: (len(trials) + 1) // 2]
         basis, _, state = trials[0]
+        features = self._features(pairs, basis)
         gate_features = state.gates.features(pairs.inputs)
-        data = EMData(
-            basis.evaluate(pairs.inputs),
-            self._target_scaling.apply(pairs.targets),
-            pairs.weights,
-        )
         state = EMState(state.experts, state.gates, gate_features, -np.inf)
-        return basis, data, m_step(data, state, e_step(data, state), self._expert)
+        return basis, features, m_step(features, state, e_step(features, state), self._expert)
 
     def _first_responsibilities(
         self, pairs: TrainingPairs, number: int, rng: np.random.Generator
     ) -> Array:
-        """Clusters of inputs and targets together, in which targets count more or less."""
+        """Responsibilities (N, M) from clusters of inputs and targets, weighted by the start."""
         inputs = self._scaling.apply(pairs.inputs)
         targets = self._target_scaling.apply(pairs.targets)
         share = (0.5, 0.7, 0.9, 0.3)[number % 4]
@@ -337,7 +277,7 @@ class ExpertMixture(ConditionalDensity):
                 np.sqrt(share / targets.shape[1]) * targets,
             ]
         )
-        labels = clusters(points, pairs.weights, self.n_experts, rng)
+        labels = k_means(points, self.n_experts, rng)[1]
         result = np.full((len(pairs), self.n_experts), 0.02 / self.n_experts)
         result[np.arange(len(pairs)), labels] += 0.98
         return result
@@ -347,10 +287,10 @@ class ExpertMixture(ConditionalDensity):
             return maximum_likelihood(sums)
         return maximise_evidence(sums, self._prior, old, rounds=6 if old is None else 3)
 
-    # ---- what is learned
+    # Predictions and files.
 
     def _keep_used(self) -> None:
-        """Leaves kernels out that no expert uses, and prepares what predictions need."""
+        """Drops kernels that no expert uses, and prepares predictions."""
         if isinstance(self.basis_, RadialBasis):
             self._candidates = self.basis_.centres
             self.width_ = self.basis_.width
@@ -358,12 +298,8 @@ class ExpertMixture(ConditionalDensity):
             used = used.astype(np.intp)
             self.basis_ = self.basis_.subset(used[used > 0] - 1)
             self.experts_ = tuple(
-                SparseRegression(
-                    np.searchsorted(used, one.active), one.precisions, one.weights,
-                    one.covariance, one.noise, one.evidence,
-                )
-                for one in self.experts_
-            )  # fmt: skip
+                replace(one, active=np.searchsorted(used, one.active)) for one in self.experts_
+            )
         self._prepare()
 
     def _prepare(self) -> None:
@@ -382,7 +318,6 @@ class ExpertMixture(ConditionalDensity):
             'target_centre': self._target_scaling.centre,
             'target_scale': self._target_scaling.scale,
             'n_experts': np.array(self.n_experts_),
-            'inflation': np.array(self.inflation_),
         }
         if isinstance(self.basis_, RadialBasis):
             arrays['candidates'] = self._candidates
@@ -408,16 +343,66 @@ class ExpertMixture(ConditionalDensity):
         if isinstance(self.basis_, RadialBasis):
             self._candidates = np.asarray(arrays['candidates'])
             self.width_ = self.basis_.width
-        experts = []
-        for i in range(int(arrays['n_experts'])):
-            own = part(f'expert{i}', arrays)
-            experts.append(
-                SparseRegression(
-                    own['active'], own['precisions'], own['weights'], own['covariance'],
-                    own['noise'], np.nan,
-                )
-            )  # fmt: skip
-        self.experts_ = tuple(experts)
-        self.inflation_ = float(arrays['inflation'])
-        self.gates_ = self._gates_of(part('gates', arrays))
+        # Older files have a factor on all covariances.
+        inflation = float(arrays.get('inflation', np.array(1.0)))
+        stored = [part(f'expert{i}', arrays) for i in range(int(arrays['n_experts']))]
+        self.experts_ = tuple(
+            SparseRegression(
+                own['active'], own['precisions'], own['weights'], own['covariance'],
+                inflation * own['noise'], np.nan,
+            )
+            for own in stored
+        )  # fmt: skip
+        self.gates_ = self._gates.of_arrays(part('gates', arrays))
         self._prepare()
+
+
+class ConditionalExperts(ExpertMixture):
+    """The conditional BME (BME 2.2.2): the gates are a softmax of the input, g = softmax(V phi(r)).
+
+    Arguments and attributes are those of `ExpertMixture`.
+    """
+
+    kind = 'conditional_experts'
+    _gates = SoftmaxGates
+
+
+class JointExperts(ExpertMixture):
+    """The joint BME (BME 2.2.3): a mixture over inputs and targets together.
+
+        p(x, r) = sum_i a_i N(r; m_i, C_i) N(x; W_i phi(r), O_i)                    (BME 33)
+
+    Arguments and attributes are those of `ExpertMixture`.
+    """
+
+    kind = 'joint_experts'
+    _gates = GaussianGates
+
+
+class RelevanceVectorRegression(ExpertMixture):
+    """One sparse Bayesian regression, the baseline with a single mode (BME 3).
+
+    Arguments and attributes are those of `ExpertMixture`, without those that choose experts.
+    """
+
+    kind = 'relevance_vector_regression'
+    _gates = SoftmaxGates
+
+    def __init__(
+        self,
+        basis: str = 'rbf',
+        seed: int = 0,
+        *,
+        width: float | None = None,
+        max_kernels: int = 400,
+        max_iterations: int = 100,
+        tolerance: float = 1e-4,
+        scaling: str = 'each',
+    ) -> None:
+        super().__init__(
+            1, basis, seed, width=width, max_kernels=max_kernels, n_starts=1,
+            max_iterations=max_iterations, tolerance=tolerance, scaling=scaling,
+        )  # fmt: skip
+
+    def _expert(self, sums: WeightedSums, old: SparseRegression | None) -> SparseRegression:
+        return maximise_evidence(sums, self._prior, old)

@@ -1,20 +1,19 @@
-"""Gates: which expert is responsible for an input (BME 2.2.2 and 2.2.3).
+"""Gates: the probability that an expert is responsible for an input (BME 2.2.2 and 2.2.3).
 
 `SoftmaxGates` model the choice alone:
 
-    g(r) = softmax(V phi(r)),    V_ik ~ N(0, 1 / b_k),    b_k ~ Gamma(A, B)
+    g(r) = softmax(V phi(r)),    V_ik ~ N(0, 1 / b_k),    b_k ~ Gamma(A, B)         (BME 16)
 
-`GaussianGates` model where each expert's inputs lie:
+`GaussianGates` model where the inputs of each expert lie:
 
-    g_i(r) proportional to a_i N(r; m_i, C_i)
+    g_i(r) = a_i N(r; m_i, C_i) / sum_j a_j N(r; m_j, C_j)                          (BME 32)
 
-Both learn towards responsibilities h (N, M) and never lower
+Both learn from responsibilities h (N, M) and never lower
 
     sum_n s_n sum_i h_ni log g_i(r_n) + penalty
 
-which is their share of the bound that the experts climb. The penalty of the softmax is its log
-prior and the Laplace approximation of the integral over V, that of the Gaussians an inverse
-Wishart.
+which is their share of the bound that EM raises. The penalty of the softmax is its log prior and
+the Laplace approximation of the integral over V; that of the Gaussians is an inverse Wishart prior.
 """
 
 from __future__ import annotations
@@ -29,20 +28,21 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from hmt_ros.experts.basis import Basis, LinearBasis, RadialBasis, basis_of
 from hmt_ros.experts.model_file import Arrays, nested, part
-from hmt_ros.experts.training_pairs import Standardisation
+from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 # Gamma hyperprior of precisions: shape and rate (BME 2.2.2).
 SHAPE, RATE = 1e-2, 1e-4
-# Bounds on precisions: a gate that is as sharp as it likes would never converge.
+# Lower bound of precisions: a gate that may become ever sharper would never converge.
 LEAST_PRECISION = 1e-5
-# A function that determines less than this part of a parameter may be pruned.
+# A function that determines less than this share of a parameter may be pruned.
 USELESS = 0.05
 DAMPING_LIMIT = 1e10
-# Newton steps between two E-steps; the next M-step goes on from there.
-NEWTON_STEPS = 3
+NEWTON_STEPS = 3  # between two E-steps; the next M-step continues from there
+# Kernels of new softmax gates: at most this many, and at most one for this many samples.
+GATE_KERNELS, SAMPLES_PER_KERNEL = 60, 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +50,10 @@ class SoftmaxGates:
     """Multinomial logistic regression with relevance determination.
 
     Attributes:
-        basis: K functions.
+        basis: K basis functions phi.
         weights: (M, K) V.
         precisions: (K,) b.
-        penalty: of the bound, nats.
+        penalty: Share of the bound that does not depend on the responsibilities, nats.
     """
 
     basis: Basis
@@ -63,12 +63,24 @@ class SoftmaxGates:
 
     @classmethod
     def flat(cls, basis: Basis, experts: int) -> SoftmaxGates:
-        """Equal gates of M experts that have learned nothing."""
+        """Equal gates of M experts, before learning."""
         count = len(basis)
         return cls(basis, np.zeros((experts, count)), np.full(count, 1e-1), -np.inf)
 
+    @classmethod
+    def first(
+        cls, experts: int, basis: Basis, pairs: TrainingPairs, scaling: Standardisation, prior: bool
+    ) -> SoftmaxGates:
+        """Gates of M experts before learning, over some of the kernels of the experts' basis."""
+        if experts == 1:
+            basis = LinearBasis(scaling)
+        elif isinstance(basis, RadialBasis):
+            count = min(GATE_KERNELS, max(experts, len(pairs) // SAMPLES_PER_KERNEL))
+            basis = basis.subset(np.arange(min(count, len(basis.centres))))
+        return cls.flat(basis, experts)
+
     def features(self, inputs: Array) -> Array:
-        """What `log_scores` and `learned` want of inputs (n, p)."""
+        """Features (n, K) of inputs (n, p), for `log_scores` and `learned`."""
         return self.basis.evaluate(inputs)
 
     def log_scores(self, features: Array) -> Array:
@@ -78,7 +90,7 @@ class SoftmaxGates:
     def learned(
         self, features: Array, responsibilities: Array, sample_weights: Array
     ) -> tuple[SoftmaxGates, Array]:
-        """Better gates and the features that are left after pruning (n, K')."""
+        """Improved gates, and the features (n, K') that remain after pruning."""
         if len(self.weights) == 1:
             return replace(self, penalty=0.0), features
         problem = _Softmax(features, responsibilities, sample_weights)
@@ -99,17 +111,17 @@ class SoftmaxGates:
         return SoftmaxGates(basis, best.weights, best.precisions, best.penalty), features
 
     def of_experts(self, kept: Index) -> SoftmaxGates:
-        """The gates of some of the experts."""
+        """Gates of some of the experts."""
         return replace(self, weights=self.weights[kept])
 
     def arrays(self) -> Arrays:
-        """For a file."""
+        """Arrays for a file."""
         own = {'weights': self.weights, 'precisions': self.precisions}
         return own | nested('basis', self.basis.arrays())
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> SoftmaxGates:
-        """The gates whose `arrays` these are."""
+        """The gates that `arrays` describes."""
         basis = basis_of(part('basis', arrays))
         return cls(basis, arrays['weights'], arrays['precisions'], 0.0)
 
@@ -122,11 +134,11 @@ class SoftmaxGates:
 
 @dataclass(frozen=True, eq=False)
 class _SoftmaxFit:
-    """Weights with their precisions, and how good they are.
+    """Weights with their precisions, and their share of the bound.
 
     Attributes:
-        value: share of the bound, nats.
-        penalty: the part of it that does not depend on responsibilities.
+        value: Share of the bound, nats.
+        penalty: Part of the value that does not depend on the responsibilities, nats.
         determined: (K,) effective number of parameters of each function, 0 to M.
     """
 
@@ -170,7 +182,7 @@ class _Softmax:
         return result
 
     def newton(self, weights: Array, precisions: Array, steps: int) -> Array:
-        """Damped Newton steps, each accepted by the ratio of true to predicted gain."""
+        """Damped Newton steps; the ratio of true to predicted gain sets the damping."""
         shape = weights.shape
         prior = np.tile(precisions, shape[0])
         likelihood, gates = self.likelihood(weights)
@@ -205,7 +217,7 @@ class _Softmax:
         return weights
 
     def laplace(self, weights: Array, precisions: Array) -> _SoftmaxFit:
-        """The share of the bound, with the integral over weights approximated at their optimum."""
+        """The share of the bound, with a Laplace approximation at the weights."""
         experts, count = weights.shape
         likelihood, gates = self.likelihood(weights)
         hessian = self.curvature(gates)
@@ -214,7 +226,7 @@ class _Softmax:
         half_log_det = float(np.log(np.diagonal(factor)).sum())
         penalty = -0.5 * float((precisions * weights**2).sum()) - half_log_det
         penalty += 0.5 * experts * float(np.log(precisions).sum())
-        # Relative to a precision at the top of its hyperprior, so that functions can be left out.
+        # Relative to the mode of the hyperprior, so that pruning a function costs nothing.
         hyper = SHAPE * np.log(precisions * RATE / SHAPE) - RATE * precisions + SHAPE
         penalty += float(hyper.sum())
         inverse = solve_triangular(factor, np.eye(len(factor)), lower=True)
@@ -236,13 +248,13 @@ class GaussianGates:
     """Where the inputs of each expert lie.
 
     Attributes:
-        standardisation: r -> z.
+        standardisation: Maps inputs r to z.
         log_shares: (M,) log a.
         means: (M, p) m, standardised.
         covariances: (M, p, p) C, standardised.
-        strength: samples that the prior of C counts for.
+        strength: Strength of the prior of C, in samples.
         target: (p, p) covariance that the prior pulls to.
-        penalty: of the bound, nats.
+        penalty: Share of the bound that does not depend on the responsibilities, nats.
     """
 
     standardisation: Standardisation
@@ -261,12 +273,33 @@ class GaussianGates:
         log_det = 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
         object.__setattr__(self, '_log_dets', log_det)
 
+    @classmethod
+    def first(
+        cls, experts: int, basis: Basis, pairs: TrainingPairs, scaling: Standardisation, prior: bool
+    ) -> GaussianGates:
+        """Gates of M experts before learning, with or without a prior of their covariances."""
+        p = pairs.inputs.shape[1]
+        share = pairs.weights / pairs.weights.sum()
+        z = scaling.apply(pairs.inputs)
+        variances = np.maximum(share @ (z - share @ z) ** 2, 1e-6)
+        # Experts divide the space of inputs between them.
+        target = np.diag(variances) * experts ** (-2.0 / p)
+        return cls(
+            scaling,
+            np.full(experts, -np.log(experts)),
+            np.zeros((experts, p)),
+            np.broadcast_to(target, (experts, p, p)).copy(),
+            p + 1.0 if prior else 0.0,
+            target,
+            0.0,
+        )
+
     def features(self, inputs: Array) -> Array:
         """Standardised inputs (n, p)."""
         return self.standardisation.apply(inputs)
 
     def log_scores(self, features: Array) -> Array:
-        """log a_i N(r; m_i, C_i), (n, M), not normalised over experts; r standardised."""
+        """log a_i N(r; m_i, C_i), (n, M), not normalised over experts, of standardised r (n, p)."""
         whiteners: Array = self.__dict__['_whiteners']
         log_dets: Array = self.__dict__['_log_dets']
         result = np.empty((len(features), len(self.means)))
@@ -280,7 +313,12 @@ class GaussianGates:
     def learned(
         self, features: Array, responsibilities: Array, sample_weights: Array
     ) -> tuple[GaussianGates, Array]:
-        """Weighted means and covariances (BME 45 to 47) with their prior."""
+        """Weighted shares, means and covariances, the latter with their prior.
+
+        a_i = sum_n h_ni / N                                                    (BME 45)
+        m_i = sum_n h_ni r_n / sum_n h_ni                                       (BME 46)
+        C_i = sum_n h_ni (r_n - m_i) (r_n - m_i)' / sum_n h_ni                  (BME 47)
+        """
         share = responsibilities * sample_weights[:, None]
         total = share.sum(0)
         means = (share.T @ features) / total[:, None]
@@ -299,7 +337,7 @@ class GaussianGates:
         return replace(result, penalty=penalty), features
 
     def of_experts(self, kept: Index) -> GaussianGates:
-        """The gates of some of the experts."""
+        """Gates of some of the experts."""
         shares = self.log_shares[kept]
         return replace(
             self,
@@ -309,7 +347,7 @@ class GaussianGates:
         )
 
     def arrays(self) -> Arrays:
-        """For a file."""
+        """Arrays for a file."""
         return {
             'log_shares': self.log_shares,
             'means': self.means,
@@ -320,7 +358,7 @@ class GaussianGates:
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> GaussianGates:
-        """The gates whose `arrays` these are."""
+        """The gates that `arrays` describes."""
         return cls(
             basis_of(part('basis', arrays)).standardisation,
             arrays['log_shares'],
@@ -332,8 +370,11 @@ class GaussianGates:
         )
 
 
+Gates = SoftmaxGates | GaussianGates
+
+
 def log_softmax(scores: Array) -> Array:
-    """Scores (n, M) less the logarithm of the sum of their exponentials."""
+    """Scores (n, M) minus the logarithm of the sum of their exponentials."""
     result: Array = scores - scores.max(axis=1, keepdims=True)
     result -= np.log(np.exp(result).sum(axis=1, keepdims=True))
     return result

@@ -1,7 +1,7 @@
-"""Learned models in files: one .npz of plain arrays, without pickled objects.
+"""Model files: one .npz of plain arrays, without pickled objects.
 
-An archive names its format, the version of the format and the kind of model, and holds the
-constructor's parameters as JSON besides the learned arrays. A part of a larger file keeps its
+An archive names its format, the version of the format and the kind of model. It holds the
+constructor's parameters as JSON and the learned arrays. A model inside another one keeps its
 arrays under a prefix: `nested` and `part`.
 """
 
@@ -24,21 +24,20 @@ VERSION = 1
 
 Arrays = dict[str, NDArray[Any]]
 
-# Inputs and outputs of a model at most; a descriptor has a few hundred numbers, a pose forty.
+# Maximum number of inputs or outputs of a model; a descriptor has a few hundred, a pose forty.
 MOST_NUMBERS = 10_000
-# What wrong arrays lead to, wherever they are looked at.
+# The exceptions that wrong arrays cause wherever they are used.
 FAULTS = (KeyError, TypeError, ValueError, IndexError, np.linalg.LinAlgError)
 
-# What every archive holds besides the arrays of its kind.
 _HEADER = ('format', 'version', 'kind', 'parameters')
 
 
 def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
-    """The arrays that say what an archive is.
+    """The arrays that identify an archive.
 
     Args:
-        kind: of model.
-        parameters: anything that JSON can hold.
+        kind: Kind of model.
+        parameters: Constructor's parameters; JSON must be able to hold them.
     """
     return {
         'format': np.array(FORMAT),
@@ -48,16 +47,16 @@ def header(kind: str, parameters: Mapping[str, Any]) -> Arrays:
     }
 
 
-def check_header(arrays: Mapping[str, NDArray[Any]], kind: str | None, where: str) -> str:
-    """The kind of model that the arrays are.
+def check_header(arrays: Mapping[str, NDArray[Any]], kind: str | None, where: str) -> None:
+    """Checks the arrays of `header`.
 
     Args:
-        arrays: of an archive.
-        kind: wanted; None for any.
-        where: the name of the file, for messages.
+        arrays: Arrays of an archive.
+        kind: Kind that is wanted; None accepts any.
+        where: Name of the file, for messages.
 
     Raises:
-        ValueError: another format, another version, another kind.
+        ValueError: the format, the version or the kind is another one.
     """
     if any(name not in arrays for name in _HEADER) or str(arrays['format']) != FORMAT:
         raise ValueError(f'{where}: not a model file of hmt_ros; train one with `train`')
@@ -69,31 +68,18 @@ def check_header(arrays: Mapping[str, NDArray[Any]], kind: str | None, where: st
     found = str(arrays['kind'])
     if kind is not None and found != kind:
         raise ValueError(f'{where}: a model of kind {found!r}, wanted {kind!r}; load it as {found}')
-    return found
 
 
 def parameters_of(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """The constructor's parameters that an archive holds."""
+    """The constructor's parameters in an archive."""
     result = json.loads(str(arrays['parameters']))
     if not isinstance(result, dict):
         raise ValueError(f'parameters are a {type(result).__name__}, wanted a mapping')
     return result
 
 
-def shape_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
-    """Numbers of inputs and outputs of a stored model.
-
-    Raises:
-        ValueError: numbers that no model has.
-    """
-    inputs, outputs = (int(n) for n in arrays['shape'])
-    if not (1 <= inputs <= MOST_NUMBERS and 1 <= outputs <= MOST_NUMBERS):
-        raise ValueError(f'{inputs} inputs and {outputs} outputs, wanted 1 to {MOST_NUMBERS}')
-    return inputs, outputs
-
-
 def damaged(where: str, fault: Exception) -> ValueError:
-    """What to raise from one of `FAULTS` of the arrays in a file."""
+    """The error to raise from one of `FAULTS`."""
     text = ' '.join(str(fault).split())
     return ValueError(
         f'{where}: a damaged model file ({type(fault).__name__}: {text}); train it again'
@@ -101,11 +87,11 @@ def damaged(where: str, fault: Exception) -> ValueError:
 
 
 def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
-    """Writes an archive, whole or not at all; the same arrays give the same bytes.
+    """Writes an archive completely or not at all; the same arrays give the same bytes.
 
     Args:
-        path: of the file; '.npz' is appended where it is missing.
-        arrays: with those of `header`.
+        path: File to write; '.npz' is appended where it is missing.
+        arrays: Arrays with those of `header`.
 
     Returns:
         The path written.
@@ -128,11 +114,11 @@ def write_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]]) -> Path:
 
 
 def read_arrays(path: str | Path, kind: str | None = None) -> Arrays:
-    """The arrays of an archive of the kind.
+    """The arrays of an archive.
 
     Raises:
-        FileNotFoundError: no such file.
-        ValueError: not an archive of this format, version and kind.
+        FileNotFoundError: there is no such file.
+        ValueError: the file is not an archive of this format, version and kind.
     """
     path = Path(path)
     if not path.is_file():
@@ -153,12 +139,12 @@ def read_arrays(path: str | Path, kind: str | None = None) -> Arrays:
 
 
 def nested(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
-    """The arrays under names that open with the prefix, to go into a larger archive."""
+    """The arrays with names under a prefix, as part of a larger archive."""
     return {f'{prefix}/{name}': value for name, value in arrays.items()}
 
 
 def part(prefix: str, arrays: Mapping[str, NDArray[Any]]) -> Arrays:
-    """The arrays that `nested` has put under the prefix."""
+    """The arrays that `nested` put under a prefix."""
     opening = f'{prefix}/'
     return {
         name.removeprefix(opening): value

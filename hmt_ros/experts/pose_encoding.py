@@ -1,11 +1,11 @@
-"""The target that experts learn: a pose as it looks from where the camera sees it, without a wrap.
+"""The encoding of poses as targets for experts: as the camera sees them, without wrap-around.
 
-A target has D = 6 + A numbers. The first six are two axes of the pelvis, the one to the front and
-the one up, in the frame of the viewing ray: the camera turned so that its optical axis meets the
-pelvis. The same posture then has the same target wherever in the image it is, and a turning person
-meets no jump from +180 to -180 degrees. The others are the A joint angles, all of which lie within
-limits less than a turn apart. Where the person is, is not part of the target: the look of a
-silhouette does not say it, see `root_placement`.
+A target has D = 6 + A numbers. The first six are the front axis and the up axis of the pelvis, in
+the frame of the viewing ray: the camera, turned so that its optical axis meets the pelvis. One
+posture then has one target wherever it is in the image, and a turning person does not jump from
++180 to -180 degrees. The other numbers are the A joint angles, whose limits span less than a turn.
+The position of the person is not part of the target, because the shape of a silhouette does not
+show it; see `root_placement`.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ AXES = 6
 ROOT = ('root_tx', 'root_ty', 'root_tz')
 TURNS = ('root_z', 'root_y', 'root_x')
 # A mean over opposite headings is a short vector, whose direction means little: its derivative is
-# taken as if it were not shorter than this.
+# computed as if it had at least this length.
 SHORTEST = 0.1
-STEEPEST = np.radians(86.0)  # of the middle root angle; further, the other two fall together
+STEEPEST = np.radians(86.0)  # limit of the middle root angle, near which the other two coincide
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +35,11 @@ class PoseEncoding:
     """Targets of the poses of a body.
 
     Attributes:
-        body: whose root has the degrees of freedom tx, ty, tz, z, y, x in this order, as those that
-            ship.
+        body: Body whose root has the degrees of freedom tx, ty, tz, z, y, x in this order, as the
+            bodies that ship have.
 
     Raises:
-        ValueError: a body with another root.
+        ValueError: the body has another root.
     """
 
     body: Body
@@ -58,17 +58,11 @@ class PoseEncoding:
         """Length of a target, D."""
         return self.body.dimension
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the numbers of a target, (D,)."""
-        axes = tuple(f'{axis}_{c}' for axis in ('front', 'up') for c in 'xyz')
-        return axes + self.body.dof_names[AXES:]
-
     def encode(self, poses: ArrayLike) -> Array:
-        """Targets (N, D) of poses (N, d), whose roots lie before the camera.
+        """Targets (N, D) of poses (N, d), whose roots lie in front of the camera.
 
         Raises:
-            ValueError: poses of wrong shape, not finite, or at the camera's centre.
+            ValueError: poses have a wrong shape, are not finite, or lie at the camera's centre.
         """
         poses = np.asarray(poses, dtype=np.float64)
         turned = root_rotations(self.body, poses)
@@ -77,10 +71,10 @@ class PoseEncoding:
         return np.concatenate([axes, poses[:, AXES:]], axis=1)
 
     def decode(self, targets: ArrayLike, roots: ArrayLike) -> Array:
-        """Poses (N, d) of targets (N, D), with the roots at (N, 3), camera frame, m.
+        """Poses (N, d) of targets (N, D) with roots (N, 3) in the camera frame, m.
 
-        Axes that are not perpendicular are made so, the front first; joint angles beyond the limits
-        of the body are set to them.
+        The axes are made perpendicular, the front axis first. Joint angles are clipped to the
+        limits of the body.
         """
         targets, roots = self._checked(targets, roots)
         poses = np.empty((len(targets), self.body.dimension))
@@ -92,14 +86,14 @@ class PoseEncoding:
         return poses
 
     def jacobians(self, targets: ArrayLike, roots: ArrayLike) -> tuple[Array, Array]:
-        """Derivatives of `decode`: by the targets (N, d, D) and by the roots (N, d, 3).
+        """Derivatives of `decode` with respect to targets (N, d, D) and roots (N, d, 3).
 
-        A joint angle that is set to its limit is taken to move all the same: its spread stays.
+        Clipping of joint angles is ignored, so that their variance stays.
         """
         targets, roots = self._checked(targets, roots)
         n, d = len(targets), self.body.dimension
         poses = self.decode(targets, roots)
-        # Angles from a small rotation of the root: the inverse of the axes that they turn about.
+        # Root angles from a small rotation: the inverse of the axes of the angles.
         axes = forward(self.body.skeleton, poses).axes[3:AXES].transpose(2, 1, 0)  # (N, 3, angle)
         from_rotation = np.linalg.pinv(axes, rcond=np.cos(STEEPEST) / 2)
         by_target, by_root = np.zeros((n, d, d)), np.zeros((n, d, 3))
@@ -112,21 +106,6 @@ class PoseEncoding:
         by_root[:, 3:AXES] = from_rotation @ _rotation_by_root(roots)
         return by_target, by_root
 
-    def decode_gaussian(
-        self, mean: Array, covariance: Array, root: Array, root_covariance: Array
-    ) -> tuple[Array, Array]:
-        """Gaussian over poses, (d,) and (d, d), of one over targets and one over the root.
-
-        By linearisation; target and root are independent.
-
-        Args:
-            mean, covariance: (D,), (D, D) over targets.
-            root, root_covariance: (3,) m, (3, 3) m^2.
-        """
-        by_target, by_root = (x[0] for x in self.jacobians(mean[None], root[None]))
-        result = by_target @ covariance @ by_target.T + by_root @ root_covariance @ by_root.T
-        return self.decode(mean[None], root[None])[0], 0.5 * (result + result.T)
-
     def encoding_jacobian(self, pose: ArrayLike) -> Array:
         """Derivative (D, d) of `encode` at a pose (d,)."""
         pose = np.asarray(pose, dtype=np.float64)[None]
@@ -135,11 +114,12 @@ class PoseEncoding:
         to_ray = ray_rotations(pose[:, :3])[0].T
         axes = forward(self.body.skeleton, pose).axes[3:AXES, :, 0].T  # (3, angle)
         front_up = root_rotations(self.body, pose)[0].T[1:]  # camera frame
+        by_root = _rotation_by_root(pose[:, :3])[0]
         for k, axis in enumerate(front_up):
             rows = slice(3 * k, 3 * k + 3)
-            result[rows, 3:AXES] = to_ray @ -_cross_matrix(axis) @ axes
-            # The frame of the ray turns with the root: seen from it the axis turns back.
-            result[rows, :3] = to_ray @ _cross_matrix(axis) @ _rotation_by_root(pose[:, :3])[0]
+            result[rows, 3:AXES] = to_ray @ np.cross(axes, axis, axisa=0, axisc=0)
+            # The frame of the ray turns with the root, so in it the axis turns back.
+            result[rows, :3] = to_ray @ np.cross(axis, by_root, axisb=0, axisc=0)
         result[AXES:, AXES:] = np.eye(d - AXES)
         return result
 
@@ -154,10 +134,10 @@ class PoseEncoding:
 
 
 def ray_rotations(points: Array) -> Array:
-    """The least rotations (N, 3, 3) that turn the optical axis to points (N, 3).
+    """The smallest rotations (N, 3, 3) that turn the optical axis to points (N, 3).
 
     Raises:
-        ValueError: a point at the camera's centre or straight behind it.
+        ValueError: a point lies at the camera's centre or straight behind it.
     """
     distance = np.linalg.norm(points, axis=1)
     if not (distance > 0).all() or not (points[:, 2] > -0.99 * distance).all():
@@ -172,7 +152,7 @@ def ray_rotations(points: Array) -> Array:
 
 
 def _rotation_by_root(points: Array) -> Array:
-    """Small rotation (N, 3, 3) of the ray's frame, camera frame, by the point (N, 3)."""
+    """Derivatives (N, 3, 3) of the rotation of the ray's frame by points (N, 3), camera frame."""
     distance = np.linalg.norm(points, axis=1)
     direction = points / distance[:, None]
     a, b, c = direction.T
@@ -184,7 +164,7 @@ def _rotation_by_root(points: Array) -> Array:
             [zero, zero, one]]  # fmt: skip
     change = np.array([by_a, by_b, by_c]).transpose(3, 0, 1, 2)  # (N, component, 3, 3)
     skew = change @ ray_rotations(points)[:, None].transpose(0, 1, 3, 2)
-    # A direction keeps its length: only changes across it count, and for these it is a rotation.
+    # A direction keeps its length: only changes across it count.
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
     across /= distance[:, None, None]
     skew = np.einsum('ncij,ncd->ndij', skew, across)
@@ -192,7 +172,7 @@ def _rotation_by_root(points: Array) -> Array:
 
 
 def _orthogonal(axes: Array) -> Array:
-    """Rotations (N, 3, 3) whose second and third columns are nearest to axes (N, 6)."""
+    """Rotations (N, 3, 3) whose second and third columns are those of axes (N, 6)."""
     front = _unit(axes[:, :3])
     up = axes[:, 3:] - (axes[:, 3:] * front).sum(1, keepdims=True) * front
     up = _unit(up)
@@ -205,7 +185,7 @@ def _orthogonal(axes: Array) -> Array:
 
 
 def _rotation_by_axes(axes: Array) -> Array:
-    """Small rotations (N, 3, 6) that axes (N, 6) cause, in the frame that they are given in."""
+    """Derivatives (N, 3, 6) of the rotation of axes (N, 6), in the frame of the axes."""
     front, up = axes[:, :3], axes[:, 3:]
     frame = _orthogonal(axes)
     y, z = frame[:, :, 1], frame[:, :, 2]
@@ -233,12 +213,8 @@ def _rotation_by_axes(axes: Array) -> Array:
 
 
 def _unit(vectors: Array) -> Array:
-    """Unit vectors (N, 3); of a vector of no length the optical axis, against the view."""
+    """Unit vectors (N, 3); a zero vector gives the direction to the camera."""
     norm = np.sqrt((vectors * vectors).sum(1, keepdims=True))
     result: Array = vectors / np.maximum(norm, 1e-9)
     result[norm[:, 0] <= 1e-9] = 0.0, 0.0, -1.0
     return result
-
-
-def _cross_matrix(v: Array) -> Array:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -1,10 +1,10 @@
-"""From a silhouette to a mixture over full poses: descriptor, experts, encoding and placement.
+"""From a silhouette to a mixture over full poses: descriptor, experts, encoding and root.
 
     mask -> centred view -> descriptor -> experts -> mixture over targets
-    mask -> place and size -> root of each component -> mixture over poses
+    mask -> bounding box -> root of each component -> mixture over poses
 
-All that is learned is in one object and one file. With dynamics, which are experts of
-p(x_t | x_t-1, r_t), it also propagates a mixture over time (BME 2.1).
+One object and one file hold everything that is learned. With dynamics, a model of
+p(x_t | x_t-1, r_t), the mixture is also propagated over time (BME 2.1).
 """
 
 from __future__ import annotations
@@ -18,17 +18,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.experts.calibrated_experts import CalibratedExperts
-from hmt_ros.experts.conditional_density import ConditionalDensity
-from hmt_ros.experts.density_propagation import propagate, reduced
+from hmt_ros.experts.conditional_density import ConditionalDensity, stored_model
+from hmt_ros.experts.density_propagation import propagate
 from hmt_ros.experts.descriptor.centred_view import centred_view
-from hmt_ros.experts.descriptor.contour import person_blob
-from hmt_ros.experts.descriptor.silhouette_descriptor import (
-    PlaceAndSize,
-    SilhouetteDescriptor,
-    place_and_size,
-    silhouette_parts,
-)
+from hmt_ros.experts.descriptor.contour import PersonBlob, person_blob
+from hmt_ros.experts.descriptor.silhouette_descriptor import SilhouetteDescriptor, silhouette_parts
 from hmt_ros.experts.model_file import (
     FAULTS,
     Arrays,
@@ -47,50 +41,53 @@ from hmt_ros.experts.root_placement import (
     place_roots,
     placed_gaussians,
 )
-from hmt_ros.experts.stored_models import stored_model
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.reduction import reduced
 
 Array = NDArray[np.float64]
 
+FOLDER = Path(__file__).resolve().parent / 'models'
+# Trained from procedural motions: `train --motions procedural`.
+SHIPPED = 'procedural'
+
 KIND = 'pose_predictor'
 MAX_COMPONENTS = 8
-LIGHTEST = 1e-3  # weight below which a component is left out
-JITTER = 1e-9  # m^2 and rad^2, of a pose
-# Share of p(x_t | r_t) in a mixture that is propagated, so that a track that has lost its way finds
-# back.
+LIGHTEST = 1e-3  # weight below which a component is dropped
+JITTER = 1e-9  # variance that is added to poses, m^2 and rad^2
+# Share of p(x_t | r_t) in a propagated mixture, from which a lost track recovers.
 ANEW = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What was made of a silhouette.
+    """The prediction from a silhouette.
 
     Attributes:
-        mixture: over poses, heaviest component first.
-        place: of the person in the image; its remarks are for the user.
-        placement: of the components, in the order of the mixture.
-        support: 0 to 1, how far the silhouette is like those that were learned from.
+        mixture: Mixture over poses, heaviest component first.
+        place: Person in the image; its remarks are for the user.
+        placement: Roots of the components, in the order of the mixture.
+        support: Support of the silhouette by training data, from 0 to 1.
     """
 
     mixture: GaussianMixture
-    place: PlaceAndSize
+    place: PersonBlob
     placement: RootPlacement
     support: float
 
 
 class PosePredictor:
-    """Mixtures over the poses of a body from silhouettes.
+    """Predicts mixtures over the poses of a body from silhouettes.
 
     Args:
-        body: whose poses are predicted.
-        descriptor: that has learned.
-        model: of p(z | descriptor), that has learned.
-        target_basis: (D, D) B; what models learn is z = B' x of a target x.
-        dynamics: of p(z | previous z, descriptor), that has learned; None: no dynamics.
-        notes: what a file keeps to say where the model comes from; JSON.
+        body: Body of the poses.
+        descriptor: Descriptor that has learned.
+        model: Model of p(z | descriptor) that has learned.
+        target_basis: (D, D) B; models learn z = B' x of a target x.
+        dynamics: Model of p(z | previous z, descriptor) that has learned, or None.
+        notes: Origin of the model, for its file; JSON must be able to hold it.
 
     Raises:
-        ValueError: parts that do not fit each other.
+        ValueError: the parts do not fit each other.
     """
 
     def __init__(
@@ -120,14 +117,14 @@ class PosePredictor:
 
     @property
     def body(self) -> Body:
-        """Whose poses are predicted."""
+        """Body of the predicted poses."""
         return self.encoding.body
 
     def with_body(self, body: Body) -> PosePredictor:
-        """The same predictor for a person of other lengths.
+        """The predictor for a person with other segment lengths.
 
         Raises:
-            ValueError: a body with other degrees of freedom.
+            ValueError: the body has other degrees of freedom.
         """
         _check_body(body, self.body.dof_names, f'this predictor, of {self.body.name}')
         return PosePredictor(
@@ -147,20 +144,20 @@ class PosePredictor:
         max_components: int = MAX_COMPONENTS,
         size_spread: float = SIZE_SPREAD,
     ) -> Prediction:
-        """What a mask (H, W) says about the person in it.
+        """The prediction from the silhouette of a person.
 
         Args:
-            mask: not zero where the person is.
-            camera: that saw it.
-            previous: mixture over poses one step before; taken into account where there are
-                dynamics.
-            max_components: of the mixture at most; the heaviest stay.
-            size_spread: relative standard deviation of the person's size; 0 where the lengths of
-                the body are those of the person.
+            mask: (H, W), not zero in the foreground.
+            camera: Camera of the mask.
+            previous: Mixture over poses one step before, which the dynamics propagate (BME 2.1,
+                rule 1). Without dynamics it is ignored.
+            max_components: Maximum number of components of the mixture; the heaviest stay.
+            size_spread: Relative standard deviation of the person's size; 0 if the body has the
+                lengths of the person.
 
         Raises:
-            NoSilhouetteError: nobody is seen.
-            ValueError: a mask that is not of this camera.
+            NoSilhouetteError: the mask has no person.
+            ValueError: the mask has not the size of the camera's image.
         """
         seen = np.asarray(mask)
         if seen.shape != (camera.height, camera.width):
@@ -169,14 +166,12 @@ class PosePredictor:
                 f'({camera.height}, {camera.width})'
             )
         blob = person_blob(seen)
-        place = place_and_size(blob)
-        parts = silhouette_parts(centred_view(blob, camera), self.descriptor.points)
-        descriptor = self.descriptor.describe_parts([parts])
-        support = float(self.model.support(descriptor)[0])
+        descriptor = self._described(blob, camera)
+        support = float(self.model.support(descriptor[None])[0])
         before = None if previous is None else self._to_targets(previous)
-        targets = self.targets_after(descriptor[0], before, max_components)
+        targets = self.targets_after(descriptor, before, max_components)
         placement = place_roots(
-            self.encoding, camera, place, targets.means, targets.covariances,
+            self.encoding, camera, blob, targets.means, targets.covariances,
             size_spread=size_spread,
         )  # fmt: skip
         means, covariances = placed_gaussians(
@@ -184,27 +179,16 @@ class PosePredictor:
         )
         covariances += JITTER * np.eye(self.encoding.size)
         mixture = GaussianMixture(targets.weights, means, covariances)
-        return Prediction(mixture, place, placement, support)
-
-    def propagate(
-        self, previous: GaussianMixture, mask: ArrayLike, camera: Camera
-    ) -> GaussianMixture:
-        """Mixture over poses given that of the image before (BME 2.1, rule 1).
-
-        Without dynamics, and where no kernel of the dynamics fires, this is `predict`.
-        """
-        return self.observe(mask, camera, previous).mixture
+        return Prediction(mixture, blob, placement, support)
 
     def describe(self, mask: ArrayLike, camera: Camera) -> Array:
-        """Descriptor (p,) of the person in a mask (H, W), seen straight."""
-        view = centred_view(person_blob(mask), camera)
-        parts = silhouette_parts(view, self.descriptor.points)
-        result: Array = self.descriptor.describe_parts([parts])[0]
-        return result
+        """Descriptor (p,) of the person in a mask (H, W)."""
+        return self._described(person_blob(mask), camera)
 
-    def targets(self, descriptors: ArrayLike) -> list[GaussianMixture]:
-        """Mixtures over targets (D,) for descriptors (n, p)."""
-        return [_transformed(x, self._from_basis) for x in self.model.predict(descriptors)]
+    def _described(self, blob: PersonBlob, camera: Camera) -> Array:
+        parts = silhouette_parts(centred_view(blob, camera), self.descriptor.points)
+        result: Array = self.descriptor.describe([parts])[0]
+        return result
 
     def targets_after(
         self,
@@ -216,9 +200,8 @@ class PosePredictor:
 
         Args:
             descriptor: (p,).
-            previous: mixture over targets one step before; taken into account where there are
-                dynamics.
-            max_components: of the mixture at most; the heaviest stay.
+            previous: Mixture over targets one step before; ignored without dynamics.
+            max_components: Maximum number of components of the mixture; the heaviest stay.
         """
         row = np.asarray(descriptor, dtype=np.float64)
         found = _heaviest(self.model.predict(row[None])[0], max_components)
@@ -227,13 +210,13 @@ class PosePredictor:
                 self.dynamics, _transformed(previous, self.target_basis), row, without_past=found,
                 n_components=max_components,
             )  # fmt: skip
-            # The past may be wrong, and rule (1) never gives up what it has once followed.
+            # Rule (1) alone never recovers from a wrong past.
             whole = _blended(after, found, ANEW)
             found = _heaviest(reduced(whole, max_components), max_components)
         return _transformed(found, self._from_basis)
 
     def _to_targets(self, poses: GaussianMixture) -> GaussianMixture:
-        """A mixture over poses as one over targets."""
+        """The mixture over targets of a mixture over poses."""
         slopes = np.stack([self.encoding.encoding_jacobian(mean) for mean in poses.means])
         covariances = slopes @ poses.covariances @ slopes.transpose(0, 2, 1)
         # Axes of unit length have no spread along themselves.
@@ -241,7 +224,7 @@ class PosePredictor:
         return GaussianMixture(poses.weights, self.encoding.encode(poses.means), covariances)
 
     def save(self, path: str | Path) -> Path:
-        """Writes the predictor into an .npz file, without pickled objects, and returns its path."""
+        """Writes the predictor into an .npz file without pickled objects and returns its path."""
         body = self.body
         parameters = {
             'body': body.name,
@@ -263,13 +246,13 @@ class PosePredictor:
         """Reads a predictor that `save` wrote.
 
         Args:
-            path: of the file.
-            body: of the person, with the degrees of freedom that the predictor has learned; None:
-                the shipped body of the name in the file, with the lengths in the file.
+            path: File to read.
+            body: Body of the person, with the degrees of freedom that the predictor has learned.
+                None takes the shipped body of that name, with the lengths in the file.
 
         Raises:
-            FileNotFoundError: no such file.
-            ValueError: not such a file, another version, or another body.
+            FileNotFoundError: there is no such file.
+            ValueError: the file is no predictor, or one of another version or body.
         """
         arrays = read_arrays(path, KIND)
         where = str(path)
@@ -285,11 +268,11 @@ class PosePredictor:
             descriptor = SilhouetteDescriptor.from_arrays(
                 parameters['descriptor'], part('descriptor', arrays)
             )
-            model = stored_model(part('model', arrays), where, CalibratedExperts)
+            model = stored_model(part('model', arrays), where)
             dynamics = part('dynamics', arrays)
             return cls(
                 body, descriptor, model, np.asarray(arrays['target_basis'], dtype=np.float64),
-                stored_model(dynamics, where, CalibratedExperts) if dynamics else None,
+                stored_model(dynamics, where) if dynamics else None,
                 parameters['notes'],
             )  # fmt: skip
         except _WrongBodyError as fault:
@@ -302,8 +285,23 @@ class PosePredictor:
             raise damaged(where, fault) from fault
 
 
+def load_predictor(model: str | Path = SHIPPED) -> PosePredictor:
+    """A predictor that ships, by its name, or one from a file that `train` wrote.
+
+    Raises:
+        FileNotFoundError: there is neither such a name nor such a file.
+        ValueError: the file is no predictor, or one of another version or body.
+    """
+    known = sorted(path.stem for path in FOLDER.glob('*.npz'))
+    if str(model) in known:
+        return PosePredictor.load(FOLDER / f'{model}.npz')
+    if not Path(model).is_file():
+        raise FileNotFoundError(f'{model}: no such model; wanted a file, or one of {known}')
+    return PosePredictor.load(model)
+
+
 class _WrongBodyError(ValueError):
-    """A body that a predictor was not trained for."""
+    """Raised for a body that a predictor was not trained for."""
 
 
 def _check_body(body: Body, names: Sequence[str], where: str) -> None:
@@ -332,7 +330,7 @@ def _heaviest(mixture: GaussianMixture, count: int) -> GaussianMixture:
 
 
 def _blended(a: GaussianMixture, b: GaussianMixture, share: float) -> GaussianMixture:
-    """The components of both, with this share of the weight for those of b."""
+    """The components of a and b, with this share of the weight for those of b."""
     weights = (1.0 - share) * a.normalised().weights, share * b.normalised().weights
     return GaussianMixture(
         np.concatenate(weights),
@@ -342,7 +340,7 @@ def _blended(a: GaussianMixture, b: GaussianMixture, share: float) -> GaussianMi
 
 
 def _transformed(mixture: GaussianMixture, basis: Array) -> GaussianMixture:
-    """The mixture of B' x for x of a mixture."""
+    """The mixture over B' x of a mixture over x."""
     covariances = basis.T @ mixture.covariances @ basis
     covariances = 0.5 * (covariances + covariances.transpose(0, 2, 1))
     return GaussianMixture(mixture.weights, mixture.means @ basis, covariances)

@@ -1,7 +1,10 @@
-"""Learning of a pose predictor, and what a training set says of how ambiguous silhouettes are.
+"""Learning of a pose predictor: its models by name, its training, and reports on ambiguity.
 
-The reports are those of BME: affinity matrices of poses and of descriptors (fig. 7), and the number
-of clusters of poses that fall under one cluster of descriptors (fig. 6).
+The reports are those of BME 3: affinity matrices of poses and of descriptors (fig. 7), and the
+number of clusters of poses under one cluster of descriptors (fig. 6).
+
+How many experts a model has, how stiff they are and how many components of the descriptor it sees
+was chosen on motions of other people, so numbers on those motions are optimistic.
 """
 
 from __future__ import annotations
@@ -16,54 +19,137 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body
 from hmt_ros.experts.calibrated_experts import CalibratedExperts
 from hmt_ros.experts.conditional_density import ConditionalDensity
-from hmt_ros.experts.descriptor.shape_context import cluster_centres, squared_distances
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
     SilhouetteDescriptor,
-    SilhouetteParts,
     silhouette_parts,
 )
+from hmt_ros.experts.expert_mixture import (
+    ConditionalExperts,
+    JointExperts,
+    RelevanceVectorRegression,
+)
+from hmt_ros.experts.neighbour_models import LocalExperts, NearestNeighbours
 from hmt_ros.experts.pose_encoding import PoseEncoding
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.experts.training_pairs import finite_matrix
 from hmt_ros.experts.training_set import TrainingSet
+from hmt_ros.inference.clustering import k_means, squared_distances
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Bytes = NDArray[np.uint8]
 Progress = Callable[[Iterable[Bytes], int], Iterable[Bytes]]
 
-FOR_DESCRIPTOR = 3000  # silhouettes that the descriptor learns from at most
-FOR_BASIS = 600  # poses that the metric of targets is averaged over at most
-AWAY = 5.0  # m, depth of the poses in that average
-SMALLEST = 3e-3  # m per radian, of a number that moves no joint: it counts a little all the same
-# Added to the previous states that dynamics learns from, in their standard deviations: what comes
-# before is an estimate, not the truth.
+SAMPLES_PER_EXPERT = 40  # minimum for a linear expert of the joint model
+NEIGHBOURS = 40  # of the local model
+WIDTH = 3.0  # of the kernels of the conditional model, in standard deviations of an input
+
+FOR_DESCRIPTOR = 3000  # maximum number of silhouettes that the descriptor learns from
+FOR_BASIS = 600  # maximum number of poses that the metric of targets is averaged over
+AWAY = 5.0  # depth of the poses in that average, m
+SMALLEST = 3e-3  # metric of a number that moves no joint, m per radian
+# Standard deviation of the noise that is added to previous states for the learning of dynamics, in
+# units of theirs: a previous state is an estimate, not the truth.
 STATE_NOISE = 0.5
+
+
+@dataclass(frozen=True)
+class ModelKind:
+    """How a model is made.
+
+    Attributes:
+        make: Makes the model from a number of experts, a seed and, if known, the number of samples.
+            The baselines take the first as the number of neighbours, or ignore it.
+        experts: Default number of experts M.
+        components: Number of components of the descriptor that the model sees.
+        dynamics_experts: Number of experts of p(x_t | x_t-1, r_t); None takes M.
+        few: Whether each expert needs many samples, so that few samples have few experts.
+        folds: Number of parts of the motions for calibration; fewer where learning is slow.
+    """
+
+    make: Callable[[int, int, int | None], ConditionalDensity]
+    experts: int
+    components: int = 64
+    dynamics_experts: int | None = None
+    few: bool = False
+    folds: int = 3
+
+
+def _local(experts: int, seed: int, samples: int | None) -> ConditionalDensity:
+    # A third of the samples is left out at a time, and the neighbours are among the others.
+    neighbours = NEIGHBOURS if samples is None else max(min(NEIGHBOURS, samples // 3), 8)
+    return LocalExperts(experts, neighbours, seed=seed)
+
+
+def _conditional(experts: int, seed: int, _: int | None) -> ConditionalDensity:
+    return ConditionalExperts(
+        experts, scaling='common', seed=seed, width=WIDTH, n_starts=1, max_iterations=5,
+        max_kernels=200,
+    )  # fmt: skip
+
+
+def _joint(experts: int, seed: int, _: int | None) -> ConditionalDensity:
+    # Many linear experts follow folds for which a few experts with kernels are too stiff.
+    return JointExperts(
+        experts, 'linear', scaling='common', seed=seed, n_starts=1, max_iterations=12
+    )
+
+
+KINDS = {
+    'local': ModelKind(_local, 5),
+    'conditional': ModelKind(_conditional, 16, 20, 6, few=True, folds=2),
+    'joint': ModelKind(_joint, 120, 20, 40, few=True, folds=2),
+    'relevance-vector': ModelKind(
+        lambda _, seed, __: RelevanceVectorRegression(scaling='common', seed=seed), 1
+    ),
+    'nearest': ModelKind(lambda experts, _, __: NearestNeighbours(experts, scaling='common'), 5),
+}
+
+
+def new_model(
+    name: str, experts: int | None = None, seed: int = 0, samples: int | None = None
+) -> ConditionalDensity:
+    """A calibrated model before learning.
+
+    Args:
+        name: Name in `KINDS`.
+        experts: Number of experts M; None takes the default. Few samples have fewer.
+        seed: Seed of the model.
+        samples: Number of samples that it will learn from.
+
+    Raises:
+        ValueError: there is no such model.
+    """
+    if name not in KINDS:
+        raise ValueError(f'no model {name!r}, wanted one of {", ".join(sorted(KINDS))}')
+    kind = KINDS[name]
+    count = kind.experts if experts is None else experts
+    if kind.few and samples is not None:
+        count = max(min(count, samples // SAMPLES_PER_EXPERT), 1)
+    return CalibratedExperts(kind.make(count, seed, samples), kind.folds)
 
 
 @dataclass(frozen=True, eq=False)
 class Described:
-    """A training set as numbers.
+    """Descriptors and targets of a training set.
 
     Attributes:
-        descriptor: that has learned.
-        parts: (N,) views of the silhouettes.
+        descriptor: Descriptor that has learned from the silhouettes.
         descriptors: (N, p).
         targets, previous: (N, D) encoded poses, and those one step before.
-        motions: (N,) the number of the motion that a sample is of.
+        motions: (N,) number of the motion of each sample.
     """
 
     descriptor: SilhouetteDescriptor
-    parts: list[SilhouetteParts]
     descriptors: Array
     targets: Array
     previous: Array
     motions: Index
 
     def with_components(self, count: int) -> Described:
-        """The same with the first components of the descriptor alone, `count` at most.
+        """The training set with at most `count` components of the descriptor.
 
-        Full covariances of inputs want fewer of them than distances to neighbours.
+        Full covariances of inputs need fewer components than distances to neighbours.
         """
         count = min(count, self.descriptor.size)
         return replace(
@@ -82,10 +168,10 @@ def described(
     """Descriptors and targets of a training set.
 
     Args:
-        body: of the poses.
-        pairs: silhouettes and poses.
-        descriptor: that is to learn; None: the usual one.
-        progress: goes through the silhouettes, and is told how many there are.
+        body: Body of the poses.
+        pairs: Silhouettes and poses.
+        descriptor: Descriptor that learns; None takes the default.
+        progress: Iterates over the silhouettes, given their number.
     """
     descriptor = descriptor or SilhouetteDescriptor()
     masks: Iterable[Bytes] = pairs.masks()
@@ -93,10 +179,10 @@ def described(
         masks = progress(masks, len(pairs))
     parts = [silhouette_parts(mask, descriptor.points) for mask in masks]
     some = np.random.default_rng(descriptor.seed).permutation(len(parts))[:FOR_DESCRIPTOR]
-    descriptor.fit_parts([parts[i] for i in np.sort(some)])
+    descriptor.fit([parts[i] for i in np.sort(some)])
     encoding = PoseEncoding(body)
     return Described(
-        descriptor, parts, descriptor.describe_parts(parts), encoding.encode(pairs.poses),
+        descriptor, descriptor.describe(parts), encoding.encode(pairs.poses),
         encoding.encode(pairs.previous), pairs.sequences,
     )  # fmt: skip
 
@@ -112,20 +198,20 @@ def learned_predictor(
     """A predictor that has learned from a training set.
 
     Args:
-        body: of the poses.
-        training: described.
-        model: that is to learn p(z | descriptor).
-        dynamics: that is to learn p(z | previous z, descriptor), or None.
-        notes: kept in the file.
-        seed: of the noise of previous states.
+        body: Body of the poses.
+        training: Descriptors and targets.
+        model: Model that learns p(z | descriptor).
+        dynamics: Model that learns p(z | previous z, descriptor), or None.
+        notes: Notes for the file.
+        seed: Seed of the noise of previous states.
 
     Raises:
-        ValueError: too few samples, or some that are not finite.
+        ValueError: there are too few samples, or some are not finite.
     """
     for name in ('descriptors', 'targets', 'previous'):
         finite_matrix(getattr(training, name), name, '(N, ...)')
     basis = target_basis(PoseEncoding(body), training.targets)
-    # As much variance in states as in descriptors: dynamics measures distances over both.
+    # States and descriptors get the same variance: dynamics measure distances over both.
     spread = float((training.targets @ basis).var(0).sum())
     basis = basis * np.sqrt(training.descriptors.var(0).sum() / max(spread, 1e-12))
     states = training.targets @ basis
@@ -141,7 +227,7 @@ def learned_predictor(
 
 def _learn(model: ConditionalDensity, inputs: Array, targets: Array, motions: Index) -> None:
     if isinstance(model, CalibratedExperts):
-        # Of a single motion stretches of time are left out.
+        # With a single motion, intervals of time are left out.
         several = len(np.unique(motions)) > 1
         model.fit(inputs, targets, groups=motions if several else None)
     else:
@@ -149,9 +235,9 @@ def _learn(model: ConditionalDensity, inputs: Array, targets: Array, motions: In
 
 
 def target_basis(encoding: PoseEncoding, targets: Array) -> Array:
-    """(D, D) B with |B' dx| the distance that the joints move for a change dx of a target, m.
+    """(D, D) B such that |B' dx| is the distance that joints move for a change dx of a target, m.
 
-    Root mean square over joints other than the pelvis, on average over the targets (N, D). A change
+    The root mean square over all joints but the pelvis, averaged over the targets (N, D). A change
     of a wrist then counts less than one of a hip.
     """
     chosen = targets[:: max(len(targets) // FOR_BASIS, 1)][:FOR_BASIS]
@@ -168,7 +254,7 @@ def target_basis(encoding: PoseEncoding, targets: Array) -> Array:
 
 
 def affinities(vectors: Array) -> Array:
-    """Affinities (n, n) of vectors (n, q): exp(-d^2 / 2 s^2), s the median distance."""
+    """Affinities (n, n) of vectors (n, q): exp(-d^2 / 2 s^2), s the median d (BME fig. 7)."""
     squared = squared_distances(vectors, vectors)
     off = squared[~np.eye(len(squared), dtype=bool)]
     scale = max(float(np.median(off)) if len(off) else 1.0, 1e-12)
@@ -177,24 +263,23 @@ def affinities(vectors: Array) -> Array:
 
 
 def multimodality(inputs: Array, targets: Array, clusters: int, seed: int = 0) -> Index:
-    """How many clusters of targets fall under each cluster of inputs (BME fig. 6).
+    """The number of clusters of targets under each cluster of inputs (BME fig. 6).
 
     Args:
-        inputs: (N, p), clustered for themselves.
-        targets: (N, D), clustered for themselves.
-        clusters: of either.
-        seed: of the clustering.
+        inputs, targets: (N, p) and (N, D); they are clustered independently.
+        clusters: Number of clusters of inputs, and of targets.
+        seed: Seed of the clustering.
 
     Returns:
         (H,) number of clusters of inputs under which 1, 2, ... H clusters of targets fall.
 
     Raises:
-        ValueError: more clusters than samples.
+        ValueError: there are more clusters than samples.
     """
     if not 1 <= clusters <= len(inputs):
         raise ValueError(f'{clusters} clusters of {len(inputs)} samples')
     labels = [
-        squared_distances(x, cluster_centres(x, clusters, seed, sweeps=5)).argmin(1)
+        k_means(x, clusters, np.random.default_rng(seed), iterations=5)[1]
         for x in (inputs, targets)
     ]
     pairs = np.unique(np.stack(labels, axis=1), axis=0)

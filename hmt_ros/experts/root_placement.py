@@ -1,16 +1,17 @@
-"""Where the root of a predicted posture is, from the place and the size of the silhouette.
+"""The position of a predicted posture, from the position and the size of the silhouette.
 
-The look of a silhouette says nothing of depth; its size against that of the posture does. The root
-is moved until the flesh of the posture, projected exactly, has the box of the silhouette:
+The shape of a silhouette does not show the depth; its size relative to that of the posture does.
+The root is moved until the flesh of the posture, projected exactly, has the bounding box of the
+silhouette. With the residual r(t), the sides of the box of the flesh at root t minus those of the
+silhouette, and J = dr/dt, the Gauss-Newton step is
 
-    r(t) = sides of the box of the flesh at root t, minus those seen,
-    t <- t - (J' S^-1 J + P^-1)^-1 (J' S^-1 r + P^-1 (t - t_0)),   S = J_x C J_x' + noise,
+    t <- t - (J' S^-1 J + P^-1)^-1 (J' S^-1 r + P^-1 (t - t_0)),   S = J_x C J_x' + noise
 
-Gauss-Newton with J = dr/dt. C is the covariance of the predicted posture: an arm that may as well
-hang says little about the width. P is wide. A side at which the border of the image cuts the
-person only says that the person reaches it; the root then depends more on the other sides and on
-P, and its covariance is widened. The person may be larger or smaller than the body, which stretches
-all distances from the camera alike.
+C is the covariance of the predicted posture, which has the derivative J_x: an arm that may also
+hang down says little about the width. P is a wide prior. A side at which the border of the image
+cuts the person only says that the person reaches that border. The root then depends on the other
+sides and on P, and its covariance is larger. A person may be larger or smaller than the body, which
+scales all distances from the camera alike.
 """
 
 from __future__ import annotations
@@ -24,38 +25,38 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import Frames, forward
-from hmt_ros.experts.descriptor.silhouette_descriptor import PlaceAndSize
+from hmt_ros.experts.descriptor.contour import PersonBlob
 from hmt_ros.experts.pose_encoding import PoseEncoding
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-STACKS, SLICES = 9, 12  # of the mesh whose box is taken: within 1 % of the radius of a part
-SIZE_SPREAD = 0.06  # relative, of persons' sizes against the body's
-CUT_SPREAD = 0.15  # the same, of what the rest of a person says who is cut
-# Of a side of the box: noise of the outline, px, and what hair, clothes and shoes add, as a share
-# of the longer side of the box.
+STACKS, SLICES = 9, 12  # of the mesh; its box is exact to 1 % of the radius of a part
+SIZE_SPREAD = 0.06  # relative standard deviation of the size of persons
+CUT_SPREAD = 0.15  # additional one for a person whom the border cuts
+# Standard deviation of a side of the box: of the outline, px, and of hair, clothes and shoes, as a
+# share of the longer side of the box.
 OUTLINE_SIGMA, CLOTHES = 1.5, 0.02
-# Relative deviation of the depth, and of the place across in units of depth, before the box counts.
+# Prior standard deviations along and across the line of sight, as shares of the distance.
 DEPTH_SPREAD, ACROSS_SPREAD = 0.7, 1.0
 STEPS = 10
-DONE = 1e-3  # relative to the depth
-TURNED = 0.05  # share of the depth: a step that turns the line of sight this far, as an angle
-LONGEST_STEP = 0.4  # shares of the depth
+# Steps as shares of the depth: the end of the iterations, the length from which the derivatives of
+# the encoding are computed again, and the maximum length.
+DONE, TURNED, LONGEST_STEP = 1e-3, 0.05, 0.4
 
 
 @dataclass(frozen=True, eq=False)
 class RootPlacement:
-    """Places of the roots of M postures.
+    """Roots of M postures.
 
     Attributes:
-        roots: (M, 3) camera frame, m.
-        covariances: (M, 3, 3) with the postures as they are, m^2.
-        by_targets: (M, 3, D) derivatives of the roots by the targets of the postures.
-        misfits: (M,) root mean squared distance between the sides of the boxes, px; of sides that
-            are cut what is missing.
-        cut: whether the border of the image cuts the person, so that the depth is a guess at best.
-        jacobians: of the encoding at the postures and their roots.
+        roots: (M, 3) in the camera frame, m.
+        covariances: (M, 3, 3) for fixed postures, m^2.
+        by_targets: (M, 3, D) derivatives of the roots with respect to the targets of the postures.
+        misfits: (M,) root mean squared distance between the sides of the boxes, px; for a side that
+            is cut, the part that is missing.
+        cut: Whether the border of the image cuts the person, which makes the depth uncertain.
+        jacobians: Derivatives of the encoding at the postures and their roots.
     """
 
     roots: Array
@@ -69,25 +70,25 @@ class RootPlacement:
 def place_roots(
     encoding: PoseEncoding,
     camera: Camera,
-    place: PlaceAndSize,
+    place: PersonBlob,
     targets: Array,
     covariances: Array,
     *,
     size_spread: float = SIZE_SPREAD,
 ) -> RootPlacement:
-    """Places of the roots of postures that a silhouette may be of.
+    """Roots of the postures that were predicted from a silhouette.
 
     Args:
-        encoding: of the body, with flesh.
-        camera: that saw the silhouette.
-        place: of the silhouette.
+        encoding: Encoding of the body, which has flesh.
+        camera: Camera of the silhouette.
+        place: Person in the image.
         targets: (M, D) predicted.
         covariances: (M, D, D) of the prediction.
-        size_spread: relative standard deviation of the person's size; 0 where the lengths of the
-            body are those of the person.
+        size_spread: Relative standard deviation of the person's size; 0 if the body has the lengths
+            of the person.
 
     Raises:
-        ValueError: a body without flesh.
+        ValueError: the body has no flesh.
     """
     body = encoding.body
     if not body.shapes:
@@ -99,16 +100,20 @@ def place_roots(
     roots = _first_roots(encoding, camera, sides, targets)
     start, prior = roots.copy(), _prior(roots)
     nearest = 1.05 * body.lower[2]
-    slopes = encoding.jacobians(targets, roots)
-    for _ in range(STEPS):
+
+    def linearised(slopes: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
+        """r, J and J_x at the roots, and J' S^-1."""
         residual, by_root, by_target = _box_error(
             encoding, mesh, camera, targets, roots, slopes, sides, cut
         )
         spread = by_target @ covariances @ by_target.transpose(0, 2, 1) + noise * np.eye(4)
-        weighted = np.linalg.solve(spread, by_root).transpose(0, 2, 1)
-        precision = weighted @ by_root + prior
+        return residual, by_root, by_target, np.linalg.solve(spread, by_root).transpose(0, 2, 1)
+
+    slopes = encoding.jacobians(targets, roots)
+    for _ in range(STEPS):
+        residual, by_root, _, weighted = linearised(slopes)
         pull = weighted @ residual[..., None] + prior @ (roots - start)[..., None]
-        step = -np.linalg.solve(precision, pull)[..., 0]
+        step = -np.linalg.solve(weighted @ by_root + prior, pull)[..., 0]
         depth = roots[:, 2]
         share = np.linalg.norm(step, axis=1) / depth
         step *= np.minimum(1.0, LONGEST_STEP / np.maximum(share, 1e-12))[:, None]
@@ -119,11 +124,7 @@ def place_roots(
         if share.max() > TURNED:
             slopes = encoding.jacobians(targets, roots)
     slopes = encoding.jacobians(targets, roots)
-    residual, by_root, by_target = _box_error(
-        encoding, mesh, camera, targets, roots, slopes, sides, cut
-    )
-    spread = by_target @ covariances @ by_target.transpose(0, 2, 1) + noise * np.eye(4)
-    weighted = np.linalg.solve(spread, by_root).transpose(0, 2, 1)
+    residual, by_root, by_target, weighted = linearised(slopes)
     gain = np.linalg.solve(weighted @ by_root + prior, weighted)  # (M, 3, 4)
     left = np.eye(3) - gain @ by_root
     own = noise * gain @ gain.transpose(0, 2, 1)
@@ -137,14 +138,14 @@ def place_roots(
 def placed_gaussians(
     encoding: PoseEncoding, targets: Array, covariances: Array, placement: RootPlacement
 ) -> tuple[Array, Array]:
-    """Gaussians over poses, (M, d) and (M, d, d), of postures that were placed.
+    """Gaussians over poses, (M, d) and (M, d, d), from Gaussians over targets and their placement.
 
-    The root follows the posture: another posture would be placed where its box is the one seen.
+    The root moves with the posture so that the box stays that of the silhouette.
 
     Args:
-        encoding: of the body.
+        encoding: Encoding of the body.
         targets, covariances: (M, D), (M, D, D) of the postures.
-        placement: of the same postures.
+        placement: Placement of these postures.
     """
     by_target, by_root = placement.jacobians
     whole = by_target + by_root @ placement.by_targets
@@ -160,7 +161,7 @@ def _mesh(body: Body) -> Mesh:
 
 
 def _first_roots(encoding: PoseEncoding, camera: Camera, sides: Array, targets: Array) -> Array:
-    """Roots (M, 3) where the middle of the box is, as far as its diagonal says."""
+    """Roots (M, 3) on the ray of the middle of the box, at the depth that its diagonal gives."""
     left, top, right, bottom = sides
     middle = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
     ray, first, second = camera.rays(np.array([middle, [left, top], [right, bottom]]))
@@ -175,7 +176,7 @@ def _first_roots(encoding: PoseEncoding, camera: Camera, sides: Array, targets: 
 
 
 def _prior(roots: Array) -> Array:
-    """Precisions (M, 3, 3) of the places before the box is compared."""
+    """Precisions (M, 3, 3) of the prior of the roots."""
     distance = np.linalg.norm(roots, axis=1)
     along = roots / distance[:, None]
     outer = along[:, :, None] * along[:, None, :]
@@ -195,18 +196,18 @@ def _box_error(
     sides: Array,
     cut: NDArray[np.bool_],
 ) -> tuple[Array, Array, Array]:
-    """Sides of the boxes of M postures minus those seen (M, 4), and their derivatives.
+    """Sides of the boxes of M postures minus those of the silhouette, and their derivatives.
 
-    `slopes` are the Jacobians of the encoding about there.
+    `slopes` are the Jacobians of the encoding near these postures and roots.
 
     Returns:
-        residuals (M, 4), by the roots (M, 4, 3), by the targets (M, 4, D).
+        residuals (M, 4), derivatives with respect to roots (M, 4, 3) and to targets (M, 4, D).
     """
     poses = encoding.decode(targets, roots)
     by_target, by_root = slopes
     frames = forward(encoding.body.skeleton, poses)
     points = frames.points(mesh.segments, mesh.vertices)  # (V, 3, M)
-    points[:, 2] = np.maximum(points[:, 2], 0.05)  # a hand behind the camera is at its plane
+    points[:, 2] = np.maximum(points[:, 2], 0.05)  # a hand may be behind the camera
     u, v = camera.project_with_derivative(points.transpose(1, 0, 2), derivative=False)[0]
     outermost = np.stack([u.argmin(0), v.argmin(0), u.argmax(0), v.argmax(0)], axis=1)  # (M, 4)
     rows = np.arange(len(poses))[:, None]
@@ -218,7 +219,7 @@ def _box_error(
     slope = np.stack([by_point[c, :, :, k].T for k, c in enumerate(coordinate)], axis=1)
     by_pose = np.einsum('mkc,mkdc->mkd', slope, _by_pose(frames, mesh, outermost, chosen))
     residual = value - sides
-    # Where the image ends the person reaches it, and how far beyond is not known.
+    # The person reaches the border of the image; how far beyond is unknown.
     outwards = np.array([-1.0, -1.0, 1.0, 1.0])
     unknown = cut & (residual * outwards >= 0)
     residual[unknown] = 0.0
@@ -227,7 +228,7 @@ def _box_error(
 
 
 def _by_pose(frames: Frames, mesh: Mesh, vertices: Index, points: Array) -> Array:
-    """Derivatives (M, 4, d, 3) of points (M, 4, 3) on the segments of vertices, by their poses."""
+    """Derivatives (M, 4, d, 3) with respect to poses, of points (M, 4, 3) at some vertices."""
     skeleton = frames.skeleton
     axes, origins = frames.dofs_by_pose()  # (M, d, 3)
     arm = points[:, :, None] - origins[:, None]

@@ -1,18 +1,18 @@
-"""Sparse Bayesian regression with several outputs, by greedy evidence maximisation (BME 2.2).
+"""Sparse Bayesian regression with several outputs, by greedy evidence maximisation (BME 2.2.2).
 
     X = Phi W + E,   E_n ~ N(0, O / h_n),   W ~ MN(0, A^-1, O),   A = diag(precisions)
 
-Samples have weights h, the outputs share one subset of basis functions and one precision for each
-of them, and the prior of the weights has the noise's covariance across outputs. With this choice
-everything is in closed form: with L = A + Phi' H Phi, the posterior of W is MN(M, L^-1, O),
+Samples have weights h. All outputs share one subset of the basis functions and one precision for
+each function; the prior of the weights has the covariance of the noise across outputs. This choice
+makes everything closed-form: with L = A + Phi' H Phi, the posterior of W is MN(M, L^-1, O),
 M = L^-1 Phi' H X, and the evidence, the integral over W of the weighted likelihood, is
 
     log p(X) = -D T/2 log 2 pi - T/2 log|O| + D/2 (log|A| - log|L|) - 1/2 tr O^-1 (X'HX - M'LM)
 
 where T = sum h. For given precisions the best O is (X'HX - M'LM + prior) / (T + nu). For given O
-the best precision of one function has the closed form of Tipping & Faul (AISTATS 2003), with all D
-outputs together: functions are added, removed and re-estimated one at a time, always the one that
-gains most. Only the sums Phi'H Phi, Phi'HX and X'HX enter, so a step costs O(K m + K D) for K
+the best precision of one function has the closed form of Tipping and Faul (AISTATS 2003), here with
+all D outputs together. Functions are added, removed and re-estimated one at a time, always the one
+that gains most. Only the sums Phi'H Phi, Phi'HX and X'HX enter, so a step costs O(K m + K D) for K
 candidates of which m are active, whatever the number of samples.
 """
 
@@ -28,17 +28,16 @@ from scipy.linalg.lapack import dpotri
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-# A candidate whose part that the active ones do not explain is below this share is not added.
+# A candidate is not added if the active functions explain all but this share of it.
 INDEPENDENT = 1e-8
-# Two functions that are equal but for this share of their squares are one.
+# Two functions that differ by less than this share of their squares count as one.
 ALIGNED = 1e-8
-# Rounds of greedy steps, each followed by a new estimate of the noise.
-ROUNDS = 100
+ROUNDS = 100  # of greedy steps, each followed by a new estimate of the noise
 
 
 @dataclass(frozen=True, eq=False)
 class WeightedSums:
-    """What the evidence needs to know of the samples.
+    """Sums over samples, from which the evidence follows.
 
     Attributes:
         gram: (K, K) Phi' H Phi of all candidates.
@@ -55,7 +54,7 @@ class WeightedSums:
     @classmethod
     def of(cls, features: Array, targets: Array, weights: Array) -> WeightedSums:
         """Sums over features (N, K), targets (N, D), weights (N,)."""
-        # Most samples are none of an expert's business.
+        # Most samples belong to other experts.
         some = weights > 1e-10 * weights.max()
         if not some.all():
             features, targets, weights = features[some], targets[some], weights[some]
@@ -69,8 +68,8 @@ class RegressionPrior:
     """Inverse Wishart penalty -nu/2 log|O| - 1/2 tr(O^-1 scale) of the noise.
 
     Attributes:
-        strength: nu >= 0, in samples.
-        scale: (D, D) nu times the covariance that it pulls to.
+        strength: Strength nu >= 0, in samples.
+        scale: (D, D) nu times the covariance that the prior pulls to.
     """
 
     strength: float
@@ -117,7 +116,7 @@ def posterior(
     inner = sums.gram[np.ix_(active, active)] + np.diag(precisions)
     covariance, half, weights = np.zeros((0, 0)), np.zeros((0, outputs)), np.zeros((0, outputs))
     log_det_inner = 0.0
-    # LAPACK as older versions of scipy call it refuses empty matrices.
+    # LAPACK, called by older versions of scipy, refuses empty matrices.
     if count:
         # Scaled to a unit diagonal: precisions span many orders of magnitude.
         root = 1.0 / np.sqrt(np.diagonal(inner))
@@ -140,20 +139,13 @@ def posterior(
         + outputs * (log_det_inner - float(np.log(precisions).sum()))
         + float(np.trace(z))
     )
-    return SparseRegression(
-        active,
-        precisions,
-        weights,
-        covariance,
-        noise,
-        evidence,
-    )
+    return SparseRegression(active, precisions, weights, covariance, noise, evidence)
 
 
 def with_best_noise(
     sums: WeightedSums, found: SparseRegression, prior: RegressionPrior
 ) -> SparseRegression:
-    """The same functions and precisions with the noise that maximises the evidence."""
+    """The regression with the same functions and precisions, and the best noise."""
     cross = sums.cross[found.active]
     residual = sums.outer - cross.T @ found.weights
     noise = (residual + prior.scale) / (sums.total + prior.strength)
@@ -170,15 +162,15 @@ def maximise_evidence(
     rounds: int = ROUNDS,
     tolerance: float = 1e-3,
 ) -> SparseRegression:
-    """Climbs the evidence from a start, or from the mean alone.
+    """Maximises the evidence from a start, or from no functions.
 
     Args:
-        sums: of the samples.
-        prior: of the noise.
-        start: an earlier result, perhaps for other weights of the samples.
-        steps: greedy ones between two estimates of the noise.
-        rounds: at most so many estimates of the noise.
-        tolerance: ends when a round gains less, nats.
+        sums: Sums over the samples.
+        prior: Prior of the noise.
+        start: Earlier result, perhaps for other weights of the samples.
+        steps: Number of greedy steps between two estimates of the noise.
+        rounds: Maximum number of estimates of the noise.
+        tolerance: Gain of a round below which the rounds end, nats.
     """
     if start is None:
         none: Index = np.zeros(0, dtype=np.intp)
@@ -197,10 +189,10 @@ def maximise_evidence(
 
 
 def maximum_likelihood(sums: WeightedSums) -> SparseRegression:
-    """Least squares with all functions, no prior and no uncertainty of the weights.
+    """Least squares with all functions, without prior and without uncertainty of the weights.
 
     Raises:
-        ValueError: the functions depend on each other, or residuals that vanish.
+        ValueError: the functions are linearly dependent, or residuals vanish.
     """
     count = len(sums.gram)
     try:
@@ -218,11 +210,9 @@ def maximum_likelihood(sums: WeightedSums) -> SparseRegression:
     log_det = 2.0 * float(np.log(np.diagonal(noise_factor)).sum())
     outputs = len(noise)
     evidence = -0.5 * sums.total * (outputs * (np.log(2.0 * np.pi) + 1.0) + log_det)
-    everything = np.arange(count)
-    nothing = np.zeros((count, count))
-    return SparseRegression(
-        everything, np.zeros(count), weights, nothing, 0.5 * (noise + noise.T), evidence
-    )
+    noise = 0.5 * (noise + noise.T)
+    covariance = np.zeros((count, count))
+    return SparseRegression(np.arange(count), np.zeros(count), weights, covariance, noise, evidence)
 
 
 def _greedy(
@@ -232,7 +222,7 @@ def _greedy(
     steps: int,
     tolerance: float,
 ) -> tuple[SparseRegression, bool]:
-    """Adds, removes and re-estimates functions for a fixed noise, the best one each time."""
+    """Adds, removes and re-estimates functions for a fixed noise, each time the best one."""
     state = _GreedyState(sums, found)
     moved = False
     for _ in range(steps):
@@ -245,14 +235,14 @@ def _greedy(
         none: Index = np.zeros(0, dtype=np.intp)
         return posterior(sums, none, np.zeros(0), found.noise, prior), True
     better = posterior(sums, state.active, state.precisions, found.noise, prior)
-    # Rank-one updates have drifted: what they promised did not come true.
+    # Rank-one updates drift, and the gain may not be real.
     if not better.evidence > found.evidence:
         return found, False
     return better, True
 
 
 class _GreedyState:
-    """Tipping & Faul's quantities for all candidates, kept by rank-one updates.
+    """The quantities of Tipping and Faul for all candidates, updated by rank one.
 
     S_k = phi_k' C^-1 phi_k and Q_k = phi_k' C^-1 X in whitened outputs, C = H^-1 + Phi A^-1 Phi'.
     """
@@ -275,7 +265,7 @@ class _GreedyState:
         self._exclude()
 
     def step(self, tolerance: float) -> bool:
-        """Does what gains most; False when nothing gains as much as the tolerance, in nats."""
+        """Makes the best change; False when no change gains more than the tolerance, nats."""
         with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
             k, gain, precision = self._best()
         if not gain > tolerance:
@@ -294,7 +284,7 @@ class _GreedyState:
         """The function with the largest gain of evidence, the gain, and its new precision."""
         d = self.outputs
         s, q = self.S.copy(), np.einsum('kd,kd->k', self.Q, self.Q)
-        # Active functions: as if they were not in the model.
+        # Active functions are treated as if they were not in the model.
         a, own = self.precisions, self.active
         variances = np.diagonal(self.covariance)
         s[own], q[own] = 1.0 / variances - a, q[own] / (a * variances) ** 2
@@ -307,13 +297,13 @@ class _GreedyState:
         gain[self.excluded | (~self.is_active & (self.least >= self.S))] = -np.inf
         gain[own] -= 0.5 * (d * np.log(a / (a + s[own])) + q[own] / (a + s[own]))
         gain[np.isnan(gain)] = -np.inf
-        # A precision that stays as it is cannot be updated, and gains nothing.
+        # An unchanged precision gains nothing, and its update would divide by zero.
         gain[own] = np.where(np.abs(best[own] - a) <= 1e-9 * a, -np.inf, gain[own])
         k = int(np.argmax(gain))
         return k, float(gain[k]), float(best[k])
 
     def _exclude(self) -> None:
-        """Candidates that equal an active function: only the sum of their variances counts."""
+        """Excludes candidates that equal an active function, which would add nothing."""
         squares = np.diagonal(self.gram)
         aligned = self.gram[:, self.active] ** 2 >= (1.0 - ALIGNED) * np.outer(
             squares, squares[self.active]
@@ -358,9 +348,9 @@ class _GreedyState:
         self._exclude()
 
     def _take(self, place: int, column: Array, kappa: float) -> None:
-        """Takes kappa column column' from the covariance."""
+        """Subtracts kappa column column' from the covariance."""
         left = self.gram[:, self.active] @ column
-        # The weight itself: Q of an active function is its precision times its weight.
+        # Q of an active function is its precision times its weight.
         weight = self.Q[self.active[place]] / self.precisions[place]
         self.covariance = self.covariance - kappa * np.outer(column, column)
         self.S = self.S + kappa * left**2

@@ -1,4 +1,4 @@
-"""Pairs of inputs and targets, checked once where they come in, and their scales."""
+"""Pairs of inputs and targets, checked once where they enter, and their scales."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class TrainingPairs:
 
 @dataclass(frozen=True, eq=False)
 class Standardisation:
-    """Moves and scales columns: z = (v - centre) / scale.
+    """Shifts and scales columns: z = (v - centre) / scale.
 
     Attributes:
-        centre, scale: (p,) each; scales are positive.
+        centre, scale: (p,) each.
 
     Raises:
-        ValueError: a scale that is not.
+        ValueError: a scale is not positive.
     """
 
     centre: Array
@@ -53,20 +53,25 @@ class Standardisation:
 
     @classmethod
     def of(cls, values: Array, weights: Array, scaling: str = 'each') -> Standardisation:
-        """That which makes the weighted mean 0 and the variance 1.
+        """The standardisation that makes the weighted mean 0 and the variance 1.
 
         Args:
             values: (N, p).
             weights: (N,).
-            scaling: 'each' column by itself, or one scale 'common' to all, which keeps the
-                metric. A column that does not vary keeps its scale.
+            scaling: 'each' scales every column by itself; 'common' has one scale for all columns,
+                which keeps the metric. A column that does not vary keeps its scale.
+
+        Raises:
+            ValueError: the scaling is another one.
         """
+        if scaling not in SCALINGS:
+            raise ValueError(f'scaling is {scaling!r}, wanted one of {", ".join(SCALINGS)}')
         share = weights / weights.sum()
         centre = share @ values
         variance = share @ (values - centre) ** 2
         if scaling == 'common':
             variance = np.full_like(variance, variance.mean())
-        # Rounding makes a tiny variance of a column that is constant.
+        # Rounding gives a constant column a tiny variance.
         constant = variance <= (1e-12 * np.maximum(1.0, np.abs(centre))) ** 2
         return cls(centre, np.where(constant, 1.0, np.sqrt(variance)))
 
@@ -84,16 +89,17 @@ def checked_pairs(
     at_least: int = 1,
     what: str = 'samples',
 ) -> TrainingPairs:
-    """The pairs as arrays; samples of weight zero are left out.
+    """The pairs as arrays, without samples of weight zero.
 
     Args:
         inputs: (N, p).
         targets: (N, D).
         sample_weight: (N,) not negative, or None for ones.
-        at_least, what: how many samples are needed, and for what.
+        at_least: Minimum number of samples.
+        what: Reason for that minimum, for the message.
 
     Raises:
-        ValueError: wrong shapes, values that are not finite, too few samples.
+        ValueError: shapes are wrong, values are not finite, or there are too few samples.
     """
     inputs = finite_matrix(inputs, 'inputs', '(N, p)')
     targets = finite_matrix(targets, 'targets', '(N, D)')
@@ -124,26 +130,11 @@ def checked_pairs(
     return TrainingPairs(inputs[kept], targets[kept], weights[kept])
 
 
-def checked_inputs(inputs: ArrayLike, columns: int) -> Array:
-    """Inputs (n, p) of a model that has learned from p columns.
-
-    Raises:
-        ValueError: wrong shape, values that are not finite.
-    """
-    inputs = finite_matrix(inputs, 'inputs', f'(n, {columns})')
-    if inputs.shape[1] != columns:
-        raise ValueError(
-            f'inputs have {inputs.shape[1]} columns, wanted {columns} as in training; '
-            'describe them as the training data were'
-        )
-    return inputs
-
-
 def finite_matrix(values: ArrayLike, name: str, wanted: str) -> Array:
     """Values as a matrix of finite numbers.
 
     Raises:
-        ValueError: not two axes, or values that are not finite.
+        ValueError: the values have not two axes, or are not finite.
     """
     matrix = np.asarray(values, dtype=np.float64)
     if matrix.ndim != 2:
@@ -156,14 +147,3 @@ def finite_matrix(values: ArrayLike, name: str, wanted: str) -> Array:
             f'column {column}; leave such rows out'
         )
     return matrix
-
-
-def checked_scaling(scaling: str) -> str:
-    """The name of a scaling.
-
-    Raises:
-        ValueError: no such scaling.
-    """
-    if scaling not in SCALINGS:
-        raise ValueError(f'scaling is {scaling!r}, wanted one of {", ".join(SCALINGS)}')
-    return scaling

@@ -1,10 +1,10 @@
-"""Pairs of silhouettes and poses to learn from: motions seen from all around (BME 3).
+"""Training pairs of silhouettes and poses: motions seen from all around (BME 3).
 
-Recorded or procedural motions are poses of one body. Of these the ones that differ are kept, some
-mirrored left to right, some with the arms and trunk of another moment. Each is turned to a random
-heading, seen from a random height and distance by a person of random build, and drawn as a
-silhouette whose outline is as uneven as that of background subtraction. The same seed gives the
-same set.
+Recorded or procedural motions become poses of one body, and poses that are nearly equal are
+dropped. Some are mirrored left to right, some get the arms and trunk of another pose. Each is
+turned to a random heading, seen from a random height and distance with a random build, and
+drawn as a silhouette with an outline as uneven as that of background subtraction. The same seed
+gives the same set.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.mirror import mirror, root_angles, root_rotations
 from hmt_ros.experts.pose_encoding import AXES, PoseEncoding
-from hmt_ros.motion.motion_file import Motion, read_motion
+from hmt_ros.motion.motion_file import read_motion
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.motion.retarget import body_from_motion, retarget
 from hmt_ros.rendering.renderer import render_silhouettes
@@ -32,36 +32,39 @@ Bytes = NDArray[np.uint8]
 Item = TypeVar('Item')
 Progress = Callable[[Iterable[Item], int], Iterable[Item]]
 
-RATE = 30.0  # Hz, of the sequences and of the step that dynamics learns
+RATE = 30.0  # of the sequences and of the step that dynamics learn, Hz
 MOTION_SUFFIXES = ('.bvh', '.amc')
-# A level camera that looks along the world's y axis, far enough for every motion.
+# Orientation of a level camera that looks along the world's y axis.
 LEVEL = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
-SIDE = 224  # px, of a training image
-FILLED = 0.86  # of it that the largest person of a group fills
-ROOM = 0.36  # m that flesh reaches beyond the joints, both ends together
+SIDE = 224  # of a training image, px
+FILLED = 0.86  # share of it that the largest person of a group fills
+ROOM = 0.36  # length of the flesh beyond the joints, both ends together, m
 GROUP = 16  # silhouettes of one person
 LEGS = ('hip', 'knee', 'ankle')
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How a training set is made.
+    """Settings of a training set.
 
     Attributes:
-        samples: number of pairs.
-        novelty: poses of a motion that differ less than this from the last one kept are left out,
-            mean distance of joints, m.
-        mirrored: share of poses that are mirrored left to right.
-        mixed: share of poses whose trunk, head and arms are those of another pose.
-        elevation, elevation_spread: by which the camera looks down on the person, mean and standard
-            deviation, degrees; never beyond -20 and 50.
-        roll_spread: of the camera, degrees.
-        distances: of the camera to the person, m, least and most.
-        length_spread: relative standard deviation of each length.
-        width_range, width_spread: factors on the thickness of the whole body, and relative standard
-            deviation of each part of it.
-        boundary_noise: standard deviation of the outline, px of a person 200 px tall.
-        seed: of all that is random.
+        samples: Number of pairs.
+        novelty: Mean distance of the joints from the last pose kept, below which a pose of a motion
+            is dropped, m.
+        mirrored: Share of poses that are mirrored left to right.
+        mixed: Share of poses whose trunk, head and arms are those of another pose.
+        elevation, elevation_spread: Angle by which the camera looks down, mean and standard
+            deviation, degrees; it stays between -20 and 50.
+        roll_spread: Standard deviation of the roll of the camera, degrees.
+        distances: Minimum and maximum distance of the camera to the person, m.
+        length_spread: Relative standard deviation of each segment length.
+        width_range: Range of the factor on the thickness of the whole body.
+        width_spread: Relative standard deviation of the thickness of each part.
+        boundary_noise: Standard deviation of the outline, px of a person 200 px tall.
+        seed: Seed of all random choices.
+
+    Raises:
+        ValueError: a value is out of its range.
     """
 
     samples: int = 6000
@@ -88,16 +91,16 @@ class TrainingSettings:
 
 @dataclass(frozen=True, eq=False)
 class PoseSequence:
-    """A motion as poses of the body that is learned.
+    """A motion as poses of the body of the predictor.
 
     Attributes:
-        name: of the motion.
-        activity: what is done.
+        name: Name of the motion.
+        activity: Activity, such as walk.
         poses: (T, d), RATE poses per second, as a level camera sees them.
-        lengths: of the person who moved, by name, m.
+        lengths: Segment lengths of the person by name, m.
 
     Raises:
-        ValueError: poses that are not finite.
+        ValueError: poses are not finite.
     """
 
     name: str
@@ -119,11 +122,11 @@ class TrainingSet:
     """Pairs of silhouettes and poses.
 
     Attributes:
-        poses: (N, d) as the camera of the image sees them.
-        previous: (N, d) the same person 1 / RATE s before.
+        poses: (N, d) in the frame of the image's camera.
+        previous: (N, d) of the same person 1 / RATE s before.
         packed: (N, SIDE, SIDE / 8) silhouettes, bits.
-        activities: (N,) what is done.
-        sequences, frames: (N,) where the pose comes from.
+        activities: (N,) activity of each pair.
+        sequences, frames: (N,) sequence and frame of each pose.
     """
 
     poses: Array
@@ -141,36 +144,33 @@ class TrainingSet:
         return np.unpackbits(self.packed[sample], axis=1)
 
     def masks(self) -> Iterator[Bytes]:
-        """All silhouettes in turn."""
+        """Iterates over all silhouettes."""
         return (self.mask(i) for i in range(len(self)))
 
 
 def motion_files(folder: Path) -> list[Path]:
-    """Motions of a folder and of those in it, in a fixed order.
+    """The motion files in a folder and its subfolders, in a fixed order.
 
     Raises:
-        ValueError: no such folder, or no motion in it.
+        ValueError: there is no such folder, or no motion in it.
     """
+    wanted = ' or '.join(MOTION_SUFFIXES)
     if not folder.is_dir():
-        raise ValueError(f'{folder} is no folder: wanted one with motions ({_suffixes()})')
+        raise ValueError(f'{folder} is no folder: wanted one with motions ({wanted})')
     found = sorted(x for x in folder.rglob('*') if x.suffix.lower() in MOTION_SUFFIXES)
     if not found:
-        raise ValueError(f'{folder} has no motion: wanted files {_suffixes()}')
+        raise ValueError(f'{folder} has no motion: wanted files {wanted}')
     return found
 
 
-def _suffixes() -> str:
-    return ' or '.join(MOTION_SUFFIXES)
-
-
 def recorded_sequence(path: Path, body: Body) -> PoseSequence:
-    """The motion of a file as poses of a body.
+    """The motion in a file as poses of a body.
 
     Raises:
-        ValueError, OSError: a file that is no motion, or of a skeleton that is not known.
+        ValueError, OSError: the file is no motion, or its skeleton is unknown.
     """
     motion = read_motion(path)
-    motion = _at_rate(motion)
+    motion = motion.part(0, None, max(round(motion.fps / RATE), 1))
     own = body_from_motion(motion, body)
     pelvis = motion.joint_positions(['pelvis'])[:, 0]
     centre = 0.5 * (pelvis.min(0) + pelvis.max(0))
@@ -180,12 +180,8 @@ def recorded_sequence(path: Path, body: Body) -> PoseSequence:
     return PoseSequence(motion.name, activity_of(path.stem), poses, own.segment_lengths)
 
 
-def _at_rate(motion: Motion) -> Motion:
-    return motion.part(0, None, max(round(motion.fps / RATE), 1))
-
-
 def activity_of(stem: str) -> str:
-    """What is done, from the name of a file: cmu_07_05_slowwalk is slowwalk."""
+    """The activity in the name of a file: slowwalk in cmu_07_05_slowwalk."""
     words = [x for x in stem.replace('-', '_').split('_') if x]
     named = [x for x in words if sum(c.isalpha() for c in x) > 1 and not x[0].isdigit()]
     return (named[-1].rstrip('0123456789') if named else stem).lower()
@@ -200,7 +196,7 @@ def procedural_sequence(
 
 
 def typical_body(body: Body, sequences: Sequence[PoseSequence]) -> Body:
-    """The body with the median lengths of those who moved, every motion counting once."""
+    """The body with the median segment lengths over all motions."""
     names = list(sequences[0].lengths)
     table = np.array([[sequence.lengths[name] for name in names] for sequence in sequences])
     medians = np.median(table, axis=0).tolist()
@@ -213,21 +209,21 @@ def training_set(
     settings: TrainingSettings | None = None,
     progress: Progress[Index] | None = None,
 ) -> TrainingSet:
-    """Pairs of silhouettes and poses of motions.
+    """Pairs of silhouettes and poses from motions.
 
     Args:
-        body: with flesh, whose poses the sequences are.
-        sequences: the motions.
-        settings: how.
-        progress: goes through groups of silhouettes, and is told how many there are.
+        body: Body of the poses, with flesh.
+        sequences: Motions.
+        settings: Settings; None takes the defaults.
+        progress: Iterates over groups of silhouettes, given their number.
 
     Raises:
-        ValueError: no motions, or a body without flesh or with another root.
+        ValueError: there are no motions, or the body has no flesh or another root.
     """
     s = settings or TrainingSettings()
     if not sequences:
         raise ValueError('no motions to learn from')
-    PoseEncoding(body)  # a root that can be turned
+    PoseEncoding(body)  # checks the root
     rng = np.random.default_rng(s.seed)
     pool = [_novel(body, sequence.poses, s.novelty) for sequence in sequences]
     which = np.repeat(np.arange(len(pool)), [len(x) for x in pool])
@@ -240,7 +236,7 @@ def training_set(
     poses[swapped] = mirror(body, poses[swapped])
     previous[swapped] = mirror(body, previous[swapped])
     view = _views(len(poses), s, rng)
-    # One distance for all persons of a group: they are as large in the image of one camera.
+    # A group has one distance, so that one camera fits all.
     groups = [np.arange(i, min(i + GROUP, len(poses))) for i in range(0, len(poses), GROUP)]
     distances = np.repeat(rng.uniform(*s.distances, len(groups)), GROUP)[: len(poses)]
     poses, previous = _seen(body, poses, previous, view, distances)
@@ -256,7 +252,7 @@ def training_set(
 
 
 def _novel(body: Body, poses: Array, distance: float) -> Index:
-    """Frames (n,) of poses (T, d) that differ from the one kept before; heading does not count."""
+    """Frames (n,) of poses (T, d) that differ from the last one kept, whatever the heading."""
     still = poses.copy()
     still[:, :3] = 0.0
     still[:, 3] = 0.0
@@ -270,14 +266,14 @@ def _novel(body: Body, poses: Array, distance: float) -> Index:
 
 
 def _drawn(available: int, count: int, rng: np.random.Generator) -> Index:
-    """So many of the available, none a second time before all have come."""
+    """Indices (count,) of samples; none is drawn again before all have been drawn."""
     rounds = -(-count // available)
     order = np.concatenate([rng.permutation(available) for _ in range(rounds)])
     return np.sort(order[:count])
 
 
 def _moments(sequences: Sequence[PoseSequence], which: Index, frames: Index) -> tuple[Array, Array]:
-    """Poses (N, d), and those one step before; the first frame of a motion stands still."""
+    """Poses (N, d), and those one step before; before its first frame a motion stands still."""
     moments = list(zip(which.tolist(), frames.tolist(), strict=True))
     poses = np.stack([sequences[i].poses[t] for i, t in moments])
     previous = np.stack([sequences[i].poses[max(t - 1, 0)] for i, t in moments])
@@ -287,7 +283,7 @@ def _moments(sequences: Sequence[PoseSequence], which: Index, frames: Index) -> 
 def _mixed(
     body: Body, poses: Array, previous: Array, share: float, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Some poses get trunk, head and arms of another one."""
+    """Gives a share of the poses the trunk, head and arms of another one."""
     names = body.dof_names
     upper = np.array(
         [i >= AXES and not any(leg in name for leg in LEGS) for i, name in enumerate(names)]
@@ -323,7 +319,7 @@ def _about(axis: int, angle: Array) -> Array:
 def _seen(
     body: Body, poses: Array, previous: Array, view: Array, distances: Array
 ) -> tuple[Array, Array]:
-    """Poses turned to a view, with the middle of the joints on the optical axis."""
+    """Poses rotated to a view, with the middle of the joints on the optical axis."""
     step = np.einsum('nij,nj->ni', view, previous[:, :3] - poses[:, :3])
     poses, previous = poses.copy(), previous.copy()
     for x in (poses, previous):
@@ -337,7 +333,7 @@ def _seen(
 
 
 def random_build(body: Body, s: TrainingSettings, rng: np.random.Generator) -> Body:
-    """A body with random lengths and widths, as the persons of a training set have."""
+    """A body with the random lengths and widths of the persons of a training set."""
     lengths = {
         name: value * (1.0 + s.length_spread * rng.normal())
         for name, value in body.segment_lengths.items()
@@ -348,7 +344,7 @@ def random_build(body: Body, s: TrainingSettings, rng: np.random.Generator) -> B
 
 
 def _fitting_camera(body: Body, poses: Array) -> Camera:
-    """A camera in whose image all persons of a group fit."""
+    """A camera whose image shows all persons of a group completely."""
     joints = body.joint_positions(poses)
     reach = np.abs(joints[..., :2]).max(2) + 0.5 * ROOM
     focal = 0.5 * FILLED * SIDE / float((reach / np.maximum(joints[..., 2], 0.3)).max())
@@ -357,7 +353,7 @@ def _fitting_camera(body: Body, poses: Array) -> Camera:
 
 
 def _uneven(mask: Bytes, deviation: float, rng: np.random.Generator) -> Bytes:
-    """The mask with an outline moved by smooth noise, px of a person 200 px tall."""
+    """The mask with its outline moved by smooth noise, px of a person 200 px tall."""
     noise = rng.normal(size=mask.shape).astype(np.float32)
     if deviation == 0 or not mask.any():
         return mask
@@ -365,25 +361,10 @@ def _uneven(mask: Bytes, deviation: float, rng: np.random.Generator) -> Bytes:
     outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 3)
     smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), 1.5), dtype=np.float32)
     smooth *= np.float32(deviation * max(cv2.boundingRect(mask)[2:]) / 200.0 / smooth.std())
-    # Between the pixels the distance is half a pixel from either side.
+    # The outline lies between pixels, half a pixel from either side.
     signed = np.where(mask > 0, inside - 0.5, 0.5 - outside)
     result: Bytes = (signed + smooth > 0).astype(np.uint8)
     return result if result.any() else mask
-
-
-@dataclass(frozen=True, eq=False)
-class SeenSequence:
-    """A motion as a camera sees it, frame after frame.
-
-    Attributes:
-        poses: (n, d) before the camera, with the middle of the joints on its optical axis.
-        masks: (n, SIDE, SIDE) silhouettes, 1 inside.
-        camera: that sees them.
-    """
-
-    poses: Array
-    masks: Bytes
-    camera: Camera
 
 
 def seen_from(
@@ -396,22 +377,26 @@ def seen_from(
     distance: float = 5.0,
     boundary_noise: float = 0.0,
     seed: int = 0,
-) -> SeenSequence:
-    """Some frames of a motion, seen from one side all the time.
+) -> tuple[Array, Bytes]:
+    """Frames of a motion, seen by a camera with a fixed direction.
 
     Args:
-        body: of the person, with flesh, whose poses the sequence has.
-        sequence: the motion.
-        heading: where the person looks on average: 0 to the camera, 90 across the image to the
-            right, 180 away from the camera, degrees.
-        elevation: by which the camera looks down, degrees.
-        frames: of the motion.
-        distance: of the camera, m.
-        boundary_noise: standard deviation of the outline, px of a person 200 px tall.
-        seed: of that noise.
+        body: Body of the sequence's poses, with flesh.
+        sequence: Motion.
+        heading: Mean heading of the person: 0 looks at the camera, 90 to the right of the image,
+            180 away from the camera, degrees.
+        elevation: Angle by which the camera looks down, degrees.
+        frames: Frames of the motion.
+        distance: Distance of the camera, m.
+        boundary_noise: Standard deviation of the outline, px of a person 200 px tall.
+        seed: Seed of that noise.
+
+    Returns:
+        Poses (n, d) with the middle of the joints on the optical axis, and silhouettes
+        (n, SIDE, SIDE), 1 inside.
 
     Raises:
-        ValueError: no frames.
+        ValueError: there are no frames.
     """
     poses = sequence.poses[frames]
     if len(poses) == 0:
@@ -421,24 +406,6 @@ def seen_from(
     down = np.full(len(poses), np.radians(elevation))
     view = _about(0, down) @ _about(1, np.full(len(poses), turn))
     poses, _ = _seen(body, poses, poses, view, np.full(len(poses), distance))
-    camera = _fitting_camera(body, poses)
     rng = np.random.default_rng(seed)
-    drawn = render_silhouettes(body, poses, camera)
-    masks = np.stack([_uneven(mask.view(np.uint8), boundary_noise, rng) for mask in drawn])
-    return SeenSequence(poses, masks, camera)
-
-
-def side_view(
-    body: Body, sequence: PoseSequence, count: int = 120, distance: float = 5.0
-) -> SeenSequence:
-    """The first frames of a motion, of a person who on average looks across the image.
-
-    Args:
-        body: with flesh, whose poses the sequence has.
-        sequence: the motion.
-        count: of frames at most; longer motions are seen at half the rate of the sequence.
-        distance: of the camera, m.
-    """
-    step = 2 if len(sequence.poses) >= 2 * count else 1
-    frames = slice(0, count * step, step)
-    return seen_from(body, sequence, 90.0, frames=frames, distance=distance)
+    drawn = render_silhouettes(body, poses, _fitting_camera(body, poses))
+    return poses, np.stack([_uneven(mask.view(np.uint8), boundary_noise, rng) for mask in drawn])

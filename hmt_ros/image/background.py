@@ -26,14 +26,15 @@ class BackgroundSettings:
     """How the background is subtracted.
 
     Attributes:
-        method: 'mog2' or 'knn'.
-        threshold: squared distance, in variances of the background, above which a pixel is
+        method: Background model of OpenCV, 'mog2' or 'knn'.
+        threshold: Squared distance from the background, in its variances, above which a pixel is
             foreground.
-        shadow_threshold: a pixel of the background's colour, darkened down to this factor, is
-            shadow.
-        smallest_part: pieces with less than this fraction of the largest one are dropped.
-        largest_gap: pieces further than this from the largest one are dropped, as a fraction of its
-            height.
+        shadow_threshold: Smallest brightness of a shadow, as a fraction of the background's; darker
+            pixels are foreground.
+        smallest_part: Smallest area of a piece of the silhouette, as a fraction of the largest
+            piece's; smaller pieces are dropped.
+        largest_gap: Maximum distance of a piece of the silhouette from the largest one, as a
+            fraction of its height; pieces further away are dropped.
     """
 
     method: str = 'mog2'

@@ -1,96 +1,85 @@
-"""Negative log-likelihood of an image, and soft prior of the body, for a batch of poses (KJS 2)."""
+"""Minus the log-likelihood of an image, for a batch of poses (KJS 2).
+
+    E(x) = sum_t E_t(x) + E_keypoints(x) + E_prior(x) + E_intersection(x)
+
+over the image terms t of `terms.registry`. `ImageLikelihood.given` is this sum for one observation.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, make_dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.kinematics import Frames, forward
-from hmt_ros.body.self_intersection import self_intersection_energy
+from hmt_ros.body.kinematics import Frames
+from hmt_ros.body.pose_terms import AnglePrior, FrameTerm, Posed, SelfIntersection
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface import flesh_table_of, lens_of
-from hmt_ros.image.terms.accumulation import tree_of
-from hmt_ros.image.terms.compiled_pass import (
-    TERM_COUNT,
-    Evidence,
-    Model,
-    Placement,
-    Term,
-    Terms,
-    add_energies,
-)
-from hmt_ros.image.terms.keypoints import joint_energy
+from hmt_ros.image.terms.image_term import Request, TermSettings, Weighting
+from hmt_ros.image.terms.keypoints import KEYPOINTS, KeypointTerm
+from hmt_ros.image.terms.registry import TERMS, Model, Placement, add_energies
+from hmt_ros.image.terms.residuals import tree_of
 from hmt_ros.image.texture import Textures, no_textures
+from hmt_ros.inference.energy import Derivatives, Energy
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-TERMS = Terms._fields
-NO_MAP = ImageMap(np.zeros((2, 2, 2), np.float32))
+OFF = TermSettings(0.0, 1.0, 1.0)
+
+# One field a term of the registry, so that a new term needs no line here.
+_ImageTerms: Any = make_dataclass(
+    '_ImageTerms',
+    [(term.name, TermSettings, field(default=term.settings)) for term in TERMS],
+    frozen=True,
+)
 
 
 @dataclass(frozen=True)
-class TermSettings:
-    """One term of the likelihood.
+class LikelihoodSettings(_ImageTerms):  # type: ignore[misc]
+    """The terms of the likelihood and of the prior."""
 
-    Attributes:
-        weight: how many independent measurements the term counts for; 0 switches it off. For
-            joints: a factor.
-        sigma: standard deviation of one measurement, px (intensity: grey levels; joints: a factor
-            on the keypoints' own).
-        scale: of the Geman-McClure kernel, in sigmas.
-    """
-
-    weight: float
-    sigma: float
-    scale: float
-
-    def __post_init__(self) -> None:
-        if not (self.weight >= 0 and self.sigma > 0 and self.scale > 0):
-            raise ValueError(f'a term needs weight >= 0, sigma > 0 and scale > 0, saw {self}')
-
-
-@dataclass(frozen=True)
-class LikelihoodSettings:
-    """The terms of the likelihood and of the prior.
-
-    Attributes:
-        joints: keypoints.
-        containment: the model's contour lies inside the silhouette.
-        coverage: the silhouette's outline lies on the model's contour.
-        edges: visible contours lie on edges.
-        intensity: the texture of the last image is found again.
-        motion: the texture moves with the optical flow.
-        prior_weight: factor on the soft prior of the joint angles.
-        self_intersection_sigma: overlap of body parts that costs 1/2, m; inf switches it off.
-    """
-
-    joints: TermSettings = field(default=TermSettings(1.0, 1.0, 5.0))
-    containment: TermSettings = field(default=TermSettings(30.0, 3.0, 8.0))
-    coverage: TermSettings = field(default=TermSettings(30.0, 3.0, 8.0))
-    edges: TermSettings = field(default=TermSettings(20.0, 2.5, 3.0))
-    intensity: TermSettings = field(default=TermSettings(4.0, 20.0, 2.0))
-    motion: TermSettings = field(default=TermSettings(5.0, 1.5, 2.0))
+    keypoints: TermSettings = KEYPOINTS
     prior_weight: float = 1.0
     self_intersection_sigma: float = 0.03
+
+    @classmethod
+    def of_terms(cls, **settings: TermSettings) -> LikelihoodSettings:
+        """Settings with the image terms and keypoints that are named, all others switched off."""
+        names = [*(term.name for term in TERMS), 'keypoints']
+        chosen: dict[str, Any] = {name: settings.get(name, OFF) for name in names}
+        return cls(**chosen)
+
+
+LikelihoodSettings.__doc__ = '\n'.join(
+    [
+        'The terms of the likelihood and of the prior.',
+        '',
+        'Attributes:',
+        *(f'    {term.name}: {term.meaning}' for term in TERMS),
+        '    keypoints: Distance of the joints from the keypoints.',
+        '    prior_weight: Factor on the soft prior of the joint angles.',
+        '    self_intersection_sigma: Overlap of two body parts that costs an energy of 1/2, m;',
+        '        inf switches the term off.',
+    ]
+)
 
 
 @dataclass(frozen=True, eq=False)
 class ImageEnergy:
-    """Terms of an image at N poses.
+    """Energies of the image terms at N poses.
 
     Attributes:
-        terms: name -> (N,) energy.
+        terms: name -> (N,) energy, of the terms that are on and have evidence.
         costs: (N, M) what each sample of the silhouette's outline costs.
         gradient, hessian: (N, d), (N, d, d) of the sum; None: not asked for.
     """
@@ -109,11 +98,11 @@ class ImageEnergy:
 
 @dataclass(frozen=True, eq=False)
 class ImageLikelihood:
-    """-log p(image | pose) - log prior(pose) of a body before a camera.
+    """What poses of a body before a camera cost, by image.
 
     Attributes:
         body, camera: who is seen by what.
-        settings: the terms.
+        settings: of the terms.
         parts: the parts of the flesh that are compared with the image; None: all.
         occluders: the parts that hide others; None: all.
     """
@@ -124,86 +113,96 @@ class ImageLikelihood:
     parts: tuple[int, ...] | None = None
     occluders: tuple[int, ...] | None = None
 
-    def energy(
+    def given(
         self,
-        poses: Array,
         observation: Observation,
         textures: Textures | None = None,
-        which: Index | None = None,
-    ) -> tuple[Array, Array, Array]:
-        """Value (N,), gradient (N, d) and Gauss-Newton Hessian (N, d, d) at poses (N, d).
+        texture_rows: Index | None = None,
+    ) -> Posed:
+        """-log p(image | pose) - log prior(pose), of one observation.
 
         Args:
-            poses: (N, d).
             observation: of the image.
             textures: of the last image, for the terms of intensity and motion.
-            which: (N,) the texture that each pose carries.
+            texture_rows: (N,) row of the textures that each problem carries; None: none.
         """
-        frames = forward(self.body.skeleton, poses)
-        image = self.image_energy(frames, observation, textures, which)
-        assert image.gradient is not None
-        assert image.hessian is not None
-        value, gradient, hessian = image.value, image.gradient, image.hessian
-        for part in (self.prior(poses), self.intersection(frames)):
-            value += part[0]
-            gradient += part[1]
-            hessian += part[2]
-        return value, gradient, hessian
+        terms = (*self.seen(observation, textures, texture_rows), *self.priors)
+        return Posed(self.body.skeleton, terms)
 
-    def image_energy(
+    def seen(
+        self,
+        observation: Observation,
+        textures: Textures | None = None,
+        texture_rows: Index | None = None,
+        explained: Array | None = None,
+    ) -> tuple[FrameTerm, ...]:
+        """The terms of the image and of the keypoints; arguments as for `given`, `energies`."""
+        image = ObservedImage(self, observation, textures, texture_rows, explained)
+        keypoints, s = observation.keypoints, self.settings.keypoints
+        if keypoints is None or s.weight == 0:
+            return (image,)
+        return (image, KeypointTerm(self.body.skeleton, self.camera, keypoints, s))
+
+    @cached_property
+    def priors(self) -> tuple[FrameTerm, ...]:
+        """What is known of a pose without any image: joint angles, parts that do not intersect."""
+        s = self.settings
+        angles = AnglePrior(self.body, s.prior_weight)
+        if not np.isfinite(s.self_intersection_sigma):
+            return (angles,)
+        return (angles, SelfIntersection(self.body, s.self_intersection_sigma))
+
+    def energies(
         self,
         frames: Frames,
         observation: Observation,
         textures: Textures | None = None,
-        which: Index | None = None,
+        texture_rows: Index | None = None,
         *,
         explained: Array | None = None,
         derivatives: bool = True,
     ) -> ImageEnergy:
-        """The terms of the image at the frames of N poses.
+        """The image terms, one by one, at the frames of N poses.
 
         Args:
             frames: of the poses.
             observation: of the image.
-            textures, which: as for `energy`.
+            textures: of the last image, for the terms of intensity and motion.
+            texture_rows: (N,) row of the textures that each pose carries; None: none.
             explained: (N, M) or (1, M) what each sample of the outline costs at most, because
                 something else explains it.
             derivatives: whether gradient and Hessian are wanted.
         """
         n, d = frames.count, self.body.dimension
-        evidence, terms = _evidence(observation), self._terms(observation, textures)
-        samples = len(evidence.outline_pixels)
-        energies, costs = np.zeros((n, TERM_COUNT)), np.zeros((n, samples))
+        request = Request(n, explained)
+        textured = textures is not None and len(textures.counts) > 0
+        inputs, running = [], []
+        for term in TERMS:
+            s: TermSettings = getattr(self.settings, term.name)
+            evidence = observation.evidence.get(term.name)
+            on = evidence is not None and (textured or not term.needs_texture)
+            weighting = Weighting(float(s.weight) if on else 0.0, float(s.sigma), float(s.scale))
+            inputs.append(term.inputs(weighting, evidence, request))
+            running.append(bool(inputs[-1].term.weight > 0))
+        energies = np.zeros((n, len(TERMS)))
         gradient = np.zeros((n if derivatives else 0, d))
         hessian = np.zeros((n if derivatives else 0, d, d))
-        if explained is None:
-            explained = np.full((1, samples), np.inf)
-        own = np.full(n, -1) if which is None else which
-        textures = textures or no_textures()
-        if any(term.weight > 0 for term in terms):
+        rows = np.full(n, -1) if texture_rows is None else texture_rows
+        if any(running):
             placement = Placement(*frames.by_pose(), *frames.dofs_by_pose())
+            shape = any(on and term.needs_contour for on, term in zip(running, TERMS, strict=True))
 
             def work(first: int, last: int) -> None:
                 add_energies(
-                    first, last, self._model, terms, evidence, textures, own, placement, explained,
-                    energies, costs, gradient, hessian,
+                    first, last, self._model, tuple(inputs), shape, textures or no_textures(),
+                    rows, placement, energies, gradient, hessian,
                 )  # fmt: skip
 
             _in_threads(work, n)
-        result = {
-            name: energies[:, i] for i, name in enumerate(TERMS) if getattr(terms, name).weight > 0
+        result = {term.name: energies[:, i] for i, term in enumerate(TERMS) if running[i]} or {
+            'nothing': np.zeros(n)
         }
-        if observation.keypoints is not None and self.settings.joints.weight > 0:
-            s = self.settings.joints
-            value, g, h = joint_energy(
-                frames, self.camera, observation.keypoints,
-                scale=s.scale, weight=s.weight / s.sigma**2,
-            )  # fmt: skip
-            result['joints'] = value
-            if derivatives:
-                gradient += g
-                hessian += h
-        result = result or {'nothing': np.zeros(n)}
+        costs = next((x.costs for x in inputs if hasattr(x, 'costs')), np.zeros((n, 0)))
         if not derivatives:
             return ImageEnergy(result, costs, None, None)
         return ImageEnergy(result, costs, gradient, hessian)
@@ -222,41 +221,6 @@ class ImageLikelihood:
         result = replace(self)
         result.__dict__['_model'] = scaled
         return result
-
-    def prior(self, poses: Array) -> tuple[Array, Array, Array]:
-        """Energy, gradient and Hessian of the soft prior of the joint angles."""
-        body = self.body
-        precision = self.settings.prior_weight * body.prior_sigma**-2.0
-        offset = poses - body.prior_mean
-        value = 0.5 * (offset * offset) @ precision
-        hessian = np.broadcast_to(np.diag(precision), (len(poses), body.dimension, body.dimension))
-        return value, offset * precision, hessian
-
-    def intersection(self, frames: Frames) -> tuple[Array, Array, Array]:
-        """Energy, gradient and Hessian of the prior against self-intersection."""
-        sigma = self.settings.self_intersection_sigma
-        if not np.isfinite(sigma):
-            n, d = frames.count, self.body.dimension
-            return np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d))
-        return self_intersection_energy(self.body, frames, sigma=sigma)
-
-    def _terms(self, observation: Observation, textures: Textures | None) -> Terms:
-        s, o = self.settings, observation
-        textured = textures is not None and len(textures.counts) > 0
-        present = {
-            'containment': o.distance is not None,
-            'coverage': o.outline is not None and o.outline.pixels.size > 0,
-            'edges': o.edges is not None,
-            'intensity': o.intensity is not None and textured,
-            'motion': o.flow is not None and textured,
-        }
-        return Terms(
-            *(
-                Term(t.weight if present[name] else 0.0, t.sigma, t.scale)
-                for name in TERMS
-                for t in (getattr(s, name),)
-            )
-        )
 
     @cached_property
     def _model(self) -> Model:
@@ -277,26 +241,40 @@ class ImageLikelihood:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class ObservedImage:
+    """The image terms of one observation; a `FrameTerm`. Attributes as `ImageLikelihood.energies`.
+
+    Its texture rows are those of the problems, not of the poses of one call.
+    """
+
+    likelihood: ImageLikelihood
+    observation: Observation
+    textures: Textures | None = None
+    texture_rows: Index | None = None
+    explained: Array | None = None
+
+    def energy(
+        self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `hmt_ros.body.pose_terms.FrameTerm`."""
+        found = self.likelihood.energies(
+            frames,
+            self.observation,
+            self.textures,
+            None if self.texture_rows is None else self.texture_rows[rows],
+            explained=self.explained,
+            derivatives=bool(derivatives),
+        )
+        return Energy(found.value, found.gradient, found.hessian)
+
+
 def _selected(parts: Sequence[int] | None, count: int) -> NDArray[np.bool_]:
     result = np.ones(count, dtype=bool)
     if parts is not None:
         result[:] = False
         result[list(parts)] = True
     return result
-
-
-def _evidence(observation: Observation) -> Evidence:
-    o = observation
-    outline = o.outline
-    none = np.zeros((0, 2))
-    return Evidence(
-        o.distance or NO_MAP,
-        o.edges or NO_MAP,
-        o.intensity or NO_MAP,
-        o.flow or NO_MAP,
-        none if outline is None else outline.pixels,
-        none if outline is None else outline.normals,
-    )
 
 
 @lru_cache(maxsize=1)

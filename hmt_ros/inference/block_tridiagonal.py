@@ -23,7 +23,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs, dtrtri
 
-from hmt_ros.inference.exact_sums import dot, fma
+from hmt_ros.inference.exact_sums import dot
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ class BlockTridiagonal:
         """The columns (T n, width + 1) of LAPACK's band storage: [j, i - j] = P[i, j]."""
         t, n = self.diagonal.shape[:2]
         columns = np.zeros((t * n, self.bandwidth + 1))
-        fill_diagonal(columns, np.ascontiguousarray(self.diagonal))
+        add_diagonal(columns, np.ascontiguousarray(self.diagonal.swapaxes(1, 2)), n)
         fill_lower(columns, np.ascontiguousarray(self.lower))
         return columns
 
@@ -211,13 +211,16 @@ def factorise_band(band: Array, times: int, size: int) -> BlockCholesky:
 
 
 @njit(cache=True, nogil=True)
-def fill_diagonal(columns: Array, diagonal: Array) -> None:
-    """Writes the lower triangles of D_t (T, n, n) into the columns (T n, width + 1) of a band."""
-    times, n, _ = diagonal.shape
+def add_diagonal(columns: Array, blocks: Array, n: int) -> None:
+    """Adds blocks (T, d, d) to the leading parts of diagonal blocks in a band (T n, width + 1).
+
+    Of each block the upper triangle is read.
+    """
+    times, d, _ = blocks.shape
     for t in range(times):
-        for b in range(n):
-            for a in range(b, n):
-                columns[t * n + b, a - b] = diagonal[t, a, b]
+        for b in range(d):
+            for a in range(b, d):
+                columns[t * n + b, a - b] += blocks[t, b, a]
 
 
 @njit(cache=True, nogil=True)
@@ -241,4 +244,4 @@ def add_band_product(columns: Array, x: Array, result: Array) -> None:
             own = x[s, c]
             result[s, c] += dot(columns[c], x[s], c, last)
             for b in range(1, last):
-                result[s, c + b] = fma(columns[c, b], own, result[s, c + b])
+                result[s, c + b] += columns[c, b] * own

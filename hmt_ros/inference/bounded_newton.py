@@ -12,29 +12,17 @@ Each problem has its own lambda and its own active set, and leaves the batch whe
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from enum import IntEnum
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.inference.box_step import DAMPING_LIMIT, box_steps
+from hmt_ros.inference.energy import EnergyFunction, EnergyTerm
+from hmt_ros.inference.trust_region import Status, TrustRegion
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
-
-# objective(x (n, d), problem (n,)) -> value (n,), gradient (n, d), Hessian (n, d, d); `problem`
-# says which of the N problems each row belongs to, as converged ones are left out.
-Objective = Callable[[Array, Index], tuple[Array, Array, Array]]
-
-
-class Status(IntEnum):
-    """Why a minimisation stopped."""
-
-    CONVERGED = 0  # the predicted decrease, or the gradient on the free variables, is small enough
-    ITERATION_LIMIT = 1
-    STALLED = 2  # no step of any length decreases the energy
-    NOT_FINITE = 3  # the energy at the start is not a number or infinite
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,9 +45,18 @@ class Minimum:
     status: NDArray[np.int8]
     iterations: NDArray[np.int32]
 
+    def __getitem__(self, rows: Index) -> Minimum:
+        """Some of them."""
+        return Minimum(*(getattr(self, f.name)[rows] for f in fields(Minimum)))
+
+    def joined(self, other: Minimum) -> Minimum:
+        """These and others."""
+        parts = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(Minimum))
+        return Minimum(*(np.concatenate(pair) for pair in parts))
+
 
 def minimise(
-    objective: Objective,
+    term: EnergyTerm | Callable[[Array, Index], tuple[Array, Array, Array]],
     x: ArrayLike,
     lower: ArrayLike = -np.inf,
     upper: ArrayLike = np.inf,
@@ -72,7 +69,8 @@ def minimise(
     """Minimises N problems from their starts x (N, d).
 
     Args:
-        objective: value, gradient and Hessian (exact or Gauss-Newton) for some of the problems.
+        term: the energy; rows are those of the N problems that have not converged yet. A function
+            of points and rows that returns value, gradient and Hessian will do.
         x: starts (N, d); projected onto the box.
         lower, upper: limits (d,) or (N, d), or scalars.
         step_scale: (d,) length of a step that is moderate for each variable;
@@ -81,6 +79,8 @@ def minimise(
         max_iterations: evaluations per problem after the first one.
         tolerance: converged when a step is predicted to gain less than this, in units of energy.
     """
+    if callable(term):
+        term = EnergyFunction(term)
     lower, upper = (np.asarray(limit, dtype=np.float64) for limit in (lower, upper))
     x = np.clip(np.array(x, dtype=np.float64, ndmin=2), lower, upper)
     n, d = x.shape
@@ -88,53 +88,36 @@ def minimise(
     metric = np.broadcast_to(np.asarray(step_scale, dtype=np.float64) ** -2.0, (d,))
 
     everyone = np.arange(n)
-    value, gradient, hessian = (np.array(part) for part in objective(x, everyone))
-    lam = np.full(n, float(damping))
-    growth = np.full(n, 2.0)
+    first = term.energy(x, everyone)
+    value, gradient, hessian = (np.array(p) for p in (first.value, *first.derivatives()))
+    region = TrustRegion(n, damping, limit=DAMPING_LIMIT, least_factor=1.0 / 3.0)
     iterations = np.zeros(n, dtype=np.int32)
     status = np.full(n, Status.ITERATION_LIMIT, dtype=np.int8)
     status[~np.isfinite(value)] = Status.NOT_FINITE
 
-    active = everyone[np.isfinite(value)]
     for _ in range(max_iterations):
+        active = everyone[status == Status.ITERATION_LIMIT]
+        step, predicted = np.empty((len(active), d)), np.empty(len(active))
+        box_steps(
+            x, gradient, hessian, lower, upper, region.damping, metric, active, step, predicted
+        )
+        done = predicted < tolerance
+        status[active[done]] = Status.CONVERGED
+        active, step, predicted = active[~done], step[~done], predicted[~done]
         if len(active) == 0:
             break
         start, low, high = x[active], lower[active], upper[active]
-        step, predicted = np.empty_like(start), np.empty(len(active))
-        box_steps(x, gradient, hessian, lower, upper, lam, metric, active, step, predicted)
-        done = predicted < tolerance
-        if done.any():
-            status[active[done]] = Status.CONVERGED
-            active = active[~done]
-            if len(active) == 0:
-                break
-            start, low, high = start[~done], low[~done], high[~done]
-            step, predicted = step[~done], predicted[~done]
-
         trial = np.minimum(np.maximum(start + step, low), high)
         # Rounding must not leave a variable a hair away from the limit it was put on.
         trial = np.where(step <= low - start, low, trial)
         trial = np.where(step >= high - start, high, trial)
-        new_value, new_gradient, new_hessian = objective(trial, active)
+        found = term.energy(trial, active)
         iterations[active] += 1
-        decrease = value[active] - new_value
-        ratio = np.where(np.isfinite(decrease), decrease, -np.inf) / predicted
-        better = ratio > 1e-3
-
+        better = region.accept(active, value[active] - found.value, predicted)
         rows = active[better]
-        x[rows] = trial[better]
-        value[rows] = new_value[better]
-        gradient[rows] = new_gradient[better]
-        hessian[rows] = new_hessian[better]
-        # Nielsen's rule: smooth in the ratio, and ever faster while steps are refused.
-        lam[rows] *= np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.minimum(ratio[better], 2.0) - 1.0) ** 3)
-        growth[rows] = 2.0
-        rows = active[~better]
-        lam[rows] *= growth[rows]
-        growth[rows] *= 2.0
-        stalled = lam > DAMPING_LIMIT
-        status[stalled] = Status.STALLED
-        active = active[~stalled[active]]
+        x[rows], value[rows] = trial[better], found.value[better]
+        gradient[rows], hessian[rows] = (part[better] for part in found.derivatives())
+        status[region.refuse(active[~better])] = Status.STALLED
 
     free = ~resting(x, gradient, lower, upper)
     return Minimum(x, value, gradient, hessian, free, status, iterations)

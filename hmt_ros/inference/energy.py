@@ -8,6 +8,7 @@ every optimiser takes such a sum (KJS 2 and 3.2, VMS 5).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, Protocol
@@ -23,8 +24,9 @@ class Derivatives(IntEnum):
     """Which derivatives an energy is asked for."""
 
     NONE = 0
-    POSITIVE = 1  # gradient and a positive semi-definite Hessian: Gauss-Newton, or a majorising one
-    EXACT = 2  # gradient and the exact Hessian, where the term knows it; else as POSITIVE
+    GRADIENT = 1  # the gradient; a term may return a Hessian with it
+    POSITIVE = 2  # gradient and a positive semi-definite Hessian: Gauss-Newton, or a majorising one
+    EXACT = 3  # gradient and the exact Hessian, where the term knows it; else as POSITIVE
 
 
 class Energy(NamedTuple):
@@ -39,18 +41,6 @@ class Energy(NamedTuple):
     value: Array
     gradient: Array | None = None
     hessian: Array | None = None
-
-    def plus(self, other: Energy) -> Energy:
-        """The sum of both."""
-        if self.gradient is None or other.gradient is None:
-            return Energy(self.value + other.value)
-        assert self.hessian is not None
-        assert other.hessian is not None
-        return Energy(
-            self.value + other.value,
-            self.gradient + other.gradient,
-            self.hessian + other.hessian,
-        )
 
     def derivatives(self) -> tuple[Array, Array]:
         """Gradient and Hessian.
@@ -80,6 +70,41 @@ class EnergyTerm(Protocol):
         ...
 
 
+def add_energies(energies: Iterable[Energy]) -> Energy:
+    """The sum of energies of the same points, in their order."""
+    first, *others = energies
+    value, gradient, hessian = first
+    if not others:
+        return first
+    value = value.copy()
+    if gradient is not None and hessian is not None:
+        gradient, hessian = gradient.copy(), hessian.copy()
+    for other in others:
+        value += other.value
+        if gradient is not None and hessian is not None:
+            own = other.derivatives()
+            gradient += own[0]
+            hessian += own[1]
+    return Energy(value, gradient, hessian)
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyFunction:
+    """A term that is written as a function.
+
+    Attributes:
+        function: maps points (n, d) and rows (n,) to value, gradient and Hessian, of any kind.
+    """
+
+    function: Callable[[Array, Index], tuple[Array, Array, Array]]
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`; the derivatives are always there."""
+        return Energy(*self.function(x, rows))
+
+
 @dataclass(frozen=True, eq=False)
 class Sum:
     """The product of factors: the sum of their energies, in the order in which they are given."""
@@ -90,11 +115,7 @@ class Sum:
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
         """See `EnergyTerm`."""
-        first, *others = self.terms
-        total = first.energy(x, rows, derivatives=derivatives)
-        for term in others:
-            total = total.plus(term.energy(x, rows, derivatives=derivatives))
-        return total
+        return add_energies(term.energy(x, rows, derivatives=derivatives) for term in self.terms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,15 +177,21 @@ class Student:
         value = 0.5 * (nu + d) * np.log1p(distance / nu)
         if not derivatives:
             return Energy(value)
-        shrinkage = (nu + d) / (nu + distance)
+        shrinkage = self.shrinkage(distance, d)
         return Energy(value, shrinkage[:, None] * pulled, shrinkage[:, None, None] * precisions)
+
+    def shrinkage(self, distance: Array, dimension: int) -> Array:
+        """Curvature over that of the Gaussian with the same precision, at distances D (N,)."""
+        nu = self.degrees_of_freedom
+        return (nu + dimension) / (nu + distance)
 
 
 def _pulls(term: Quadratic | Student, x: Array, rows: Index) -> tuple[Array, Array, Array]:
-    """x - m, P (x - m) and P of each point."""
+    """x - m (n, d), P (x - m) (n, d) and P (n, d, d) of each point."""
     offset = x - _of_rows(term.centres, rows, 2)
     if term.precisions.ndim == 2:
-        return offset, offset @ term.precisions, term.precisions
+        shape = (*x.shape, x.shape[1])
+        return offset, offset @ term.precisions, np.broadcast_to(term.precisions, shape)
     precisions = term.precisions[rows]
     return offset, np.einsum('nij,nj->ni', precisions, offset), precisions
 
@@ -193,11 +220,9 @@ class Restricted:
         """The energy at values x (n, f) of the free variables; see `EnergyTerm`."""
         whole = np.repeat(self.point[None], len(x), axis=0)
         whole[:, self.free] = x
-        found = self.term.energy(whole, rows, derivatives=derivatives)
-        if found.gradient is None or found.hessian is None:
-            return found
-        return Energy(
-            found.value,
-            found.gradient[:, self.free],
-            found.hessian[:, self.free[:, None], self.free],
-        )
+        value, gradient, hessian = self.term.energy(whole, rows, derivatives=derivatives)
+        if gradient is not None:
+            gradient = gradient[:, self.free]
+        if hessian is not None:
+            hessian = hessian[:, self.free[:, None], self.free]
+        return Energy(value, gradient, hessian)

@@ -151,44 +151,14 @@ class GaussianMixture:
         return GaussianMixture(self.weights[i], self.means[i], self.covariances[i])
 
     def reduce(self, k: int) -> GaussianMixture:
-        """A mixture of at most k components with the same mean and covariance.
-
-        Greedy pairwise merging. The pair that costs least is merged first, by the upper bound on
-        the Kullback-Leibler divergence that the merge causes [Runnalls, IEEE TAES 2007]:
-
-            B(i, j) = 1/2 ((w_i + w_j) log|S_ij| - w_i log|S_i| - w_j log|S_j|)
+        """At most k components with the same mean and covariance (`reduction.merged_pairwise`).
 
         Raises:
             ValueError: k < 1.
         """
-        if k < 1:
-            raise ValueError(f'k must be at least 1, saw {k}')
-        w, m, s = (a.copy() for a in self._arrays())
-        alive = w > 0
-        if alive.sum() < len(w):
-            w, m, s = w[alive], m[alive], s[alive]
-        if len(w) <= k:
-            return GaussianMixture(w, m, s)
-        log_det = np.linalg.slogdet(s)[1]
-        cost = np.full((len(w), len(w)), np.inf)
-        for i in range(len(w) - 1):
-            cost[i, i + 1 :] = _merge_cost(w, m, s, log_det, i, np.arange(i + 1, len(w)))
-        remaining = len(w)
-        active = np.ones(len(w), dtype=bool)
-        while remaining > k:
-            i, j = (int(x) for x in np.unravel_index(int(np.argmin(cost)), cost.shape))
-            total, mean, cov = _merged(w, m, s, i, np.array([j]))
-            w[i], m[i], s[i] = total[0], mean[0], cov[0]
-            log_det[i] = np.linalg.slogdet(s[i])[1]
-            active[j] = False
-            cost[j, :] = cost[:, j] = np.inf
-            others = np.flatnonzero(active & (np.arange(len(w)) != i))
-            if len(others):
-                new = _merge_cost(w, m, s, log_det, i, others)
-                for other, value in zip(others, new, strict=True):
-                    cost[min(i, int(other)), max(i, int(other))] = value
-            remaining -= 1
-        return GaussianMixture(w[active], m[active], s[active])
+        from hmt_ros.inference.reduction import merged_pairwise
+
+        return merged_pairwise(self, k)
 
 
 def bhattacharyya_distances(
@@ -218,25 +188,4 @@ def _points(x: ArrayLike, dimension: int) -> Array:
 
 def _solve_lower(factor: Array, right: Array) -> Array:
     result: Array = solve_triangular(factor, right, lower=True, check_finite=False)
-    return result
-
-
-def _merged(
-    w: Array, m: Array, s: Array, i: int, j: NDArray[np.int_]
-) -> tuple[Array, Array, Array]:
-    """Moment-preserving merges of component i with each of the components j."""
-    total = w[i] + w[j]
-    a, b = w[i] / total, w[j] / total
-    offset = m[j] - m[i]
-    mean = m[i] + b[:, None] * offset
-    spread = (a * b)[:, None, None] * offset[:, :, None] * offset[:, None, :]
-    cov = a[:, None, None] * s[i] + b[:, None, None] * s[j] + spread
-    return total, mean, cov
-
-
-def _merge_cost(w: Array, m: Array, s: Array, log_det: Array, i: int, j: NDArray[np.int_]) -> Array:
-    total, _, cov = _merged(w, m, s, i, j)
-    result: Array = 0.5 * (
-        total * np.linalg.slogdet(cov)[1] - w[i] * log_det[i] - w[j] * log_det[j]
-    )
     return result

@@ -17,6 +17,7 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference import minimise
+from hmt_ros.inference.energy import EnergyFunction
 from hmt_ros.motion.limb_angles import limb_angles
 from hmt_ros.motion.motion_file import Motion
 from hmt_ros.motion.rig import SIDES
@@ -213,7 +214,7 @@ def _refined(body: Body, misfit: Misfit, start: Array, fps: float) -> Array:
             return value + 0.5 * (pull * off * off).sum(1), gradient + pull * off, hessian
 
         best = minimise(
-            objective, poses, skeleton.lower, skeleton.upper,
+            EnergyFunction(objective), poses, skeleton.lower, skeleton.upper,
             step_scale=step_scale, max_iterations=iterations, tolerance=1e-4,
         )  # fmt: skip
         return best.x, best.value

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.model_file import read_body
 from hmt_ros.body.skeleton import Skeleton
+from msg_tools.files.bounded_file import read_bytes
 
 Array = NDArray[np.float64]
 
@@ -139,10 +140,10 @@ def read_text(path: Path) -> str:
     """
     if not path.is_file():
         raise FileNotFoundError(f'no motion file {path}')
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise MotionFileError(path, None, f'{size} bytes, wanted at most {LARGEST_FILE}')
-    content = path.read_bytes()
+    try:
+        content = read_bytes(path, LARGEST_FILE)
+    except ValueError as error:
+        raise MotionFileError(path, None, str(error)) from error
     if b'\0' in content:
         line = content.count(b'\n', 0, content.index(b'\0')) + 1
         raise MotionFileError(path, line, 'binary data, wanted the text of a motion file')

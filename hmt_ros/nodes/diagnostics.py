@@ -1,22 +1,27 @@
-"""What a node tells of its work: rates on /diagnostics, and each message on `~/handled`."""
+"""What a node reports in its diagnostics: rates of messages, and events of the middleware.
+
+Without these events a publisher whose quality of service does not fit is silence without a cause.
+"""
 
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections import Counter
+from collections.abc import Callable
+from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-
-from hmt_ros.sessions.handled import Handled
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.qos import qos_policy_name_from_kind
 
 
 class Rates:
-    """What happened in the last period of diagnostics.
+    """Rates in the last period of the diagnostics.
 
     Args:
-        name: of what is counted.
-        done: what one calls those that were used.
+        name: of the messages that are counted, 'images'.
+        done: what those are called that were used, 'tracked'.
 
     Attributes:
         dropped, faults, lost: of the period.
@@ -36,7 +41,7 @@ class Rates:
         """Ends a period.
 
         Args:
-            counts: 'received', 'dropped', 'faults', 'lost' and those used, of all time.
+            counts: 'received', 'dropped', 'faults', 'lost' and those used, since the start.
             latencies: of the period, s.
         """
         now = time.monotonic()
@@ -50,7 +55,7 @@ class Rates:
         self._latencies, self._counts, self._began = latencies, counts, now
 
     def values(self) -> list[tuple[str, str]]:
-        """For diagnostics."""
+        """Keys and values of the diagnostics."""
         known = self._latencies or [math.nan]
         return [
             (f'{self._name} received a second', f'{self._received:.1f}'),
@@ -60,7 +65,7 @@ class Rates:
         ]
 
     def line(self) -> str:
-        """For the console."""
+        """The rates as a line for the console."""
         latency = ''
         if self._latencies:
             mean = 1e3 * sum(self._latencies) / len(self._latencies)
@@ -72,17 +77,118 @@ class Rates:
         )
 
 
-def handled_message(handled: Handled) -> DiagnosticStatus:
-    """What `~/handled` tells of a message."""
-    values = [
-        ('stamp', handled.stamp_ns),
-        *(('fault', text) for text in handled.faults),
-        *(('warning', text) for text in handled.warnings),
-        *handled.published,
-    ]
-    return DiagnosticStatus(
-        level=DiagnosticStatus.WARN if handled.faults else DiagnosticStatus.OK,
-        name=handled.source,
-        message='; '.join(handled.faults),
-        values=[KeyValue(key=key, value=str(value)) for key, value in values],
-    )
+class MiddlewareEvents:
+    """Counts lost messages and partners that do not fit, and warns of the first of each kind.
+
+    Args:
+        warn: takes the text of a warning.
+    """
+
+    def __init__(self, warn: Callable[[str], None]) -> None:
+        self._warn = warn
+        self._counts: Counter[str] = Counter()
+        self._lost: Counter[str] = Counter()
+        self._policies: dict[str, str] = {}
+        # The thread that estimates makes diagnostics, too.
+        self._lock = threading.Lock()
+
+    def of_subscription(self, topic: str) -> SubscriptionEventCallbacks:
+        """Callbacks for a subscription.
+
+        Args:
+            topic: its full name.
+        """
+
+        def incompatible(event: Any) -> None:
+            policy = _policy(event)
+            with self._lock:
+                self._policies[topic] = policy
+            self._count(
+                f'publishers of {topic} with another {policy}',
+                event.total_count_change,
+                f'{topic}: a publisher offers another {policy} than is asked for, none of its '
+                f'messages will arrive; see "ros2 topic info --verbose {topic}"',
+            )
+
+        def other_type(event: Any) -> None:
+            self._count(
+                f'publishers of {topic} with another type',
+                event.total_count_change,
+                f'{topic}: a publisher has another type, none of its messages will arrive',
+            )
+
+        def lost(event: Any) -> None:
+            count = event.total_count_change
+            with self._lock:
+                self._lost[topic] += count
+            self._count(
+                f'messages lost of {topic}',
+                count,
+                f'{topic}: {count} messages were lost on their way',
+            )
+
+        return SubscriptionEventCallbacks(
+            incompatible_qos=incompatible, incompatible_type=other_type, message_lost=lost
+        )
+
+    def of_publisher(self, topic: str) -> PublisherEventCallbacks:
+        """Callbacks for a publisher.
+
+        Args:
+            topic: its full name.
+        """
+
+        def incompatible(event: Any) -> None:
+            policy = _policy(event)
+            self._count(
+                f'subscriptions to {topic} with another {policy}',
+                event.total_count_change,
+                f'{topic}: a subscription asks for another {policy} than is offered, it will get '
+                f'no messages; see "ros2 topic info --verbose {topic}"',
+            )
+
+        def other_type(event: Any) -> None:
+            self._count(
+                f'subscriptions to {topic} with another type',
+                event.total_count_change,
+                f'{topic}: a subscription has another type, it will get no messages',
+            )
+
+        return PublisherEventCallbacks(incompatible_qos=incompatible, incompatible_type=other_type)
+
+    def refused_policy(self, topic: str) -> str:
+        """The policy of the last publisher that did not fit; '' where all fit."""
+        with self._lock:
+            return self._policies.get(topic, '')
+
+    @property
+    def lost(self) -> int:
+        """Number of messages lost so far, over all topics."""
+        with self._lock:
+            return self._lost.total()
+
+    def values(self) -> list[tuple[str, str]]:
+        """Keys and values of the diagnostics."""
+        with self._lock:
+            counts = [(what, str(count)) for what, count in sorted(self._counts.items())]
+        return [('messages lost', str(self.lost)), *counts]
+
+    def forget(self) -> None:
+        """Forgets the publishers that did not fit; those that still exist will be found again."""
+        with self._lock:
+            self._policies.clear()
+
+    def _count(self, what: str, count: int, text: str) -> None:
+        with self._lock:
+            first = what not in self._counts
+            self._counts[what] += count
+        if first:
+            self._warn(f'{text} (more of the kind are counted in /diagnostics)')
+
+
+def _policy(event: Any) -> str:
+    """Name of the policy that does not fit."""
+    try:
+        return str(qos_policy_name_from_kind(event.last_policy_kind)).lower()
+    except ValueError:
+        return f'policy {event.last_policy_kind}'

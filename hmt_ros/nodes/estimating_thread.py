@@ -1,15 +1,17 @@
-"""The thread that estimates: gives a session its messages, in the order in which they came."""
+"""The thread that estimates: it gives a session its messages in the order of their arrival.
+
+Messages wait in a bounded queue; when an estimate is late the oldest images are dropped.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
 import traceback
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
-from hmt_ros.nodes.input_queue import InputQueue, Waiting
 from hmt_ros.nodes.subscribed_topic import SubscribedTopic
 from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.session import Session
@@ -22,8 +24,89 @@ SMALL_QUEUE = 100
 _RESTART = 'restart'
 
 
+class Waiting(NamedTuple):
+    """Something that waits.
+
+    Attributes:
+        source: where it comes from.
+        content: what it is.
+        arrival: when it came, in seconds of a clock that does not jump.
+        dropped: images that were dropped since the last one was taken out.
+    """
+
+    source: str
+    content: Any
+    arrival: float
+    dropped: int
+
+
+class InputQueue:
+    """First in, first out, between two threads.
+
+    Args:
+        limits: most that may wait, by source; a source that is not named has none.
+        counted: the source whose dropped members are counted.
+    """
+
+    def __init__(self, limits: Mapping[str, int], counted: str) -> None:
+        self._limits = dict(limits)
+        self._counted = counted
+        self._waiting: deque[tuple[str, Any, float]] = deque()
+        self._sizes: Counter[str] = Counter()
+        self._dropped = 0
+        self._closed = False
+        self._changed = threading.Condition()
+
+    def limit(self, source: str, most: int) -> None:
+        """Changes how many of a source may wait."""
+        with self._changed:
+            self._limits[source] = most
+
+    def put(self, source: str, content: Any, arrival: float) -> None:
+        """Adds something; drops the oldest of its source where there are too many."""
+        with self._changed:
+            if self._closed:
+                return
+            self._waiting.append((source, content, arrival))
+            self._sizes[source] += 1
+            while self._sizes[source] > self._limits.get(source, self._sizes[source]):
+                index = next(i for i, item in enumerate(self._waiting) if item[0] == source)
+                del self._waiting[index]
+                self._sizes[source] -= 1
+                self._dropped += source == self._counted
+            self._changed.notify()
+
+    def get(self) -> Waiting | None:
+        """Waits for something and takes it out; None: the queue is closed."""
+        with self._changed:
+            while not self._waiting and not self._closed:
+                self._changed.wait()
+            if self._closed:
+                return None
+            source, content, arrival = self._waiting.popleft()
+            self._sizes[source] -= 1
+            dropped, self._dropped = self._dropped, 0
+            return Waiting(source, content, arrival, dropped)
+
+    def close(self) -> list[Waiting]:
+        """Ends every `get`; returns what waited."""
+        with self._changed:
+            self._closed = True
+            left = [Waiting(*waiting, dropped=0) for waiting in self._waiting]
+            if left:
+                left[0] = left[0]._replace(dropped=self._dropped)
+            self._waiting.clear()
+            self._sizes.clear()
+            self._changed.notify_all()
+            return left
+
+    def __len__(self) -> int:
+        with self._changed:
+            return len(self._waiting)
+
+
 class InnerFaults:
-    """Faults of the node itself, since it was started.
+    """Errors of the node itself since its start.
 
     Attributes:
         count: how many.
@@ -48,20 +131,18 @@ class _TooLarge(NamedTuple):
 
 
 class EstimatingThread:
-    """From the bytes of messages to what became of them.
+    """Handles messages from their bytes to the report on them.
 
     All methods may be called by any thread.
 
     Args:
-        session: is used by this thread alone, until `stop` has returned True.
+        session: used by this thread alone, until `stop` has returned True.
         inputs: where messages come from.
-        counted: the source whose messages are counted, and dropped when the estimate is late.
-        queue_size: most of these that wait.
-        done: how many of these were used so far.
-        tell: is told what became of each message.
-        tell_change: is called when the state of the session has become another.
-        inner_faults: counts what the session should not have raised.
-        log_error: takes such a fault as a text.
+        queue_size: maximum number of images or mixtures that wait.
+        tell: takes the report on each message.
+        tell_change: called when status or kinds of faults of the session have changed.
+        inner_faults: counts errors that the session should not have raised.
+        log_error: takes the traceback of such an error.
 
     Attributes:
         queue: what waits.
@@ -69,12 +150,10 @@ class EstimatingThread:
 
     def __init__(
         self,
-        session: Session,
+        session: Session[Any, Any],
         inputs: Iterable[SubscribedTopic],
-        counted: str,
         queue_size: int,
         *,
-        done: Callable[[], int],
         tell: Callable[[Handled], None],
         tell_change: Callable[[], None],
         inner_faults: InnerFaults,
@@ -82,13 +161,12 @@ class EstimatingThread:
     ) -> None:
         self._session = session
         self._inputs: Mapping[str, SubscribedTopic] = {one.source: one for one in inputs}
-        self._counted = counted
         limits = dict.fromkeys(self._inputs, SMALL_QUEUE)
         # Of several requests to start anew the last counts.
         limits[_RESTART] = 1
-        limits[counted] = queue_size
-        self.queue = InputQueue(limits, counted=counted)
-        self._done, self._tell, self._tell_change = done, tell, tell_change
+        limits[session.COUNTED] = queue_size
+        self.queue = InputQueue(limits, counted=session.COUNTED)
+        self._tell, self._tell_change = tell, tell_change
         self._inner_faults, self._log_error = inner_faults, log_error
         self._latencies: deque[float] = deque(maxlen=1000)
         self._thread = threading.Thread(target=self._work, name='estimate', daemon=True)
@@ -100,20 +178,20 @@ class EstimatingThread:
         content = data if len(data) <= largest else _TooLarge(len(data), largest)
         self.queue.put(source, content, arrival)
 
-    def restart(self, start: Any) -> None:
-        """Has the session start anew once what has come before is handled."""
-        self.queue.put(_RESTART, start, time.monotonic())
+    def restart(self, action: Callable[[], None]) -> None:
+        """Restarts the session by an action, after the messages that have come before."""
+        self.queue.put(_RESTART, action, time.monotonic())
 
     def limit(self, queue_size: int) -> None:
-        """Changes how many of the counted messages may wait."""
-        self.queue.limit(self._counted, queue_size)
+        """Changes how many images or mixtures may wait."""
+        self.queue.limit(self._session.COUNTED, queue_size)
 
     def take_latencies(self) -> list[float]:
-        """From the arrival of messages that were used to their estimate, s; each is told once."""
+        """Times from the arrival of messages to their estimates, s, since the last call."""
         return [self._latencies.popleft() for _ in range(len(self._latencies))]
 
     def stop(self, timeout: float | None = None) -> bool:
-        """Ends after the present message. What waits is dropped, but for a request to start anew.
+        """Ends the thread after the present message; drops what waits, except a restart.
 
         Returns:
             Whether the thread has ended within `timeout` s.
@@ -123,9 +201,9 @@ class EstimatingThread:
         if self._thread.is_alive():
             return False
         for waiting in left:
-            self._session.count_dropped(waiting.dropped + (waiting.source == self._counted))
+            self._session.count_dropped(waiting.dropped + (waiting.source == self._session.COUNTED))
             if waiting.source == _RESTART:
-                self._session.restart(waiting.content)
+                waiting.content()
         return True
 
     def _work(self) -> None:
@@ -147,9 +225,9 @@ class EstimatingThread:
     def _handle(self, waiting: Waiting) -> None:
         session = self._session
         session.count_dropped(waiting.dropped)
-        done = self._done()
+        done = session.state.counts[session.DONE]
         if waiting.source == _RESTART:
-            session.restart(waiting.content)
+            waiting.content()
             return
         try:
             if isinstance(waiting.content, _TooLarge):
@@ -162,6 +240,6 @@ class EstimatingThread:
             handled = session.refuse(waiting.source, error_line(error))
         else:
             handled = session.take(waiting.source, message)
-        if self._done() > done:
+        if session.state.counts[session.DONE] > done:
             self._latencies.append(time.monotonic() - waiting.arrival)
         self._tell(handled)

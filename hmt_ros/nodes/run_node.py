@@ -1,4 +1,4 @@
-"""Runs a node in a process of its own, until it is told to stop."""
+"""Runs a node in a process of its own, until a signal stops it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from typing import Any
 
 import rclpy
 from rclpy.exceptions import ParameterException
@@ -16,30 +16,30 @@ from rclpy.signals import SignalHandlerOptions
 from hmt_ros.nodes.session_node import SessionNode
 from msg_tools.files.error_line import error_line
 
-# Names, in the environment, the process without which a node ends.
+# Environment variable with the id of the process without which a node ends.
 OWNER = 'HMT_ROS_OWNER'
 
-# What a last estimate may take at the end, s; kernels that are being compiled are not waited for.
+# Time for a last estimate at the end, s; too short to wait for kernels that are being compiled.
 _LAST_ESTIMATE = 5.0
 
 
-def run(name: str, make: Callable[[], SessionNode], args: list[str] | None = None) -> int:
-    """Runs a node until it is told to stop; 0, or 1 where it could not start."""
-    # The handlers of rclpy end the context under whatever is going on; ours let it come to its end.
+def run(kind: type[SessionNode[Any, Any]], args: list[str] | None = None) -> int:
+    """Runs a node until a signal stops it; returns 0, or 1 if it could not start."""
+    # The handlers of rclpy end the context in the middle of the work; ours let the work finish.
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopped.set())
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        node = make()
+        node = kind()
     except (ParameterException, ValueError, RuntimeError) as error:
-        sys.stderr.write(f'{name}: {error_line(error)}\n')
+        sys.stderr.write(f'{kind.NAME}: {error_line(error)}\n')
         rclpy.try_shutdown()
         return 1
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     node.start()
-    # Whoever started a node for a while, and was killed, can not end it any more.
+    # A process that started a node and was killed can not end it any more.
     owner = os.environ.get(OWNER)
     while not stopped.is_set() and owner in (None, str(os.getppid())):
         _spin_once(executor, node)
@@ -52,7 +52,7 @@ def run(name: str, make: Callable[[], SessionNode], args: list[str] | None = Non
     return 0
 
 
-def _spin_once(executor: SingleThreadedExecutor, node: SessionNode) -> None:
+def _spin_once(executor: SingleThreadedExecutor, node: SessionNode[Any, Any]) -> None:
     try:
         # A signal does not wake who waits for messages.
         executor.spin_once(timeout_sec=0.2)

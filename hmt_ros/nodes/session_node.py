@@ -4,10 +4,8 @@ The executor's thread only puts messages into a queue and answers services; one 
 estimates. Messages pass as bytes in both directions: what a bag or a wire holds is read and written
 by the same code as offline.
 
-`~/handled` (diagnostic_msgs/DiagnosticStatus) tells of every message that was taken in what became
-of it, after all that it led to has been published: `name` is its source, `message` why it was not
-used, `values` its stamp, faults, warnings, and then the topics and stamps that were published. A
-player that waits for it feeds the node in lock step.
+`~/handled` (hmt_msgs/Handled) reports on every message that was received, after all that it led to
+has been published. A player that waits for it feeds the node in lock step.
 """
 
 from __future__ import annotations
@@ -15,11 +13,16 @@ from __future__ import annotations
 import time
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle
@@ -27,59 +30,65 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from hmt_ros.nodes.diagnostics import Rates, handled_message
+from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates
 from hmt_ros.nodes.estimating_thread import EstimatingThread, InnerFaults
-from hmt_ros.nodes.middleware_events import MiddlewareEvents
-from hmt_ros.nodes.parameter_descriptor import parameter_descriptor
-from hmt_ros.nodes.subscribed_topic import ANSWERS, LATCHED, RELIABLE, SubscribedTopic
-from hmt_ros.sessions.declared_parameters import declared_parameters, with_values
-from hmt_ros.sessions.handled import Handled, Output
-from hmt_ros.sessions.published_topic import SUBSCRIBERS, PublishedTopic
-from hmt_ros.sessions.session import Session
+from hmt_ros.nodes.subscribed_topic import (
+    ANSWERS,
+    LATCHED,
+    RELIABLE,
+    SubscribedTopic,
+    message_class,
+)
+from hmt_ros.sessions.declared_parameters import (
+    AT_LAUNCH,
+    EFFECTS,
+    DeclaredParameter,
+    NodeParameters,
+    declared_parameters,
+    with_values,
+)
+from hmt_ros.sessions.handled import HANDLED, Handled, Output, handled_message
+from hmt_ros.sessions.session import SUBSCRIBERS, Session, SessionState
+from msg_tools import RosbagsMessages
 from msg_tools.files.error_line import error_line
+from msg_tools.messages.cdr import serialise
+
+AnySession = TypeVar('AnySession', bound=Session[Any, Any])
+Parameters = TypeVar('Parameters', bound=NodeParameters)
 
 # An active node that is sent nothing for so long says so, s.
 _SILENCE = 3.0
 
 
-class SessionNode(LifecycleNode):
-    """What all nodes have in common; parameters are the fields of a settings dataclass.
+class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
+    """A node around a session; its parameters are those of a settings dataclass.
+
+    Args:
+        options: of `rclpy.lifecycle.LifecycleNode`.
 
     Attributes:
-        TOPICS: that are published.
-        CLASSES: generated classes of their types.
-        COUNTED: the source whose messages are counted, and dropped when the node is late.
-        COUNTED_NAME: what one calls them.
-        DONE: what one calls those that were used.
+        NAME: of the node.
+        SUBJECT: what the diagnostics are about.
+        SESSION: class of the session.
+        DEFAULTS: parameters with their default values.
     """
 
-    TOPICS: ClassVar[Mapping[str, PublishedTopic]]
-    CLASSES: ClassVar[Mapping[str, type]]
-    COUNTED: ClassVar[str]
-    COUNTED_NAME: ClassVar[str]
-    DONE: ClassVar[str]
+    NAME: ClassVar[str]
+    SUBJECT: ClassVar[str]
+    # Of the types of the class, which a class variable can not name.
+    SESSION: ClassVar[Any]
+    DEFAULTS: ClassVar[Any]
 
-    def __init__(self, name: str, defaults: Any, subject: str, **options: Any) -> None:
-        """See the class.
-
-        Args:
-            name: of the node.
-            defaults: settings with the default values.
-            subject: what the diagnostics are about.
-            options: of `rclpy.lifecycle.LifecycleNode`.
-        """
-        super().__init__(name, **options)
-        self._defaults, self._subject = defaults, subject
-        declared = declared_parameters(defaults)
-        self.declare_parameters(
-            '', [(p.name, p.default, parameter_descriptor(p)) for p in declared]
-        )
-        names = [parameter.name for parameter in declared]
-        self._values = {name: self.get_parameter(name).value for name in names}
-        self._settings = with_values(defaults, self._values)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(self.NAME, **options)
+        declared = declared_parameters(self.DEFAULTS)
+        self.declare_parameters('', [(p.name, p.default, _descriptor(p)) for p in declared])
+        values = {p.name: self.get_parameter(p.name).value for p in declared}
+        self._settings: Parameters = with_values(self.DEFAULTS, values)
+        self._names = values.keys()
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._refuse_impossible_transitions()
-        self._session: Any = None
+        self._session: AnySession | None = None
         self._thread: EstimatingThread | None = None
         self._outputs: dict[str, Any] = {}
         self._handled: Any = None
@@ -90,73 +99,32 @@ class SessionNode(LifecycleNode):
         self._last_arrival: float | None = None
         self._ticks, self._told_at = 0, 0
         self._events = MiddlewareEvents(self.get_logger().warn)
-        self._rates = Rates(self.COUNTED_NAME, self.DONE)
+        self._counted = f'{self.SESSION.UNIT}s'
+        self._rates = Rates(self._counted, self.SESSION.DONE)
         self._diagnostics = self.create_publisher(
             DiagnosticArray,
             '/diagnostics',
             RELIABLE,
             event_callbacks=self._events.of_publisher('/diagnostics'),
         )
-        # With use_sim_time and nobody who tells the time, diagnostics are needed most.
+        # With use_sim_time and without a clock, diagnostics are needed most.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._diagnose_period, clock=steady)
 
     # What a node decides.
 
     @abstractmethod
-    def _new_session(
-        self, publish: Callable[[Output], None], wanted: Callable[[str], bool]
-    ) -> Session:
-        """The session; ValueError: the settings name something that can not be used."""
-
-    @abstractmethod
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
-        """Type, name and callback of the services."""
+        """Types, names and callbacks of the services."""
 
     @abstractmethod
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
-        """The topics to subscribe to; the last is the one that gives the tempo."""
+        """The topics to subscribe to, the one that sets the pace last."""
 
-    @abstractmethod
-    def _summary(self, state: Any) -> str:
-        """What the present estimate is, in a few words, for the diagnostics."""
+    def _finish(self, session: AnySession) -> None:
+        """Publishes what is left when the node does not listen any more."""
 
-    @abstractmethod
-    def _state_values(self, state: Any) -> list[tuple[str, str]]:
-        """Values of the diagnostics."""
-
-    @abstractmethod
-    def _counts(self, state: Any) -> Counter[str]:
-        """How many messages of `COUNTED` were 'received', 'dropped', and `DONE`."""
-
-    def _judgement(self, state: Any) -> tuple[bytes, str]:
-        """Level and message of the diagnostics of an active node."""
-        rates = self._rates
-        deaf = self._deaf_topic()
-        if deaf:
-            return DiagnosticStatus.WARN, deaf
-        if rates.dropped:
-            late = f'late: {rates.dropped} {self.COUNTED_NAME} dropped in a second'
-            return DiagnosticStatus.WARN, late
-        if rates.faults:
-            return DiagnosticStatus.WARN, state.last_fault
-        if rates.lost:
-            return DiagnosticStatus.WARN, f'{rates.lost} messages lost on their way in a second'
-        if state.wants:
-            return DiagnosticStatus.WARN, f'waits for {state.wants}'
-        if self._last_arrival is not None:
-            silence = time.monotonic() - self._last_arrival
-            if silence > _SILENCE:
-                return DiagnosticStatus.WARN, f'no {self.COUNTED_NAME} for {silence:.0f} s'
-        return DiagnosticStatus.OK, f'{state.status}, {self._summary(state)}'
-
-    def _check_changed(self, settings: Any, changed: Mapping[str, Any]) -> None:
-        """Raises ValueError where new values name something that can not be used."""
-
-    def _finish(self, session: Any) -> None:
-        """What is still to be published when nothing more is listened to."""
-
-    # What it does with that.
+    # What all nodes do.
 
     def start(self) -> None:
         """Configures and activates the node, unless it is to wait for its services."""
@@ -181,22 +149,22 @@ class SessionNode(LifecycleNode):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Reads files, opens topics."""
         try:
-            self._session = self._new_session(self._publish, self._is_wanted)
+            self._session = self.SESSION(self._settings, self._publish, self._is_wanted)
         except ValueError as error:
             self._failure = error_line(error)
             self.get_logger().error(self._failure)
             self._diagnose()
             return TransitionCallbackReturn.FAILURE
         self._failure = ''
-        for topic, published in self.TOPICS.items():
+        for topic, published in self.SESSION.TOPICS.items():
             self._outputs[topic] = self.create_lifecycle_publisher(
-                self.CLASSES[published.msgtype],
+                message_class(published.msgtype),
                 topic,
                 LATCHED if published.latched else RELIABLE,
                 event_callbacks=self._events.of_publisher(self.resolve_topic_name(topic)),
             )
         self._handled = self.create_lifecycle_publisher(
-            DiagnosticStatus,
+            message_class(HANDLED),
             '~/handled',
             ANSWERS,
             event_callbacks=self._events.of_publisher(self.resolve_topic_name('~/handled')),
@@ -217,9 +185,7 @@ class SessionNode(LifecycleNode):
         self._thread = EstimatingThread(
             session,
             inputs,
-            self.COUNTED,
             self._settings.queue_size,
-            done=lambda: self._counts(session.state)[self.DONE],
             tell=self._tell,
             tell_change=self._diagnose,
             inner_faults=self._inner_faults,
@@ -228,8 +194,8 @@ class SessionNode(LifecycleNode):
         for one in inputs:
             self._subscribe(one)
         topic = self._inputs[-1].topic_name
-        wants = self._session.state.wants
-        self.get_logger().info(f'{self.COUNTED_NAME} from {topic}; waits for {wants}')
+        wants = session.state.wants
+        self.get_logger().info(f'{self._counted} from {topic}; waits for {wants}')
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -261,14 +227,14 @@ class SessionNode(LifecycleNode):
 
         def receive(data: bytes) -> None:
             now = time.monotonic()
-            if wanted.source == self.COUNTED:
+            if wanted.source == self.SESSION.COUNTED:
                 self._last_arrival = now
             thread.put(wanted.source, data, now)
 
         events = self._events.of_subscription(self.resolve_topic_name(wanted.topic))
         self._inputs.append(
             self.create_subscription(
-                wanted.kind,
+                message_class(wanted.msgtype),
                 wanted.topic,
                 receive,
                 wanted.qos,
@@ -286,7 +252,7 @@ class SessionNode(LifecycleNode):
         self._last_arrival = None
 
     def _deaf_topic(self) -> str:
-        """Of a topic that only publishers that do not fit publish, which and why; '': none."""
+        """A topic whose publishers all have a quality of service that does not fit, and why."""
         try:
             for subscription in list(self._inputs):
                 topic = subscription.topic_name
@@ -330,15 +296,15 @@ class SessionNode(LifecycleNode):
     # Parameters.
 
     def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        changed = {p.name: p.value for p in parameters if p.name in self._values}
+        changed = {p.name: p.value for p in parameters if p.name in self._names}
         if not changed:
             return SetParametersResult(successful=True)
         try:
-            settings = with_values(self._defaults, {**self._values, **changed})
-            self._check_changed(settings, changed)
+            settings = with_values(self._settings, changed)
+            if any(name in changed for name in self.SESSION.CHECKED):
+                self.SESSION(settings, lambda output: None)
         except ValueError as error:
             return SetParametersResult(successful=False, reason=error_line(error))
-        self._values.update(changed)
         self._settings = settings
         if self._session is not None:
             self._session.parameters = settings
@@ -346,13 +312,13 @@ class SessionNode(LifecycleNode):
             self._thread.limit(settings.queue_size)
         return SetParametersResult(successful=True)
 
-    # What the thread that estimates calls.
+    # Called by the thread that estimates.
 
     def _tell(self, handled: Handled) -> None:
         for text in handled.warnings:
             self.get_logger().warn(f'{text} (more of the kind are counted in /diagnostics)')
         if self._handled.get_subscription_count():
-            self._handled.publish(handled_message(handled))
+            self._handled.publish(serialise(handled_message(RosbagsMessages(), handled)))
 
     def _publish(self, output: Output) -> None:
         self._outputs[output.topic].publish(output.data)
@@ -366,16 +332,16 @@ class SessionNode(LifecycleNode):
         counts: Counter[str] = Counter()
         if self._session is not None:
             state = self._session.state
-            counts = Counter(self._counts(state))
+            counts = Counter(state.counts)
             counts['faults'] = state.faults.total()
         counts['lost'] = self._events.lost
         latencies = [] if self._thread is None else self._thread.take_latencies()
         self._rates.next_period(counts, latencies)
         self._diagnose()
-        self._tell_status(counts)
+        self._log_status(counts)
 
-    def _tell_status(self, counts: Counter[str]) -> None:
-        """One line a period, or a few periods, while there is something new to tell."""
+    def _log_status(self, counts: Counter[str]) -> None:
+        """One line a period, or a few periods, while messages arrive."""
         self._ticks += 1
         interval = self._settings.status_interval
         if not interval or self._ticks < interval or counts['received'] == self._told_at:
@@ -383,32 +349,51 @@ class SessionNode(LifecycleNode):
         self._ticks, self._told_at = 0, counts['received']
         if self._session is not None:
             label = self._state_machine.current_state[1]
-            _, text = self._present_judgement(label, self._session.state)
+            _, text = self._judgement(label, self._session.state)
             self.get_logger().info(f'{text}; {self._rates.line()}')
 
-    def _present_judgement(self, label: str, state: Any) -> tuple[bytes, str]:
+    def _judgement(self, label: str, state: SessionState | None) -> tuple[bytes, str]:
+        """Level and message of the diagnostics."""
         if self._failure:
             return DiagnosticStatus.ERROR, self._failure
         if state is None or label != 'active':
             return DiagnosticStatus.OK, label
-        return self._judgement(state)
+        trouble = state.trouble() or self._deaf_topic() or self._trouble_of_period(state)
+        if trouble:
+            return DiagnosticStatus.WARN, trouble
+        return DiagnosticStatus.OK, f'{state.status}, {state.summary()}'
+
+    def _trouble_of_period(self, state: SessionState) -> str:
+        rates = self._rates
+        if rates.dropped:
+            return f'late: {rates.dropped} {self._counted} dropped in a second'
+        if rates.faults:
+            return state.last_fault
+        if rates.lost:
+            return f'{rates.lost} messages lost on their way in a second'
+        if state.wants:
+            return f'waits for {state.wants}'
+        if self._last_arrival is not None:
+            silence = time.monotonic() - self._last_arrival
+            if silence > _SILENCE:
+                return f'no {self._counted} for {silence:.0f} s'
+        return ''
 
     def _diagnose(self) -> None:
         label = self._state_machine.current_state[1]
         state = self._session.state if self._session is not None else None
-        name = f'{self.get_fully_qualified_name().strip("/")}: {self._subject}'
-        level, text = self._present_judgement(label, state)
+        name = f'{self.get_fully_qualified_name().strip("/")}: {self.SUBJECT}'
+        level, text = self._judgement(label, state)
         status = DiagnosticStatus(name=name, level=level, message=text)
         values = [('lifecycle', label)]
         if state is not None:
-            counts = self._counts(state)
             values += [
                 ('status', state.status),
                 *(
-                    (f'{self.COUNTED_NAME} {what}', str(counts[what]))
-                    for what in ('received', self.DONE, 'skipped', 'dropped')
+                    (f'{self._counted} {what}', str(state.counts[what]))
+                    for what in ('received', self.SESSION.DONE, 'skipped', 'dropped')
                 ),
-                *self._state_values(state),
+                *state.values(),
                 *((f'faults: {kind}', str(count)) for kind, count in sorted(state.faults.items())),
                 ('last fault', state.last_fault),
                 ('errors of the node itself', str(self._inner_faults.count)),
@@ -424,3 +409,20 @@ class SessionNode(LifecycleNode):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
+
+
+def _descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
+    """How a parameter is declared to ROS: description, limits, whether it can change."""
+    descriptor = ParameterDescriptor(
+        description=f'{parameter.description} {EFFECTS[parameter.effect]}',
+        read_only=parameter.effect == AT_LAUNCH,
+    )
+    if parameter.limits is not None:
+        low, high = parameter.limits
+        if isinstance(parameter.default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+        else:
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(low), to_value=float(high))
+            ]
+    return descriptor

@@ -1,17 +1,17 @@
-"""Topics that nodes subscribe to, and the quality of service of what they publish."""
+"""Topics of the nodes: what they subscribe to, and the quality of service of what they publish."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from importlib import import_module
+from typing import Any, NamedTuple
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from hmt_ros.sessions.camera_input import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from msg_tools.messages.images import MAX_PIXELS
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-# Of `~/handled`: whoever counts on an answer to each message must not miss those to a burst.
+# For `~/handled`: who waits for an answer to each message must not miss those to a burst.
 ANSWERS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     depth=1,
@@ -20,7 +20,7 @@ LATCHED = QoSProfile(
 )
 
 
-# Bytes of a message: what is larger is no mixture of a person, or more pixels than are taken.
+# Largest messages that are taken, bytes. A mixture over the poses of a person is smaller.
 LARGEST_MESSAGE = 2**24
 LARGEST_IMAGE = 8 * MAX_PIXELS + 2**16
 
@@ -29,39 +29,32 @@ class SubscribedTopic(NamedTuple):
     """A subscribed topic.
 
     Attributes:
-        source: what the session calls it.
+        source: name that the session has for it.
         topic: its name.
-        kind: generated class.
         msgtype: for example 'sensor_msgs/msg/Image'.
-        qos: of the subscription.
-        largest: bytes of a message that is taken.
+        qos: quality of service of the subscription.
+        largest: size of the largest message that is taken, bytes.
     """
 
     source: str
     topic: str
-    kind: type
     msgtype: str
-    qos: QoSProfile
+    qos: QoSProfile = qos_profile_sensor_data
     largest: int = LARGEST_MESSAGE
 
 
-def camera_info_topic() -> SubscribedTopic:
-    """The calibration of a camera."""
-    kind = 'sensor_msgs/msg/CameraInfo'
-    return SubscribedTopic(CAMERA_INFO, 'camera_info', CameraInfo, kind, qos_profile_sensor_data)
+CAMERA_INFO_TOPIC = SubscribedTopic(CAMERA_INFO, 'camera_info', 'sensor_msgs/msg/CameraInfo')
 
 
 def image_topic(image_transport: str) -> SubscribedTopic:
     """The images of a camera, 'raw' or 'compressed'."""
+    topic, kind = ('image', 'Image')
     if image_transport == 'compressed':
-        kind = 'sensor_msgs/msg/CompressedImage'
-        return SubscribedTopic(
-            IMAGE,
-            'image/compressed',
-            CompressedImage,
-            kind,
-            qos_profile_sensor_data,
-            LARGEST_IMAGE,
-        )
-    kind = 'sensor_msgs/msg/Image'
-    return SubscribedTopic(IMAGE, 'image', Image, kind, qos_profile_sensor_data, LARGEST_IMAGE)
+        topic, kind = ('image/compressed', 'CompressedImage')
+    return SubscribedTopic(IMAGE, topic, f'sensor_msgs/msg/{kind}', largest=LARGEST_IMAGE)
+
+
+def message_class(msgtype: str) -> Any:
+    """The generated class of a message type."""
+    package, _, name = msgtype.split('/')
+    return getattr(import_module(f'{package}.msg'), name)

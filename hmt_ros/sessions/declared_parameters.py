@@ -1,9 +1,10 @@
 """Settings dataclasses as ROS parameters.
 
-A settings dataclass, with the dataclasses inside it, is what a node is parametrised by. Its fields
-are the parameters (`likelihood.edges.weight` for a field of a field of a field), its docstring
-describes them, and its own checks decide whether values go together. So a field that is added to
-the settings is a parameter without being named a second time.
+A node is parametrised by a dataclass whose docstring describes the parameters and whose checks
+decide whether values go together. A field made by `parameter_field` is a parameter. A field with
+`nested_parameters` holds settings of a library class and lists which of them are parameters
+(`likelihood.edges.weight` is a field of a field of a field). Everything else can only be set by a
+program.
 """
 
 from __future__ import annotations
@@ -14,17 +15,13 @@ import inspect
 import math
 import re
 import textwrap
-from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 Value = bool | int | float | str
+Limits = tuple[float, float] | None
 Settings = TypeVar('Settings')
-
-# Metadata of a field.
-LIMITS = 'limits'  # (lowest, highest), or these by name for the fields of this field
-EFFECT = 'effect'  # when a new value takes effect
-FLAT = 'flat'  # fields of this field are parameters without a prefix
 
 AT_ONCE = 'at once'
 NEXT_TRACK = 'next track'
@@ -36,21 +33,80 @@ EFFECTS = {
     NEXT_TRACK: 'A new value takes effect when the next track starts, after ~/reset for example.',
     NEXT_WINDOW: 'A new value takes effect when the next window starts, after a jump in time say.',
     NEXT_CONFIGURE: 'A new value takes effect when the node is configured the next time.',
-    AT_LAUNCH: 'Can only be set at launch.',
+    AT_LAUNCH: 'The value can only be set at launch.',
 }
 
-_LARGEST_INTEGER = 2**31 - 1
+NOT_NEGATIVE = (0.0, math.inf)
+FRACTION = (0.0, 1.0)
+
+TRANSPORTS = ('raw', 'compressed')
+
+# Metadata of a field that is one parameter or holds several.
+_EFFECT, _LIMITS, _PREFIX = 'effect', 'limits', 'prefix'
 
 
-def parameter_field(default: Value, effect: str, limits: tuple[float, float] | None = None) -> Any:
-    """A field of a settings dataclass that is a parameter.
+def parameter_field(default: Value, effect: str, limits: Limits = None) -> Any:
+    """A field that is a parameter.
 
     Args:
-        default: its value.
-        effect: one of `EFFECTS`.
-        limits: lowest and highest value; None: numbers keep the sign of the default.
+        default: its value unless another is given.
+        effect: when a new value takes effect; one of `EFFECTS`.
+        limits: lowest and highest value; None where the parameter is no number.
     """
-    return dataclasses.field(default=default, metadata={EFFECT: effect, LIMITS: limits})
+    return dataclasses.field(default=default, metadata={_EFFECT: effect, _LIMITS: {'': limits}})
+
+
+def nested_parameters(
+    effect: str, parameters: Mapping[str, Limits], prefix: str = ''
+) -> Mapping[str, Any]:
+    """Metadata of a field that holds settings of a library class, some of which are parameters.
+
+    Args:
+        effect: when new values take effect; one of `EFFECTS`.
+        parameters: the limits of those that are parameters, by name; dots lead into settings within
+            the settings.
+        prefix: what the names of the parameters begin with.
+    """
+    return {_EFFECT: effect, _LIMITS: parameters, _PREFIX: prefix}
+
+
+@dataclass(frozen=True)
+class NodeParameters:
+    """Parameters that all nodes have.
+
+    Attributes:
+        reset_on_time_jump: If true, a message that is older than the one before starts the estimate
+            anew; if false, it is skipped.
+        queue_size: Maximum number of messages that wait to be estimated from; when the node is late
+            the oldest are dropped.
+        status_interval: Interval between two status lines on the console while messages arrive, s;
+            0 switches them off.
+        autostart: If true, the node configures and activates itself; if false, it waits for its
+            lifecycle services.
+    """
+
+    reset_on_time_jump: bool = parameter_field(False, AT_ONCE)
+    queue_size: int = parameter_field(5, AT_ONCE, (1, 1000))
+    status_interval: int = parameter_field(1, AT_ONCE, (0, 3600))
+    autostart: bool = parameter_field(True, AT_LAUNCH)
+
+
+@dataclass(frozen=True)
+class CameraNodeParameters(NodeParameters):
+    """Parameters of the nodes that subscribe to images.
+
+    Attributes:
+        image_transport: Transport of the images, 'raw' (topic image) or 'compressed' (topic
+            image/compressed).
+    """
+
+    image_transport: str = parameter_field('raw', NEXT_CONFIGURE)
+
+    def __post_init__(self) -> None:
+        if self.image_transport not in TRANSPORTS:
+            raise ValueError(
+                f'image_transport must be one of {TRANSPORTS}, saw {self.image_transport!r}'
+            )
 
 
 class ParameterError(ValueError):
@@ -67,53 +123,58 @@ class DeclaredParameter:
         description: one sentence or more.
         limits: lowest and highest value, None where the parameter is no number.
         effect: when a new value takes effect; one of `EFFECTS`.
+        path: names of the fields that lead from the settings to the value.
     """
 
     name: str
     default: Value
     description: str
-    limits: tuple[float, float] | None
+    limits: Limits
     effect: str
+    path: tuple[str, ...]
 
-    def checked(self, value: Any) -> Any:
+    def checked(self, value: Any) -> Value:
         """A value from a file or a command line, with the type of the parameter.
 
         Raises:
             ParameterError: another type, or beyond the limits.
         """
-        wanted = type(self.default)
+        wanted: Any = type(self.default)
         if wanted is float and type(value) is int:
             value = float(value)
-        kind = type(value)
-        if kind is not wanted:
+        if type(value) is not wanted:
             raise ParameterError(f'{self.name} must be a {_NAMES[wanted]}, saw {value!r}')
         if self.limits is not None and not self.limits[0] <= value <= self.limits[1]:
             low, high = self.limits
             raise ParameterError(
                 f'{self.name} must lie between {low:g} and {high:g}, saw {value!r}'
             )
-        return wanted(value)
+        result: Value = wanted(value)
+        return result
 
 
 _NAMES = {bool: 'truth value', int: 'whole number', float: 'number', str: 'text'}
 
 
-def declared_parameters(settings: Any, effect: str = NEXT_TRACK) -> list[DeclaredParameter]:
-    """The parameters that a settings dataclass stands for; its values are the defaults.
+def declared_parameters(settings: Any) -> list[DeclaredParameter]:
+    """The parameters of a settings dataclass, those of the class before those of its bases.
 
     Args:
-        settings: an instance.
-        effect: of the fields that do not say it themselves; one of `EFFECTS`.
-
-    Raises:
-        TypeError: a field of a type that no parameter has.
+        settings: an instance; its values are the defaults.
     """
-    found = list(_parameters(settings, '', effect, {}))
-    names = [parameter.name for parameter in found]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise TypeError(f'{type(settings).__name__} gives the parameters {twice} twice')
-    return found
+    places = {name: i for i, name in enumerate(vars(type(settings)).get('__annotations__', ()))}
+    ordered = sorted(fields(settings), key=lambda field: places.get(field.name, len(places)))
+    return [
+        _declared(
+            settings,
+            (field.name, *name.split('.')) if name else (field.name,),
+            f'{field.metadata[_PREFIX]}{name}' if name else field.name,
+            limits,
+            field.metadata[_EFFECT],
+        )
+        for field in ordered
+        for name, limits in field.metadata.get(_LIMITS, {}).items()
+    ]
 
 
 def values_of(settings: Any) -> dict[str, Value]:
@@ -134,82 +195,44 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
             near = difflib.get_close_matches(name, known, n=1)
             hint = f'; is {near[0]} meant?' if near else ''
             raise ParameterError(f'there is no parameter {name}{hint}')
-    checked = {name: known[name].checked(value) for name, value in values.items()}
-    return _rebuilt(settings, '', checked)
-
-
-def described_fields(cls: type) -> dict[str, str]:
-    """What the section 'Attributes:' of a docstring says of each name, as one line each."""
-    text = inspect.cleandoc(cls.__doc__ or '')
-    _, _, section = text.partition('Attributes:\n')
-    # Ends where a line is not indented any more.
-    block = re.split(r'\n(?=\S)', section, maxsplit=1)[0]
-    result: dict[str, str] = {}
-    for entry in re.split(r'\n(?=\S)', textwrap.dedent(block)):
-        names, colon, words = entry.partition(':')
-        if colon:
-            for name in names.split(','):
-                result[name.strip()] = ' '.join(words.split())
+    checked = {known[name].path: known[name].checked(value) for name, value in values.items()}
+    result: Settings = _rebuilt(settings, checked)
     return result
 
 
-def _parameters(
-    settings: Any, prefix: str, effect: str, limits: Mapping[str, Any]
-) -> Iterator[DeclaredParameter]:
-    described = described_fields(type(settings))
-    for field in fields(settings):
-        value = getattr(settings, field.name)
-        own_effect = field.metadata.get(EFFECT, effect)
-        if is_dataclass(value):
-            inner = _inner_prefix(field, prefix)
-            named = field.metadata.get(LIMITS, {})
-            named = {f'{inner}{name}': pair for name, pair in named.items()}
-            group = described.get(field.name, '')
-            for parameter in _parameters(value, inner, own_effect, {**limits, **named}):
-                yield replace(parameter, description=_in_group(parameter, group, field))
-        elif type(value) in _NAMES:
-            name = f'{prefix}{field.name}'
-            yield DeclaredParameter(
-                name,
-                value,
-                described.get(field.name, ''),
-                limits.get(name, _limits(field, value)),
-                own_effect,
-            )
-        else:
-            raise TypeError(
-                f'{type(settings).__name__}.{field.name} is a {type(value).__name__}, '
-                f'wanted one of {[cls.__name__ for cls in _NAMES]} or a dataclass'
-            )
+def described_fields(cls: type) -> dict[str, str]:
+    """The section 'Attributes:' of the docstrings of a class and its bases: one line by name."""
+    result: dict[str, str] = {}
+    for each in reversed(cls.__mro__):
+        text = inspect.cleandoc(vars(each).get('__doc__') or '')
+        _, _, section = text.partition('Attributes:\n')
+        # Ends where a line is not indented any more.
+        block = re.split(r'\n(?=\S)', section, maxsplit=1)[0]
+        for entry in re.split(r'\n(?=\S)', textwrap.dedent(block)):
+            names, colon, words = entry.partition(':')
+            if colon:
+                result |= dict.fromkeys(re.split(r',\s*', names), ' '.join(words.split()))
+    return result
 
 
-def _in_group(parameter: DeclaredParameter, group: str, field: Field[Any]) -> str:
-    """The description, opened by that of the group where the same class serves several of them."""
-    if field.metadata.get(FLAT) or not group or group.startswith('settings of'):
-        return parameter.description
-    return f'{group.rstrip(".")}: {parameter.description}'
+def _declared(
+    settings: Any, path: tuple[str, ...], name: str, limits: Limits, effect: str
+) -> DeclaredParameter:
+    groups = [settings]
+    for step in path[:-1]:
+        groups.append(getattr(groups[-1], step))
+    owner, outer = groups[-1], groups[-2:-1]
+    text = described_fields(type(owner)).get(path[-1], '')
+    # Fields of one class are told apart by what the group says of each.
+    if outer and sum(type(value) is type(owner) for value in vars(outer[0]).values()) > 1:
+        group = described_fields(type(outer[0]))[path[-2]].rstrip('.')
+        text = f'{group}: {text[0].lower()}{text[1:]}'
+    return DeclaredParameter(name, getattr(owner, path[-1]), text, limits, effect, path)
 
 
-def _inner_prefix(field: Field[Any], prefix: str) -> str:
-    return prefix if field.metadata.get(FLAT) else f'{prefix}{field.name}.'
-
-
-def _limits(field: Field[Any], value: Any) -> tuple[float, float] | None:
-    """The limits that a field names; else numbers keep the sign of their default."""
-    limits: tuple[float, float] | None = field.metadata.get(LIMITS)
-    if limits is not None or type(value) not in (int, float):
-        return limits
-    default = value if field.default is MISSING else field.default
-    highest = float(_LARGEST_INTEGER) if type(value) is int else math.inf
-    return (-highest, highest) if default < 0 else (0.0, highest)
-
-
-def _rebuilt(settings: Any, prefix: str, values: Mapping[str, Value]) -> Any:
+def _rebuilt(settings: Any, values: Mapping[tuple[str, ...], Value]) -> Any:
     changes: dict[str, Any] = {}
-    for field in fields(settings):
-        value = getattr(settings, field.name)
-        if is_dataclass(value):
-            changes[field.name] = _rebuilt(value, _inner_prefix(field, prefix), values)
-        elif f'{prefix}{field.name}' in values:
-            changes[field.name] = values[f'{prefix}{field.name}']
+    for name in dict.fromkeys(path[0] for path in values):
+        inner = {path[1:]: value for path, value in values.items() if path[0] == name}
+        changes[name] = inner[()] if () in inner else _rebuilt(getattr(settings, name), inner)
     return replace(settings, **changes)

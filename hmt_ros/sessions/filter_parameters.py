@@ -11,93 +11,72 @@ import sys
 from dataclasses import dataclass, field
 
 from hmt_ros.image.background import BackgroundSettings
+from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.sessions.declared_parameters import (
-    AT_LAUNCH,
     AT_ONCE,
-    EFFECT,
-    FLAT,
-    LIMITS,
-    NEXT_CONFIGURE,
+    FRACTION,
     NEXT_TRACK,
+    NOT_NEGATIVE,
+    CameraNodeParameters,
+    nested_parameters,
     parameter_field,
 )
 from hmt_ros.sessions.parameter_file import parameter_file_text
 from hmt_ros.tracking import TrackerSettings
 
-TRANSPORTS = ('raw', 'compressed')
-
-_FRACTION = (0.0, 1.0)
-
-# Where a number may be more than a value of the same sign as its default.
-_TRACKER_LIMITS = {
+# Settings that are parameters, with their limits.
+_TRACKER = {
     'max_hypotheses': (1, 64),
     'hypothesis_merge_distance': (0.0, 1.0),
+    'proposals': None,
     'candidates': (1, 1024),
-    'combinations': (1, 65536),
-    'alternatives': (1, 64),
     'samples': (1, 65536),
-    'rounds': (1, 100),
-    'edge_jumps': (0, 64),
-    'image_trust': _FRACTION,
-    'jump_probability': _FRACTION,
-    'edge_probability': _FRACTION,
-    'prediction_probability': _FRACTION,
+    'sample_scale': NOT_NEGATIVE,
+    'reweighting': None,
+    'searched_chains': (0, 64),
+    'jump_probability': FRACTION,
+    'prediction_probability': FRACTION,
     'facing_trial': (0.0, 60.0),
-    'base_iterations': (1, 100),
-    'iterations': (1, 100),
-    'least_log_weight': (-100.0, 0.0),
-    'lost_misfit': _FRACTION,
+    'inverse_temperature': NOT_NEGATIVE,
+    'image_information': FRACTION,
+    'flesh_images': (0, 100_000),
+    'lost_misfit': FRACTION,
     'lost_images': (1, 100_000),
-    'dynamics.velocity_kept': _FRACTION,
-    'dynamics.velocity_gain': _FRACTION,
-    'observation.outline_points': (8, 10_000),
-    'observation.margin': (1, 10_000),
-    'observation.intensity_blur': (0.1, 100.0),
-    'search.samples': (3, 65536),
-    'search.refined': (1, 1024),
-    'search.iterations': (1, 100),
+    **{f'likelihood.{term.name}.weight': NOT_NEGATIVE for term in TERMS},
+    'likelihood.keypoints.weight': NOT_NEGATIVE,
+    'likelihood.prior_weight': NOT_NEGATIVE,
+    'likelihood.self_intersection_sigma': NOT_NEGATIVE,
 }
-BACKGROUND_LIMITS = {
-    'shadow_threshold': _FRACTION,
-    'smallest_part': _FRACTION,
-    'largest_gap': (0.0, 10.0),
-}
+BACKGROUND = {'method': None, 'threshold': NOT_NEGATIVE, 'shadow_threshold': FRACTION}
 
 
 @dataclass(frozen=True)
-class FilterParameters:
+class FilterParameters(CameraNodeParameters):
     """All parameters of the filter node.
 
     Attributes:
         subject_file: YAML file with the joints of the person in one image, which starts the track;
-            empty: a pose_prediction does, with use_predictions, or ~/reset with a mixture.
-        background_file: image of the empty scene, as the camera sees it; empty: learned from the
-            images before the track starts.
-        body_model: 'human37', 'human34', 'human32', or a YAML file.
-        random_seed: of all that is random. The same images give the same numbers.
-        reset_on_time_jump: whether an image that is older than the one before starts the track
-            anew; otherwise such images are skipped.
-        image_transport: 'raw' (topic image) or 'compressed' (topic image/compressed).
-        queue_size: images that wait at most; when the node is late the oldest are dropped.
-        use_keypoints: whether keypoints are a measurement. An image then waits for the keypoints of
+            if empty, a pose_prediction (with use_predictions) or a mixture (by ~/reset) starts it.
+        background_file: Image of the empty scene as the camera sees it; if empty, the background is
+            learned from the images before the track starts.
+        body_model: Body model, 'human37', 'human34', 'human32' or a YAML file.
+        random_seed: Seed of all random numbers; the same images give the same results.
+        use_keypoints: If true, keypoints are a measurement, and an image waits for the keypoints of
             its stamp.
-        keypoint_sigma_px: standard deviation of keypoints that come without a covariance, px.
-        keypoints_timeout: an image waits no longer when keypoints of a later stamp, or an image
-            that is so much younger, have come, s.
-        use_predictions: whether poses that are predicted from the image, by bme_node, start the
-            track where there is no subject_file, and are among the hypotheses. An image then waits
-            for the prediction of its stamp.
-        prediction_timeout: an image waits no longer when a prediction of a later stamp, or an image
-            that is so much younger, has come, s.
-        overlay_modes: heaviest modes that are drawn on the image; 0: no overlay.
-        overlay_quality: of the JPEG pictures of the overlay.
-        publish_tf: whether the segments of the heaviest mode are published on /tf.
-        frame_prefix: stands before the names of the segments on /tf and in human_description, so
-            that several persons differ.
-        status_interval: a line on the console says every so many seconds what the node does, while
-            messages come, s; 0: never.
-        autostart: whether the node configures and activates itself; otherwise it waits for its
-            lifecycle services.
+        keypoint_sigma_px: Standard deviation of keypoints that come without a covariance, px.
+        keypoints_timeout: Maximum time that an image waits for its keypoints, measured by the
+            stamps of later images, s; keypoints of a later stamp end the wait at once.
+        use_predictions: If true, poses that bme_node predicts from the image start the track where
+            there is no subject_file, and are among the hypotheses; an image then waits for the
+            prediction of its stamp.
+        prediction_timeout: Maximum time that an image waits for its prediction, measured by the
+            stamps of later images, s; a prediction of a later stamp ends the wait at once.
+        overlay_modes: Maximum number of modes drawn on the image, the heaviest; 0 switches the
+            overlay off.
+        overlay_quality: JPEG quality of the overlay.
+        publish_tf: If true, the links of the heaviest mode are published on /tf.
+        frame_prefix: Prefix of the names of the links on /tf and in human_description, which tells
+            several persons apart.
         tracker: settings of the tracker.
         background: settings of the background subtraction.
     """
@@ -106,9 +85,6 @@ class FilterParameters:
     background_file: str = parameter_field('', NEXT_TRACK)
     body_model: str = parameter_field('human37', NEXT_TRACK)
     random_seed: int = parameter_field(0, NEXT_TRACK, (0, 2**31 - 1))
-    reset_on_time_jump: bool = parameter_field(False, AT_ONCE)
-    image_transport: str = parameter_field('raw', NEXT_CONFIGURE)
-    queue_size: int = parameter_field(5, AT_ONCE, (1, 1000))
     use_keypoints: bool = parameter_field(False, AT_ONCE)
     keypoint_sigma_px: float = parameter_field(5.0, AT_ONCE, (0.01, 1000.0))
     keypoints_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
@@ -118,22 +94,16 @@ class FilterParameters:
     overlay_quality: int = parameter_field(85, AT_ONCE, (1, 100))
     publish_tf: bool = parameter_field(True, AT_ONCE)
     frame_prefix: str = parameter_field('', AT_ONCE)
-    status_interval: int = parameter_field(1, AT_ONCE, (0, 3600))
-    autostart: bool = parameter_field(True, AT_LAUNCH)
     tracker: TrackerSettings = field(
-        default_factory=TrackerSettings,
-        metadata={FLAT: True, EFFECT: NEXT_TRACK, LIMITS: _TRACKER_LIMITS},
+        default_factory=TrackerSettings, metadata=nested_parameters(NEXT_TRACK, _TRACKER)
     )
     background: BackgroundSettings = field(
         default_factory=BackgroundSettings,
-        metadata={EFFECT: NEXT_TRACK, LIMITS: BACKGROUND_LIMITS},
+        metadata=nested_parameters(NEXT_TRACK, BACKGROUND, 'background.'),
     )
 
     def __post_init__(self) -> None:
-        if self.image_transport not in TRANSPORTS:
-            raise ValueError(
-                f'image_transport must be one of {TRANSPORTS}, saw {self.image_transport!r}'
-            )
+        super().__post_init__()
         if not self.body_model:
             raise ValueError("body_model must be a name or a file, saw ''")
 

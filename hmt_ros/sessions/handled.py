@@ -1,12 +1,43 @@
-"""What became of a message: what sessions tell of each, and what they count over all of them."""
+"""What sessions report: the outcome of each message, and counts over all of them."""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import NamedTuple
+from enum import Enum
+from typing import Any, NamedTuple
 
+from msg_tools import MessageFactory
 from msg_tools.files.error_line import one_line
+from msg_tools.messages.headers import time_message, time_ns
+from msg_tools.messages.message_error import MessageFault
+
+HANDLED = 'hmt_msgs/msg/Handled'
+
+
+class Fault(Enum):
+    """Kinds of faults, and of remarks; the values are their names in the diagnostics."""
+
+    MESSAGE = 'message'
+    NODE = 'node itself'
+    SAME_TIME = 'time stands still'
+    TIME_JUMP = 'time jumps back'
+    CAMERA_INFO = 'camera_info'
+    CALIBRATION = 'calibration'
+    IMAGE = 'image'
+    IMAGE_SIZE = 'size of the image'
+    KEYPOINTS = 'keypoints'
+    KEYPOINT_NAMES = 'names of keypoints'
+    NO_KEYPOINTS = 'no keypoints'
+    PREDICTION = 'pose_prediction'
+    NO_PREDICTION = 'no pose_prediction'
+    SILHOUETTE = 'silhouette'
+    START = 'start'
+    OLD_START = 'old start'
+    ESTIMATE = 'estimate'
+    NEW_BODY = 'new body'
+    MIXTURE_KIND = 'kind of mixture'
+    GAP = 'gap'
 
 
 class Output(NamedTuple):
@@ -25,14 +56,13 @@ class Output(NamedTuple):
 
 @dataclass(frozen=True)
 class Handled:
-    """What became of a message.
+    """Outcome of a message.
 
     Attributes:
         source: where it came from.
         stamp_ns: of the message.
-        faults: why it, or something that waited for it, could not be used; empty: all was well.
-        warnings: what a person should be told: the first fault of each kind, an estimate that
-            starts anew.
+        faults: why it, or something that waited for it, could not be used; empty if it was used.
+        warnings: for the log: the first fault of each kind, an estimate that starts anew.
         published: (topic, stamp) of all messages that were published, in their order.
     """
 
@@ -44,12 +74,12 @@ class Handled:
 
 
 class HandlingLog:
-    """Collects what is to be told of the message that is being handled, and counts.
+    """Collects the report on the present message, and counts over all messages.
 
     Attributes:
-        counts: number of the messages that are estimated from, over all of them: 'received', and of
-            these 'skipped', 'dropped' and whatever the owner counts.
-        faults: number by kind, over all messages.
+        counts: number of the messages that are estimated from: 'received', and of these 'skipped',
+            'dropped' and what the session counts.
+        faults: number by kind.
         last_fault: the newest; '' before the first.
     """
 
@@ -60,25 +90,25 @@ class HandlingLog:
         self.begin()
 
     def begin(self) -> None:
-        """The next message is being handled."""
+        """Starts the report on the next message."""
         self._told: list[str] = []
         self._warned: list[str] = []
         self._published: list[tuple[str, int]] = []
 
-    def fault(self, kind: str, text: str) -> None:
-        """Something could not be used."""
+    def fault(self, kind: Fault | MessageFault, text: str) -> None:
+        """Reports something that could not be used."""
         self._told.append(one_line(text))
         self.note(kind, text)
 
-    def note(self, kind: str, text: str) -> None:
-        """A warning about the first of a kind; the others are counted."""
-        self.faults[kind] += 1
+    def note(self, kind: Fault | MessageFault, text: str) -> None:
+        """Warns of the first of a kind; the others are counted."""
+        self.faults[kind.value] += 1
         self.last_fault = one_line(text)
-        if self.faults[kind] == 1:
+        if self.faults[kind.value] == 1:
             self._warned.append(self.last_fault)
 
-    def skip(self, kind: str, text: str) -> None:
-        """A message that would be estimated from can not be used."""
+    def skip(self, kind: Fault | MessageFault, text: str) -> None:
+        """Reports a message that was to be estimated from and can not be used."""
         self.counts['skipped'] += 1
         self.fault(kind, text)
 
@@ -88,11 +118,36 @@ class HandlingLog:
         self.counts['dropped'] += messages
 
     def published(self, topic: str, stamp_ns: int) -> None:
-        """A message was published."""
+        """Reports a message that was published."""
         self._published.append((topic, stamp_ns))
 
     def handled(self, source: str, stamp_ns: int) -> Handled:
-        """What became of the message."""
+        """The report on the present message."""
         return Handled(
             source, stamp_ns, tuple(self._told), tuple(self._warned), tuple(self._published)
         )
+
+
+def handled_message(messages: MessageFactory, handled: Handled) -> Any:
+    """hmt_msgs/Handled, which a node publishes on `~/handled`."""
+    return messages.create(
+        HANDLED,
+        source=handled.source,
+        stamp=time_message(messages, handled.stamp_ns),
+        faults=list(handled.faults),
+        warnings=list(handled.warnings),
+        published_topics=[topic for topic, _ in handled.published],
+        published_stamps=[time_message(messages, stamp) for _, stamp in handled.published],
+    )
+
+
+def handled_of(message: Any) -> Handled:
+    """The content of an hmt_msgs/Handled, of `rosbags` or of ROS."""
+    published = zip(message.published_topics, message.published_stamps, strict=True)
+    return Handled(
+        source=str(message.source),
+        stamp_ns=time_ns(message.stamp),
+        faults=tuple(map(str, message.faults)),
+        warnings=tuple(map(str, message.warnings)),
+        published=tuple((str(topic), time_ns(stamp)) for topic, stamp in published),
+    )

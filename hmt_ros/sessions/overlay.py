@@ -39,7 +39,7 @@ def draw_modes(
         joints: (K, J, 3) joint positions of the modes, camera frame, m.
         bones: pairs of joints that are connected.
         weights: (K,).
-        count: how many modes are drawn at most.
+        count: maximum number of modes that are drawn.
     """
     result = image.copy()
     order = np.argsort(-weights, kind='stable')[:count]

@@ -16,8 +16,7 @@ from hmt_ros.sessions.declared_parameters import (
     Value,
     declared_parameters,
 )
-from msg_tools.files.error_line import error_line
-from msg_tools.files.plain_yaml import load_plain_yaml
+from msg_tools.files.plain_yaml import read_plain_yaml
 
 _KEY = 'ros__parameters'
 _WIDTH = 100
@@ -94,18 +93,9 @@ def read_parameter_file(path: str | Path, node: str, *, by_name: bool = False) -
     """
     path = Path(path)
     try:
-        if path.stat().st_size > _LARGEST_FILE:
-            raise ParameterError(
-                f'{path}: {path.stat().st_size} bytes, wanted a parameter file of at most '
-                f'{_LARGEST_FILE}'
-            )
-        document = load_plain_yaml(path.read_text('utf-8'))
-    except OSError as error:
-        raise ParameterError(f'{path}: can not be read ({error.strerror})') from error
-    except ParameterError:
-        raise
+        document = read_plain_yaml(path, _LARGEST_FILE)
     except ValueError as error:
-        raise ParameterError(f'{path}: not YAML ({error_line(error)})') from error
+        raise ParameterError(f'{path}: {error}') from error
     if document is None:
         return {}
     if not isinstance(document, dict):

@@ -1,19 +1,80 @@
-"""What stands behind the topics of a node: messages in, messages out, without ROS."""
+"""A session stands behind the topics of a node: messages in, messages out, without ROS."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.sessions.handled import Handled, HandlingLog, Output
+from hmt_ros.sessions.declared_parameters import NodeParameters
+from hmt_ros.sessions.handled import Fault, Handled, HandlingLog, Output
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import serialise
+from msg_tools.messages.headers import time_ns
+
+# Key of the diagnostics, before the name of a topic, for the number of its subscribers.
+SUBSCRIBERS = 'subscribers of '
+
+
+class PublishedTopic(NamedTuple):
+    """A topic of a node, the same in bags.
+
+    Attributes:
+        msgtype: for example 'hmt_msgs/msg/PoseMixture'.
+        latched: late subscribers get the last message.
+    """
+
+    msgtype: str
+    latched: bool = False
+
+
+class Order(Enum):
+    """How the stamp of a message relates to those before."""
+
+    NEXT = 'next'
+    SKIPPED = 'skipped'
+    JUMP = 'jump'
+
+
+@dataclass(frozen=True)
+class SessionState:
+    """State of a session, for diagnostics.
+
+    Attributes:
+        status: in a word or two; see the sessions.
+        wants: what the next step waits for, '' while it works.
+        entropy: of the weights of the present mixture, nats; NaN where there is none.
+        counts: number of the messages that are estimated from: 'received', and of these 'skipped',
+            'dropped' and what the session counts.
+        faults: number of faults by kind.
+        last_fault: the newest; '' before the first.
+    """
+
+    status: str
+    wants: str
+    entropy: float = math.nan
+    counts: Counter[str] = field(default_factory=Counter)
+    faults: Counter[str] = field(default_factory=Counter)
+    last_fault: str = ''
+
+    def summary(self) -> str:
+        """The present estimate in a few words."""
+        raise NotImplementedError
+
+    def trouble(self) -> str:
+        """Why the estimate is not to be trusted, '' where it is."""
+        return ''
+
+    def values(self) -> list[tuple[str, str]]:
+        """Keys and values that only this kind of session has in the diagnostics."""
+        raise NotImplementedError
 
 
 def everything(_topic: str) -> bool:
@@ -21,26 +82,47 @@ def everything(_topic: str) -> bool:
     return True
 
 
-class Session(ABC):
-    """What a node or a replay gives its messages to, one after the other.
+Parameters = TypeVar('Parameters', bound=NodeParameters)
+State = TypeVar('State', bound=SessionState)
+
+
+class Session(ABC, Generic[Parameters, State]):
+    """Handles the messages of a node or a replay, one after the other.
+
+    All methods are to be called by one thread, unless they say otherwise; `state` and `parameters`
+    may be read, and `parameters` replaced, by other threads.
 
     Args:
         parameters: of the node.
-        publish: takes what is to be published, as soon as it is there.
+        publish: takes each message to be published, as soon as it is made.
         wanted: whether a topic needs to be published.
 
+    Raises:
+        ValueError: the parameters name something that can not be used.
+
     Attributes:
-        parameters: a new value takes effect when `declared_parameters` says.
-        start: what the present estimate started from; None: there is but one way to start.
-        state: for diagnostics, replaced with every message.
+        TOPICS: the topics that are published.
+        COUNTED: source of the messages that are estimated from.
+        UNIT: what one of them is called.
+        DONE: what those are called that were used; a key of `SessionState.counts`.
+        ESTIMATE: what starts anew when time jumps back.
+        CHECKED: parameters whose values only a new session can check: names of files, say.
+        parameters: a new value takes effect as `declared_parameters` says.
+        state: replaced with every message.
     """
 
-    start: Any = None
-    state: Any
+    TOPICS: ClassVar[Mapping[str, PublishedTopic]]
+    COUNTED: ClassVar[str]
+    UNIT: ClassVar[str]
+    DONE: ClassVar[str]
+    ESTIMATE: ClassVar[str]
+    CHECKED: ClassVar[tuple[str, ...]]
+
+    state: State
 
     def __init__(
         self,
-        parameters: Any,
+        parameters: Parameters,
         publish: Callable[[Output], None],
         wanted: Callable[[str], bool] = everything,
     ) -> None:
@@ -49,31 +131,38 @@ class Session(ABC):
         self._wanted = wanted
         self._messages = RosbagsMessages()
         self._log = HandlingLog()
+        self._weights = np.empty(0)
 
-    @abstractmethod
     def take(self, source: str, message: Any) -> Handled:
-        """Handles a message."""
+        """Handles a message.
 
-    @abstractmethod
-    def restart(self, start: Any = None) -> None:
+        Args:
+            source: a source that the module of the session names.
+            message: of the type of the source, from `rosbags` or ROS.
+        """
+        self._log.begin()
+        stamp = time_ns(message.header.stamp)
+        self._log.counts['received'] += source == self.COUNTED
+        self._take(source, message, stamp)
+        return self._handled(source, stamp)
+
+    def restart(self) -> None:
         """Starts the estimate anew."""
-
-    @abstractmethod
-    def _present_state(self) -> Any:
-        """What is going on."""
+        self._forget()
+        self._weights = np.empty(0)
+        self.state = self._present_state()
 
     def refuse(self, source: str, text: str) -> Handled:
-        """Counts a message that could not even be read."""
+        """Counts a message that could not be read."""
         self._log.begin()
-        self._log.fault('message', f'message of {source} can not be read: {text}')
-        self.state = self._present_state()
-        return self._log.handled(source, 0)
+        self._log.fault(Fault.MESSAGE, f'message of {source} can not be read: {text}')
+        return self._handled(source, 0)
 
     def break_off(self, source: str, text: str) -> Handled:
-        """What became of a message over which the session itself has failed; it starts anew."""
-        self._log.fault('node itself', text)
-        self.restart(self.start)
-        # A trace is in the log already.
+        """Counts an error of the session itself, and starts the estimate anew."""
+        self._log.fault(Fault.NODE, text)
+        self._start_again()
+        # The traceback is in the log of the node already.
         return replace(self._log.handled(source, 0), warnings=())
 
     def count_dropped(self, messages: int) -> None:
@@ -81,6 +170,53 @@ class Session(ABC):
         if messages:
             self._log.count_dropped(messages)
             self.state = self._present_state()
+
+    @abstractmethod
+    def _take(self, source: str, message: Any, stamp: int) -> None:
+        """Handles a message; `take` reports on it."""
+
+    @abstractmethod
+    def _forget(self) -> None:
+        """Drops the estimate."""
+
+    @abstractmethod
+    def _present_state(self) -> State:
+        """The state now."""
+
+    def _start_again(self) -> None:
+        """Starts the estimate anew as the last time."""
+        self.restart()
+
+    def _handled(self, source: str, stamp: int) -> Handled:
+        self.state = self._present_state()
+        return self._log.handled(source, stamp)
+
+    def _totals(self) -> dict[str, Any]:
+        """What `SessionState` says over all messages."""
+        log = self._log
+        return {
+            'entropy': entropy(self._weights),
+            'counts': Counter(log.counts),
+            'faults': Counter(log.faults),
+            'last_fault': log.last_fault,
+        }
+
+    def _order(self, stamp: int, newest: int | None) -> Order:
+        """How a stamp relates to the newest before; faults are reported here."""
+        if newest is None or stamp > newest:
+            return Order.NEXT
+        text = f'{self.UNIT} of {stamp} ns comes after one of {newest} ns'
+        if stamp == newest:
+            self._log.skip(Fault.SAME_TIME, f'{text}, wanted stamps that increase')
+            return Order.SKIPPED
+        if not self.parameters.reset_on_time_jump:
+            self._log.skip(
+                Fault.TIME_JUMP,
+                f'{text}: skipped; with reset_on_time_jump {self.ESTIMATE} would start anew',
+            )
+            return Order.SKIPPED
+        self._log.note(Fault.TIME_JUMP, f'{text}: {self.ESTIMATE} starts anew')
+        return Order.JUMP
 
     def _publish(self, topic: str, stamp: int, message: Any) -> None:
         self._log.published(topic, stamp)

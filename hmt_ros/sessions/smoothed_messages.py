@@ -1,4 +1,4 @@
-"""What is published of a smoothed window, as messages; as `track_messages` for tracked images."""
+"""Messages about a smoothed window, as `track_messages` makes them about a tracked image."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from hmt_ros.body import Body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions.published_topic import PublishedTopic
+from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
 from msg_tools import MessageFactory
-from msg_tools.messages.joint_states import heaviest_joint_state
 from msg_tools.messages.markers import trajectory_markers
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.states import heaviest_joint_state
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture as TrajectoryContent
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
@@ -36,7 +36,7 @@ DRAWN = 8
 
 @dataclass(frozen=True, eq=False)
 class SmoothedBody:
-    """Whose poses they are.
+    """The person of the poses.
 
     Attributes:
         body: at its present lengths.
@@ -59,6 +59,7 @@ def trajectory_content(
         body_model=of.body.name,
         dof_names=of.body.dof_names,
         frame_id=of.frame_id,
+        segment_lengths=of.body.segment_lengths,
     )
 
 
@@ -76,7 +77,7 @@ def window_messages(
     Args:
         messages: factory.
         found: trajectories, with stamps.
-        of: whose poses they are.
+        of: person of the poses.
         covariances: whether they are part of the message.
         wanted: whether a topic is to be made.
         publish: takes the topic and the message, one after the other.
@@ -122,7 +123,7 @@ def final_messages(
         messages: factory.
         pose: its density.
         of: whose pose it is.
-        components: of the message at most.
+        components: maximum number of components of the message.
         wanted: whether a topic is to be made.
         publish: takes the topic and the message, one after the other.
 
@@ -132,17 +133,12 @@ def final_messages(
     if not wanted('smoothed_pose_mixture') and not wanted('smoothed_joint_states'):
         return
     mixture = pose.mixture.reduce(components).normalised()
-    content = PoseMixture(
-        mixture=GaussianMixture(
-            mixture.weights, mixture.means, _symmetric(np.array(mixture.covariances))
-        ),
-        body_model=of.body.name,
-        dof_names=of.body.dof_names,
-        joint_names=of.body.joint_names,
-        joint_positions=of.body.joint_positions(mixture.means),
-        kind=MixtureKind.SMOOTHED,
-        stamp_ns=pose.stamp_ns,
-        frame_id=of.frame_id,
+    content = PoseMixture.of_body(
+        of.body,
+        GaussianMixture(mixture.weights, mixture.means, _symmetric(np.array(mixture.covariances))),
+        MixtureKind.SMOOTHED,
+        pose.stamp_ns,
+        of.frame_id,
     )
     if wanted('smoothed_pose_mixture'):
         publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
@@ -167,6 +163,6 @@ def _without_covariances(found: TrajectoryMixture) -> dict[str, Any]:
 
 
 def _symmetric(covariances: Array) -> Array:
-    """What rounding has left of it is taken away."""
+    """The covariances without the asymmetry of rounding."""
     result: Array = 0.5 * (covariances + np.swapaxes(covariances, -1, -2))
     return result

@@ -1,35 +1,33 @@
-"""The smoother behind its topics: messages in, messages out, without ROS.
+"""The smoother behind its topics.
 
-The node and offline replay give their messages to a `SmootherSession`, one after the other; the
-same messages in the same order give the same bytes. The rules:
+The node and offline replay give their messages to a `SmootherSession`; the same messages in the
+same order give the same bytes. The rules:
 
-- Mixtures are smoothed in the order of their stamps, in a window that slides. A pose is published
-  as smoothed once `fixed_lag` later ones have been seen; those that are still open are published
+- Mixtures are smoothed in the order of their stamps, in a sliding window. A pose is published as
+  smoothed once `fixed_lag` later ones have been seen; the poses that are still open are published
   when the window ends: at the end of the stream (`finish`), where time jumps back, at a new body.
-- A mixture that is not younger than the one before is skipped, or starts a new window where
-  `reset_on_time_jump` says so.
-- A mixture waits until the body has come that its joint positions are of: topics may overtake each
-  other. At most `queue_size` wait; the oldest are dropped. A body with other lengths is a new
-  track, and starts a new window.
-- Gaps are bridged by the dynamics. One that is longer than `longest_interval` is told.
-- What can not be used is skipped. Of each kind of fault the first is told, all are counted.
+- A mixture that is not younger than the one before is skipped, or starts a new window with
+  `reset_on_time_jump`.
+- A mixture names its body and carries the segment lengths of the person; without lengths it is
+  about the model at its own lengths. Another body, other lengths or another frame are a new track,
+  and start a new window.
+- The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
+- What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
 from __future__ import annotations
 
-import math
-from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions.handled import Handled, Output
-from hmt_ros.sessions.session import Session, entropy, everything
+from hmt_ros.inference.reduction import merged_if_close
+from hmt_ros.sessions.handled import Fault, Handled, Output
+from hmt_ros.sessions.session import Order, Session, SessionState, everything
 from hmt_ros.sessions.smoothed_messages import (
+    TOPICS,
     SmoothedBody,
     final_messages,
     trajectory_content,
@@ -37,58 +35,55 @@ from hmt_ros.sessions.smoothed_messages import (
 )
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow
-from hmt_ros.smoothing.mode_sequence import merge_close_modes
 from hmt_ros.smoothing.path_smoother import PathSmoother
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
-from msg_tools.messages.headers import SECOND_NS, time_ns
-from msg_tools.messages.message_error import check_names
+from msg_tools.messages.bodies import body_of
+from msg_tools.messages.headers import SECOND_NS
+from msg_tools.messages.message_error import MessageFault
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
-BODY, MIXTURE = 'body', 'likelihood_mixture'
+MIXTURE = 'likelihood_mixture'
 FINISH = 'finish'  # what `finish` calls the end of the stream
-
-# Positions of joints agree with the kinematics up to this, m.
-_SAME_PLACE = 1e-4
-# Kinds of faults of a mixture, by words of what is said of them.
-_FAULTS = ('dof_names', 'no components', 'not finite', 'not positive definite', 'weight')
 
 
 @dataclass(frozen=True)
-class SmootherState:
-    """What is going on, for diagnostics.
+class SmootherState(SessionState):
+    """State of the smoother: its status is 'waiting' or 'smoothing'.
 
     Attributes:
-        status: 'no body', 'waiting' or 'smoothing'.
-        wants: what the next step waits for, '' while smoothing.
         window: poses in the window.
         trajectories: components of the mixture over them.
-        entropy: of their weights, nats.
         gaps: intervals between mixtures that were longer than `longest_interval`.
         longest_gap: s.
-        mixtures: number of mixtures: 'received', and of these 'smoothed', 'skipped', 'dropped'.
-        faults: number of faults by kind.
-        last_fault: the newest; '' before the first.
     """
 
-    status: str
-    wants: str
     window: int = 0
     trajectories: int = 0
-    entropy: float = math.nan
     gaps: int = 0
     longest_gap: float = 0.0
-    mixtures: Counter[str] = field(default_factory=Counter)
-    faults: Counter[str] = field(default_factory=Counter)
-    last_fault: str = ''
+
+    def summary(self) -> str:
+        """The present estimate in a few words."""
+        return f'{self.trajectories} trajectories of {self.window} poses'
+
+    def values(self) -> list[tuple[str, str]]:
+        """Keys and values of the diagnostics."""
+        return [
+            ('poses in the window', str(self.window)),
+            ('trajectories', str(self.trajectories)),
+            ('entropy of the weights, nats', f'{self.entropy:.3f}'),
+            ('gaps', str(self.gaps)),
+            ('longest gap, s', f'{self.longest_gap:.3f}'),
+        ]
 
 
 class KeptMixtures(NamedTuple):
     """Likelihoods that have been smoothed since the window began, the newest.
 
     Attributes:
-        of: whose poses they are; None: nobody is known.
+        of: person of the poses; None: no mixture has come.
         items: (stamp, mixture), as they were received.
     """
 
@@ -96,26 +91,21 @@ class KeptMixtures(NamedTuple):
     items: tuple[tuple[int, GaussianMixture], ...]
 
 
-class SmootherSession(Session):
-    """One person, from the first message on.
+class SmootherSession(Session[SmootherParameters, SmootherState]):
+    """Smooths the poses of one person; see `Session` for arguments and attributes.
 
-    All methods but `smooth_span` are to be called by one thread; `state`, `kept` and `parameters`
-    may be read and replaced by others.
-
-    Args:
-        parameters: of the node.
-        publish: takes what is to be published, as soon as it is there.
-        wanted: whether a topic needs to be published.
-
-    Raises:
-        ValueError: the parameters name a body that can not be used.
+    `smooth_span` may be called by any thread.
 
     Attributes:
-        parameters: a new value takes effect when `declared_parameters` says.
-        start: None, there is but one way to start.
-        state: see `SmootherState`.
         kept: for `smooth_span`.
     """
+
+    TOPICS = TOPICS
+    COUNTED = MIXTURE
+    UNIT = 'mixture'
+    DONE = 'smoothed'
+    ESTIMATE = 'the window'
+    CHECKED = ('body_model',)
 
     def __init__(
         self,
@@ -127,107 +117,46 @@ class SmootherSession(Session):
             known_body(parameters.body_model)
         super().__init__(parameters, publish, wanted)
         self._of: SmoothedBody | None = None
+        self._resolved: tuple[Any, SmoothedBody] | None = None
         self._window: SlidingWindow | None = None
-        self._waiting: deque[Any] = deque()
         self._newest: int | None = None
-        self._weights = np.empty(0)
         self._gaps, self._longest_gap = 0, 0.0
         self.kept = KeptMixtures(None, ())
         self.state = self._present_state()
 
-    # What comes in.
-
-    def take(self, source: str, message: Any) -> Handled:
-        """Handles a message.
-
-        Args:
-            source: `BODY` or `MIXTURE`.
-            message: hmt_msgs/Body or PoseMixture.
-        """
-        self._log.begin()
-        if source == BODY:
-            self._take_body(message)
-        else:
-            self._log.counts['received'] += 1
-            self._waiting.append(message)
-        self._smooth_what_is_ready()
-        while len(self._waiting) > self.parameters.queue_size:
-            self._drop(self._waiting.popleft())
-        self.state = self._present_state()
-        return self._log.handled(source, time_ns(message.header.stamp))
+    # Inputs.
 
     def finish(self) -> Handled:
-        """The stream ends: publishes the poses that are still open; what comes begins a window."""
+        """Publishes the poses that are still open; the next mixture begins a new window."""
         self._log.begin()
         stamp = self._newest or 0
         self._end_window()
-        self.state = self._present_state()
-        return self._log.handled(FINISH, stamp)
+        return self._handled(FINISH, stamp)
 
-    def restart(self, start: None = None) -> None:
-        """Forgets the window; the next mixture is the first of a new one."""
+    def _forget(self) -> None:
         self._window = None
         self._newest = None
-        self._weights = np.empty(0)
         self.kept = KeptMixtures(self._of, ())
-        self.state = self._present_state()
 
-    def _take_body(self, message: Any) -> None:
+    def _take(self, source: str, message: Any, stamp: int) -> None:
         try:
-            body = self._body_of(message)
-        except ValueError as error:
-            self._log.fault('body', str(error))
+            content = pose_mixture_of(message)
+            mixture, of = content.mixture, self._whose(content)
+        except MessageError as error:
+            self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
             return
-        known, self._of = self._of, SmoothedBody(body, str(message.header.frame_id))
-        if known is None:
-            self.kept = KeptMixtures(self._of, ())
-        elif not _same(known, self._of):
-            if self._newest is not None:
-                self._log.note('new body', 'another body has come: a new window begins')
-            new, self._of = self._of, known
+        if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
+            self._log.note(
+                Fault.MIXTURE_KIND,
+                f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
+                'say counts more than once',
+            )
+        order = self._order(stamp, self._newest)
+        if order is Order.SKIPPED:
+            return
+        if order is Order.JUMP:
             self._end_window()
-            self._of = new
-            self.kept = KeptMixtures(new, ())
-
-    def _body_of(self, message: Any) -> Body:
-        chosen = self.parameters.body_model
-        name = chosen or str(message.name)
-        # A message must not have files read: what it names ships with the package.
-        body = known_body(name, load_body if chosen else named_body)
-        lengths = dict(
-            zip(map(str, message.segment_names), map(float, message.segment_lengths), strict=False)
-        )
-        try:
-            body = body.with_segment_lengths(lengths)
-        except KeyError as error:
-            raise ValueError(f'body {name}: {error.args[0]}') from error
-        check_names(tuple(map(str, message.dof_names)), body.dof_names, f'body {name}: dof_names')
-        return body
-
-    def _smooth_what_is_ready(self) -> None:
-        received, self._waiting = self._waiting, deque()
-        for message in received:
-            content = None if self._of is None else _content(message, self._of.body)
-            if self._of is None or not (content is None or _is_of(content, self._of.body)):
-                self._waiting.append(message)
-                continue
-            # The body of those before will not come any more.
-            for older in self._waiting:
-                self._drop(older)
-            self._waiting.clear()
-            self._take_mixture(message, content, self._of)
-
-    def _drop(self, message: Any) -> None:
-        self._log.counts['dropped'] += 1
-        stamp = time_ns(message.header.stamp)
-        what = 'no body has come' if self._of is None else 'no body that its joints are of has come'
-        self._log.fault('no body', f'mixture of {stamp} ns is dropped: {what}')
-
-    def _take_mixture(self, message: Any, content: PoseMixture | None, of: SmoothedBody) -> None:
-        stamp = time_ns(message.header.stamp)
-        mixture = self._readable(message, content, stamp, of)
-        if mixture is None or not self._in_time(stamp):
-            return
+        self._begin_track(of)
         p = self.parameters
         if self._newest is not None:
             interval = (stamp - self._newest) / SECOND_NS
@@ -235,19 +164,19 @@ class SmootherSession(Session):
                 self._gaps += 1
                 self._longest_gap = max(self._longest_gap, interval)
                 self._log.note(
-                    'gap',
+                    Fault.GAP,
                     f'no mixture for {interval:.2f} s before {stamp} ns: the dynamics bridge it',
                 )
         if self._window is None:
             self._window = self._new_window(of.body)
         used = mixture
         if p.merge_distance > 0:
-            used = merge_close_modes([mixture], p.merge_distance)[0]
+            used = merged_if_close(mixture, p.merge_distance)
         try:
             update = self._window.step(stamp, used)
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
-            self._log.skip('estimate', f'mixture of {stamp} ns can not be smoothed: {text}')
+            self._log.skip(Fault.ESTIMATE, f'mixture of {stamp} ns can not be smoothed: {text}')
             self._end_window()
             return
         self._newest = stamp
@@ -265,47 +194,36 @@ class SmootherSession(Session):
         for pose in update.final:
             self._publish_final(pose, of)
 
-    def _readable(
-        self, message: Any, content: PoseMixture | None, stamp: int, of: SmoothedBody
-    ) -> GaussianMixture | None:
-        """The mixture of a message, None where it can not be used."""
-        name = str(message.body_model)
-        try:
-            if not self.parameters.body_model and name and name != of.body.name:
-                raise MessageError(f'mixture is of the body {name}, wanted one of {of.body.name}')
-            if content is None:
-                content = pose_mixture_of(message, of.body.dof_names)
-        except ValueError as error:
-            text = str(error)
-            kind = next((words for words in _FAULTS if words in text), 'mixture')
-            self._log.skip(kind, f'mixture of {stamp} ns: {text}')
-            return None
-        if content.kind in (MixtureKind.POSTERIOR, MixtureKind.SMOOTHED):
-            self._log.note(
-                'kind of mixture',
-                f'mixtures are of the kind {content.kind.name}, wanted LIKELIHOOD: what the images '
-                'say counts more than once',
-            )
-        return content.mixture
+    def _whose(self, content: PoseMixture) -> SmoothedBody:
+        """The person that a mixture is about; the same object while that does not change.
 
-    def _in_time(self, stamp: int) -> bool:
-        """Whether a mixture comes after the one before, or may begin a new window."""
-        newest = self._newest
-        if newest is None or stamp > newest:
-            return True
-        text = f'mixture of {stamp} ns comes after one of {newest} ns'
-        if stamp == newest:
-            self._log.skip('time stands still', f'{text}, wanted stamps that increase')
-            return False
-        if not self.parameters.reset_on_time_jump:
-            self._log.skip(
-                'time jumps back',
-                f'{text}: skipped; with reset_on_time_jump a new window would begin',
-            )
-            return False
-        self._log.note('time jumps back', f'{text}: a new window begins')
+        Raises:
+            MessageError: a body that is not known, or not the one that the parameters name.
+        """
+        about = content.body_model, content.dof_names, content.segment_lengths, content.frame_id
+        if self._window is not None and self._resolved is not None and self._resolved[0] == about:
+            return self._resolved[1]
+        chosen = self.parameters.body_model
+        try:
+            # A message must not have files read: what it names ships with the package.
+            model = known_body(chosen) if chosen else known_body(content.body_model, named_body)
+        except ValueError as error:
+            raise MessageError(str(error), MessageFault.BODY) from error
+        of = SmoothedBody(body_of(content, model, any_name=bool(chosen)), content.frame_id)
+        self._resolved = about, of
+        return of
+
+    def _begin_track(self, of: SmoothedBody) -> None:
+        """Ends the window of another person."""
+        known = self._of
+        if known is not None and _same(known, of):
+            return
+        if self._newest is not None:
+            text = 'mixtures are about another body: a new window begins'
+            self._log.note(Fault.NEW_BODY, text)
         self._end_window()
-        return True
+        self._of = of
+        self.kept = KeptMixtures(of, ())
 
     def _new_window(self, body: Body) -> SlidingWindow:
         p = self.parameters
@@ -316,7 +234,7 @@ class SmootherSession(Session):
         p = self.parameters
         kind = closed_form if p.method == 'paths' else MixtureSmoother
         return kind(
-            p.dynamics.of(body.skeleton),
+            p.dynamics.of(body),
             body.lower,
             body.upper,
             p.max_trajectories,
@@ -331,7 +249,7 @@ class SmootherSession(Session):
                 self._publish_final(pose, self._of)
         self.restart()
 
-    # What comes out.
+    # Outputs.
 
     def _publish_final(self, pose: FinalPose, of: SmoothedBody) -> None:
         final_messages(
@@ -372,24 +290,19 @@ class SmootherSession(Session):
         content = trajectory_content(found, of, covariances=True)
         return trajectory_mixture_message(self._messages, content)
 
-    # What is told.
+    # State.
 
     def _present_state(self) -> SmootherState:
-        status, wants = 'no body', 'body'
-        if self._of is not None:
-            smooths = self._newest is not None
-            status, wants = ('smoothing', '') if smooths else ('waiting', 'likelihood_mixture')
+        smooths = self._newest is not None
+        status, wants = ('smoothing', '') if smooths else ('waiting', 'likelihood_mixture')
         return SmootherState(
             status,
             wants,
+            **self._totals(),
             window=0 if self._window is None else len(self._window.stamps_ns),
             trajectories=len(self._weights),
-            entropy=entropy(self._weights),
             gaps=self._gaps,
             longest_gap=self._longest_gap,
-            mixtures=Counter(self._log.counts),
-            faults=Counter(self._log.faults),
-            last_fault=self._log.last_fault,
         )
 
 
@@ -404,20 +317,6 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
     except OSError as error:
         text = error_line(error)
         raise ValueError(f'{text}; body_model names it, or a file with it') from error
-
-
-def _content(message: Any, body: Body) -> PoseMixture | None:
-    """The content of a mixture with the joints of a body; None: there are none, or faults."""
-    try:
-        return pose_mixture_of(message, body.dof_names, body.joint_names)
-    except ValueError:
-        return None
-
-
-def _is_of(content: PoseMixture, body: Body) -> bool:
-    """Whether the joints of a mixture are where the body has them."""
-    computed = body.joint_positions(content.mixture.means[:1])
-    return bool(np.abs(computed - content.joint_positions[:1]).max() < _SAME_PLACE)
 
 
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:

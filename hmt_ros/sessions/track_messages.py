@@ -1,7 +1,7 @@
-"""What is published of a tracked image, as messages.
+"""Messages about a tracked image.
 
-`TOPICS` says the names and types; the functions here make the messages from arrays. Nothing in a
-message depends on anything but the track and the image.
+`TOPICS` holds names and types; the functions make the messages from arrays. A message depends on
+the track and the image alone.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.overlay import draw_modes
-from hmt_ros.sessions.published_topic import PublishedTopic
+from hmt_ros.sessions.session import PublishedTopic
 from msg_tools import MessageFactory
 from msg_tools.messages.bodies import description_message, message_of_body
 from msg_tools.messages.images import compressed_image_message
-from msg_tools.messages.joint_states import heaviest_joint_state
 from msg_tools.messages.markers import skeleton_markers
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
-from msg_tools.messages.transforms import transforms_message
+from msg_tools.messages.states import heaviest_joint_state, transforms_message
 from msg_tools.messages.urdf import link_frames
 
 Array = NDArray[np.float64]
@@ -73,7 +72,7 @@ class Presentation:
     """How a track is shown.
 
     Attributes:
-        max_hypotheses: modes that a track has at most.
+        max_hypotheses: maximum number of modes of a track.
         overlay_modes: heaviest modes that are drawn on the image; 0: no overlay.
         overlay_quality: of the JPEG, 1 to 100.
         publish_tf: whether there are transforms.
@@ -112,15 +111,17 @@ def track_messages(
     skeleton = track.body.skeleton
     frames = forward(skeleton, track.posterior.means)
     joints = frames.joints().transpose(2, 0, 1)
-    posterior = _content(
-        track, track.posterior, joints, MixtureKind.POSTERIOR, track.log_likelihoods
+    posterior = PoseMixture.of_body(
+        track.body,
+        track.posterior,
+        MixtureKind.POSTERIOR,
+        stamp,
+        frame,
+        joint_positions=joints,
+        log_likelihoods=track.log_likelihoods,
     )
-    likelihood = _content(
-        track,
-        track.likelihood,
-        track.body.joint_positions(track.likelihood.means),
-        MixtureKind.LIKELIHOOD,
-        None,
+    likelihood = PoseMixture.of_body(
+        track.body, track.likelihood, MixtureKind.LIKELIHOOD, stamp, frame
     )
     if track.starts:
         publish('body', message_of_body(messages, track.body, stamp, frame))
@@ -163,26 +164,6 @@ def track_messages(
         publish(
             'overlay/compressed', compressed_image_message(messages, drawn, stamp, frame, quality)
         )
-
-
-def _content(
-    track: TrackedImage,
-    mixture: GaussianMixture,
-    joints: Array,
-    kind: MixtureKind,
-    log_likelihoods: Array | None,
-) -> PoseMixture:
-    return PoseMixture(
-        mixture=mixture,
-        body_model=track.body.name,
-        dof_names=track.body.dof_names,
-        joint_names=track.body.joint_names,
-        joint_positions=joints,
-        kind=kind,
-        stamp_ns=track.stamp_ns,
-        frame_id=track.frame_id,
-        log_likelihoods=log_likelihoods,
-    )
 
 
 def _link_transforms(

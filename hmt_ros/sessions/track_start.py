@@ -1,4 +1,4 @@
-"""What a track starts from: body, background, subject or mixture, all read and checked at once."""
+"""The start of a track: body, background, subject or mixture, all read and checked at once."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.sessions.camera_session import read_picture
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.picture_file import read_picture
 from hmt_ros.tracking import Subject, Tracker, read_subject
 from msg_tools.files.error_line import error_line
+from msg_tools.messages.bodies import body_of
 from msg_tools.messages.pose_mixtures import pose_mixture_of
 
 
 @dataclass(frozen=True, eq=False)
 class TrackStart:
-    """All that a new tracker needs besides the camera.
+    """Everything that a new tracker needs besides the camera.
 
     Attributes:
         parameters: of the track.
         body: the model, or for a mixture the body that its poses are of.
         background: (H, W, 3) BGR image of the empty scene, or None: to be learned.
-        initial: what the first image is explained from; None: nothing is known yet.
+        initial: prior of the first image; None: a prediction has to start the track.
     """
 
     parameters: FilterParameters
@@ -65,7 +66,7 @@ def prepare_start(
     Args:
         parameters: of the track.
         mixture: hmt_msgs/PoseMixture to start from; without components or None: the subject file.
-        present: body of the present track, if any, which a mixture is about.
+        present: body of the present track, if any: a mixture without segment lengths is about it.
 
     Raises:
         ValueError: a file or a mixture that can not be used; one line that says why.
@@ -74,13 +75,10 @@ def prepare_start(
     background = read_picture(parameters.background_file) if parameters.background_file else None
     initial: Subject | GaussianMixture | None = None
     if mixture is not None and len(mixture.components):
+        content = pose_mixture_of(mixture)
         if present is not None and present.name == body.name:
             body = present
-        if mixture.body_model and str(mixture.body_model) != body.name:
-            raise ValueError(
-                f'the mixture is of the body {mixture.body_model}, wanted one of {body.name}'
-            )
-        initial = pose_mixture_of(mixture, body.dof_names).mixture
+        body, initial = body_of(content, body), content.mixture
     elif parameters.subject_file:
         initial = read_subject(parameters.subject_file, body)
     return TrackStart(parameters, body, background, initial)

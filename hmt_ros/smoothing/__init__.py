@@ -1,6 +1,6 @@
 """Mixtures over whole trajectories: network, paths, refinement, variational mixture (VMS)."""
 
-from hmt_ros.smoothing.dynamics import LinearGaussianDynamics
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.smoothing.mixture_smoother import MixtureSmoother
 from hmt_ros.smoothing.sliding_window import FinalPose, SlidingWindow, WindowUpdate
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture

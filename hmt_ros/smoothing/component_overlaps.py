@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hmt_ros.inference.exact_sums import dot, fma
+from hmt_ros.inference.exact_sums import dot
 
 Array = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ def add_overlaps(
                         c -= total
                     y = dot(bands[j, c], delta, c, width)
                     white[j, c] = y
-                    square = fma(y, y, square)
+                    square += y * y
                     if i % STRIDE == 0 and log - 0.5 * square < best - NEGLIGIBLE_DENSITY:
                         break
                 log -= 0.5 * square
@@ -130,48 +130,18 @@ def add_overlaps(
                 y = white[j, c]
                 last = min(width, total - c)
                 for b in range(last):
-                    pull[c + b] = fma(y, bands[j, c, b], pull[c + b])
+                    pull[c + b] += y * bands[j, c, b]
             factor = responsibility / inflation[j]
             for c in range(total):
                 move = factor * pull[c]
                 gradient[s, c] -= move
-                mean_gradient[j, c] = fma(share, move, mean_gradient[j, c])
+                mean_gradient[j, c] += share * move
             if len(band_gradient):
                 for c in range(total):
                     delta[c] = (samples[s, c] - means[j, c]) / inflation[j]
                 for c in range(total):
                     y = share * responsibility * white[j, c]
                     for b in range(min(width, total - c)):
-                        band_gradient[j, c, b] = fma(-y, delta[c + b], band_gradient[j, c, b])
+                        band_gradient[j, c, b] -= y * delta[c + b]
             inflation_gradient[j] += share * responsibility * (squares[j] - total)
             weight_gradient[j] += share * responsibility
-
-
-@njit(cache=True, nogil=True)
-def pair_distances(
-    means: Array, covariances: Array, scales: Array, pairs: NDArray[np.int64]
-) -> Array:
-    """(m_i - m_j)' (s_i C_i + s_j C_j)^-1 (m_i - m_j), shape (P,), of pairs (P, 2)."""
-    n = means.shape[1]
-    f = np.empty((n, n))
-    white = np.empty(n)
-    result = np.zeros(len(pairs))
-    for p in range(len(pairs)):
-        i, j = pairs[p]
-        for a in range(n):
-            for b in range(a + 1):
-                f[a, b] = scales[i] * covariances[i, a, b] + scales[j] * covariances[j, a, b]
-            for b in range(a):
-                total = f[a, b]
-                for k in range(b):
-                    total -= f[a, k] * f[b, k]
-                f[a, b] = total * f[b, b]
-            total = f[a, a]
-            offset = means[i, a] - means[j, a]
-            for k in range(a):
-                total -= f[a, k] * f[a, k]
-                offset -= f[a, k] * white[k]
-            f[a, a] = 1.0 / np.sqrt(total)
-            white[a] = offset * f[a, a]
-            result[p] += white[a] * white[a]
-    return result

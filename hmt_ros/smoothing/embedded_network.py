@@ -11,30 +11,23 @@ first.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import gammaln, logsumexp
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.exact_sums import fma
-from hmt_ros.smoothing.dynamics import LinearGaussianDynamics
+from hmt_ros.inference.gaussian_pairs import pair_log_densities
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.smoothing.likelihood import check_mixtures
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-# Pairs whose covariances are factorised side by side.
-LANES = 4
-# How many parts the pairs are split into; fixed, so that no result depends on the machine.
-PARTS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,11 +157,10 @@ def _with_first(
         return EmbeddedNetwork((nodes,), ())
     rest = embedded_network(mixtures, dynamics, intervals[1:])
     d = dynamics.dimension
-    a, q = dynamics.transition(float(intervals[0]))
+    means, spread = dynamics.predict(first.means, first.covariances, float(intervals[0]))
     pairs = np.indices((len(first), len(mixtures[0]))).reshape(2, -1).T
-    spread = (a @ first.covariances @ a.T + q)[:, :d, :d]
     links = pair_log_densities(
-        (first.means @ a.T)[:, :d], spread, mixtures[0].means, mixtures[0].covariances, pairs
+        means[:, :d], spread[:, :d, :d], mixtures[0].means, mixtures[0].covariances, pairs
     )
     return EmbeddedNetwork(
         (nodes, *rest.nodes), (links.reshape(len(first), len(mixtures[0])), *rest.links)
@@ -253,32 +245,6 @@ def sampled_network(
     return EmbeddedNetwork(tuple(nodes), tuple(links))
 
 
-def pair_log_densities(
-    means_a: Array, covariances_a: Array, means_b: Array, covariances_b: Array, pairs: Index
-) -> Array:
-    """log N(a_i; b_j, A_i + B_j), shape (P,), of pairs (P, 2) of indices i, j."""
-    result = np.empty(len(pairs))
-    # Arrays of one kind: for others, read-only ones for example, another kernel would be compiled.
-    a, big_a, b, big_b = (
-        np.require(x, np.float64, ('C', 'W'))
-        for x in (means_a, covariances_a, means_b, covariances_b)
-    )
-    pairs = np.require(pairs, np.int64, ('C', 'W'))
-    edges = np.linspace(0, len(pairs), PARTS + 1).astype(int)
-
-    def work(part: int) -> None:
-        at = slice(edges[part], edges[part + 1])
-        _pair_log_densities(a, big_a, b, big_b, pairs[at], result[at])
-
-    list(_threads().map(work, range(PARTS)))
-    return result
-
-
-@lru_cache(maxsize=1)
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(2, thread_name_prefix='smoothing')
-
-
 def _velocity_covariance(dynamics: LinearGaussianDynamics) -> Array:
     d = dynamics.dimension
     return np.asarray(np.linalg.inv(dynamics.initial_precision[d:, d:]), dtype=np.float64)
@@ -295,77 +261,3 @@ def _log_mode(mixture: GaussianMixture, k: int, freedom: float, x: Array) -> Arr
     log_scale -= 0.5 * d * np.log(freedom * np.pi) + np.log(np.diagonal(factor)).sum()
     result: Array = log_scale - 0.5 * (freedom + d) * np.log1p((z * z).sum(0) / freedom)
     return result
-
-
-@njit(cache=True, nogil=True)
-def _pair_log_densities(
-    means_a: Array,
-    covariances_a: Array,
-    means_b: Array,
-    covariances_b: Array,
-    pairs: Index,
-    result: Array,
-) -> None:
-    """Cholesky factors and forward substitution of four pairs at a time, two columns at a time.
-
-    The last row of each factor is the offset: what becomes of it is the whitened offset.
-    """
-    d = means_a.shape[1]
-    f = np.empty((d + 1, d, LANES))
-    for first in range(0, len(pairs), LANES):
-        count = min(LANES, len(pairs) - first)
-        for lane in range(LANES):
-            i, j = pairs[first + min(lane, count - 1)]
-            for a in range(d):
-                f[d, a, lane] = means_a[i, a] - means_b[j, a]
-                for b in range(a + 1):
-                    f[a, b, lane] = covariances_a[i, a, b] + covariances_b[j, a, b]
-        for i in range(d + 1):
-            j = 0
-            while j + 1 < i:
-                p0, p1, p2, p3 = f[i, j, 0], f[i, j, 1], f[i, j, 2], f[i, j, 3]
-                q0, q1, q2, q3 = f[i, j + 1, 0], f[i, j + 1, 1], f[i, j + 1, 2], f[i, j + 1, 3]
-                for k in range(j):
-                    x0, x1, x2, x3 = f[i, k, 0], f[i, k, 1], f[i, k, 2], f[i, k, 3]
-                    p0 = fma(-x0, f[j, k, 0], p0)
-                    p1 = fma(-x1, f[j, k, 1], p1)
-                    p2 = fma(-x2, f[j, k, 2], p2)
-                    p3 = fma(-x3, f[j, k, 3], p3)
-                    q0 = fma(-x0, f[j + 1, k, 0], q0)
-                    q1 = fma(-x1, f[j + 1, k, 1], q1)
-                    q2 = fma(-x2, f[j + 1, k, 2], q2)
-                    q3 = fma(-x3, f[j + 1, k, 3], q3)
-                # The diagonal holds inverses.
-                p0 *= f[j, j, 0]
-                p1 *= f[j, j, 1]
-                p2 *= f[j, j, 2]
-                p3 *= f[j, j, 3]
-                f[i, j, 0], f[i, j, 1], f[i, j, 2], f[i, j, 3] = p0, p1, p2, p3
-                f[i, j + 1, 0] = fma(-p0, f[j + 1, j, 0], q0) * f[j + 1, j + 1, 0]
-                f[i, j + 1, 1] = fma(-p1, f[j + 1, j, 1], q1) * f[j + 1, j + 1, 1]
-                f[i, j + 1, 2] = fma(-p2, f[j + 1, j, 2], q2) * f[j + 1, j + 1, 2]
-                f[i, j + 1, 3] = fma(-p3, f[j + 1, j, 3], q3) * f[j + 1, j + 1, 3]
-                j += 2
-            if j < i:
-                for lane in range(LANES):
-                    total = f[i, j, lane]
-                    for k in range(j):
-                        total = fma(-f[i, k, lane], f[j, k, lane], total)
-                    f[i, j, lane] = total * f[j, j, lane]
-            if i == d:
-                break
-            s0, s1, s2, s3 = f[i, i, 0], f[i, i, 1], f[i, i, 2], f[i, i, 3]
-            for k in range(i):
-                s0 = fma(-f[i, k, 0], f[i, k, 0], s0)
-                s1 = fma(-f[i, k, 1], f[i, k, 1], s1)
-                s2 = fma(-f[i, k, 2], f[i, k, 2], s2)
-                s3 = fma(-f[i, k, 3], f[i, k, 3], s3)
-            f[i, i, 0] = 1.0 / np.sqrt(s0)
-            f[i, i, 1] = 1.0 / np.sqrt(s1)
-            f[i, i, 2] = 1.0 / np.sqrt(s2)
-            f[i, i, 3] = 1.0 / np.sqrt(s3)
-        for lane in range(count):
-            total = d * np.log(2 * np.pi)
-            for a in range(d):
-                total += f[d, a, lane] ** 2 - 2.0 * np.log(f[a, a, lane])
-            result[first + lane] = -0.5 * total

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
-from hmt_ros.smoothing.likelihood import Curvature
+from hmt_ros.inference.energy import Derivatives, Energy
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -34,14 +34,13 @@ class ImageSequence:
         return len(self.observations)
 
     def energy(
-        self, poses: Array, times: Index, curvature: Curvature
-    ) -> tuple[Array, Array, Array | None]:
-        """See `SequenceLikelihood`; the Hessian is that of Gauss-Newton."""
-        n, d = poses.shape
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`; the rows are times, the Hessian is that of Gauss-Newton."""
+        n, d = x.shape
         value, gradient, hessian = np.empty(n), np.empty((n, d)), np.empty((n, d, d))
-        for t in np.unique(times):
-            at = times == t
-            value[at], gradient[at], hessian[at] = self.likelihood.energy(
-                poses[at], self.observations[t]
-            )
-        return value, gradient, hessian if curvature else None
+        for t in np.unique(rows):
+            at = rows == t
+            found = self.likelihood.given(self.observations[t]).energy(x[at])
+            value[at], gradient[at], hessian[at] = found.value, *found.derivatives()
+        return Energy(value, gradient, hessian)

@@ -1,14 +1,13 @@
 """What a smoother knows of the observations: -log p(r_t | x_t), its gradient and its curvature.
 
-Either the mixtures that a filter made, `MixtureLikelihood`, or the images themselves,
-`ImageSequence`, or any other object with the method of `SequenceLikelihood` (VMS 5).
+The mixtures that a filter made, `MixtureLikelihood`, or the images themselves, `ImageSequence`, or
+any other `EnergyTerm` whose rows are times (VMS 5).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.exact_sums import dot, fma
+from hmt_ros.inference.energy import Derivatives, Energy, EnergyTerm
+from hmt_ros.inference.exact_sums import dot
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -26,30 +26,12 @@ Index = NDArray[np.intp]
 NEGLIGIBLE = 60.0
 
 
-class Curvature(IntEnum):
-    """Which second derivatives are wanted."""
-
-    NONE = 0
-    POSITIVE = 1  # positive semi-definite: Gauss-Newton, or that of a majorising quadratic
-    EXACT = 2  # indefinite between modes
-
-
-class SequenceLikelihood(Protocol):
-    """-log p(r_t | x_t) of all times t < T of a sequence."""
+class SequenceLikelihood(EnergyTerm, Protocol):
+    """-log p(r_t | x_t) of all times t < T of a sequence; the rows of the term are times."""
 
     @property
     def times(self) -> int:
         """T."""
-        ...
-
-    def energy(
-        self, poses: Array, times: Index, curvature: Curvature
-    ) -> tuple[Array, Array, Array | None]:
-        """Value (N,), gradient (N, d) and Hessian (N, d, d) at poses (N, d) of times (N,).
-
-        The Hessian is None where none is wanted; of a likelihood that knows no exact one it is
-        positive semi-definite always.
-        """
         ...
 
 
@@ -111,26 +93,28 @@ class MixtureLikelihood:
         return self.log_scales[at], self.means[at], self.precisions[at]
 
     def energy(
-        self, poses: Array, times: Index, curvature: Curvature
-    ) -> tuple[Array, Array, Array | None]:
-        """See `SequenceLikelihood`."""
-        n, d = poses.shape
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`; the rows are times."""
+        n, d = x.shape
+        wanted = derivatives >= Derivatives.POSITIVE
         value, gradient = np.empty(n), np.empty((n, d))
-        hessian = np.empty((n if curvature else 0, d, d))
+        hessian = np.empty((n if wanted else 0, d, d))
         add_mixture_energy(
-            np.ascontiguousarray(poses),
-            times.astype(np.int64),
+            np.ascontiguousarray(x),
+            rows.astype(np.int64),
             self.first,
             self.log_scales,
             self.means,
             self.whiteners,
             self.precisions,
-            int(curvature),
+            wanted,
+            derivatives == Derivatives.EXACT,
             value,
             gradient,
             hessian,
         )
-        return value, gradient, hessian if curvature else None
+        return Energy(value, gradient, hessian if wanted else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,25 +150,46 @@ class WindowLikelihood:
         )
 
     def energy(
-        self, poses: Array, times: Index, curvature: Curvature
-    ) -> tuple[Array, Array, Array | None]:
-        """See `SequenceLikelihood`; what it calls poses are states here."""
-        count, n = poses.shape
-        value, gradient = np.zeros(count), np.zeros((count, n))
-        hessian = np.zeros((count, n, n)) if curvature else None
-        at = np.flatnonzero(times == 0)
-        value[at], gradient[at], second = self.first.energy(poses[at], times[at], curvature)
-        if hessian is not None:
-            hessian[at] = second
-        if self.later is not None:
-            at = np.flatnonzero(times > 0)
-            d = self.later.means.shape[1]
-            value[at], gradient[at, :d], second = self.later.energy(
-                poses[at, :d], times[at] - 1, curvature
-            )
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`; the rows are times, the points states."""
+        count, n = x.shape
+        value, gradient, hessian = np.zeros(count), np.zeros((count, n)), None
+        if derivatives >= Derivatives.POSITIVE:
+            hessian = np.zeros((count, n, n))
+        for term, shift, at in (
+            (self.first, 0, np.flatnonzero(rows == 0)),
+            (self.later, 1, np.flatnonzero(rows > 0)),
+        ):
+            if term is None:
+                continue
+            d = term.means.shape[1]
+            found = term.energy(x[at, :d], rows[at] - shift, derivatives=derivatives)
+            value[at], gradient[at, :d] = found.value, found.gradient
             if hessian is not None:
-                hessian[at, :d, :d] = second
-        return value, gradient, hessian
+                hessian[at, :d, :d] = found.hessian
+        return Energy(value, gradient, hessian)
+
+
+@dataclass(frozen=True, eq=False)
+class LikelihoodPart:
+    """The likelihood of some consecutive times.
+
+    Attributes:
+        whole: of all times.
+        first: the first of them.
+        times: how many.
+    """
+
+    whole: SequenceLikelihood
+    first: int
+    times: int
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`; the rows are times from the first on."""
+        return self.whole.energy(x, rows + self.first, derivatives=derivatives)
 
 
 def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = True) -> None:
@@ -227,7 +232,8 @@ def add_mixture_energy(
     means: Array,
     whiteners: Array,
     precisions: Array,
-    curvature: int,
+    second: bool,
+    exact: bool,
     value: Array,
     gradient: Array,
     hessian: Array,
@@ -290,10 +296,10 @@ def add_mixture_energy(
             for a in range(d):
                 factor = white[k, a]
                 for b in range(a + 1):
-                    pull[k, b] = fma(factor, whiteners[mode, a, b], pull[k, b])
+                    pull[k, b] += factor * whiteners[mode, a, b]
             for a in range(d):
-                gradient[i, a] = fma(logs[k], pull[k, a], gradient[i, a])
-        if curvature == 0:
+                gradient[i, a] += logs[k] * pull[k, a]
+        if not second:
             continue
         opened = False
         for k in range(count):
@@ -304,17 +310,17 @@ def add_mixture_energy(
             if opened:
                 for a in range(d):
                     for b in range(d):
-                        hessian[i, a, b] = fma(share, precisions[mode, a, b], hessian[i, a, b])
+                        hessian[i, a, b] += share * precisions[mode, a, b]
             else:
                 for a in range(d):
                     for b in range(d):
                         hessian[i, a, b] = share * precisions[mode, a, b]
                 opened = True
-        if curvature == 2:
+        if exact:
             for k in range(count):
                 if logs[k] == 0.0 or logs[k] == 1.0:
                     continue
                 for a in range(d):
                     one = logs[k] * (pull[k, a] - gradient[i, a])
                     for b in range(d):
-                        hessian[i, a, b] = fma(-one, pull[k, b] - gradient[i, b], hessian[i, a, b])
+                        hessian[i, a, b] -= one * (pull[k, b] - gradient[i, b])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -12,8 +12,9 @@ from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.block_tridiagonal import BlockCholesky
-from hmt_ros.smoothing.dynamics import LinearGaussianDynamics, TrajectoryPrior
-from hmt_ros.smoothing.likelihood import Curvature, SequenceLikelihood, check_mixtures
+from hmt_ros.inference.energy import Derivatives
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
+from hmt_ros.smoothing.likelihood import LikelihoodPart, SequenceLikelihood, check_mixtures
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.path_gaussians import path_gaussians
 from hmt_ros.smoothing.paths import Paths
@@ -34,6 +35,10 @@ Array = NDArray[np.float64]
 SAMPLE_BUDGET = 400_000
 # Components lighter than this, against the heaviest, do not take part in the descent.
 LEAST_SHARE = 1e-6
+# From this many images on, paths are first refined where they leave the best one, and by so many
+# images on either side.
+LONG = 100
+MARGIN = 8
 # A path whose Gaussian lies within so many standard deviations of an optimum says nothing new.
 SAME_DISTANCE = 0.3
 # Modes closer than so many standard deviations are merged, as alternatives to the optima.
@@ -142,15 +147,13 @@ class MixtureSmoother:
     ) -> TrajectoryMixture:
         """As `smooth`, of what was checked."""
         likelihood = sequence.likelihood if observation is None else observation
-        sets = [self.optima(sequence, likelihood)]
-        if observation is None:
-            sets += self.merged_paths(sequence)
-        best = sets[0]
-        if len(sets) > 1:
-            energies = [
-                self._descended(one, sequence.prior, likelihood, seed, 0).fresh[0] for one in sets
-            ]
-            best = sets[int(np.argmin(energies))]
+        best, least = self.optima(sequence, likelihood), np.nan
+        for other in self.merged_paths(sequence) if observation is None else ():
+            if np.isnan(least):
+                least = self._free_energy(best, sequence.prior, likelihood, seed)
+            energy = self._free_energy(other, sequence.prior, likelihood, seed)
+            if energy < least:
+                best, least = other, energy
         found = self._fitted(best, sequence.prior, likelihood, seed, stamps_ns)
         return self.as_evidence(found, sequence.intervals)
 
@@ -174,6 +177,8 @@ class MixtureSmoother:
         best = refine(starts[:1], prior, likelihood, low[:d], high[:d])
         shared = paths.nodes == paths.nodes[0]
         starts = np.where(shared[:, :, None], best.states, starts)
+        if starts.shape[1] >= LONG:
+            starts = with_refined_parts(starts, shared, prior, likelihood, low[:d], high[:d])
         refined = refine(starts, prior, likelihood, low[:d], high[:d])
         refined = refined.without_duplicates()
         if self.start == 'laplace':
@@ -202,17 +207,24 @@ class MixtureSmoother:
             refined.factors + tuple(beside.factors[i] for i in distinct),
         )
 
-    def merged_paths(self, sequence: ModeSequence) -> list[Candidates]:
+    def merged_paths(self, sequence: ModeSequence) -> Iterator[Candidates]:
         """Gaussians of paths through modes that were merged, for each distance that merges some."""
-        result = []
         count = sum(len(mixture) for mixture in sequence.mixtures)
         for distance in MERGE_DISTANCES:
             merged = sequence.merged(distance)
             left = sum(len(mixture) for mixture in merged.mixtures)
             if left < count:
-                result.append(self._on_paths(merged, self.paths(merged)))
+                yield self._on_paths(merged, self.paths(merged))
                 count = left
-        return result
+
+    def _free_energy(
+        self,
+        candidates: Candidates,
+        prior: TrajectoryPrior,
+        likelihood: SequenceLikelihood,
+        seed: int,
+    ) -> float:
+        return self._descended(candidates, prior, likelihood, seed, 0).fresh[0]
 
     def _on_paths(self, sequence: ModeSequence, paths: Paths) -> Candidates:
         low, high = self._limits()
@@ -275,7 +287,8 @@ class MixtureSmoother:
         energies, _ = prior.energy(found.states)
         at = np.tile(np.arange(times), count)
         poses = found.states[:, :, : prior.dimension].reshape(-1, prior.dimension)
-        observed = likelihood.energy(poses, at, Curvature.NONE)[0].reshape(count, times).sum(1)
+        energy = likelihood.energy(poses, at, derivatives=Derivatives.NONE)
+        observed = energy.value.reshape(count, times).sum(1)
         d = self.dynamics.dimension
         return TrajectoryMixture(
             weights=found.weights[order],
@@ -299,6 +312,46 @@ class MixtureSmoother:
             self.dynamics.dimension,
             self.dynamics.state_dimension,
         )
+
+
+def with_refined_parts(
+    starts: Array,
+    shared: NDArray[np.bool_],
+    prior: TrajectoryPrior,
+    likelihood: SequenceLikelihood,
+    lower: Array,
+    upper: Array,
+) -> Array:
+    """Starts (M, T, n) that are optimal where they differ from the first one, given the rest.
+
+    The paths of a long sequence agree but for its ends, and many have the same ends: their parts
+    are few and short, while each step of a whole trajectory costs as much as all its images.
+
+    Args:
+        starts: (M, T, n); the first one is an optimum.
+        shared: (M, T) whether they are as the first one.
+        prior, likelihood, lower, upper: as for `refine`.
+    """
+    times = starts.shape[1]
+    parts: dict[tuple[int, int], list[int]] = {}
+    for i, same in enumerate(shared):
+        apart = np.convolve(~same, np.ones(2 * MARGIN + 1), 'same') > 0
+        edges = np.flatnonzero(np.diff(apart, prepend=False, append=False))
+        for first, last in zip(edges[::2], edges[1::2]):
+            if last - first <= times // 2:
+                parts.setdefault((int(first), int(last)), []).append(i)
+    result = starts.copy()
+    for (first, last), owners in parts.items():
+        some, owner = np.unique(starts[owners, first:last], axis=0, return_inverse=True)
+        found = refine(
+            some,
+            prior.between(first, last, starts[0]),
+            LikelihoodPart(likelihood, first, last - first),
+            lower,
+            upper,
+        )
+        result[owners, first:last] = found.states[owner.reshape(-1)]
+    return result
 
 
 def intervals_of(stamps_ns: Sequence[int] | None, times: int, step: float) -> Array:

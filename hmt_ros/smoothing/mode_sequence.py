@@ -7,7 +7,6 @@ it merged, and few trajectories cover what many would have to.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.smoothing.component_overlaps import pair_distances
-from hmt_ros.smoothing.dynamics import LinearGaussianDynamics, TrajectoryPrior
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
+from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, embedded_network
 from hmt_ros.smoothing.likelihood import MixtureLikelihood, WindowLikelihood
 from hmt_ros.smoothing.paths import (
@@ -110,37 +109,6 @@ class ModeSequence:
 
     def merged(self, distance: float) -> ModeSequence:
         """The sequence with modes merged that are closer than so many standard deviations."""
-        return replace(self, mixtures=tuple(merge_close_modes(self.mixtures, distance)))
-
-
-def merge_close_modes(
-    mixtures: Sequence[GaussianMixture], distance: float
-) -> list[GaussianMixture]:
-    """The mixtures with modes merged, the closest first, until none are closer than a distance.
-
-    Args:
-        mixtures: weights, mean and covariance of each are kept.
-        distance: between means, in standard deviations of the average of two covariances.
-    """
-    return [_merged(mixture, distance) for mixture in mixtures]
-
-
-def _merged(mixture: GaussianMixture, distance: float) -> GaussianMixture:
-    while len(mixture) > 1:
-        i, j = np.triu_indices(len(mixture), 1)
-        scales = np.full(len(mixture), 0.5)
-        pairs = np.stack([i, j], axis=1)
-        squares = pair_distances(
-            np.array(mixture.means), np.array(mixture.covariances), scales, pairs
+        return replace(
+            self, mixtures=tuple(merged_if_close(mixture, distance) for mixture in self.mixtures)
         )
-        closest = int(np.argmin(squares))
-        if squares[closest] >= distance**2:
-            break
-        both = mixture[pairs[closest]]
-        rest = mixture[[k for k in range(len(mixture)) if k not in pairs[closest]]]
-        mixture = GaussianMixture(
-            np.append(rest.weights, both.weights.sum()),
-            np.concatenate([rest.means, both.mean()[None]]),
-            np.concatenate([rest.covariances, both.covariance()[None]]),
-        )
-    return mixture

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.inference.block_tridiagonal import BlockCholesky, factorise_band
-from hmt_ros.smoothing.dynamics import TrajectoryPrior
+from hmt_ros.inference.block_tridiagonal import BlockCholesky, add_diagonal, factorise_band
+from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 from hmt_ros.smoothing.likelihood import MixtureLikelihood, WindowLikelihood
-from hmt_ros.smoothing.trajectory_refinement import add_diagonal
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -4,7 +4,7 @@ The posterior of a sequence of Gaussian mixtures is a Gaussian mixture with a co
 path through their modes. The most probable paths that differ are found by the embedded network, and
 their components, with the weights that they have in the posterior, are the result: neither descent
 to optima nor of the free energy, which cost fifty times as much. Modes that overlap share their
-mass among many paths; they should be merged before (`mode_sequence.merge_close_modes`).
+mass among many paths; they should be merged before (`reduction.merged_if_close`).
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from hmt_ros.smoothing.likelihood import Curvature, SequenceLikelihood
+from hmt_ros.inference.energy import Derivatives
+from hmt_ros.smoothing.likelihood import SequenceLikelihood
 from hmt_ros.smoothing.mixture_smoother import MixtureSmoother
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.path_gaussians import path_gaussians
@@ -60,7 +61,8 @@ class PathSmoother(MixtureSmoother):
         energies, _ = prior.energy(states)
         poses = states[:, :, : prior.dimension].reshape(-1, prior.dimension)
         at = np.tile(np.arange(times), count)
-        observed = likelihood.energy(poses, at, Curvature.NONE)[0].reshape(count, times).sum(1)
+        energy = likelihood.energy(poses, at, derivatives=Derivatives.NONE)
+        observed = energy.value.reshape(count, times).sum(1)
         log = found.log_weights[order]
         result = TrajectoryMixture(
             weights=np.exp(log - logsumexp(log)),

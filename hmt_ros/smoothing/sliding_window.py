@@ -18,8 +18,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.smoothing.dynamics import LinearGaussianDynamics
-from hmt_ros.smoothing.embedded_network import pair_log_densities
+from hmt_ros.inference.gaussian_pairs import pair_log_densities
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
+from hmt_ros.inference.reduction import merged_if_alike
 from hmt_ros.smoothing.likelihood import check_mixtures
 from hmt_ros.smoothing.mixture_smoother import MixtureSmoother, intervals_of
 from hmt_ros.smoothing.mode_sequence import ModeSequence
@@ -241,9 +242,7 @@ def filtered_state(
         followed: weights (M,) of trajectories and their states (M, n) at the new time.
     """
     d, n = dynamics.dimension, dynamics.state_dimension
-    a, q = dynamics.transition(interval)
-    means = state.means @ a.T
-    covariances = a @ state.covariances @ a.T + q
+    means, covariances = dynamics.predict(state.means, state.covariances, interval)
     pairs = np.indices((len(state), len(mixture))).reshape(2, -1).T
     log = pair_log_densities(
         means[:, :d], covariances[:, :d, :d], mixture.means, mixture.covariances, pairs
@@ -261,7 +260,8 @@ def filtered_state(
     spread = keep @ covariances[i] @ keep.swapaxes(1, 2)
     spread += gain @ mixture.covariances[k] @ gain.swapaxes(1, 2)
     weights = np.exp(log[order] - logsumexp(log[order]))
-    found = _merged(GaussianMixture(weights, fused, 0.5 * (spread + spread.swapaxes(1, 2))))
+    found = GaussianMixture(weights, fused, 0.5 * (spread + spread.swapaxes(1, 2)))
+    found = merged_if_alike(found, MERGE_DISTANCE, MERGE_LOG_DETERMINANT)
     if len(found) <= count:
         return found.normalised()
     score = found.weights.copy()
@@ -271,23 +271,3 @@ def filtered_state(
         score += followed[0] @ share
     chosen = np.sort(np.argsort(-score, kind='stable')[:count])
     return found[chosen].normalised()
-
-
-def _merged(mixture: GaussianMixture) -> GaussianMixture:
-    """Components that tell nearly the same become one with their mean and covariance."""
-    whiteners = np.linalg.inv(mixture.cholesky())
-    log_det = -2.0 * np.log(np.diagonal(whiteners, axis1=1, axis2=2)).sum(1)
-    left = np.ones(len(mixture), dtype=bool)
-    parts = []
-    for i in range(len(mixture)):
-        if not left[i]:
-            continue
-        at = np.flatnonzero(left)
-        white = (mixture.means[at] - mixture.means[i]) @ whiteners[i].T
-        near = (white * white).sum(1) < MERGE_DISTANCE**2
-        near &= np.abs(log_det[at] - log_det[i]) < MERGE_LOG_DETERMINANT
-        group = mixture[at[near]]
-        parts.append((group.weights.sum(), group.mean(), group.covariance()))
-        left[at[near]] = False
-    weights, means, covariances = zip(*parts)
-    return GaussianMixture(np.array(weights), np.array(means), np.array(covariances))

@@ -20,14 +20,16 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.blas import dsbmv
 from scipy.linalg.lapack import dpbtrs
 
-from hmt_ros.inference import Status
 from hmt_ros.inference.block_tridiagonal import (
     BlockCholesky,
     NotPositiveDefiniteError,
+    add_diagonal,
     factorise_band,
 )
-from hmt_ros.smoothing.dynamics import TrajectoryPrior
-from hmt_ros.smoothing.likelihood import Curvature, SequenceLikelihood
+from hmt_ros.inference.energy import Derivatives
+from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
+from hmt_ros.inference.trust_region import Status, TrustRegion
+from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -161,14 +163,15 @@ class _Problem:
         self.bounded = bool(np.isfinite(self.low).any() or np.isfinite(self.high).any())
         self.width = prior.precision.bandwidth
         self.band = prior.precision.band()
-        self.lam = np.full(count, FIRST_DAMPING)
-        self.growth = np.full(count, 2.0)
+        self.region = TrustRegion(
+            count, FIRST_DAMPING, limit=DAMPING_LIMIT, least_factor=0.1, least_refused=FIRST_DAMPING
+        )
         self.exact = np.ones(count, dtype=bool)
         self.status = np.full(count, Status.ITERATION_LIMIT, dtype=np.int8)
         self.iterations = np.zeros(count, dtype=np.int32)
         self.states = np.clip(starts, self.low, self.high)
         self.energy, self.observed, self.gradient, self.hessian = self._evaluate(
-            self.states, Curvature.EXACT
+            self.states, Derivatives.EXACT
         )
         self.status[~np.isfinite(self.energy)] = Status.NOT_FINITE
 
@@ -185,29 +188,18 @@ class _Problem:
             if len(active) == 0:
                 break
             trial = np.clip(self.states[active] + step, self.low, self.high)
-            found = self._evaluate(trial, Curvature.EXACT)
+            found = self._evaluate(trial, Derivatives.EXACT)
             self.iterations[active] += 1
-            decrease = self.energy[active] - found[0]
-            ratio = np.where(np.isfinite(decrease), decrease, -np.inf) / predicted
-            better = ratio > 1e-3
-
+            better = self.region.accept(active, self.energy[active] - found[0], predicted)
             rows = active[better]
             self.states[rows] = trial[better]
             for name, value in zip(('energy', 'observed', 'gradient', 'hessian'), found):
                 getattr(self, name)[rows] = value[better]
-            gain = 1.0 - (2.0 * np.minimum(ratio[better], 2.0) - 1.0) ** 3
-            self.lam[rows] *= np.maximum(0.1, gain)
-            self.growth[rows] = 2.0
-            self.exact[rows] = True
-
-            rows = active[~better]
-            again = self.exact[rows]
-            self.exact[rows] = False
-            rows = rows[~again]
-            self.lam[rows] = np.maximum(self.lam[rows], FIRST_DAMPING) * self.growth[rows]
-            self.growth[rows] *= 2.0
-            stalled = rows[self.lam[rows] > DAMPING_LIMIT]
-            self.status[stalled] = Status.STALLED
+            # The positive part of the curvature first, damping after that.
+            refused = active[~better]
+            damped = refused[~self.exact[refused]]
+            self.exact[rows], self.exact[refused] = True, False
+            self.status[self.region.refuse(damped)] = Status.STALLED
             active = active[self.status[active] == Status.ITERATION_LIMIT]
 
     def result(self, offset: int) -> RefinedTrajectories:
@@ -219,7 +211,7 @@ class _Problem:
         factors = [self._factor(self.hessian[i], slope[i]) for i in everyone]
         failed = np.array([i for i in everyone if factors[i] is None], dtype=np.intp)
         if len(failed):
-            positive = self._evaluate(self.states[failed], Curvature.POSITIVE)[3]
+            positive = self._evaluate(self.states[failed], Derivatives.POSITIVE)[3]
             for i, hessian in zip(failed, positive):
                 factors[i] = self._positive_factor(hessian, slope[i])
         return RefinedTrajectories(
@@ -233,14 +225,16 @@ class _Problem:
             everyone + offset,
         )
 
-    def _evaluate(self, states: Array, curvature: Curvature) -> tuple[Array, Array, Array, Array]:
+    def _evaluate(
+        self, states: Array, derivatives: Derivatives
+    ) -> tuple[Array, Array, Array, Array]:
         """Energy, that of the observations, gradient (M, T, n), Hessians (M, T, d, d)."""
         m, d = len(states), self.prior.dimension
         at = np.tile(np.arange(self.times), m)
         poses = states[:, :, :d].reshape(-1, d)
-        value, slope, hessian = self.likelihood.energy(poses, at, curvature)
-        assert hessian is not None
-        observed = value.reshape(m, self.times).sum(1)
+        found = self.likelihood.energy(poses, at, derivatives=derivatives)
+        slope, hessian = found.derivatives()
+        observed = found.value.reshape(m, self.times).sum(1)
         energy = observed + self.prior.constant
         gradient = np.empty((m, self.times, self.size))
         information = self.prior.information.reshape(-1)
@@ -270,7 +264,7 @@ class _Problem:
             if not self.exact[i] or not self._step(i, self.hessian[i], resting[row], step[row]):
                 failed.append(row)
         if failed:
-            positive = self._evaluate(self.states[active[failed]], Curvature.POSITIVE)[3]
+            positive = self._evaluate(self.states[active[failed]], Derivatives.POSITIVE)[3]
             for row, hessian in zip(failed, positive):
                 i = active[row]
                 # Indefinite: as little of the positive Hessian as makes it positive definite.
@@ -286,18 +280,20 @@ class _Problem:
                     continue
                 self.exact[i] = False
                 while not self._step(i, hessian, resting[row], step[row]):
-                    self.lam[i] *= 4.0
+                    self.region.damping[i] *= 4.0
         for row, i in enumerate(active):
             move = np.clip(self.states[i] + step[row], self.low, self.high) - self.states[i]
             slope = float(np.vdot(self.gradient[i], move))
-            damping = self.lam[i] * float(np.vdot(move * self._metric(self.hessian[i]), move))
+            damping = self.region.damping[i] * float(
+                np.vdot(move * self._metric(self.hessian[i]), move)
+            )
             predicted[row] = -0.5 * slope + 0.5 * damping if slope < 0 else 0.0
             step[row] = move
         return step, predicted
 
     def _step(self, i: int, hessian: Array, resting: NDArray[np.bool_], step: Array) -> bool:
         """Writes the step of a trajectory; False where the matrix is not positive definite."""
-        extra = self.lam[i] * self._metric(hessian)
+        extra = self.region.damping[i] * self._metric(hessian)
         held = resting if self.bounded and resting.any() else None
         factor = self._factor(hessian, extra, held)
         if factor is None:
@@ -358,16 +354,6 @@ def limits_of_states(
         i = int(np.argmin(low <= high))
         raise ValueError(f'limits of variable {i}: lower {low[i]} is above upper {high[i]}')
     return low, high
-
-
-@njit(cache=True, nogil=True)
-def add_diagonal(columns: Array, blocks: Array, n: int) -> None:
-    """Adds blocks (T, d, d) to the leading parts of diagonal blocks in a band (T n, width + 1)."""
-    times, d, _ = blocks.shape
-    for t in range(times):
-        for b in range(d):
-            for a in range(b, d):
-                columns[t * n + b, a - b] += blocks[t, b, a]
 
 
 @njit(cache=True, nogil=True)

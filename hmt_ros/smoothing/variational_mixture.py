@@ -15,9 +15,7 @@ sqrt(2 D a_i).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +23,11 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, add_band_product
-from hmt_ros.smoothing.component_overlaps import NEGLIGIBLE, add_overlaps, pair_distances
-from hmt_ros.smoothing.dynamics import TrajectoryPrior
-from hmt_ros.smoothing.likelihood import Curvature, SequenceLikelihood
+from hmt_ros.inference.energy import Derivatives
+from hmt_ros.inference.gaussian_pairs import pair_distances, threads
+from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
+from hmt_ros.smoothing.component_overlaps import NEGLIGIBLE, add_overlaps
+from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
 Array = NDArray[np.float64]
 
@@ -270,7 +270,9 @@ class FreeEnergy:
         self.inside = np.ones((self.total, width), dtype=bool)
         for b in range(width):
             self.inside[self.total - b :, b] = False
-        self.marginals = np.concatenate([factor.inverse_blocks()[0] for factor in factors])
+        self.marginals = np.empty((self.count, self.times, self.size, self.size))
+        for i, factor in enumerate(factors):
+            self.marginals[i] = factor.inverse_blocks()[0]
         self.roots = np.stack([factor.solve_transposed(z) for factor, z in zip(factors, noise)])
 
     def mixture(self, x: Array) -> Mixture:
@@ -400,7 +402,7 @@ class FreeEnergy:
                 if derivatives:
                     slope[i] += pull
 
-        list(_threads().map(work, range(PARTS)))
+        list(threads().map(work, range(PARTS)))
         return each, slope, tuple(sum(column[1:], start=column[0]) for column in zip(*sums))
 
     def _energy(self, points: Array) -> tuple[Array, Array]:
@@ -413,9 +415,10 @@ class FreeEnergy:
         gradient -= information
         poses = points.reshape(s * self.times, self.size)[:, :d]
         at = np.tile(np.arange(self.times), s)
-        observed, slope, _ = self.likelihood.energy(poses, at, Curvature.NONE)
-        gradient.reshape(s * self.times, self.size)[:, :d] += slope
-        return value + observed.reshape(s, self.times).sum(1), gradient
+        found = self.likelihood.energy(poses, at, derivatives=Derivatives.GRADIENT)
+        assert found.gradient is not None
+        gradient.reshape(s * self.times, self.size)[:, :d] += found.gradient
+        return value + found.value.reshape(s, self.times).sum(1), gradient
 
     def _near(self, means: Array, inflation: Array) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
         """(M, M) which components may overlap, by their marginals where they are farthest apart.
@@ -435,11 +438,8 @@ class FreeEnergy:
         poses = means.reshape(-1, self.size)
         pairs = np.stack([i, j], axis=1) * self.times + at[:, None]
         scales = np.repeat(inflation**2, self.times)
-        distances = pair_distances(poses, self.marginals, scales, pairs)
+        distances = pair_distances(
+            poses, self.marginals.reshape(-1, self.size, self.size), scales, pairs
+        )
         near[i, j] = near[j, i] = 0.25 * distances < NEGLIGIBLE
         return near, farthest
-
-
-@lru_cache(maxsize=1)
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(2, thread_name_prefix='smoothing')

@@ -1,9 +1,9 @@
 """The filter: proposals and mixture density propagation over images (KJS)."""
 
-from hmt_ros.tracking.pose_prediction import PosePrediction
+from hmt_ros.tracking.proposals import PosePrediction
+from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.subject import Subject, SubjectError, read_subject
 from hmt_ros.tracking.tracker import Status, Tracker
-from hmt_ros.tracking.tracker_settings import TrackerSettings
 
 __all__ = [
     'PosePrediction',

@@ -57,14 +57,14 @@ class FleshFit:
 
         Args:
             likelihood: of the body with the present widths.
-            observation: of the image.
+            observation: of the image; its keypoints say nothing of widths.
             poses, weights: (K, d), (K,) modes at the image.
         """
         frames = forward(likelihood.body.skeleton, poses)
 
         def energy(change: Array) -> float:
             scaled = likelihood.with_scaled_widths(np.exp(change[self._group]))
-            terms = scaled.image_energy(frames, observation, derivatives=False)
+            terms = scaled.energies(frames, observation, derivatives=False)
             return float(weights @ terms.value)
 
         here = energy(np.zeros(len(self._names)))

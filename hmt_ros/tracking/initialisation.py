@@ -8,7 +8,7 @@ first mixture.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,13 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward, joint_length_jacobians, point_jacobians
 from hmt_ros.flips.best_combinations import distinct_poses
 from hmt_ros.flips.interpretation_tree import enumerate_flips
-from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
-from hmt_ros.image.observation import Keypoints, Observation, Outline
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.image.terms.silhouette import Outline
 from hmt_ros.inference.bounded_newton import Minimum, minimise
-from hmt_ros.tracking.candidates import some_minima
+from hmt_ros.inference.energy import Derivatives, EnergyTerm
 from hmt_ros.tracking.subject import Subject
 
 Array = NDArray[np.float64]
@@ -71,20 +74,14 @@ def start_from_keypoints(
     lengths = (weights / weights.sum()) @ fits.x[best, d:]
     body = body.with_segment_lengths(dict(zip(body.skeleton.length_names, lengths, strict=True)))
 
-    likelihood = ImageLikelihood(
-        body,
-        camera,
-        LikelihoodSettings(joints=TermSettings(1.0, 1.0, np.inf), prior_weight=prior_weight),
-    )
-    observation = Observation(keypoints=keypoints)
-
-    def energy(x: Array, _: Index) -> tuple[Array, Array, Array]:
-        return likelihood.energy(x, observation)
+    least_squares = LikelihoodSettings.of_terms(keypoints=TermSettings(1.0, 1.0, np.inf))
+    settings = replace(least_squares, prior_weight=prior_weight)
+    energy = ImageLikelihood(body, camera, settings).given(Observation(keypoints=keypoints))
 
     heads = _distinct(_solve(energy, fits.x[:, :d], body), body, 4)
     trees = [enumerate_flips(body, heads.x, c)[0] for c in (*body.chains, *body.chain_pairs)]
     flips = np.concatenate([heads.x, *trees])
-    raw = likelihood.energy(flips, observation)[0]
+    raw = energy.energy(flips, derivatives=Derivatives.NONE).value
     keep = np.argsort(raw, kind='stable')[:192]
     solved = _distinct(_solve(energy, flips[keep], body), body, 96)
     order = np.argsort(solved.value, kind='stable')
@@ -229,10 +226,9 @@ def _first_guesses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
     return result
 
 
-def _solve(energy: object, poses: Array, body: Body) -> Minimum:
+def _solve(energy: EnergyTerm, poses: Array, body: Body) -> Minimum:
     return minimise(
-        energy,  # type: ignore[arg-type]
-        poses, body.lower, body.upper,
+        energy, poses, body.lower, body.upper,
         step_scale=np.where(body.skeleton.dof_is_rotation, 0.4, 0.3),
         damping=1.0, max_iterations=40, tolerance=1e-3,
     )  # fmt: skip
@@ -243,4 +239,4 @@ def _distinct(solved: Minimum, body: Body, count: int) -> Minimum:
     order = np.argsort(solved.value, kind='stable')
     order = order[np.isfinite(solved.value[order])]
     distinct = distinct_poses(body.joint_positions(solved.x[order]), 0.03, count)
-    return some_minima(solved, order[distinct.kept])
+    return solved[order[distinct.kept]]

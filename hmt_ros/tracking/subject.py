@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.image.observation import Keypoints
-from msg_tools.files.plain_yaml import load_plain_yaml
+from hmt_ros.image.terms.keypoints import Keypoints
+from msg_tools.files.plain_yaml import read_plain_yaml
 
 Array = NDArray[np.float64]
 
@@ -51,25 +51,10 @@ def read_subject(path: str | Path, body: Body) -> Subject:
         SubjectError: a file that is missing, is not YAML, lacks an entry, or names a joint or a
             length that the body does not have.
     """
-    path = Path(path)
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise SubjectError(
-                f'{path}: {path.stat().st_size} bytes, a subject file is far smaller'
-            )
-        text = path.read_text('utf-8')
-    except OSError as fault:
-        raise SubjectError(f'{path}: can not be read ({fault.strerror})') from fault
-    except UnicodeDecodeError as fault:
-        raise SubjectError(f'{path}: not YAML ({fault})') from fault
-    try:
-        content = load_plain_yaml(text)
+        return parse_subject(read_plain_yaml(path, LARGEST_FILE), body)
     except ValueError as fault:
-        raise SubjectError(f'{path}: not YAML ({" ".join(str(fault).split())})') from fault
-    try:
-        return parse_subject(content, body)
-    except SubjectError as fault:
-        raise SubjectError(f'{path}: {fault}') from None
+        raise SubjectError(f'{path}: {fault}') from fault
 
 
 def parse_subject(content: Any, body: Body) -> Subject:

@@ -1,10 +1,9 @@
-"""The folder of a bag while it is written: an MCAP file and its metadata, whole or not at all.
+"""Writes the folder of a bag, an MCAP file and its metadata, as a whole or not at all.
 
-The bag is written into a hidden folder `.<name>.<random>.partial` beside its place and moved there
-when it is complete and on the disk; after an error nothing is left behind. Where the process is
-killed the hidden folder stays: each chunk goes to the system when it is complete, so that
-`bag_recovery` finds all but the last. Chunks, data and summary have checksums. The same
-calls write the same bytes.
+The bag is written into a hidden folder `.<name>.<random>.partial` next to its place and moved there
+when it is complete and on the disk; an error removes it. If the process is killed the hidden folder
+stays: each complete chunk is handed to the system at once, so that `bag_recovery` finds all but the
+last. Chunks, data and summary have checksums. The same calls write the same bytes.
 """
 
 from __future__ import annotations
@@ -21,9 +20,8 @@ from typing import Any, BinaryIO
 
 from mcap.writer import CompressionType, Writer
 
-from msg_tools.bags.bag_error import BagError, reason
 from msg_tools.bags.bag_metadata import FILE_NAME, SUFFIXES, VERSION, as_yaml
-from msg_tools.bags.stored_message import Channel
+from msg_tools.bags.contents import BagError, Channel, reason
 
 LIBRARY = 'hmt_ros'
 CHUNK_BYTES = 2**20
@@ -177,7 +175,7 @@ class BagFolder:
 
     @contextmanager
     def dropping_on_error(self) -> Iterator[None]:
-        """What fails with an OSError, or not as it should, leaves nothing behind."""
+        """Removes the unfinished bag when an exception passes, and turns OSError into BagError."""
         if self._folder is None:
             raise BagError(f'{self.path} is closed')
         try:

@@ -1,4 +1,4 @@
-"""`metadata.yaml`, the file that makes a folder a rosbag2 bag."""
+"""`metadata.yaml`, which makes a folder a bag of rosbag2: reads and writes it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 import yaml
 from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability
 
-from msg_tools.bags.bag_error import BagError, reason
+from msg_tools.bags.contents import BagError, reason
+from msg_tools.files.bounded_file import read_bytes
 
 FILE_NAME = 'metadata.yaml'
 # What the names of the other files of a bag end with.
@@ -37,20 +38,18 @@ def read_file_names(folder: Path) -> list[str]:
         BagError: no metadata, or not that of a bag.
     """
     path = folder / FILE_NAME
+    if not path.is_file():
+        raise BagError(
+            f'{folder} is no bag: it has no {FILE_NAME}; give the .mcap file itself, or write '
+            'the metadata anew with `ros2 bag reindex`'
+        )
     try:
-        if not path.is_file():
-            raise BagError(
-                f'{folder} is no bag: it has no {FILE_NAME}; give the .mcap file itself, or write '
-                'the metadata anew with `ros2 bag reindex`'
-            )
-        if path.stat().st_size > MAX_BYTES:
-            raise BagError(f'{path} has more than {MAX_BYTES} bytes: it is not that of a bag')
-        document = yaml.safe_load(path.read_text('utf-8'))
-    except OSError as error:
-        raise BagError(f'{path} can not be read: {reason(error)}') from error
+        content = read_bytes(path, MAX_BYTES)
+    except ValueError as error:
+        raise BagError(f'{path}: {error}') from error
+    try:
+        document = yaml.safe_load(content.decode('utf-8'))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        if isinstance(error, BagError):
-            raise
         raise BagError(f'{path} is not YAML: {reason(error)}') from error
     information = None
     if isinstance(document, dict):
@@ -90,7 +89,7 @@ def recorded_quality_of_service(text: str) -> list[dict[str, Any]]:
         text: YAML, with numbers in bags of ROS 2 Iron and before.
 
     Returns:
-        Nothing where the text can not be understood: players then offer what is usual.
+        An empty list if the text can not be understood: players then offer the usual QoS.
     """
     try:
         profiles = yaml.safe_load(text)

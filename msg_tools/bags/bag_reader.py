@@ -1,8 +1,8 @@
-"""Reading a bag: a folder of rosbag2, a single .mcap or .db3 file, also compressed with zstd.
+"""Reads a bag: a folder of rosbag2, or a single .mcap or .db3 file, also compressed with zstd.
 
-Messages come in the order of their log times, whatever the order in the files, the same every time;
-of equal times in the order of the files. Memory holds the chunks of the present time, never a whole
-file. Everything that is wrong with a bag is a `BagError` of one line.
+Messages come in the order of their log times; messages of equal times come in the order of the
+files. Memory holds the chunks of the present time, never a whole file. Every fault of a bag is a
+`BagError` of one line.
 
     with BagReader('walk') as bag:
         topic = bag.find_topic(['sensor_msgs/msg/CompressedImage'])
@@ -25,8 +25,8 @@ from typing import Any
 from rosbags.typesys.store import Typestore
 
 from msg_tools.bags import sqlite_file
-from msg_tools.bags.bag_error import BagError, reason
 from msg_tools.bags.bag_metadata import read_file_names
+from msg_tools.bags.contents import BagError, Channel, Source, StoredMessage, merge, reason
 from msg_tools.bags.decompression import (
     ZSTD_MAGIC,
     DecompressionError,
@@ -35,10 +35,8 @@ from msg_tools.bags.decompression import (
 )
 from msg_tools.bags.mcap_file import McapFile
 from msg_tools.bags.sqlite_file import SqliteFile
-from msg_tools.bags.stored_message import Channel, StoredMessage
-from msg_tools.bags.time_order import Source, merge
 from msg_tools.messages.cdr import deserialise
-from msg_tools.messages.typestore import typestore_of_definition
+from msg_tools.messages.message_types import typestore_of_definition
 
 _NEVER = 2**64  # later than any log time
 
@@ -49,7 +47,7 @@ class Topic:
 
     Attributes:
         name: as written in the bag, with or without a leading slash.
-        msgtype: for example 'sensor_msgs/msg/Image'; '' when the bag does not tell.
+        msgtype: for example 'sensor_msgs/msg/Image'; '' if the bag does not contain it.
         encoding: of the messages; 'cdr' for ROS 2.
         message_count: how many there are, by the statistics of the bag.
     """

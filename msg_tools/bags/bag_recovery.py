@@ -1,4 +1,4 @@
-"""A bag anew from what is whole in one whose writing was cut off, or which was damaged later."""
+"""Writes a new bag from the intact parts of one that was cut off or damaged."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from msg_tools.bags.bag_error import BagError, reason
 from msg_tools.bags.bag_folder import BagFolder, unfinished_folders
 from msg_tools.bags.bag_metadata import (
     DATABASE_SUFFIXES,
@@ -19,6 +18,7 @@ from msg_tools.bags.bag_metadata import (
     read_file_names,
     recorded_quality_of_service,
 )
+from msg_tools.bags.contents import BagError, Channel, reason
 from msg_tools.bags.decompression import ZSTD_MAGIC, DecompressionError, decompress_file
 from msg_tools.bags.mcap_salvage import (
     Loss,
@@ -29,7 +29,6 @@ from msg_tools.bags.mcap_salvage import (
     SavedMessage,
     SavedMetadata,
 )
-from msg_tools.bags.stored_message import Channel
 
 # Written anew.
 _OWN_METADATA = 'rosbag2'
@@ -43,7 +42,7 @@ class Recovery:
         path: the new bag.
         messages: how many were saved.
         topics: how many topics they are of.
-        lost_messages: how many were not; None where the bag does not tell how many there were.
+        lost_messages: how many were not; None if the bag has no count of its messages.
         losses: one line for each loss.
     """
 
@@ -70,7 +69,7 @@ def recover_bag(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
         raise BagError(f'{target} exists, and nothing is overwritten; give another name')
     paths, losses = _files(Path(source))
     with _opened(Path(source), paths, losses) as files:
-        # Opened before: what can not be read at all is told before anything is written.
+        # Opened before: a bag that can not be read at all is an error before anything is written.
         folder = BagFolder(target, profile=_profile(files))
         try:
             channels: dict[Channel, int] = {}

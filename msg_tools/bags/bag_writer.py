@@ -1,7 +1,7 @@
-"""Writing a bag of our own messages, which rosbag2 plays: whole or not at all.
+"""Writes messages into a bag that rosbag2 plays, as a whole or not at all.
 
-Time is what the caller says, the stamp of the message: log time and publish time are the same. See
-`msg_tools.bags.bag_folder` for what becomes of a bag that is not completed.
+Log time and publish time are both the stamp that the caller gives. `msg_tools.bags.bag_folder`
+describes what happens to a bag that is not completed.
 
     with BagWriter('out') as bag:
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
@@ -14,12 +14,11 @@ import os
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
-from msg_tools.bags.bag_error import BagError, reason
 from msg_tools.bags.bag_folder import BagFolder
 from msg_tools.bags.bag_metadata import quality_of_service
-from msg_tools.bags.stored_message import Channel
+from msg_tools.bags.contents import BagError, Channel, reason
 from msg_tools.messages.cdr import serialise
-from msg_tools.messages.typestore import typestore
+from msg_tools.messages.message_types import typestore
 
 
 class _Topic(NamedTuple):

@@ -1,4 +1,4 @@
-"""Decompression that never trusts a length field on its own."""
+"""Decompression of zstd and lz4 with limits on the size of the result."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import BinaryIO
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
-from msg_tools.bags.bag_error import reason
+from msg_tools.bags.contents import reason
 
 MAX_BYTES = 2**29  # longest record, chunk or message that is read; the largest real ones are images
 PIECE_BYTES = 2**20

@@ -1,4 +1,4 @@
-"""One MCAP file, read in log-time order, believing nothing that has not been checked.
+"""Reads one MCAP file in the order of log times, and checks every length and checksum.
 
 Written against the MCAP specification, version 0 (https://mcap.dev/spec). The reader of `rosbags`
 wants the profile `ros2` and an index or sorted messages, and passes some damage by; the one of
@@ -23,7 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from msg_tools.bags.bag_error import BagError, reason
+from msg_tools.bags.contents import BagError, Channel, Source, StoredMessage, merge, reason
 from msg_tools.bags.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -45,8 +45,6 @@ from msg_tools.bags.mcap_records import (
     record_head,
     records_in,
 )
-from msg_tools.bags.stored_message import Channel, StoredMessage
-from msg_tools.bags.time_order import Source, merge
 
 # Bare messages, outside of chunks, are read together up to this size.
 RUN_BYTES = 2**20

@@ -1,4 +1,4 @@
-"""Records of an MCAP file: lengths that are checked, fields that end with their record."""
+"""Records of an MCAP file and their fields, with checked lengths."""
 
 from __future__ import annotations
 

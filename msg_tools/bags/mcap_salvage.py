@@ -1,9 +1,9 @@
-"""What is whole in a damaged MCAP file, in the order of the file, one chunk in memory at a time.
+"""Finds the intact parts of a damaged MCAP file, in the order of the file, chunk by chunk.
 
-A chunk is whole when its checksum says so, or, where it has none, when it can be decompressed and
-divided into records; outside of chunks a record is whole when it lies in the file to its end.
-Behind damage the next chunk is looked for. The summary, where it is whole, tells of channels whose
-description was lost, and how many messages there have been.
+A chunk is intact if its checksum fits or, without a checksum, if it can be decompressed and divided
+into records; outside of chunks a record is intact if the file contains all of it. After damage the
+search goes on for the next chunk. An intact summary gives the channels whose description was lost,
+and the number of messages.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from msg_tools.bags.bag_error import BagError, reason
+from msg_tools.bags.contents import BagError, Channel, reason
 from msg_tools.bags.decompression import MAX_BYTES
 from msg_tools.bags.mcap_records import (
     ATTACHMENT,
@@ -43,7 +43,6 @@ from msg_tools.bags.mcap_records import (
     record_head,
     records_in,
 )
-from msg_tools.bags.stored_message import Channel
 
 # What stands before the summary.
 _DATA_RECORDS = (HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA)

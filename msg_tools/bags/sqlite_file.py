@@ -1,4 +1,4 @@
-"""One file of a bag that rosbag2 stored with SQLite (.db3), the default before ROS 2 Iron."""
+"""Reads one SQLite file (.db3) of a bag, the default storage before ROS 2 Iron."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from contextlib import closing
 from pathlib import Path
 from urllib.parse import quote
 
-from msg_tools.bags.bag_error import BagError, reason
-from msg_tools.bags.stored_message import Channel, StoredMessage
+from msg_tools.bags.contents import BagError, Channel, StoredMessage, reason
 
 MAGIC = b'SQLite format 3\x00'
 

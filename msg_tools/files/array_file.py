@@ -1,7 +1,7 @@
-"""Archives of plain arrays (.npz) from outside: data alone, and no more of it than is agreed.
+"""Reads archives of plain arrays (.npz) from outside, up to an agreed size.
 
-Nothing is unpickled. An archive is compressed and could unfold to any size, and the head of an
-array could claim one: both are looked at before memory is spent.
+Nothing is unpickled. A compressed archive could expand to any size, and the header of an array
+could claim any size: both are checked before memory is allocated.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as array_format
 from numpy.typing import NDArray
+
+from msg_tools.files.error_line import error_line
 
 # Bytes of all arrays of an archive together.
 LARGEST_ARCHIVE = 2**31
@@ -59,7 +61,7 @@ def read_archive(path: str | Path, largest: int = LARGEST_ARCHIVE) -> dict[str, 
         with np.load(path, allow_pickle=False) as content:
             return {name: content[name] for name in content.files}
     except _FAULTS as fault:
-        raise ValueError(' '.join(str(fault).split()) or type(fault).__name__) from fault
+        raise ValueError(error_line(fault)) from fault
 
 
 def _check_sizes(archive: zipfile.ZipFile, largest: int) -> None:

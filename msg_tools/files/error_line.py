@@ -1,4 +1,4 @@
-"""What an error says, for a log or a message of ours that is one line."""
+"""Texts of errors as one line, for logs and messages."""
 
 from __future__ import annotations
 

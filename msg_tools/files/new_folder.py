@@ -1,4 +1,4 @@
-"""Folders that are written whole or not at all."""
+"""Writes folders as a whole or not at all."""
 
 from __future__ import annotations
 

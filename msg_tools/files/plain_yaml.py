@@ -1,14 +1,18 @@
-"""YAML that people write by hand: data alone, without aliases, not deep.
+"""Reads YAML that people write by hand: plain data without aliases, of limited depth.
 
-Tags of Python are unknown to the loader. Aliases, which ROS does not read in its parameter files
-either, could make a short file stand for more data than any memory holds.
+The loader knows no tags of Python. Aliases could expand a short file to more data than memory
+holds; ROS does not accept them in its parameter files either.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import yaml
+
+from msg_tools.files.bounded_file import read_bytes
+from msg_tools.files.error_line import error_line
 
 _DEEPEST = 50
 
@@ -33,6 +37,24 @@ class _PlainLoader(yaml.SafeLoader):
         return 0 if mark is None else int(mark.line) + 1
 
 
+def read_plain_yaml(path: str | Path, largest: int) -> Any:
+    """The document in a file.
+
+    Args:
+        path: of the file.
+        largest: bytes that it may have.
+
+    Raises:
+        ValueError: a file that can not be read or is larger, or not plain YAML; one line, without
+            the path.
+    """
+    content = read_bytes(path, largest)
+    try:
+        return load_plain_yaml(content.decode('utf-8'))
+    except ValueError as error:
+        raise ValueError(f'not YAML ({error})') from error
+
+
 def load_plain_yaml(text: str) -> Any:
     """The document that a text holds.
 
@@ -42,4 +64,4 @@ def load_plain_yaml(text: str) -> Any:
     try:
         return yaml.load(text, Loader=_PlainLoader)
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        raise ValueError(' '.join(str(error).split())) from error
+        raise ValueError(error_line(error)) from error

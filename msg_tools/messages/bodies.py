@@ -1,83 +1,81 @@
-"""hmt_msgs/Body: what the numbers of all other messages mean."""
+"""hmt_msgs/Body, and the body that the poses in a message belong to."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from hmt_ros.body import Body
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.message_error import MessageError
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_error import MessageError, MessageFault, check_names
+from msg_tools.messages.message_types import MessageFactory
+from msg_tools.messages.pose_mixtures import PoseMixture
+from msg_tools.messages.trajectory_mixtures import TrajectoryMixture
 from msg_tools.messages.urdf import body_urdf, segments_of
 
 
-def body_message(
-    messages: MessageFactory,
-    *,
-    name: str,
-    dof_names: Sequence[str],
-    lower: ArrayLike,
-    upper: ArrayLike,
-    joint_names: Sequence[str],
-    segment_lengths: Mapping[str, float],
-    urdf: str,
-    stamp_ns: int,
-    frame_id: str,
-) -> Any:
-    """hmt_msgs/Body.
+def message_of_body(messages: MessageFactory, body: Body, stamp_ns: int, frame_id: str) -> Any:
+    """hmt_msgs/Body of a body at its present lengths.
 
     Args:
         messages: factory of messages.
-        name: of the body model.
-        dof_names: (d,) degrees of freedom.
-        lower, upper: (d,) limits, m or rad.
-        joint_names: (J,) joints.
-        segment_lengths: m, by the name of the length, in this order.
-        urdf: the same body for viewers, see `msg_tools.messages.urdf`.
+        body: the person.
         stamp_ns: of the image that fixed the body.
-        frame_id: optical frame of the camera.
-
-    Raises:
-        MessageError: limits that are not one for each degree of freedom.
+        frame_id: optical frame of the camera; the root link of the URDF in the message.
     """
-    limits = [np.asarray(limit, dtype=np.float64) for limit in (lower, upper)]
-    if any(limit.shape != (len(dof_names),) for limit in limits):
-        raise MessageError(
-            f'body has {len(dof_names)} dof_names, but limits of shapes {limits[0].shape} and '
-            f'{limits[1].shape}'
-        )
     return messages.create(
         'hmt_msgs/msg/Body',
         header=header_message(messages, stamp_ns, frame_id),
-        name=name,
-        dof_names=list(dof_names),
-        lower=limits[0],
-        upper=limits[1],
-        joint_names=list(joint_names),
-        segment_names=list(segment_lengths),
-        segment_lengths=np.array(list(segment_lengths.values()), dtype=np.float64),
-        urdf=urdf,
-    )
-
-
-def message_of_body(messages: MessageFactory, body: Body, stamp_ns: int, frame_id: str) -> Any:
-    """hmt_msgs/Body of a body at its present lengths; the root of its URDF is `frame_id`."""
-    return body_message(
-        messages,
         name=body.name,
-        dof_names=body.dof_names,
+        dof_names=list(body.dof_names),
         lower=body.lower,
         upper=body.upper,
-        joint_names=body.joint_names,
-        segment_lengths=body.segment_lengths,
+        joint_names=list(body.joint_names),
+        segment_names=list(body.segment_lengths),
+        segment_lengths=np.array(list(body.segment_lengths.values()), dtype=np.float64),
         urdf=body_urdf(body.name, segments_of(body.skeleton), frame_id),
-        stamp_ns=stamp_ns,
-        frame_id=frame_id,
     )
+
+
+def resized(model: Body, segment_lengths: Mapping[str, float]) -> Body:
+    """A body model at the segment lengths of a message, m; empty: at its own lengths.
+
+    Raises:
+        MessageError: a length that the model does not have, or that is not finite.
+    """
+    try:
+        return model.with_segment_lengths(segment_lengths)
+    except KeyError as error:
+        raise MessageError(f'body {model.name}: {error.args[0]}', MessageFault.BODY) from error
+    except ValueError as error:
+        raise MessageError(f'body {model.name}: {error}', MessageFault.BODY) from error
+
+
+def body_of(
+    content: PoseMixture | TrajectoryMixture, model: Body, *, any_name: bool = False
+) -> Body:
+    """The person that a mixture is about: a body model at the lengths that the message carries.
+
+    A message without lengths (of another publisher, or in a bag older than the fields) is taken to
+    be about the model at its own lengths.
+
+    Args:
+        content: the mixture.
+        model: of the person.
+        any_name: whether the message may call the model by another name.
+
+    Raises:
+        MessageError: a mixture of another model, or of other degrees of freedom.
+    """
+    name = content.body_model
+    if name not in ('', model.name) and not any_name:
+        raise MessageError(
+            f'mixture is of the body {name}, wanted one of {model.name}', MessageFault.BODY
+        )
+    check_names(content.dof_names, model.dof_names, 'mixture: dof_names')
+    return resized(model, content.segment_lengths) if content.segment_lengths else model
 
 
 def description_message(

@@ -14,7 +14,7 @@ import numpy as np
 
 from hmt_ros.body import Camera
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_types import MessageFactory
 
 # Number of coefficients that stand for no distortion.
 _COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}

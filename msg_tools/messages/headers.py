@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_types import MessageFactory
 
 SECOND_NS = 1_000_000_000
 EARLIEST_NS = -(2**31) * SECOND_NS  # that a message can tell

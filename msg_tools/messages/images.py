@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_types import MessageFactory
 
 Picture = NDArray[np.uint8]
 
@@ -136,7 +136,7 @@ def _decode_compressed(message: Any) -> Picture:
 def decode_picture(content: bytes, form: str = 'unknown format') -> Picture:
     """The picture of a PNG or JPEG file, BGR (H, W, 3).
 
-    The size that the file tells is looked at before anything is decoded.
+    The size in the header of the file is checked before anything is decoded.
 
     Args:
         content: of the file.

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_error import MessageError
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_types import MessageFactory
 
 _ADD, _DELETE = 0, 2
 _LINE_LIST, _SPHERE_LIST = 5, 7

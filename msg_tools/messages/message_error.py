@@ -1,9 +1,10 @@
-"""The error of messages that contradict themselves, and the checks that the conversions share."""
+"""`MessageError`, raised for contradictory messages, and the checks that the conversions share."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,28 @@ WEIGHT_TOLERANCE = 1e-6
 SYMMETRY_TOLERANCE = 1e-9
 
 
+class MessageFault(Enum):
+    """Kinds of contradictions in a message."""
+
+    NAMES = 'names'
+    BODY = 'body'
+    NO_COMPONENTS = 'no components'
+    NOT_FINITE = 'not finite'
+    WEIGHTS = 'weights'
+    COVARIANCES = 'covariances'
+    OTHER = 'contents'
+
+
 class MessageError(ValueError):
-    """A message that can not be understood, in one line: what was seen and what was wanted."""
+    """A message that can not be understood, in one line: what was seen and what was wanted.
+
+    Attributes:
+        fault: kind of the contradiction.
+    """
+
+    def __init__(self, text: str, fault: MessageFault = MessageFault.OTHER) -> None:
+        super().__init__(text)
+        self.fault = fault
 
 
 def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
@@ -34,20 +55,49 @@ def numbers(values: Any, shape: tuple[int, ...], what: str) -> Array:
     return array.reshape(shape)
 
 
+def freeze_arrays(
+    record: Any, shapes: Mapping[str, tuple[int, ...]], what: str, optional: Sequence[str] = ()
+) -> None:
+    """Makes the attributes of a frozen dataclass read-only arrays of floats, in a shape each.
+
+    Args:
+        record: the dataclass.
+        shapes: of its attributes, by name.
+        what: the record is, for messages.
+        optional: names of attributes that may be None, and stay so.
+
+    Raises:
+        MessageError: another shape.
+    """
+    for name, shape in shapes.items():
+        value = getattr(record, name)
+        if value is None and name in optional:
+            continue
+        array = np.array(value, dtype=np.float64)
+        if array.shape != shape:
+            raise MessageError(f'{what}: {name} has shape {array.shape}, wanted {shape}')
+        array.setflags(write=False)
+        object.__setattr__(record, name, array)
+
+
 def check_finite(values: Array, what: str) -> None:
     """Raises MessageError where a value is NaN or infinite."""
     if not np.isfinite(values).all():
-        raise MessageError(f'{what} has values that are not finite')
+        raise MessageError(f'{what} has values that are not finite', MessageFault.NOT_FINITE)
 
 
 def check_weights(weights: Array, what: str) -> None:
     """Raises MessageError where weights are no probabilities."""
     if not np.isfinite(weights).all() or (weights < 0).any():
         worst = weights[~(weights >= 0) | ~np.isfinite(weights)][0]
-        raise MessageError(f'{what} has the weight {worst}, wanted numbers from 0 to 1')
+        raise MessageError(
+            f'{what} has the weight {worst}, wanted numbers from 0 to 1', MessageFault.WEIGHTS
+        )
     total = float(weights.sum())
     if abs(total - 1.0) > WEIGHT_TOLERANCE:
-        raise MessageError(f'{what} has weights that sum to {total:.9g}, wanted 1')
+        raise MessageError(
+            f'{what} has weights that sum to {total:.9g}, wanted 1', MessageFault.WEIGHTS
+        )
 
 
 def check_covariances(covariances: Array, what: str) -> None:
@@ -59,13 +109,14 @@ def check_covariances(covariances: Array, what: str) -> None:
     if asymmetry.any():
         scale = np.abs(covariances).max(axis=(-1, -2), keepdims=True)
         if (np.abs(asymmetry) > SYMMETRY_TOLERANCE * scale).any():
-            raise MessageError(f'covariance of {what} is not symmetric')
+            raise MessageError(f'covariance of {what} is not symmetric', MessageFault.COVARIANCES)
     try:
         np.linalg.cholesky(covariances)
     except np.linalg.LinAlgError:
         smallest = float(np.linalg.eigvalsh(covariances).min())
         raise MessageError(
-            f'covariance of {what} is not positive definite: smallest eigenvalue {smallest:.3g}'
+            f'covariance of {what} is not positive definite: smallest eigenvalue {smallest:.3g}',
+            MessageFault.COVARIANCES,
         ) from None
 
 
@@ -78,7 +129,7 @@ def names_of(values: Sequence[str], what: str) -> tuple[str, ...]:
     names = tuple(str(value) for value in values)
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise MessageError(f'{what} has the name {twice!r} twice')
+        raise MessageError(f'{what} has the name {twice!r} twice', MessageFault.NAMES)
     return names
 
 
@@ -87,6 +138,30 @@ def check_names(names: tuple[str, ...], wanted: Sequence[str] | None, what: str)
     if wanted is None or names == tuple(wanted):
         return
     if len(names) != len(wanted):
-        raise MessageError(f'{what} has {len(names)} names, wanted {len(wanted)}')
+        raise MessageError(
+            f'{what} has {len(names)} names, wanted {len(wanted)}', MessageFault.NAMES
+        )
     index = next(i for i, (a, b) in enumerate(zip(names, wanted, strict=True)) if a != b)
-    raise MessageError(f'{what} has {names[index]!r} at {index}, wanted {wanted[index]!r}')
+    raise MessageError(
+        f'{what} has {names[index]!r} at {index}, wanted {wanted[index]!r}', MessageFault.NAMES
+    )
+
+
+def lengths_of(message: Any, what: str) -> dict[str, float]:
+    """Segment lengths of a message by name, m; empty where it has none.
+
+    Bags older than the fields carry a definition without them: such a message has none, either.
+
+    Raises:
+        MessageError: a name that is there twice, another number of lengths than of names.
+    """
+    names = names_of(getattr(message, 'segment_names', ()), f'{what}: segment_names')
+    lengths = numbers(
+        getattr(message, 'segment_lengths', ()), (len(names),), f'{what}: segment_lengths'
+    )
+    return dict(zip(names, lengths.tolist(), strict=True))
+
+
+def check_lengths(lengths: Mapping[str, float], what: str) -> None:
+    """Raises MessageError where a segment length is not finite."""
+    check_finite(np.array(list(lengths.values()), dtype=np.float64), f'{what}: segment_lengths')

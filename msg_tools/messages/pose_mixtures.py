@@ -1,36 +1,46 @@
-"""hmt_msgs/PoseMixture: a mixture over the pose of a body, as arrays."""
+"""hmt_msgs/PoseMixture: a mixture over the pose of a body, as arrays.
+
+`pose_mixture_of` is the one reader of the message, and `pose_mixture_message` the one writer.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.body import Body
 from hmt_ros.inference import GaussianMixture
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.message_error import (
     MessageError,
+    MessageFault,
     check_covariances,
     check_finite,
+    check_lengths,
     check_names,
     check_weights,
+    freeze_arrays,
+    lengths_of,
     names_of,
     numbers,
 )
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_types import MessageFactory
 
 Array = NDArray[np.float64]
 
-# As many as any node publishes; a message of more costs whoever reads it time without end.
+POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
+# No node publishes more components; a message with millions would block its reader.
 MAX_COMPONENTS = 1024
 
 
 class MixtureKind(IntEnum):
-    """What a mixture is the density of; the constants of PoseMixture.msg."""
+    """The density that a mixture stands for; the constants of PoseMixture.msg."""
 
     POSTERIOR = 0
     LIKELIHOOD = 1
@@ -41,10 +51,12 @@ class MixtureKind(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class PoseMixture:
-    """The content of the message.
+    """The content of the message: K components over d degrees of freedom.
 
     Attributes:
-        mixture: K Gaussians over d degrees of freedom; weights sum to 1.
+        weights: (K,) sum to 1; K = 0: nobody was seen.
+        means: (K, d) poses, m and rad.
+        covariances: (K, d, d) positive definite; None: unknown.
         body_model: name of the body.
         dof_names: (d,) order of the variables.
         joint_names: (J,) order of the joints.
@@ -52,14 +64,19 @@ class PoseMixture:
         kind: see `MixtureKind`.
         stamp_ns: of the image.
         frame_id: optical frame of the camera.
+        segment_lengths: m, by name: the person's body is the model at these lengths. Empty:
+            unknown, as in messages of other publishers and in bags older than this field; the
+            body is then the one of the Body topic, or the model at its own lengths.
         log_likelihoods: (K,) log p(image | mean) up to a constant; NaN: unknown. None: all unknown.
         degrees_of_freedom: (K,) of Student components; 0: Gaussian. None: all Gaussian.
 
     Raises:
-        MessageError: shapes, weights or covariances that a message must not have.
+        MessageError: shapes or values that a message must not have.
     """
 
-    mixture: GaussianMixture
+    weights: Array
+    means: Array
+    covariances: Array | None
     body_model: str
     dof_names: tuple[str, ...]
     joint_names: tuple[str, ...]
@@ -67,63 +84,120 @@ class PoseMixture:
     kind: MixtureKind
     stamp_ns: int
     frame_id: str
+    segment_lengths: Mapping[str, float] = field(default_factory=dict)
     log_likelihoods: Array | None = None
     degrees_of_freedom: Array | None = None
 
     def __post_init__(self) -> None:
-        components, d = self.mixture.means.shape
-        if components == 0:
-            raise MessageError('mixture has no components')
         object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'mixture: dof_names'))
         object.__setattr__(self, 'joint_names', names_of(self.joint_names, 'mixture: joint_names'))
-        if len(self.dof_names) != d:
-            raise MessageError(f'mixture has {d} variables, but {len(self.dof_names)} dof_names')
+        check_lengths(self.segment_lengths, 'mixture')
+        components, d = len(self.weights), len(self.dof_names)
         shapes = {
+            'weights': (components,),
+            'means': (components, d),
+            'covariances': (components, d, d),
             'joint_positions': (components, len(self.joint_names), 3),
             'log_likelihoods': (components,),
             'degrees_of_freedom': (components,),
         }
-        unknown = {
-            'log_likelihoods': np.full(components, np.nan),
-            'degrees_of_freedom': np.zeros(components),
-        }
-        for name, shape in shapes.items():
-            value = getattr(self, name)
-            array = np.array(unknown[name] if value is None else value, dtype=np.float64)
-            if array.shape != shape:
-                raise MessageError(f'mixture: {name} has shape {array.shape}, wanted {shape}')
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        if self.log_likelihoods is None:
+            object.__setattr__(self, 'log_likelihoods', np.full(components, np.nan))
+        if self.degrees_of_freedom is None:
+            object.__setattr__(self, 'degrees_of_freedom', np.zeros(components))
+        freeze_arrays(self, shapes, 'mixture', optional=('covariances',))
+        check_finite(self.means, 'mixture: mean')
         check_finite(self.joint_positions, 'mixture: joint_positions')
-        check_weights(self.mixture.weights, 'mixture')
-        check_covariances(self.mixture.covariances, 'mixture')
+        if components:
+            check_weights(self.weights, 'mixture')
+        if self.covariances is not None:
+            check_covariances(self.covariances, 'mixture')
+
+    @classmethod
+    def of_body(
+        cls,
+        body: Body,
+        mixture: GaussianMixture | None,
+        kind: MixtureKind,
+        stamp_ns: int,
+        frame_id: str,
+        *,
+        joint_positions: Array | None = None,
+        log_likelihoods: Array | None = None,
+    ) -> PoseMixture:
+        """A mixture over the poses of a body at its present lengths.
+
+        Args:
+            body: the person.
+            mixture: K Gaussians over its poses; None: nobody was seen.
+            kind, stamp_ns, frame_id, log_likelihoods: see the attributes.
+            joint_positions: (K, J, 3) m, of the means; None: computed here.
+
+        Raises:
+            MessageError: shapes or values that a message must not have.
+        """
+        if mixture is None:
+            d = body.dimension
+            mixture = GaussianMixture(np.empty(0), np.empty((0, d)), np.empty((0, d, d)))
+        if joint_positions is None:
+            joint_positions = body.joint_positions(mixture.means)
+        return cls(
+            weights=mixture.weights,
+            means=mixture.means,
+            covariances=mixture.covariances,
+            body_model=body.name,
+            dof_names=body.dof_names,
+            joint_names=body.joint_names,
+            joint_positions=joint_positions,
+            kind=kind,
+            stamp_ns=stamp_ns,
+            frame_id=frame_id,
+            segment_lengths=body.segment_lengths,
+            log_likelihoods=log_likelihoods,
+        )
+
+    @cached_property
+    def mixture(self) -> GaussianMixture:
+        """The components as Gaussians.
+
+        Raises:
+            MessageError: there is no component, or the covariances are unknown.
+        """
+        if not len(self.weights):
+            raise MessageError('mixture has no components', MessageFault.NO_COMPONENTS)
+        if self.covariances is None:
+            raise MessageError('mixture has no covariances', MessageFault.COVARIANCES)
+        return GaussianMixture(self.weights, self.means, self.covariances)
 
 
 def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
     """hmt_msgs/PoseMixture; the components heaviest first, of equal weights in their order."""
-    mixture = content.mixture
     assert content.log_likelihoods is not None
     assert content.degrees_of_freedom is not None
     components = [
         messages.create(
             'hmt_msgs/msg/PoseComponent',
-            weight=float(mixture.weights[k]),
-            mean=mixture.means[k],
-            covariance=mixture.covariances[k].reshape(-1),
+            weight=float(content.weights[k]),
+            mean=content.means[k],
+            covariance=np.empty(0)
+            if content.covariances is None
+            else content.covariances[k].reshape(-1),
             log_likelihood=float(content.log_likelihoods[k]),
             degrees_of_freedom=float(content.degrees_of_freedom[k]),
             joint_positions=messages.points(content.joint_positions[k]),
         )
-        for k in np.argsort(-mixture.weights, kind='stable')
+        for k in np.argsort(-content.weights, kind='stable')
     ]
     return messages.create(
-        'hmt_msgs/msg/PoseMixture',
+        POSE_MIXTURE,
         header=header_message(messages, content.stamp_ns, content.frame_id),
         body_model=content.body_model,
         dof_names=list(content.dof_names),
         joint_names=list(content.joint_names),
         kind=int(content.kind),
         components=components,
+        segment_names=list(content.segment_lengths),
+        segment_lengths=np.array(list(content.segment_lengths.values()), dtype=np.float64),
     )
 
 
@@ -134,53 +208,58 @@ def pose_mixture_of(
 ) -> PoseMixture:
     """The content of an hmt_msgs/PoseMixture, of `rosbags` or of ROS.
 
+    A message without components (nobody was seen), without covariances or without segment lengths
+    (see `PoseMixture`) is understood; `PoseMixture.mixture` wants the first two.
+
     Args:
         message: the message.
         dof_names, joint_names: what it has to be about, in this order; None: anything.
 
     Raises:
         MessageError: names that differ, arrays whose lengths contradict each other, weights that
-            are no probabilities, covariances that are unknown or not positive definite.
+            are no probabilities, covariances that are not positive definite.
     """
     names = names_of(message.dof_names, 'mixture: dof_names')
     joints = names_of(message.joint_names, 'mixture: joint_names')
     check_names(names, dof_names, 'mixture: dof_names')
     check_names(joints, joint_names, 'mixture: joint_names')
-    if not message.components:
-        raise MessageError('mixture has no components')
-    if len(message.components) > MAX_COMPONENTS:
+    components = message.components
+    if len(components) > MAX_COMPONENTS:
         raise MessageError(
-            f'mixture has {len(message.components)} components, the limit is {MAX_COMPONENTS}'
+            f'mixture has {len(components)} components, the limit is {MAX_COMPONENTS}'
         )
-    d = len(names)
+    n, d = len(components), len(names)
+    known = any(len(component.covariance) for component in components)
     means, covariances, positions = [], [], []
-    for k, component in enumerate(message.components):
+    for k, component in enumerate(components):
         what = f'mixture: component {k}'
         means.append(numbers(component.mean, (d,), f'{what}: mean'))
-        if len(component.covariance) == 0 and d:
-            raise MessageError(f'{what} has no covariance')
-        covariances.append(numbers(component.covariance, (d, d), f'{what}: covariance'))
+        if known and len(component.covariance) == 0:
+            raise MessageError(
+                f'{what} has no covariance, others have one', MessageFault.COVARIANCES
+            )
+        if known:
+            covariances.append(numbers(component.covariance, (d, d), f'{what}: covariance'))
         points = component.joint_positions
         if len(points) != len(joints):
             raise MessageError(f'{what} has {len(points)} joint_positions, wanted {len(joints)}')
         positions.append([(point.x, point.y, point.z) for point in points])
-    weights = np.array([component.weight for component in message.components])
-    check_weights(weights, 'mixture')
-    check_finite(np.array(means), 'mixture: mean')
-    check_finite(np.array(covariances), 'mixture: covariance')
     try:
         kind = MixtureKind(int(message.kind))
     except ValueError:
         raise MessageError(f'mixture has the kind {message.kind}, which is not known') from None
     return PoseMixture(
-        mixture=GaussianMixture(weights, np.array(means), np.array(covariances)),
+        weights=np.array([component.weight for component in components]),
+        means=np.reshape(means, (n, d)),
+        covariances=np.array(covariances) if known else None,
         body_model=str(message.body_model),
         dof_names=names,
         joint_names=joints,
-        joint_positions=np.reshape(positions, (len(weights), len(joints), 3)),
+        joint_positions=np.reshape(positions, (n, len(joints), 3)),
         kind=kind,
         stamp_ns=time_ns(message.header.stamp),
         frame_id=str(message.header.frame_id),
-        log_likelihoods=np.array([c.log_likelihood for c in message.components]),
-        degrees_of_freedom=np.array([c.degrees_of_freedom for c in message.components]),
+        segment_lengths=lengths_of(message, 'mixture'),
+        log_likelihoods=np.array([c.log_likelihood for c in components]),
+        degrees_of_freedom=np.array([c.degrees_of_freedom for c in components]),
     )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,14 +14,19 @@ from msg_tools.messages.message_error import (
     MessageError,
     check_covariances,
     check_finite,
+    check_lengths,
     check_names,
     check_weights,
+    freeze_arrays,
+    lengths_of,
     names_of,
     numbers,
 )
-from msg_tools.messages.message_factory import MessageFactory
+from msg_tools.messages.message_types import MessageFactory
 
 Array = NDArray[np.float64]
+
+TRAJECTORY_MIXTURE = 'hmt_msgs/msg/TrajectoryMixture'
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +45,7 @@ class TrajectoryMixture:
         body_model: name of the body.
         dof_names: (d,) order of the variables.
         frame_id: optical frame of the camera.
+        segment_lengths: m, by name, as in `PoseMixture`; empty: unknown.
 
     Raises:
         MessageError: shapes or values that a message must not have.
@@ -56,10 +62,12 @@ class TrajectoryMixture:
     body_model: str
     dof_names: tuple[str, ...]
     frame_id: str
+    segment_lengths: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'stamps_ns', tuple(int(stamp) for stamp in self.stamps_ns))
         object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'trajectories: dof_names'))
+        check_lengths(self.segment_lengths, 'trajectories')
         m, t, d = len(self.weights), len(self.stamps_ns), len(self.dof_names)
         if m == 0 or t == 0:
             raise MessageError(f'trajectories: {m} components of {t} poses, wanted one at least')
@@ -71,15 +79,7 @@ class TrajectoryMixture:
             'inflation': (m,),
             'free_energy': (len(self.free_energy),),
         }
-        for name, shape in shapes.items():
-            value = getattr(self, name)
-            if value is None:
-                continue
-            array = np.array(value, dtype=np.float64)
-            if array.shape != shape:
-                raise MessageError(f'trajectories: {name} has shape {array.shape}, wanted {shape}')
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        freeze_arrays(self, shapes, 'trajectories', optional=('marginal_covariances',))
         if any(b <= a for a, b in zip(self.stamps_ns, self.stamps_ns[1:], strict=False)):
             raise MessageError('trajectories: stamps do not increase')
         check_weights(self.weights, 'trajectories')
@@ -103,7 +103,7 @@ def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixt
         for m in np.argsort(-content.weights, kind='stable')
     ]
     return messages.create(
-        'hmt_msgs/msg/TrajectoryMixture',
+        TRAJECTORY_MIXTURE,
         header=header_message(messages, content.stamps_ns[-1], content.frame_id),
         body_model=content.body_model,
         dof_names=list(content.dof_names),
@@ -112,6 +112,8 @@ def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixt
         final_until=time_message(messages, max(content.final_until_ns, EARLIEST_NS)),
         free_energy=content.free_energy,
         components=components,
+        segment_names=list(content.segment_lengths),
+        segment_lengths=np.array(list(content.segment_lengths.values()), dtype=np.float64),
     )
 
 
@@ -166,4 +168,5 @@ def trajectory_mixture_of(
         body_model=str(message.body_model),
         dof_names=names,
         frame_id=str(message.header.frame_id),
+        segment_lengths=lengths_of(message, 'trajectories'),
     )

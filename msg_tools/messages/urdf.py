@@ -7,7 +7,7 @@ Seen from its parent a segment is
     Trans(offset + translations) * mount * Rot(axis_1, q_1) * ... * Rot(axis_n, q_n)
 
 as in `hmt_ros.body.skeleton`. Links have no inertia: the URDF is for looking at. `link_frames`
-tells where all links are, also those within a chain: viewers find fault with a link without frame.
+gives the frames of all links, also of those within a chain: viewers complain of links without one.
 """
 
 from __future__ import annotations

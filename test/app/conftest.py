@@ -56,10 +56,7 @@ def mixture_of(body, pose, modes, rng):
 
 
 def pose_message(body, mixture, stamp, kind, **fields):
-    content = PoseMixture(
-        mixture, body.name, body.dof_names, body.joint_names, body.joint_positions(mixture.means),
-        kind, stamp, FRAME_ID,
-    )  # fmt: skip
+    content = PoseMixture.of_body(body, mixture, kind, stamp, FRAME_ID)
     message = pose_mixture_message(MESSAGES, content)
     for name, value in fields.items():
         setattr(message, name, value)
@@ -83,6 +80,7 @@ def window_message(body, poses, last, rng):
         body_model=body.name,
         dof_names=body.dof_names,
         frame_id=FRAME_ID,
+        segment_lengths=body.segment_lengths,
     )
     return trajectory_mixture_message(MESSAGES, content)
 

@@ -9,9 +9,8 @@ import pytest
 
 from hmt_ros.app import make_bag
 from hmt_ros.app.demo import main
-from hmt_ros.app.report.pictures import LEFT, RIGHT, draw_overview
-from hmt_ros.app.report.recorded_mixtures import read_mixtures
-from hmt_ros.app.report.recorded_track import Moment, RecordedTrack
+from hmt_ros.app.report.mixtures import Layer, Moment, read_mixtures
+from hmt_ros.app.report.skeletons import LEFT, RIGHT, draw_overview
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import Camera
 from msg_tools import BagReader
@@ -78,16 +77,16 @@ def test_it_tells_what_came_out(output):
 def made_up_track(source):
     """A made-up track: the true joints, and the same moved back and forth."""
     truth = read_truth(source / 'truth.npz')
-    moments = []
+    moments = {}
     for stamp, joints in truth.joints.items():
         shift = np.array([-0.1, 0.0, 0.2])[:, None, None] * [0, 0, 1]
-        moments.append(Moment(stamp, np.array([0.6, 0.3, 0.1]), joints + shift))
-    return RecordedTrack(truth.joint_names, moments)
+        moments[stamp] = Moment(stamp, np.array([0.6, 0.3, 0.1]), joints + shift)
+    return Layer('pose_mixture', 'posterior', truth.frame_id, truth.joint_names, moments)
 
 
 def test_the_same_track_gives_the_same_picture(source, truth, tmp_path):
     track = made_up_track(source)
-    stamps = [moment.stamp_ns for moment in track.moments[:3]]
+    stamps = list(track.mixtures)[:3]
     camera = Camera(440.0, 440.0, 159.5, 119.5, 320, 240)
     images = {stamp: np.full((240, 320, 3), 99, np.uint8) for stamp in stamps}
     for name in ('a.png', 'b.png'):
@@ -99,9 +98,9 @@ def test_the_same_track_gives_the_same_picture(source, truth, tmp_path):
 
 def test_recorded_mixtures_are_read_heaviest_first(output):
     layers = read_mixtures(output[0] / 'small').layers
-    (track,) = (layer.track for layer in layers if layer.topic == 'pose_mixture')
-    assert len(track.moments) == 5
-    for moment in track.moments:
+    (track,) = (layer for layer in layers if layer.topic == 'pose_mixture')
+    assert len(track.mixtures) == 5
+    for moment in track.mixtures.values():
         assert (np.diff(moment.weights) <= 0).all()
         assert moment.joints.shape == (len(moment.weights), len(track.joint_names), 3)
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from hmt_ros.app.evaluate import main
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS, ground_truth
 from hmt_ros.body import load_body
-from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, joint_mixtures, score
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, HIPS, joint_mixtures, score
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.bodies import message_of_body
@@ -62,18 +63,8 @@ def truth_file(tmp_path_factory, body, poses):
 
 
 def mixture_message(body, mixture, stamp, kind=MixtureKind.POSTERIOR, frame_id=FRAME_ID, name=None):
-    positions = body.joint_positions(mixture.means)
-    content = PoseMixture(
-        mixture,
-        name or body.name,
-        body.dof_names,
-        body.joint_names,
-        positions,
-        kind,
-        stamp,
-        frame_id,
-    )
-    return pose_mixture_message(MESSAGES, content)
+    content = PoseMixture.of_body(body, mixture, kind, stamp, frame_id)
+    return pose_mixture_message(MESSAGES, replace(content, body_model=name or body.name))
 
 
 def write(path, body, mixtures, *, poses=None, with_body=True, change=None):
@@ -142,6 +133,21 @@ def test_truth_from_the_bag_itself_and_from_another_bag(capsys, bag, truth_file)
     assert report(capsys, bag, '--truth', bag)['topics'] == from_file['topics']
 
 
+def test_truth_without_pelvis_is_aligned_at_the_hips(capsys, tmp_path, bag, body, poses, mixtures):
+    names = [name for name in body.joint_names if name != 'pelvis']
+    joints = body.joint_positions(poses)[:, body.skeleton.joint_index(names)]
+    path = tmp_path / 'truth.npz'
+    np.savez(path, stamps=STAMPS, joint_names=names, joints=joints + 0.7)
+    found = report(capsys, bag, '--truth', path)['topics']['pose_mixture']
+    where = [names.index(name) for name in EVALUATED_JOINTS]
+    hips = [names.index('left_hip'), names.index('right_hip')]
+    truth = joints[:, where] - joints[:, hips].mean(1, keepdims=True)
+    wanted = score(joint_mixtures(body, mixtures, origin=HIPS), truth, seed=0).summary()
+    for key, value in without_names(wanted).items():
+        assert found[key] == pytest.approx(value, rel=1e-9), key
+    assert found['note'] == ''
+
+
 def test_model_sigma_and_seed(capsys, bag):
     usual, wide, seeded = (
         report(capsys, bag, *more)['topics']['pose_mixture']
@@ -179,7 +185,7 @@ def test_frames_without_mixture_and_mixtures_without_truth(capsys, tmp_path, bod
 
 
 def test_a_bag_without_body(capsys, tmp_path, body, mixtures, bag, truth_file):
-    """Joints tell the lengths of a body that is known by name; of another there are only errors."""
+    """Mixtures carry the lengths of a known model; of another there are only errors."""
 
     def of_a_stranger(message):
         message.body_model = 'stranger'
@@ -198,7 +204,7 @@ def test_a_bag_without_body(capsys, tmp_path, body, mixtures, bag, truth_file):
     assert 'body' in found['note']
     code, out, _ = run(capsys, path, '--truth', truth_file)
     assert code == 0
-    assert out.splitlines()[-1].startswith('pose_mixture: no covariances')
+    assert out.splitlines()[-1].startswith('pose_mixture: its body is unknown')
 
 
 def test_unknown_covariances(capsys, tmp_path, body, mixtures, truth_file):
@@ -214,8 +220,8 @@ def test_unknown_covariances(capsys, tmp_path, body, mixtures, truth_file):
 
 
 @pytest.mark.parametrize('torn', [False, True])
-def test_joints_tell_the_lengths(capsys, tmp_path, body, mixtures, truth_file, torn):
-    """The bag's body is of another person; joints that no lengths explain are noticed."""
+def test_mixtures_carry_the_lengths(capsys, tmp_path, body, mixtures, truth_file, torn):
+    """The bag's body is of another person; joints that lie elsewhere are noticed."""
     path = tmp_path / 'out'
     with BagWriter(path) as bag:
         other = body.with_stature(1.6)
@@ -228,6 +234,23 @@ def test_joints_tell_the_lengths(capsys, tmp_path, body, mixtures, truth_file, t
     note = 'joint positions are not those of the body human37 of the bag'
     assert found['note'] == (note if torn else '')
     assert (found['coverage_90'] is None) == torn
+
+
+def without_lengths(message):
+    message.segment_names, message.segment_lengths = [], np.empty(0)
+    return message
+
+
+def test_mixtures_without_lengths(capsys, tmp_path, body, mixtures, bag, truth_file):
+    """They are about the body that the bag describes; without one only positions are compared."""
+    wanted = report(capsys, bag, '--truth', truth_file)['topics']['pose_mixture']
+    described = write(tmp_path / 'described', body, mixtures, change=without_lengths)
+    found = report(capsys, described, '--truth', truth_file)['topics']['pose_mixture']
+    assert found == wanted
+    bare = write(tmp_path / 'bare', body, mixtures, with_body=False, change=without_lengths)
+    found = report(capsys, bare, '--truth', truth_file)['topics']['pose_mixture']
+    assert found['best_mm'] == wanted['best_mm']
+    assert found['coverage_90'] is None
 
 
 def test_predictions_without_anybody_are_missing(capsys, tmp_path, body, mixtures, truth_file):
@@ -372,10 +395,10 @@ def test_truth_that_can_not_be_used(capsys, tmp_path, bag, body):
         '5 stamps': save(tmp_path / 'b.npz', **{**good, 'stamps': good['stamps'][:5]}),
         'whole nanoseconds': save(tmp_path / 'c.npz', **{**good, 'stamps': good['stamps'] * 1e-9}),
         'not finite': save(tmp_path / 'd.npz', **{**good, 'joints': infinite}),
-        'no joint pelvis': save(
+        'neither a pelvis nor left_hip and right_hip': save(
             tmp_path / 'e.npz', **{**good, 'joint_names': np.char.add(good['joint_names'], '_')}
         ),
-        'wanted 4 at least': save(
+        'wanted at least 4': save(
             tmp_path / 'f.npz',
             stamps=good['stamps'],
             joint_names=['pelvis', 'neck'],

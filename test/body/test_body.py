@@ -216,22 +216,3 @@ def test_bones_connect_the_limbs(body):
             assert frozenset((f'{side}_{a}', f'{side}_{b}')) in bones
     assert frozenset(('neck', 'head')) in bones
     assert len(bones) == len(names) - 1  # a tree
-
-
-@pytest.mark.parametrize('name', ['human37', 'human34', 'human32'])
-def test_lengths_are_those_that_joints_tell(name):
-    body = load_body(name)
-    rng = np.random.default_rng(4)
-    lengths = {key: value * rng.uniform(0.8, 1.2) for key, value in body.segment_lengths.items()}
-    person = body.with_segment_lengths(lengths)
-    poses = body.prior_mean + 0.3 * rng.normal(size=(3, body.dimension))
-    joints = person.joint_positions(poses)
-    found = body.with_joints_at(poses, body.joint_names, joints)
-    assert np.abs(found.joint_positions(poses) - joints).max() < 1e-9
-    other = body.prior_mean[None] + 0.2
-    assert np.abs(found.joint_positions(other) - person.joint_positions(other)).max() < 1e-6
-    joints[0, 3] += 0.1
-    with pytest.raises(ValueError, match='mm from where'):
-        body.with_joints_at(poses, body.joint_names, joints)
-    with pytest.raises(ValueError, match='has no joint'):
-        body.with_joints_at(poses, ('tail',), joints[:, :1])

@@ -60,7 +60,7 @@ def looks(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 def frames_of(rotations: np.ndarray, places: np.ndarray) -> Frames:
     columns = rotations.transpose(2, 1, 0)[None]  # (1, axis, coordinate, n)
     empty = np.empty((0, 3, len(places)))
-    return Frames(HUMAN.skeleton, columns, places.T[None], empty, empty)
+    return Frames(HUMAN.skeleton, empty, columns, places.T[None], empty, empty)
 
 
 def test_surface_points_satisfy_the_implicit_equation(part):

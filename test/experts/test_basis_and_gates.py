@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from hmt_ros.experts.basis import LinearBasis, RadialBasis, spread_centres, squared_distances
+from hmt_ros.experts.basis import LinearBasis, RadialBasis
 from hmt_ros.experts.gates import (
     RATE,
     SHAPE,
@@ -15,6 +15,7 @@ from hmt_ros.experts.gates import (
     log_softmax,
 )
 from hmt_ros.experts.training_pairs import Standardisation
+from hmt_ros.inference.clustering import squared_distances
 
 P = 3
 
@@ -67,13 +68,6 @@ def test_common_scale_keeps_the_ratio_of_distances(rng):
     scaled = Standardisation.of(values, np.ones(50), 'common').apply(values)
     ratio = squared_distances(values, values)[0, 1:] / squared_distances(scaled, scaled)[0, 1:]
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-9)
-
-
-def test_spread_centres_take_equal_points_once(rng):
-    points = np.repeat(rng.normal(size=(6, 2)), 10, axis=0)
-    chosen = spread_centres(points, 40, rng)
-    assert len(chosen) == 6
-    assert len(np.unique(points[chosen], axis=0)) == 6
 
 
 def softmax_problem(rng, samples=80, experts=3, count=4):

@@ -13,7 +13,7 @@ from hmt_ros.experts.calibrated_experts import (
     folds_of,
 )
 from hmt_ros.experts.conditional_density import Components
-from hmt_ros.experts.learned_models import KINDS, new_model
+from hmt_ros.experts.model_file import nested
 
 GROUPS, EACH = 12, 40
 
@@ -118,11 +118,9 @@ def test_bad_input() -> None:
         Calibration(0.5, np.zeros((2, 2)), 1.0)
 
 
-def test_models_by_name() -> None:
-    for name in KINDS:
-        assert isinstance(new_model(name), CalibratedExperts)
-    few = new_model('joint', samples=200)
-    assert isinstance(few, CalibratedExperts)
-    assert few.model.get_params()['n_experts'] == 5
-    with pytest.raises(ValueError, match="no model 'forest'"):
-        new_model('forest')
+def test_files_that_nest_calibrated_models_are_refused() -> None:
+    inputs, targets, groups = grouped(7, 0.2)
+    arrays = CalibratedExperts(NearestNeighbours(3)).fit(inputs, targets, groups=groups).to_arrays()
+    own = {name: value for name, value in arrays.items() if not name.startswith('model/')}
+    with pytest.raises(ValueError, match='calibrated model inside a calibrated model'):
+        CalibratedExperts.from_arrays(own | nested('model', arrays))

@@ -5,17 +5,13 @@ import pytest
 
 from hmt_ros.experts import JointExperts
 from hmt_ros.experts.density_propagation import (
-    clustered,
-    divergence_bound,
     divided_product,
-    gaussian_divergences,
     linearised_products,
     propagate,
     propagate_by_dynamics,
-    reduced,
-    refined,
 )
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.reduction import reduced
 
 
 def random_mixture(rng, components, dimension, spread=2.0):
@@ -187,49 +183,3 @@ def test_rule_nine_on_a_grid(kernel_model):
         expected = np.where(a * b > 1e-250, a * b / c, 0.0)
     expected /= expected.sum() * STEP
     assert STEP * np.abs(on_grid(found)[0] - expected).sum() < 1e-3
-
-
-def test_divergences_between_gaussians(rng):
-    a, b = random_mixture(rng, 3, 2), random_mixture(rng, 2, 2)
-    found = gaussian_divergences(a, b)
-    for i in range(3):
-        for j in range(2):
-            inverse = np.linalg.inv(b.covariances[j])
-            offset = a.means[i] - b.means[j]
-            ratio = np.linalg.det(b.covariances[j]) / np.linalg.det(a.covariances[i])
-            expected = np.trace(inverse @ a.covariances[i]) + offset @ inverse @ offset - 2
-            assert found[i, j] == pytest.approx(0.5 * (expected + np.log(ratio)))
-
-
-def test_refinement_lowers_a_bound_of_the_divergence(rng):
-    large = random_mixture(rng, 25, 4)
-    small = large[:5].normalised()
-    bounds = [divergence_bound(large, small)]
-    for _ in range(8):
-        small = refined(large, small)
-        bounds.append(divergence_bound(large, small))
-    assert np.diff(bounds).max() < 1e-10
-    assert bounds[-1] < bounds[0]
-    points = large.sample(20_000, rng)
-    divergence = (large.log_density(points) - small.log_density(points)).mean()
-    assert divergence < bounds[-1]
-
-
-@pytest.mark.parametrize('seed', range(4))
-def test_reduction_keeps_moments_and_little_is_lost(seed):
-    rng = np.random.default_rng(seed)
-    large = random_mixture(rng, 25, 3)
-    small = reduced(large, 5)
-    assert len(small) == 5
-    np.testing.assert_allclose(small.mean(), large.mean(), atol=1e-6)
-    np.testing.assert_allclose(small.covariance(), large.covariance(), atol=1e-6)
-    points = large.sample(20_000, rng)
-    lost = [(large.log_density(points) - q.log_density(points)).mean()
-            for q in (small, clustered(large, 5), large.reduce(1))]  # fmt: skip
-    assert lost[0] < lost[1] + 0.01
-    assert lost[0] < 0.6 * lost[2]
-
-
-def test_components_that_are_few_are_kept(rng):
-    mixture = random_mixture(rng, 3, 2)
-    assert reduced(mixture, 3) == mixture.normalised()

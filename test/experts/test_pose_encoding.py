@@ -118,7 +118,9 @@ def test_a_gaussian_is_decoded_as_its_samples_are(encoding: PoseEncoding) -> Non
     mean = encoding.encode(pose)[0]
     a = 0.004 * rng.normal(size=(encoding.size, encoding.size))
     covariance, root_covariance = a @ a.T, np.diag([1e-4, 1e-4, 9e-4])
-    found, spread = encoding.decode_gaussian(mean, covariance, pose[0, :3], root_covariance)
+    by_target, by_root = (x[0] for x in encoding.jacobians(mean[None], pose[:, :3]))
+    spread = by_target @ covariance @ by_target.T + by_root @ root_covariance @ by_root.T
+    found = encoding.decode(mean[None], pose[:, :3])[0]
     targets = rng.multivariate_normal(mean, covariance, 20000)
     roots = rng.multivariate_normal(pose[0, :3], root_covariance, 20000)
     samples = encoding.decode(targets, roots)

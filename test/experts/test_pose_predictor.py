@@ -9,10 +9,9 @@ import pytest
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
+from hmt_ros.experts import LocalExperts, NearestNeighbours
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
 from hmt_ros.experts.descriptor.silhouette_descriptor import SilhouetteDescriptor
-from hmt_ros.experts.local_experts import LocalExperts
-from hmt_ros.experts.nearest_neighbours import NearestNeighbours
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.experts.predictor_learning import Described, described, learned_predictor
 from hmt_ros.experts.training_set import TrainingSettings, procedural_sequence, training_set
@@ -82,7 +81,7 @@ def test_propagation_keeps_what_was_known(
     first = int(errors(body, prior.means, poses[0]).argmin())
     sure = prior[[first]].normalised()
     alone = predictor.predict(masks[1], CAMERA)
-    after = predictor.propagate(sure, masks[1], CAMERA)
+    after = predictor.observe(masks[1], CAMERA, sure).mixture
     weighted = [float(m.weights @ errors(body, m.means, poses[1])) for m in (alone, after)]
     assert weighted[1] < weighted[0]
 
@@ -93,7 +92,7 @@ def test_without_dynamics_propagation_predicts(
     plain = learned_predictor(body, training, NearestNeighbours(5, 'common'))
     mask = clip[1][3]
     mixture = plain.predict(mask, CAMERA)
-    assert plain.propagate(mixture, mask, CAMERA) == mixture
+    assert plain.observe(mask, CAMERA, mixture).mixture == mixture
 
 
 def test_a_file_brings_it_back(

@@ -5,8 +5,7 @@ import pytest
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.camera import Viewpoint
-from hmt_ros.experts.descriptor.contour import person_blob
-from hmt_ros.experts.descriptor.silhouette_descriptor import PlaceAndSize, place_and_size
+from hmt_ros.experts.descriptor.contour import PersonBlob, person_blob
 from hmt_ros.experts.pose_encoding import PoseEncoding
 from hmt_ros.experts.root_placement import place_roots, placed_gaussians
 from hmt_ros.motion.procedural_motion import procedural_motion
@@ -25,8 +24,8 @@ def poses(body: Body) -> np.ndarray:
     return procedural_motion('dance', body, 3.0, 4.0, 5, viewpoint=Viewpoint(4.0, 1.4, 0.1))
 
 
-def seen(body: Body, poses: np.ndarray, camera: Camera = CAMERA) -> list[PlaceAndSize]:
-    return [place_and_size(person_blob(m)) for m in render_silhouettes(body, poses, camera)]
+def seen(body: Body, poses: np.ndarray, camera: Camera = CAMERA) -> list[PersonBlob]:
+    return [person_blob(m) for m in render_silhouettes(body, poses, camera)]
 
 
 def small(encoding: PoseEncoding) -> np.ndarray:
@@ -70,7 +69,7 @@ def test_derivative_of_the_root_by_the_posture(body: Body, poses: np.ndarray) ->
     target = encoding.encode(poses[:1])
     place = seen(body, poses[:1])[0]
     found = place_roots(encoding, CAMERA, place, target, small(encoding))
-    knee = encoding.names.index('left_knee')
+    knee = body.dof_names.index('left_knee')
     step = np.zeros((1, encoding.size))
     step[0, [0, knee]] = 1e-4
     sides = [
@@ -104,7 +103,7 @@ def test_a_cut_person_is_said_and_widens_the_depth(body: Body, poses: np.ndarray
 
 def test_a_person_cut_on_all_sides_keeps_a_wide_covariance(body: Body, poses: np.ndarray) -> None:
     encoding = PoseEncoding(body)
-    place = PlaceAndSize((-0.5, -0.5, 639.5, 479.5), (320.0, 240.0), 1e5, (True,) * 4)
+    place = PersonBlob(np.ones((480, 640), np.uint8), 0, 0, (True,) * 4, 0)
     target = encoding.encode(poses[:1])
     found = place_roots(encoding, CAMERA, place, target, small(encoding))
     assert np.isfinite(found.roots).all()

@@ -10,15 +10,19 @@ from benchmarks import numpy_likelihood as oracle
 from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
+from hmt_ros.body.pose_terms import AnglePrior
+from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.image import likelihood as likelihood_module
-from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
-from hmt_ros.image.observation import Keypoints, Observation, observe
+from hmt_ros.image.likelihood import OFF, ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.surface import COVER, HIDDEN
+from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
 from hmt_ros.image.texture import capture_textures
+from hmt_ros.inference.energy import Derivatives
 
 IMAGE_TERMS = ('containment', 'coverage', 'edges', 'intensity', 'motion')
 CONTOUR_TERMS = IMAGE_TERMS[:3]
-OFF = TermSettings(0.0, 1.0, 1.0)
 
 LENSES = {
     'pinhole': ((), 'plumb_bob'),
@@ -52,8 +56,7 @@ def textures(shot):
 def only(likelihood, *names):
     """The likelihood with some of its terms."""
     terms = {
-        name: getattr(likelihood.settings, name) if name in names else OFF
-        for name in (*IMAGE_TERMS, 'joints')
+        name: getattr(likelihood.settings, name) if name in names else OFF for name in IMAGE_TERMS
     }
     return replace(likelihood, settings=replace(likelihood.settings, **terms))
 
@@ -61,7 +64,7 @@ def only(likelihood, *names):
 def evaluate(likelihood, poses, observation, textures, **more):
     which = np.arange(len(poses)) % len(textures.counts)
     frames = forward(likelihood.body.skeleton, poses)
-    return likelihood.image_energy(frames, observation, textures, which, **more)
+    return likelihood.energies(frames, observation, textures, which, **more)
 
 
 def relative_difference(found, wanted):
@@ -183,7 +186,7 @@ def relative_errors(found, wanted):
     return np.abs(found - wanted) / np.abs(wanted).max(axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize('name', ['joints', 'intensity', 'motion'])
+@pytest.mark.parametrize('name', ['intensity', 'motion'])
 def test_gradients_of_smooth_terms(shot, observation, textures, name):
     likelihood = only(ImageLikelihood(shot.body, shot.camera), name)
     poses = shot.near(8, 6)
@@ -214,13 +217,13 @@ def test_gradients_of_contour_terms_at_material_points(shot, observation, name):
         pixels, projection = camera.project_with_derivative(moved.transpose(1, 0, 2))
         held = replace(surface, points=moved, pixels=pixels, projection=projection)
         if name == 'containment':
-            return oracle.containment(held, observation.distance, term).value
+            return oracle.containment(held, observation.evidence['containment'], term).value
         if name == 'coverage':
             return oracle.coverage(held, observation.outline, term).value
-        return oracle.edges(held, observation.edges, term).value
+        return oracle.edges(held, observation.evidence['edges'], term).value
 
     which = np.full(len(poses), -1)
-    found = likelihood.image_energy(frames, observation, None, which).gradient
+    found = likelihood.energies(frames, observation, None, which).gradient
     errors = relative_errors(found, numerical_gradient(value, poses))
     assert np.quantile(errors, 0.99) < 1e-6
     assert errors.max() < 1e-3
@@ -245,10 +248,10 @@ def test_sliding_of_the_contour_hardly_changes_the_gradient(shot, observation, t
 
 
 def test_gradient_and_hessian_of_the_soft_prior(shot):
-    likelihood = ImageLikelihood(shot.body, shot.camera)
+    prior, rows = AnglePrior(shot.body).quadratic, np.arange(5)
     poses = shot.near(5, 10, spread=0.4)
-    value, gradient, hessian = likelihood.prior(poses)
-    wanted = numerical_gradient(lambda x: likelihood.prior(x)[0], poses)
+    value, gradient, hessian = prior.energy(poses, rows)
+    wanted = numerical_gradient(lambda x: prior.energy(x, rows).value, poses)
     assert np.allclose(gradient, wanted, atol=1e-6)
     known = np.isfinite(shot.body.prior_sigma)
     offset = (poses - shot.body.prior_mean)[:, known] / shot.body.prior_sigma[known]
@@ -259,18 +262,19 @@ def test_gradient_and_hessian_of_the_soft_prior(shot):
 def test_self_intersection_falls_against_its_gradient(shot):
     """A Gauss-Newton model with the radii of the parts held: a direction of descent, not exact."""
     body = shot.body
-    likelihood = ImageLikelihood(body, shot.camera)
     rng = np.random.default_rng(11)
     poses = body.prior_mean + 0.5 * rng.normal(size=(200, body.dimension))
     poses = np.clip(poses, body.lower, body.upper)
-    value, gradient, hessian = likelihood.intersection(forward(body.skeleton, poses))
+
+    def energy(x):
+        return self_intersection_energy(body, forward(body.skeleton, x), sigma=0.03)
+
+    value, gradient, hessian = energy(poses)
     touching = value > 0.01
     assert touching.sum() > 20
     assert not gradient[value == 0].any()
     poses, value, gradient, hessian = (x[touching] for x in (poses, value, gradient, hessian))
-    wanted = numerical_gradient(
-        lambda x: likelihood.intersection(forward(body.skeleton, x))[0], poses
-    )
+    wanted = numerical_gradient(lambda x: energy(x)[0], poses)
     cosine = (gradient * wanted).sum(1)
     cosine /= np.linalg.norm(gradient, axis=1) * np.linalg.norm(wanted, axis=1)
     assert cosine.min() > 0.0
@@ -278,7 +282,7 @@ def test_self_intersection_falls_against_its_gradient(shot):
     # With one pair touching: 1/2 o^2 has the gradient o r and the Hessian r r^T, so H g = |r|^2 g.
     assert (np.linalg.eigvalsh(hessian)[:, 0] > -1e-9 * value.max()).all()
     step = 1e-4 * gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
-    after = likelihood.intersection(forward(body.skeleton, poses - step))[0]
+    after = energy(poses - step)[0]
     assert (after < value).all()
 
 
@@ -332,9 +336,9 @@ def test_a_pose_does_not_depend_on_its_neighbours_in_the_batch(shot, observation
     poses = shot.near(9, 14)
     likelihood = ImageLikelihood(shot.body, shot.camera)
     which = np.zeros(9, dtype=int)
-    together = likelihood.energy(poses, observation, textures, which)
+    together = likelihood.given(observation, textures, which).energy(poses)
     for n in (0, 4, 8):
-        alone = likelihood.energy(poses[n : n + 1], observation, textures, which[:1])
+        alone = likelihood.given(observation, textures, which[:1]).energy(poses[n : n + 1])
         for a, b in zip(together, alone):
             assert relative_difference(a[n : n + 1], b) <= 1e-12
 
@@ -361,8 +365,8 @@ def test_terms_without_evidence_are_off(shot, textures):
     full = observe(image, shot.masks[1], last_image=shot.images[0])
     assert set(evaluate(likelihood, poses, full, textures).terms) == set(IMAGE_TERMS)
     frames = forward(shot.body.skeleton, poses)
-    assert set(likelihood.image_energy(frames, full).terms) == set(CONTOUR_TERMS)
-    nothing = likelihood.image_energy(frames, Observation())
+    assert set(likelihood.energies(frames, full).terms) == set(CONTOUR_TERMS)
+    nothing = likelihood.energies(frames, Observation())
     assert np.array_equal(nothing.value, np.zeros(2))
     assert not nothing.hessian.any()
 
@@ -372,9 +376,11 @@ def test_the_truth_is_better_than_its_neighbours(shot, observation, textures):
     near, truth = shot.near(40, 17, spread=0.15), shot.poses[1:]
     which = np.zeros(41, dtype=int)
     frames = forward(shot.body.skeleton, np.concatenate([truth, near]))
-    found = likelihood.image_energy(frames, observation, textures, which, derivatives=False)
-    for name in ('containment', 'coverage', 'edges', 'joints', 'intensity'):
-        assert np.mean(found.terms[name][1:] > found.terms[name][0]) > 0.95, name
+    found = likelihood.energies(frames, observation, textures, which, derivatives=False)
+    terms = {name: found.terms[name] for name in ('containment', 'coverage', 'edges', 'intensity')}
+    terms['keypoints'] = keypoint_energy(shot, observation.keypoints, frames.poses).value
+    for name, value in terms.items():
+        assert np.mean(value[1:] > value[0]) > 0.95, name
 
 
 def test_what_others_explain_costs_no_more_than_that(shot, observation, textures):
@@ -398,32 +404,47 @@ def test_parts_share_the_weight_of_the_whole_contour(shot, observation):
     poses = shot.near(5, 19, spread=0.2)
     frames = forward(shot.body.skeleton, poses)
     count = len(shot.body.flesh.parts)
-    whole = likelihood.image_energy(frames, observation)
+    whole = likelihood.energies(frames, observation)
     groups = [tuple(range(0, count, 2)), tuple(range(1, count, 2))]
-    parts = [replace(likelihood, parts=group).image_energy(frames, observation) for group in groups]
+    parts = [replace(likelihood, parts=group).energies(frames, observation) for group in groups]
     assert whole.value.min() > 0
     assert np.allclose(whole.value, sum(part.value for part in parts))
     assert np.allclose(whole.hessian, sum(part.hessian for part in parts))
 
 
+def keypoint_energy(shot, keypoints, poses, settings=None, derivatives=Derivatives.POSITIVE):
+    term = KeypointTerm(
+        shot.body.skeleton, shot.camera, keypoints, settings or TermSettings(1.0, 1.0, 5.0)
+    )
+    frames = forward(shot.body.skeleton, poses)
+    return term.energy(frames, np.arange(len(poses)), derivatives=derivatives)
+
+
 def test_keypoints_are_least_squares_with_their_covariances(shot):
     body, camera = shot.body, shot.camera
     keypoints = keypoints_of(shot)
-    settings = LikelihoodSettings(joints=TermSettings(2.0, 1.5, np.inf))
-    likelihood = ImageLikelihood(body, camera, settings)
     poses = shot.near(4, 20)
-    found = likelihood.image_energy(forward(body.skeleton, poses), Observation(keypoints=keypoints))
+    found = keypoint_energy(shot, keypoints, poses, TermSettings(2.0, 1.5, np.inf))
     error = camera.project(body.joint_positions(poses)) - keypoints.pixels
     precision = np.linalg.inv(keypoints.covariances)
     square = np.einsum('nja,jab,njb->n', error, precision, error)
     assert np.allclose(found.value, 0.5 * 2.0 / 1.5**2 * square)
 
 
+def test_gradient_of_keypoints(shot):
+    keypoints, poses = keypoints_of(shot), shot.near(8, 6)
+
+    def value(x):
+        return keypoint_energy(shot, keypoints, x, derivatives=Derivatives.NONE).value
+
+    found = keypoint_energy(shot, keypoints, poses)
+    assert np.array_equal(found.value, value(poses))
+    errors = relative_errors(found.gradient, numerical_gradient(value, poses))
+    assert errors.max() < 1e-6
+
+
 def test_keypoints_that_were_not_seen_do_not_count(shot):
-    body = shot.body
-    keypoints = keypoints_of(shot)
-    likelihood = only(ImageLikelihood(body, shot.camera), 'joints')
-    frames = forward(body.skeleton, shot.near(3, 21))
+    keypoints, poses = keypoints_of(shot), shot.near(3, 21)
     chosen = [2, 5, 11]
     some = Keypoints(
         tuple(keypoints.names[i] for i in chosen), keypoints.pixels[chosen],
@@ -435,14 +456,18 @@ def test_keypoints_that_were_not_seen_do_not_count(shot):
     confidences[5] = 0.5
     confidences[0] = 0.0
     all_named = Keypoints(keypoints.names, hidden, keypoints.covariances, confidences)
-    a, b = (likelihood.image_energy(frames, Observation(keypoints=k)) for k in (some, all_named))
+    a, b = (keypoint_energy(shot, k, poses) for k in (some, all_named))
     assert a.value.min() > 0
     assert np.allclose(a.value, b.value)
     assert np.allclose(a.hessian, b.hessian)
     with pytest.raises(KeyError, match='tail'):
-        likelihood.image_energy(
-            frames, Observation(keypoints=replace(keypoints, names=('tail', *keypoints.names[1:])))
-        )
+        keypoint_energy(shot, replace(keypoints, names=('tail', *keypoints.names[1:])), poses)
+
+
+def test_only_the_terms_that_are_named_are_on():
+    settings = LikelihoodSettings.of_terms(edges=TermSettings(20.0, 2.5, 3.0))
+    on = [name for name in (*IMAGE_TERMS, 'keypoints') if getattr(settings, name).weight > 0]
+    assert on == ['edges']
 
 
 @pytest.mark.parametrize('wrong', [(-1.0, 1.0, 1.0), (1.0, 0.0, 1.0), (1.0, 1.0, -1.0)])

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from hmt_ros.image.observation import (
-    EDGE_ORIENTATIONS,
-    Keypoints,
-    ObservationSettings,
-    observe,
-)
+from hmt_ros.image.observation import MARGIN, observe
+from hmt_ros.image.terms.edges import ORIENTATIONS
+from hmt_ros.image.terms.image_term import ImageWindow
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.image.terms.silhouette import outline
 
 SIZE = (120, 160)
 
@@ -33,7 +32,7 @@ def whole(image_map, channel=0, size=SIZE, fill=np.nan):
 
 def test_signed_distance_is_that_to_the_border_between_the_pixels():
     mask = disc() | disc((110, 70), 12)
-    found = whole(observe(grey(), mask).distance)
+    found = whole(observe(grey(), mask).evidence['containment'])
     inside, outside = np.argwhere(mask), np.argwhere(~mask)
     rng = np.random.default_rng(0)
     for v, u in rng.integers(0, SIZE, (200, 2)):
@@ -47,15 +46,16 @@ def test_signed_distance_is_that_to_the_border_between_the_pixels():
 
 
 def test_the_window_holds_the_silhouette_and_its_margin():
-    settings = ObservationSettings(margin=10)
-    values, left, top = observe(grey(), disc(), settings=settings).distance
-    assert (left, top) == (80 - 24 - 10, 60 - 24 - 10)
-    assert values.shape == (1, 49 + 20, 49 + 20)
+    size = (240, 320)
+    mask = disc((160, 120), size=size)
+    values, left, top = observe(grey(size), mask).evidence['containment']
+    assert (left, top) == (160 - 24 - MARGIN, 120 - 24 - MARGIN)
+    assert values.shape == (1, 49 + 2 * MARGIN, 49 + 2 * MARGIN)
 
 
 def test_outline_points_are_even_and_their_normals_point_outwards():
-    observation = observe(grey(), disc(), settings=ObservationSettings(outline_points=60))
-    pixels, normals = observation.outline.pixels, observation.outline.normals
+    window = ImageWindow(grey(), 0, 0, disc().astype(np.uint8), None)
+    pixels, normals = outline(window, 60)
     assert len(pixels) == 60
     offset = pixels - [80, 60]
     radius = np.linalg.norm(offset, axis=1)
@@ -78,19 +78,19 @@ def test_outline_of_holes_points_into_them():
     assert along[~hole].min() > 0.95
 
 
-@pytest.mark.parametrize('quarter', range(EDGE_ORIENTATIONS))
+@pytest.mark.parametrize('quarter', range(ORIENTATIONS))
 def test_edges_stand_in_the_bin_of_their_normal(quarter):
     """A dark half-plane whose normal is at quarter * 45 degrees."""
-    angle = quarter * np.pi / EDGE_ORIENTATIONS
+    angle = quarter * np.pi / ORIENTATIONS
     normal = np.array([np.cos(angle), np.sin(angle)])
     v, u = np.mgrid[: SIZE[0], : SIZE[1]]
     signed = (u - 80) * normal[0] + (v - 60) * normal[1]
     image = grey(value=40)
     image[signed > 0] = 200
-    edges = observe(image).edges
+    edges = observe(image).evidence['edges']
     interior = (slice(20, 100), slice(20, 140))
     own = whole(edges, quarter)[interior]
-    across = whole(edges, (quarter + 2) % EDGE_ORIENTATIONS)[interior]
+    across = whole(edges, (quarter + 2) % ORIENTATIONS)[interior]
     assert np.abs(own - np.abs(signed[interior])).max() < 3.0
     # No edge of the direction across: nothing is near.
     assert across.min() >= 100
@@ -101,8 +101,8 @@ def test_edges_far_outside_the_silhouette_belong_to_the_background():
     image[:, 140:] = 250
     mask = disc()
     image[mask] = 20
-    with_silhouette = whole(observe(image, mask).edges, 0)
-    without = whole(observe(image).edges, 0)
+    with_silhouette = whole(observe(image, mask).evidence['edges'], 0)
+    without = whole(observe(image).evidence['edges'], 0)
     assert without[60, 140] < 2
     assert with_silhouette[60, 128] > 15
     assert with_silhouette[60, 105] < 2.5
@@ -111,10 +111,9 @@ def test_edges_far_outside_the_silhouette_belong_to_the_background():
 def test_an_empty_silhouette_counts_as_unknown():
     observation = observe(grey(), np.zeros(SIZE, dtype=bool))
     assert observation.silhouette is None
-    assert observation.distance is None
+    assert 'containment' not in observation.evidence
     assert observation.outline is None
-    assert observation.box is None
-    assert observation.edges.values.shape == (EDGE_ORIENTATIONS, *SIZE)
+    assert observation.evidence['edges'].values.shape == (ORIENTATIONS, *SIZE)
 
 
 @pytest.mark.parametrize(
@@ -126,17 +125,17 @@ def test_a_person_cut_by_the_border_or_hardly_seen(mask):
     image = grey()
     image[mask] = 30
     observation = observe(image, mask, last_image=grey())
-    assert observation.distance is not None
-    assert np.isfinite(observation.distance.values).all()
-    assert np.isfinite(observation.edges.values).all()
+    assert observation.evidence['containment'] is not None
+    assert np.isfinite(observation.evidence['containment'].values).all()
+    assert np.isfinite(observation.evidence['edges'].values).all()
     assert np.isfinite(observation.outline.pixels).all()
     assert np.isfinite(observation.outline.normals).all()
-    height, width = observation.distance.values.shape[1:]
+    height, width = observation.evidence['containment'].values.shape[1:]
     assert height >= 2
     assert width >= 2
-    assert observation.distance.left >= 0
-    assert observation.distance.left + width <= SIZE[1]
-    found = whole(observation.distance)
+    assert observation.evidence['containment'].left >= 0
+    assert observation.evidence['containment'].left + width <= SIZE[1]
+    found = whole(observation.evidence['containment'])
     known = ~np.isnan(found)
     assert ((found[known] < 0) == mask[known]).all()
 
@@ -146,7 +145,7 @@ def test_flow_is_the_shift_between_the_images():
     noise = np.kron(rng.integers(0, 255, (40, 50)), np.ones((4, 4))).astype(np.uint8)
     big = np.repeat(noise[:, :, None], 3, axis=2)
     before, after = big[10:130, 10:170].copy(), big[7:127, 5:165].copy()
-    flow = observe(after, disc(radius=40), last_image=before).flow
+    flow = observe(after, disc(radius=40), last_image=before).evidence['motion']
     middle = [np.median(whole(flow, channel)[40:80, 60:100]) for channel in (0, 1)]
     assert middle == pytest.approx([5.0, 3.0], abs=0.5)
 

@@ -8,7 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize
 
-from hmt_ros.inference import Status, minimise
+from hmt_ros.inference import Minimum, Status, minimise
+from hmt_ros.inference.energy import EnergyFunction
+from hmt_ros.inference.trust_region import TrustRegion
+
+
+def minimum(objective, *arguments, **options) -> Minimum:
+    """Of an energy that is written as a function."""
+    return minimise(EnergyFunction(objective), *arguments, **options)
 
 
 def quadratics(n: int, d: int, seed: int):
@@ -30,7 +37,7 @@ def quadratics(n: int, d: int, seed: int):
 def test_quadratics_in_a_box_equal_lsq_linear(d):
     a, b, objective = quadratics(30, d, d)
     lower, upper = np.full(d, -0.15), np.full(d, 0.2)
-    best = minimise(objective, np.zeros((30, d)), lower, upper, tolerance=1e-14)
+    best = minimum(objective, np.zeros((30, d)), lower, upper, tolerance=1e-14)
     assert (best.status == Status.CONVERGED).all()
     for i in range(30):
         expected = lsq_linear(a[i], b[i], (lower, upper), method='bvls', tol=1e-14)
@@ -55,7 +62,7 @@ def test_coupled_limits_do_not_end_the_search_early():
 
     hair = np.nextafter(0.0, 1.0)
     for start in ([0.0, 0.0], [hair, 0.0], [1e-17, 1e-17], [0.5, 0.0]):
-        best = minimise(objective, np.array([start]), 0.0, 2.0, tolerance=1e-14)
+        best = minimum(objective, np.array([start]), 0.0, 2.0, tolerance=1e-14)
         np.testing.assert_allclose(best.x, [[0.0, 0.2]], atol=1e-6)
         assert best.status[0] == Status.CONVERGED
 
@@ -65,7 +72,7 @@ def test_limits_of_each_problem_are_its_own():
     rng = np.random.default_rng(2)
     lower = rng.uniform(-0.4, -0.05, (8, 4))
     upper = lower + rng.uniform(0.05, 0.5, (8, 4))
-    best = minimise(objective, np.zeros((8, 4)), lower, upper, tolerance=1e-14)
+    best = minimum(objective, np.zeros((8, 4)), lower, upper, tolerance=1e-14)
     for i in range(8):
         expected = lsq_linear(a[i], b[i], (lower[i], upper[i]), method='bvls', tol=1e-14)
         np.testing.assert_allclose(best.x[i], expected.x, atol=1e-6)
@@ -73,7 +80,7 @@ def test_limits_of_each_problem_are_its_own():
 
 def test_a_free_quadratic_needs_few_steps():
     _, _, objective = quadratics(20, 6, 3)
-    best = minimise(objective, np.full((20, 6), 5.0), damping=1e-9)
+    best = minimum(objective, np.full((20, 6), 5.0), damping=1e-9)
     assert (best.status == Status.CONVERGED).all()
     assert best.iterations.max() <= 3
     assert best.free.all()
@@ -92,7 +99,7 @@ def rosenbrock(x, problem):
 
 def test_rosenbrock_from_many_starts():
     starts = np.random.default_rng(4).uniform(-3, 3, (50, 2))
-    best = minimise(rosenbrock, starts, max_iterations=200, tolerance=1e-14)
+    best = minimum(rosenbrock, starts, max_iterations=200, tolerance=1e-14)
     assert (best.status == Status.CONVERGED).all()
     np.testing.assert_allclose(best.x, 1.0, atol=1e-5)
 
@@ -102,7 +109,7 @@ def test_rosenbrock_from_many_starts():
 )
 def test_rosenbrock_at_an_active_limit_equals_scipy(lower, upper):
     start = np.array([[-1.2, 1.0], [0.0, 0.0], [1.9, 1.9]])
-    best = minimise(rosenbrock, start, lower, upper, max_iterations=300, tolerance=1e-14)
+    best = minimum(rosenbrock, start, lower, upper, max_iterations=300, tolerance=1e-14)
     for i, x in enumerate(np.clip(start, lower, upper)):
         expected = minimize(
             lambda v: (float(rosenbrock(v[None], None)[0][0]), rosenbrock(v[None], None)[1][0]),
@@ -126,7 +133,7 @@ def saddle(x, problem):
 
 def test_an_indefinite_start_descends_into_its_valley():
     starts = np.array([[0.01, 0.5], [-0.01, 0.5], [0.1, -3.0], [1e-6, 0.0]])
-    best = minimise(saddle, starts, max_iterations=100, tolerance=1e-12)
+    best = minimum(saddle, starts, max_iterations=100, tolerance=1e-12)
     assert (best.status == Status.CONVERGED).all()
     expected = np.sqrt(0.5) * np.array([1, -1, 1, 1])
     np.testing.assert_allclose(best.x[:, 0], expected, atol=1e-4)
@@ -143,7 +150,7 @@ def test_the_energy_never_rises():
         return result
 
     starts = np.random.default_rng(5).uniform(-2, 2, (10, 2))
-    best = minimise(watched, starts, max_iterations=100)
+    best = minimum(watched, starts, max_iterations=100)
     for i in range(10):
         assert best.value[i] == min(values[i])
         assert len(values[i]) == best.iterations[i] + 1
@@ -158,7 +165,7 @@ def test_converged_problems_leave_the_batch():
         return rosenbrock(x, problem)
 
     starts = np.array([[1.0, 1.0], [1.1, 1.2], [-3.0, 3.0]])
-    best = minimise(watched, starts, max_iterations=200, tolerance=1e-12)
+    best = minimum(watched, starts, max_iterations=200, tolerance=1e-12)
     assert (best.status == Status.CONVERGED).all()
     assert rows[0] == 3
     assert rows[1] == 2  # the first starts at its minimum
@@ -182,11 +189,11 @@ def wells(x, problem):
 @given(seed=st.integers(0, 2**32 - 1), d=st.integers(1, 9))
 def test_a_problem_alone_gives_the_bits_it_gives_in_a_batch(seed, d):
     starts = np.random.default_rng(seed).uniform(-3, 3, (11, d))
-    together = minimise(wells, starts, -2.0, 2.5)
-    again = minimise(wells, starts, -2.0, 2.5)
+    together = minimum(wells, starts, -2.0, 2.5)
+    again = minimum(wells, starts, -2.0, 2.5)
     np.testing.assert_array_equal(together.x, again.x)
     for i in (0, 4, 10):
-        alone = minimise(lambda x, _, i=i: wells(x, np.full(len(x), i)), starts[i], -2.0, 2.5)
+        alone = minimum(lambda x, _, i=i: wells(x, np.full(len(x), i)), starts[i], -2.0, 2.5)
         np.testing.assert_array_equal(alone.x[0], together.x[i])
         assert alone.value[0] == together.value[i]
         assert alone.iterations[0] == together.iterations[i]
@@ -204,9 +211,9 @@ def test_coupled_problems_alone_give_the_bits_they_give_in_a_batch():
         return value, hx + g, hessians[problem]
 
     starts = np.random.default_rng(7).uniform(-1, 1, (9, 37))
-    together = minimise(objective, starts, -0.2, 0.3)
+    together = minimum(objective, starts, -0.2, 0.3)
     for i in range(9):
-        alone = minimise(lambda x, _, i=i: objective(x, np.full(len(x), i)), starts[i], -0.2, 0.3)
+        alone = minimum(lambda x, _, i=i: objective(x, np.full(len(x), i)), starts[i], -0.2, 0.3)
         np.testing.assert_array_equal(alone.x[0], together.x[i])
         assert alone.iterations[0] == together.iterations[i]
 
@@ -219,7 +226,7 @@ def test_a_start_without_finite_energy_stays_where_it_is(bad):
         return value, gradient, hessian
 
     starts = np.array([[0.0, 0.0], [0.5, 0.5], [2.0, 2.0]])
-    best = minimise(objective, starts, max_iterations=100, tolerance=1e-12)
+    best = minimum(objective, starts, max_iterations=100, tolerance=1e-12)
     assert best.status.tolist() == [Status.CONVERGED, Status.NOT_FINITE, Status.CONVERGED]
     np.testing.assert_array_equal(best.x[1], starts[1])
     assert best.iterations[1] == 0
@@ -234,19 +241,19 @@ def test_a_step_into_nan_is_refused_and_shortened():
             value = x[:, 0] - np.log(x[:, 0])
             return value, 1 - 1 / x, (1 / x**2)[:, :, None]
 
-    best = minimise(objective, np.array([[8.0], [0.01]]), max_iterations=100, tolerance=1e-14)
+    best = minimum(objective, np.array([[8.0], [0.01]]), max_iterations=100, tolerance=1e-14)
     assert (best.status == Status.CONVERGED).all()
     np.testing.assert_allclose(best.x, 1.0, atol=1e-6)
 
 
 def test_a_start_outside_the_box_is_brought_inside():
-    best = minimise(rosenbrock, np.array([[9.0, -9.0]]), (-2, -2), (0.5, 2), max_iterations=0)
+    best = minimum(rosenbrock, np.array([[9.0, -9.0]]), (-2, -2), (0.5, 2), max_iterations=0)
     np.testing.assert_array_equal(best.x, [[0.5, -2.0]])
     assert best.status[0] == Status.ITERATION_LIMIT
 
 
 def test_a_box_without_room_holds_a_variable():
-    best = minimise(
+    best = minimum(
         rosenbrock,
         np.array([[0.0, 0.0]]),
         (-2, 0.25),
@@ -264,14 +271,14 @@ def test_a_wrong_gradient_stalls_and_ends():
         value, gradient, _ = rosenbrock(x, problem)
         return value, -gradient, np.tile(np.eye(2), (len(x), 1, 1))
 
-    best = minimise(objective, np.array([[-1.0, 1.0]]), max_iterations=500)
+    best = minimum(objective, np.array([[-1.0, 1.0]]), max_iterations=500)
     assert best.status[0] in (Status.STALLED, Status.CONVERGED)
     assert best.iterations[0] < 100
     np.testing.assert_array_equal(best.x, [[-1.0, 1.0]])
 
 
 def test_the_iteration_limit_is_kept():
-    best = minimise(rosenbrock, np.array([[-3.0, 3.0]]), max_iterations=3)
+    best = minimum(rosenbrock, np.array([[-3.0, 3.0]]), max_iterations=3)
     assert best.status[0] == Status.ITERATION_LIMIT
     assert best.iterations[0] == 3
 
@@ -284,13 +291,27 @@ def test_units_of_the_variables_do_not_matter_with_their_step_scale():
         return value, gradient / scale, hessian / np.outer(scale, scale)
 
     start = np.array([[-1.2, 1.0]])
-    plain = minimise(rosenbrock, start, step_scale=1.0, tolerance=1e-12, max_iterations=100)
-    other = minimise(scaled, start * scale, step_scale=scale, tolerance=1e-12, max_iterations=100)
+    plain = minimum(rosenbrock, start, step_scale=1.0, tolerance=1e-12, max_iterations=100)
+    other = minimum(scaled, start * scale, step_scale=scale, tolerance=1e-12, max_iterations=100)
     np.testing.assert_allclose(other.x / scale, plain.x, atol=1e-8)
     assert other.iterations[0] == plain.iterations[0]
 
 
 def test_inputs_are_not_changed():
     start = np.array([[9.0, 9.0]])
-    minimise(rosenbrock, start, -1.0, 0.5)
+    minimum(rosenbrock, start, -1.0, 0.5)
     np.testing.assert_array_equal(start, [[9.0, 9.0]])
+
+
+def test_damping_follows_the_ratio_of_actual_to_predicted_decrease():
+    region = TrustRegion(5, 1.0, limit=30.0, least_factor=0.25, least_refused=2.0)
+    rows = np.arange(5)
+    decrease = np.array([1.0, 0.5, 0.1, -1.0, np.nan])
+    better = region.accept(rows, decrease, np.ones(5))
+    assert better.tolist() == [True, True, True, False, False]
+    assert len(region.refuse(rows[~better])) == 0
+    np.testing.assert_allclose(region.damping, [0.25, 1.0, 1.0 + 0.8**3, 4.0, 4.0])
+    assert len(region.refuse(rows[3:])) == 0
+    np.testing.assert_allclose(region.damping[3:], 16.0)
+    assert region.refuse(rows[3:4]).tolist() == [3]
+    assert region.damping[3] == 16.0 * 8.0

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hmt_ros.inference import GaussianMixture
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
@@ -97,11 +96,9 @@ def pose_mixture() -> PoseMixture:
     root = rng.normal(size=(3, 4, 4))
     covariances = root @ root.transpose(0, 2, 1) + np.eye(4)
     return PoseMixture(
-        mixture=GaussianMixture(
-            np.array([0.2, 0.3, 0.5]),
-            rng.normal(size=(3, 4)),
-            (covariances + covariances.transpose(0, 2, 1)) / 2,
-        ),
+        weights=np.array([0.2, 0.3, 0.5]),
+        means=rng.normal(size=(3, 4)),
+        covariances=(covariances + covariances.transpose(0, 2, 1)) / 2,
         body_model='human37',
         dof_names=('root_x', 'root_yy', 'root_zzz', 'bend'),
         joint_names=('pelvis', 'head'),
@@ -109,6 +106,7 @@ def pose_mixture() -> PoseMixture:
         kind=MixtureKind.SMOOTHED,
         stamp_ns=1_700_000_000_123_456_789,
         frame_id='camera',
+        segment_lengths={'trunk': 0.5, 'thigh': 0.41},
         log_likelihoods=np.array([-3.0, -2.0, -1.0]),
         degrees_of_freedom=np.array([0.0, 5.0, 0.0]),
     )

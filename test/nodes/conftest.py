@@ -1,4 +1,4 @@
-"""A tracker that costs nothing, messages of a camera and of a filter, and who talks to a node."""
+"""Who talks to a node; fixtures of the sessions serve here, too."""
 
 from __future__ import annotations
 
@@ -8,279 +8,29 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 
-from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions import bme_session, track_start
 from hmt_ros.sessions.declared_parameters import EFFECTS, declared_parameters
+from hmt_ros.sessions.handled import handled_of
 from hmt_ros.sessions.parameter_file import read_parameter_file
-from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
-from msg_tools import RosbagsMessages
-from msg_tools.messages.bodies import message_of_body
-from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.cdr import serialise
-from msg_tools.messages.headers import header_message
-from msg_tools.messages.images import compressed_image_message, image_message
-from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from test.sessions.conftest import (  # noqa: F401
+    background_file,
+    body,
+    likelihoods,
+    outputs,
+    small_camera,
+    somebody,
+    stub_predictor,
+    stub_tracker,
+    subject_file,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
-FRAME_NS = 100_000_000
-START_NS = 1_700_000_000_000_000_000
 PATIENCE = 60.0  # s
-JOINTS = ('left_hip', 'right_hip', 'left_shoulder', 'right_shoulder', 'head')
-
-
-class StubTracker:
-    """What `hmt_ros.tracking.Tracker` shows to the outside; its two modes are where it was told."""
-
-    made: list[StubTracker] = []  # noqa: RUF012
-    fault: Exception | None = None
-
-    def __init__(self, body, camera, settings=None, background=None, seed=0):
-        self.body, self.camera, self.seed = body, camera, seed
-        self.settings = settings or TrackerSettings()
-        self.background = background
-        self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
-        self.seen: list[tuple[int, Any]] = []
-        self.predictions: list[PosePrediction | None] = []
-        self._start = None
-        StubTracker.made.append(self)
-
-    def reset(self, start=None):
-        self._start = start
-
-    @property
-    def modes(self):
-        return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]))
-
-    def step(self, image, stamp, keypoints=None, prediction=None):
-        assert image.shape == (self.camera.height, self.camera.width, 3)
-        if self.fault is not None:
-            raise self.fault
-        if self._start is None and prediction is not None:
-            self._start = prediction.mixture
-        if self._start is None or (
-            isinstance(self._start, Subject) and stamp < self._start.stamp_ns
-        ):
-            return None, None
-        self.seen.append((stamp, keypoints))
-        self.predictions.append(prediction)
-        self.status, self.misfit, self.evaluations = Status.TRACKING, 0.125, 7
-        means = np.tile(self.body.prior_mean, (2, 1))
-        means[:, 2] = 4.0
-        means[:, 0] = [0.1 * len(self.seen), -0.1]
-        covariances = np.tile(1e-3 * np.eye(self.body.dimension), (2, 1, 1))
-        return tuple(
-            GaussianMixture(np.array([share, 1 - share]), means, covariances)
-            for share in (0.75, 0.5)
-        )
-
-
-@pytest.fixture
-def stub_tracker(monkeypatch):
-    monkeypatch.setattr(track_start, 'Tracker', StubTracker)
-    monkeypatch.setattr(StubTracker, 'made', [])
-    monkeypatch.setattr(StubTracker, 'fault', None)
-    return StubTracker
-
-
-@dataclass
-class SmallCamera:
-    """Messages of a camera of 64x48 pixels; images are counted from 0, ten a second."""
-
-    camera: Camera = field(default_factory=lambda: Camera(60.0, 60.0, 31.5, 23.5, 64, 48))
-    messages: RosbagsMessages = field(default_factory=RosbagsMessages)
-
-    def stamp(self, index):
-        return START_NS + round(index * FRAME_NS)
-
-    def picture(self, index, size=(64, 48)):
-        rng = np.random.default_rng(self.stamp(index))
-        return rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
-
-    def image(self, index, size=(64, 48), frame_id='lens'):
-        picture = self.picture(index, size)
-        return image_message(self.messages, picture, self.stamp(index), frame_id)
-
-    def compressed(self, index):
-        picture = self.picture(index)
-        return compressed_image_message(self.messages, picture, self.stamp(index), 'lens')
-
-    def info(self, index=0, camera=None, frame_id='lens'):
-        return camera_info_message(
-            self.messages, camera or self.camera, self.stamp(index), frame_id
-        )
-
-    def uncalibrated(self, index=0):
-        info = self.info(index)
-        return self.messages.create(
-            'sensor_msgs/msg/CameraInfo',
-            header=info.header,
-            width=64,
-            height=48,
-            distortion_model='plumb_bob',
-        )
-
-    def keypoints(self, index, names=JOINTS, **fields):
-        fields.setdefault('u', np.arange(len(names), dtype=float))
-        fields.setdefault('v', np.arange(len(names), dtype=float))
-        return self.messages.create(
-            'hmt_msgs/msg/Keypoints2D',
-            header=header_message(self.messages, self.stamp(index), 'lens'),
-            names=list(names),
-            **fields,
-        )
-
-
-@pytest.fixture
-def small_camera():
-    return SmallCamera()
-
-
-@dataclass
-class Somebody(SmallCamera):
-    """A camera that sees a white pillar of 10x24 pixels, which moves, before a grey wall."""
-
-    def picture(self, index, size=(64, 48)):
-        picture = np.full((size[1], size[0], 3), 90, np.uint8)
-        left = 20 + round(index) % 20
-        picture[12:36, left : left + 10] = 250
-        return picture
-
-    def at_the_border(self, index):
-        picture = np.full((48, 64, 3), 90, np.uint8)
-        picture[12:36, :8] = 250
-        return image_message(self.messages, picture, self.stamp(index), 'lens')
-
-    def empty(self, index):
-        wall = np.full((48, 64, 3), 90, np.uint8)
-        return image_message(self.messages, wall, self.stamp(index), 'lens')
-
-
-@pytest.fixture
-def somebody():
-    return Somebody()
-
-
-class StubPredictor:
-    """What `hmt_ros.experts.PosePredictor` shows; its poses do not depend on the silhouette."""
-
-    body = load_body('human37')
-    asked: list[tuple[Any, GaussianMixture | None, float]] = []  # noqa: RUF012
-    fault: Exception | None = None
-
-    def with_body(self, body):
-        assert body is not self.body
-        return self
-
-    def observe(self, mask, camera, previous=None, *, max_components=8, size_spread=0.06):
-        if self.fault is not None:
-            raise self.fault
-        StubPredictor.asked.append((mask, previous, size_spread))
-        means = np.tile(self.body.prior_mean, (2, 1))
-        means[:, 2] = [4.0, 4.5]
-        covariances = np.tile(1e-2 * np.eye(self.body.dimension), (2, 1, 1))
-        return SimpleNamespace(
-            mixture=GaussianMixture([0.7, 0.3], means, covariances)[:max_components].normalised(),
-            place=SimpleNamespace(remarks=('cut at the left',) if mask[:, 0].any() else ()),
-            support=0.5,
-        )
-
-
-@pytest.fixture
-def stub_predictor(monkeypatch):
-    monkeypatch.setattr(bme_session, 'load_predictor', lambda path: StubPredictor())
-    monkeypatch.setattr(StubPredictor, 'asked', [])
-    monkeypatch.setattr(StubPredictor, 'fault', None)
-    return StubPredictor
-
-
-@pytest.fixture
-def outputs():
-    """What a session publishes."""
-    return []
-
-
-@pytest.fixture(scope='session')
-def body():
-    return load_body('human37')
-
-
-@pytest.fixture
-def subject_file(tmp_path):
-    lines = [f'stamp_ns: {START_NS}', 'sigma_px: 2.0', 'keypoints:']
-    lines += [f'  {name}: [{10 * i}.0, 20.0]' for i, name in enumerate(JOINTS)]
-    path = tmp_path / 'subject.yaml'
-    path.write_text('\n'.join(lines) + '\n')
-    return path
-
-
-@pytest.fixture
-def background_file(tmp_path):
-    path = tmp_path / 'background.png'
-    cv2.imwrite(str(path), np.full((48, 64, 3), 90, np.uint8))
-    return path
-
-
-@dataclass
-class Likelihoods:
-    """Messages of a filter whose person raises an arm; ten mixtures of two modes a second."""
-
-    body: Body = field(default_factory=lambda: load_body('human37'))
-    messages: RosbagsMessages = field(default_factory=RosbagsMessages)
-
-    def stamp(self, index):
-        return START_NS + round(index * FRAME_NS)
-
-    def body_message(self, index=0, body=None):
-        body = self.body if body is None else body
-        return message_of_body(self.messages, body, self.stamp(index), 'lens')
-
-    def mixture(self, index):
-        """A mixture over poses; the second mode is an elbow that bends more."""
-        means = np.tile(self.body.prior_mean, (2, 1))
-        means[:, 2] = 4.0
-        moving = self.body.dof_names.index('left_elbow')
-        means[:, moving] = 0.5 + 0.05 * index
-        means[1, moving] += 0.8
-        covariances = np.tile(1e-3 * np.eye(self.body.dimension), (2, 1, 1))
-        return GaussianMixture(np.array([0.6, 0.4]), means, covariances)
-
-    def nobody(self, index):
-        """A prediction from an image without a person."""
-        return self.messages.create(
-            'hmt_msgs/msg/PoseMixture',
-            header=header_message(self.messages, self.stamp(index), 'lens'),
-            kind=int(MixtureKind.PREDICTION),
-        )
-
-    def message(self, index, body=None, kind=MixtureKind.LIKELIHOOD):
-        body, mixture = self.body if body is None else body, self.mixture(index)
-        content = PoseMixture(
-            mixture=mixture,
-            body_model=body.name,
-            dof_names=body.dof_names,
-            joint_names=body.joint_names,
-            joint_positions=body.joint_positions(mixture.means),
-            kind=kind,
-            stamp_ns=self.stamp(index),
-            frame_id='lens',
-        )
-        return pose_mixture_message(self.messages, content)
-
-
-@pytest.fixture(scope='session')
-def likelihoods():
-    return Likelihoods()
 
 
 class World:
@@ -296,7 +46,8 @@ class World:
 
     def __init__(self, stderr, kind, name, inputs, **values):
         import rclpy
-        from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+        from diagnostic_msgs.msg import DiagnosticArray
+        from hmt_msgs.msg import Handled
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.parameter import Parameter
         from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -319,12 +70,12 @@ class World:
         }
         self.handled, self.diagnostics = [], []
         self.stderr, self.logged = stderr, ''
-        self.listen(DiagnosticStatus, f'{self.name}/handled', self.handled)
+        self.listen(Handled, f'{self.name}/handled', self.handled, read=handled_of)
         self.listen(DiagnosticArray, '/diagnostics', self.diagnostics)
 
-    def listen(self, kind, topic, into, qos=100):
+    def listen(self, kind, topic, into, qos=100, read=None):
         def receive(message):
-            into.append(message)
+            into.append(message if read is None else read(message))
 
         return self.other.create_subscription(kind, topic, receive, qos)
 
@@ -356,10 +107,10 @@ class World:
         self.publishers[source].publish(serialise(message))
         # A latched message may be handled in between.
         self.spin_until(
-            lambda: any(handled.name == source for handled in self.handled[count:]),
+            lambda: any(handled.source == source for handled in self.handled[count:]),
             f'an answer to {source}',
         )
-        return next(handled for handled in self.handled[count:] if handled.name == source)
+        return next(handled for handled in self.handled[count:] if handled.source == source)
 
     @staticmethod
     def of_ros(message):
@@ -514,8 +265,3 @@ def executable():
     for one in started:
         one.process.kill()
         one.process.communicate()
-
-
-def values_of(handled, key):
-    """Values of a key of what a node tells of a message."""
-    return [value.value for value in handled.values if value.key == key]

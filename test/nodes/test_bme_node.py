@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from hmt_ros.sessions.bme_parameters import BmeParameters
-from test.nodes.conftest import values_of
 
 pytestmark = pytest.mark.ros
 
@@ -42,7 +41,8 @@ def test_images_become_predictions(running, somebody):
     running.listen(PoseMixture, 'pose_prediction', found)
     running.spin_until(lambda: running.node._is_wanted('pose_prediction'))
     for message in (somebody.image(0), somebody.empty(1)):
-        assert len(values_of(running.send('image', message), 'pose_prediction')) == 1
+        ((topic, _),) = running.send('image', message).published
+        assert topic == 'pose_prediction'
     running.spin_until(lambda: len(found) == 2)
     assert [len(message.components) for message in found] == [2, 0]
     assert {message.kind for message in found} == {PoseMixture.PREDICTION}
@@ -85,9 +85,9 @@ def test_one_warning_for_each_kind_and_the_node_lives(running, somebody):
         (somebody.image, (0, 1)),
     ):
         for index in indices:
-            assert len(values_of(running.send('image', make(index)), 'fault')) == 1
+            assert len(running.send('image', make(index)).faults) == 1
     running.send('camera_info', somebody.uncalibrated())
-    assert values_of(running.send('image', somebody.image(9)), 'fault') == []
+    assert running.send('image', somebody.image(9)).faults == ()
     wanted = ('32x24 pixels', 'stamps that increase', 'reset_on_time_jump', 'not calibrated')
     running.spin_until(lambda: len(running.warnings()) >= len(wanted))
     for text, part in zip(running.warnings(), wanted, strict=True):
@@ -121,7 +121,7 @@ def test_lifecycle(world, somebody):
     assert one.change_state('activate')
     one.connect()
     one.send('camera_info', somebody.info())
-    assert values_of(one.send('image', somebody.image(0)), 'fault') == []
+    assert one.send('image', somebody.image(0)).faults == ()
     assert one.change_state('deactivate')
     assert one.change_state('cleanup')
     assert one.state == 'unconfigured'

@@ -7,8 +7,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from test.nodes.conftest import values_of
-
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -27,11 +25,9 @@ def running(stub_tracker, subject_file, world_of):
 @pytest.fixture
 def smoother(world_of):
     """A smoother to which nobody publishes mixtures."""
-    from hmt_msgs.msg import Body
-
     from hmt_ros.nodes.smoother_node import SmootherNode
 
-    return world_of(SmootherNode, 'smoother_node', {'body': Body}).start()
+    return world_of(SmootherNode, 'smoother_node', {}).start()
 
 
 def best_effort():
@@ -46,10 +42,9 @@ def transient_local():
     return QoSProfile(depth=5, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def test_publisher_that_does_not_fit_is_one_warning_with_topic_and_policy(smoother, likelihoods):
+def test_publisher_that_does_not_fit_is_one_warning_with_topic_and_policy(smoother):
     from hmt_msgs.msg import PoseMixture
 
-    smoother.send('body', likelihoods.body_message())
     wrong = [
         smoother.other.create_publisher(PoseMixture, 'likelihood_mixture', best_effort())
         for _ in range(2)
@@ -86,7 +81,7 @@ def test_subscription_that_does_not_fit_is_one_warning(smoother):
 
 
 def test_lost_messages_are_told_once_and_counted():
-    from hmt_ros.nodes.middleware_events import MiddlewareEvents
+    from hmt_ros.nodes.diagnostics import MiddlewareEvents
 
     texts = []
     events = MiddlewareEvents(texts.append)
@@ -107,7 +102,7 @@ def test_lost_messages_are_told_once_and_counted():
 
 
 def test_other_types_and_unknown_policies_are_told():
-    from hmt_ros.nodes.middleware_events import MiddlewareEvents
+    from hmt_ros.nodes.diagnostics import MiddlewareEvents
 
     texts = []
     events = MiddlewareEvents(texts.append)
@@ -167,7 +162,7 @@ def test_errors_of_the_node_itself_are_in_the_diagnostics(running, small_camera,
     stub_tracker.fault = TypeError('a fault of ours')
     # Whoever waits for an answer gets one.
     handled = running.send('image', small_camera.image(1))
-    assert values_of(handled, 'fault') == ['the node itself failed: TypeError: a fault of ours']
+    assert handled.faults == ('the node itself failed: TypeError: a fault of ours',)
     values = running.diagnosis()[2]
     assert values['errors of the node itself'] == '1'
     assert values['last error of the node itself'] == 'TypeError: a fault of ours'
@@ -217,7 +212,7 @@ def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):
     events = running.node._events.of_publisher('/tf')
     events.incompatible_qos(SimpleNamespace(total_count_change=1, last_policy_kind=2))
     page = (ROOT / 'docs' / 'nodes.md').read_text('utf-8')
-    table = page.partition('## What all nodes tell')[2].partition('| key |')[2]
+    table = page.partition('## Diagnostics')[2].partition('| key |')[2]
     cells = [line.split('|')[1] for line in table.partition('\n\n')[0].splitlines()[2:]]
     explained = {key for cell in cells for key in re.findall('`([^`]+)`', cell)}
     patterns = {
@@ -251,5 +246,5 @@ def test_messages_beyond_the_limit_are_not_even_read(running, small_camera, monk
     running.spin_until(lambda: len(running.handled) > count, 'an answer')
     assert re.fullmatch(
         r'message of image can not be read: it has 9\d{3} bytes, the limit is 5000',
-        running.handled[-1].message,
+        running.handled[-1].faults[0],
     )

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.track_messages import TOPICS
 from msg_tools.messages.cdr import serialise
-from test.nodes.conftest import PATIENCE, values_of
+from test.nodes.conftest import PATIENCE
 
 pytestmark = pytest.mark.ros
 
@@ -44,11 +43,11 @@ def running(world):
 
 
 def faults(handled):
-    return values_of(handled, 'fault')
+    return list(handled.faults)
 
 
 def published(handled):
-    return [value.key for value in handled.values if value.key in TOPICS]
+    return [topic for topic, _ in handled.published]
 
 
 @pytest.fixture
@@ -80,8 +79,8 @@ def test_images_become_messages(running, small_camera):
     running.spin_until(lambda: running.node._is_wanted('/tf'))
     running.send('camera_info', small_camera.info())
     first = running.send('image', small_camera.image(0))
-    assert first.name == 'image'
-    assert (first.values[0].key, first.values[0].value) == ('stamp', str(small_camera.stamp(0)))
+    assert first.source == 'image'
+    assert first.stamp_ns == small_camera.stamp(0)
     # What nobody listens to is not made.
     assert published(first) == [*STARTS, 'pose_mixture', '/tf']
     assert published(running.send('image', small_camera.image(1))) == ['pose_mixture', '/tf']
@@ -126,7 +125,7 @@ def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
         ({'max_hypotheses': 0}, 'out of range. Min: 1, Max: 64, value: 0'),
         ({'max_hypotheses': 20}, 'max_hypotheses <= candidates, saw 20 and 16'),
         ({'proposals': 'guess'}, "saw 'guess'"),
-        ({'likelihood__edges__sigma': 0.0}, 'sigma > 0'),
+        ({'jump_probability': 0.0}, 'jump_probability must lie in (0, 1)'),
         ({'subject_file': str(tmp_path / 'none.yaml')}, 'none.yaml: can not be read'),
         ({'background_file': str(tmp_path / 'two\nlines')}, 'two lines: can not be read'),
         ({'body_model': 'nobody'}, "no body 'nobody'"),
@@ -235,7 +234,7 @@ def test_lifecycle(world, small_camera):
     one.connect()
     # The track and the camera are those of before.
     assert faults(one.send('image', small_camera.image(1))) == []
-    assert one.node._session.state.images['tracked'] == 2
+    assert one.node._session.state.counts['tracked'] == 2
     assert one.change_state('deactivate')
     assert one.change_state('cleanup')
     assert one.state == 'unconfigured'
@@ -281,7 +280,7 @@ def test_reset_counts_though_the_node_is_deactivated(world, small_camera, held_e
     assert one.change_state('deactivate')
     assert session.start is not before
     assert session.state.status == 'waiting'
-    assert session.state.images == {'received': 2, 'tracked': 1, 'dropped': 1}
+    assert session.state.counts == {'received': 2, 'tracked': 1, 'dropped': 1}
 
 
 def test_reset(running, small_camera, stub_tracker, subject_file, body):
@@ -339,10 +338,10 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
     assert one.state == 'active'
     assert one.set(overlay_modes=1) == (True, '')
     go.set()
-    one.spin_until(lambda: one.node._session.state.images['tracked'] == 3)
+    one.spin_until(lambda: one.node._session.state.counts['tracked'] == 3)
     stamps = [stamp for stamp, _ in stub_tracker.made[0].seen]
     assert stamps == [small_camera.stamp(index) for index in (0, 10, 11)]
-    assert one.node._session.state.images == {'received': 12, 'tracked': 3, 'dropped': 9}
+    assert one.node._session.state.counts == {'received': 12, 'tracked': 3, 'dropped': 9}
     one.spin_until(lambda: any('late: 9 images' in d.status[0].message for d in one.diagnostics))
     level, _, values = one.diagnosis()
     assert values['images dropped'] == '9'

@@ -11,10 +11,10 @@ from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.energy import Derivatives
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
 from hmt_ros.smoothing.image_sequence import ImageSequence
-from hmt_ros.smoothing.likelihood import Curvature
 
 NAMES = ('pelvis', 'neck', 'left_knee', 'right_knee', 'left_ankle', 'right_ankle', 'left_elbow',
          'right_elbow', 'left_wrist', 'right_wrist')  # fmt: skip
@@ -41,7 +41,7 @@ def walk():
 def test_energies_are_those_of_the_likelihood(walk):
     _, sequence, poses = walk
     times = np.array([3, 0, 3])
-    value, gradient, hessian = sequence.energy(poses[times], times, Curvature.EXACT)
+    value, gradient, hessian = sequence.energy(poses[times], times, derivatives=Derivatives.EXACT)
     for i, t in enumerate(times):
         v, g, h = sequence.likelihood.energy(poses[[t]], sequence.observations[t])
         assert value[i] == pytest.approx(v[0])
@@ -62,8 +62,8 @@ def test_smoothing_on_images_explains_them_better_and_within_limits(walk):
     found = smoother.smooth(mixtures, observation=sequence)
     times = np.arange(5)
     start = np.array([m.means[0] for m in mixtures])
-    before = sequence.energy(start, times, Curvature.NONE)[0].sum()
-    after = sequence.energy(found.means[0], times, Curvature.NONE)[0].sum()
+    before = sequence.energy(start, times).value.sum()
+    after = sequence.energy(found.means[0], times).value.sum()
     assert after < before
     assert ((found.means >= body.lower) & (found.means <= body.upper)).all()
     assert np.isfinite(found.log_joint).all()

@@ -8,6 +8,9 @@ from scipy.stats import multivariate_normal
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother, TrajectoryMixture
+from hmt_ros.smoothing.mixture_smoother import LONG
+from hmt_ros.smoothing.mode_sequence import ModeSequence
+from hmt_ros.smoothing.trajectory_refinement import refine
 from msg_tools import RosbagsMessages
 from msg_tools.messages import trajectory_mixtures
 
@@ -231,3 +234,30 @@ def test_errors_that_last_leave_less_evidence(modes, walk):
         MixtureSmoother(walk, error_correlation=-1.0)
     with pytest.raises(ValueError, match='share of the evidence'):
         independent.tempered(0.0)
+
+
+def test_parts_of_a_long_sequence_lead_to_the_same_optima(modes):
+    """Refined first where paths leave the best one, or at once."""
+    mixtures = tuple(modes(2.0, times=LONG + 20))
+    dynamics = LinearGaussianDynamics.random_walk([0.5, 0.5])
+    sequence = ModeSequence(mixtures, dynamics, np.ones(len(mixtures) - 1))
+    found = MixtureSmoother(dynamics, -9.0, 9.0, max_trajectories=9).optima(
+        sequence, sequence.likelihood
+    )
+    starts = sequence.states(sequence.paths(9))
+    best = refine(starts[:1], sequence.prior, sequence.likelihood, -9.0, 9.0)
+    shared = sequence.paths(9).nodes == sequence.paths(9).nodes[0]
+    starts = np.where(shared[:, :, None], best.states, starts)
+    whole = refine(starts, sequence.prior, sequence.likelihood, -9.0, 9.0).without_duplicates()
+    # A minimum is found to 1e-6 nats, which is this far in units of its deviations.
+    np.testing.assert_allclose(found.states[: len(whole)], whole.states, atol=5e-3)
+
+
+def test_a_part_has_the_slope_of_the_whole(modes):
+    dynamics = LinearGaussianDynamics.constant_velocity([1.0, 2.0], 1.5)
+    prior = dynamics.prior(np.array([0.5, 1.0, 0.7, 1.0, 1.0]))
+    x = np.random.default_rng(0).normal(size=(6, 4))
+    slope = prior.energy(x[None])[1][0]
+    for first, last in ((0, 3), (2, 5), (3, 6)):
+        part = prior.between(first, last, x).energy(x[None, first:last])[1][0]
+        np.testing.assert_allclose(part, slope[first:last], atol=1e-10)

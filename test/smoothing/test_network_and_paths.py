@@ -10,9 +10,10 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, multivariate_t
 
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.smoothing import LinearGaussianDynamics
 from hmt_ros.smoothing.embedded_network import _log_mode, embedded_network, sampled_network
-from hmt_ros.smoothing.mode_sequence import ModeSequence, merge_close_modes
+from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.paths import (
     diverse_subset,
     k_best_paths,
@@ -159,7 +160,8 @@ def test_one_time_and_one_mode(walk):
 
 
 def test_merging_keeps_the_moments_and_leaves_no_close_pair(modes):
-    for mixture, found in zip(modes(0.6, k=6), merge_close_modes(modes(0.6, k=6), 2.0)):
+    for mixture in modes(0.6, k=6):
+        found = merged_if_close(mixture, 2.0)
         assert len(found) < len(mixture)
         assert found.weights.sum() == pytest.approx(mixture.weights.sum())
         np.testing.assert_allclose(found.mean(), mixture.mean())

@@ -9,8 +9,9 @@ import pytest
 from scipy.optimize import minimize
 
 from hmt_ros.inference import GaussianMixture, Status
+from hmt_ros.inference.energy import Derivatives, Energy
 from hmt_ros.smoothing import LinearGaussianDynamics
-from hmt_ros.smoothing.likelihood import Curvature, MixtureLikelihood
+from hmt_ros.smoothing.likelihood import MixtureLikelihood
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.path_gaussians import path_gaussians
 from hmt_ros.smoothing.trajectory_refinement import refine
@@ -27,29 +28,29 @@ def energy_of(sequence: ModeSequence):
     def function(flat):
         x = flat.reshape(1, times, n)
         value, gradient = prior.energy(x)
-        seen, slope, _ = likelihood.energy(x[0, :, :d], np.arange(times), Curvature.NONE)
+        seen, slope, _ = likelihood.energy(x[0, :, :d], np.arange(times))
         gradient[0, :, :d] += slope
         return value[0] + seen.sum(), gradient.reshape(-1)
 
     return function
 
 
-@pytest.mark.parametrize('curvature', [Curvature.POSITIVE, Curvature.EXACT])
-def test_likelihood_of_mixtures(modes, curvature):
+@pytest.mark.parametrize('derivatives', [Derivatives.POSITIVE, Derivatives.EXACT])
+def test_likelihood_of_mixtures(modes, derivatives):
     mixtures = modes(1.0)
     likelihood = MixtureLikelihood.of(mixtures)
     rng = np.random.default_rng(0)
     x, times = rng.normal(size=(30, 2)), rng.integers(0, 5, 30)
-    value, gradient, hessian = likelihood.energy(x, times, curvature)
+    value, gradient, hessian = likelihood.energy(x, times, derivatives=derivatives)
     expected = [-mixtures[t].log_density(p[None])[0] for t, p in zip(times, x)]
     np.testing.assert_allclose(value, expected, atol=1e-12)
     for a, step in enumerate(1e-6 * np.eye(2)):
-        up = likelihood.energy(x + step, times, Curvature.NONE)
-        down = likelihood.energy(x - step, times, Curvature.NONE)
+        up = likelihood.energy(x + step, times, derivatives=Derivatives.GRADIENT)
+        down = likelihood.energy(x - step, times, derivatives=Derivatives.GRADIENT)
         np.testing.assert_allclose(gradient[:, a], (up[0] - down[0]) / 2e-6, atol=1e-7)
-        if curvature == Curvature.EXACT:
+        if derivatives == Derivatives.EXACT:
             np.testing.assert_allclose(hessian[:, a], (up[1] - down[1]) / 2e-6, atol=1e-7)
-    if curvature == Curvature.POSITIVE:
+    if derivatives == Derivatives.POSITIVE:
         assert np.linalg.eigvalsh(hessian).min() > 0
 
 
@@ -162,12 +163,12 @@ class Bearings:
     def times(self) -> int:
         return len(self.angles)
 
-    def energy(self, poses, times, curvature):
-        away = (poses**2).sum(1)
-        residual = (np.arctan2(poses[:, 1], poses[:, 0]) - self.angles[times]) / self.sigma
-        jacobian = np.stack([-poses[:, 1], poses[:, 0]], axis=1) / away[:, None] / self.sigma
-        hessian = jacobian[:, :, None] * jacobian[:, None, :] if curvature else None
-        return 0.5 * residual**2, residual[:, None] * jacobian, hessian
+    def energy(self, x, rows, *, derivatives=Derivatives.POSITIVE):
+        away = (x**2).sum(1)
+        residual = (np.arctan2(x[:, 1], x[:, 0]) - self.angles[rows]) / self.sigma
+        jacobian = np.stack([-x[:, 1], x[:, 0]], axis=1) / away[:, None] / self.sigma
+        hessian = jacobian[:, :, None] * jacobian[:, None, :]
+        return Energy(0.5 * residual**2, residual[:, None] * jacobian, hessian)
 
 
 def test_any_object_with_value_gradient_and_hessian_is_a_likelihood():

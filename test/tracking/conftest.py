@@ -9,7 +9,7 @@ import pytest
 
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.camera import Viewpoint
-from hmt_ros.image.observation import Keypoints
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene

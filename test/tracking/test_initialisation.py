@@ -9,7 +9,8 @@ from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.image.likelihood import LikelihoodSettings
-from hmt_ros.image.observation import Keypoints, observe
+from hmt_ros.image.observation import observe
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking.initialisation import (
@@ -177,7 +178,7 @@ def test_poses_from_an_outline(human32, camera, walk):
     """Everywhere as high as the silhouette and in its middle, one every 45 degrees."""
     (mask,) = render_silhouettes(human32, walk[:1], camera)
     image = np.zeros((camera.height, camera.width, 3), np.uint8)
-    outline = observe(image, mask, wanted=()).outline
+    outline = observe(image, mask, wanted=('coverage',)).outline
     poses = poses_from_outline(human32, camera, outline)
     assert poses.shape == (8, human32.dimension)
     headings = poses[:, human32.dof_names.index('root_z')]

@@ -9,16 +9,14 @@ import pytest
 
 from hmt_ros.body import Body, load_body
 from hmt_ros.image.background import BackgroundModel
-from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings, TermSettings
-from hmt_ros.image.observation import Keypoints, Observation
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.energy import Derivatives, Energy
 from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.dynamics import DynamicsSettings
 
-OFF = TermSettings(0.0, 1.0, 1.0)
-ONLY_KEYPOINTS = LikelihoodSettings(
-    containment=OFF, coverage=OFF, edges=OFF, intensity=OFF, motion=OFF
-)
+ONLY_KEYPOINTS = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
 FRAME = 100_000_000  # ns
 
 
@@ -145,13 +143,12 @@ def test_heaviest_modes_explain_the_joints(follow, camera, human32, motion, keyp
 def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     follow, camera, human32, motion, keypoints_of
 ):
-    """exp(-temperature * energy) at the modes of the posterior, normalised."""
-    tracker, mixtures, _ = follow(frames=4, temperature=0.4)
+    """exp(-beta * energy) at the modes of the posterior, normalised."""
+    tracker, mixtures, _ = follow(frames=4, inverse_temperature=0.4)
     posterior, likelihood = mixtures[-1]
     seen = Observation(keypoints=keypoints_of(human32, motion[3], 1.0, 3))
-    energies, _, _ = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).energy(
-        posterior.means, seen
-    )
+    likelihood_of = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).given(seen)
+    energies = likelihood_of.energy(posterior.means).value
     weights = np.exp(-0.4 * (energies - energies.min()))
     assert np.allclose(likelihood.weights, np.sort(weights / weights.sum())[::-1], atol=1e-12)
 
@@ -242,9 +239,7 @@ def test_components_without_weight_start_too(human32, camera, black, motion, key
 def test_modes_move_on_where_nothing_is_seen(human32, camera, black, motion, keypoints_of):
     """Keypoints of 10^5 px say nothing: modes go where their velocities take them, share kept."""
     free = replace(ONLY_KEYPOINTS, prior_weight=0.0, self_intersection_sigma=np.inf)
-    settings = keypoint_settings(
-        likelihood=free, max_hypotheses=1, dynamics=DynamicsSettings(velocity_kept=0.8)
-    )
+    settings = keypoint_settings(likelihood=free, max_hypotheses=1, velocity_kept=0.8)
     tracker = Tracker(human32, camera, settings)
     pose = motion[0].copy()
     start = GaussianMixture(np.ones(1), pose[None], 1e-4 * np.eye(len(pose))[None])
@@ -263,9 +258,7 @@ def test_modes_move_on_where_nothing_is_seen(human32, camera, black, motion, key
     wanted = np.clip(wanted, human32.lower, human32.upper)
     assert np.abs(posterior.means[0] - wanted).max() < 1e-4
     # At rest after the same, a random walk stays.
-    settings = keypoint_settings(
-        likelihood=free, max_hypotheses=1, dynamics=DynamicsSettings(model='random_walk')
-    )
+    settings = keypoint_settings(likelihood=free, max_hypotheses=1, velocity_kept=0.0)
     still = Tracker(human32, camera, settings)
     still.reset(start)
     for i in range(3):
@@ -298,7 +291,7 @@ def jumped(motion):
 
 
 def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion, keypoints_of):
-    tracker = started(surprise=1e9, lost_images=2)
+    tracker = started(energy_rise=1e9, lost_images=2)
     other = jumped(motion)
     seen, misfits, errors = [], [], []
     for i in range(8):
@@ -344,7 +337,7 @@ def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, mot
     other = jumped(motion)
     errors = {}
     for given in (False, True):
-        tracker = started(surprise=1e9, lost_images=2)
+        tracker = started(energy_rise=1e9, lost_images=2)
         statuses = []
         for i in range(6):
             seen = keypoints_of(human32, motion[i] if i < 3 else other, 1.0, i)
@@ -364,7 +357,7 @@ def test_predictions_are_among_the_hypotheses(human32, started, black, motion, k
     """Search is off: nothing else finds the jump in its image."""
     errors = {}
     for given in (False, True):
-        tracker = started(surprise=1e9)
+        tracker = started(energy_rise=1e9)
         for i in range(4):
             pose = motion[i] if i < 3 else jumped(motion)
             prediction = predicted(human32, pose) if given else None
@@ -516,3 +509,28 @@ def test_a_dark_image_without_keypoints(human32, camera):
     posterior, likelihood = tracker.step(np.zeros((camera.height, camera.width, 3), np.uint8), 0)
     assert posterior.weights.sum() == pytest.approx(1.0)
     assert likelihood.weights.sum() == pytest.approx(1.0)
+
+
+class KnownHeight:
+    """A term that only knows how high above the floor the root is."""
+
+    def __init__(self, height: float) -> None:
+        self.height = height
+
+    def energy(self, frames, rows, *, derivatives=Derivatives.POSITIVE):
+        n, d = frames.poses.shape
+        offset = frames.poses[:, 1] - self.height
+        gradient, hessian = np.zeros((n, d)), np.zeros((n, d, d))
+        gradient[:, 1], hessian[:, 1, 1] = 1e8 * offset, 1e8
+        value = 0.5e8 * offset**2
+        return Energy(value, gradient, hessian) if derivatives else Energy(value)
+
+
+def test_a_further_term_takes_part_in_the_posterior(human32, camera, black, motion, subject):
+    height = motion[0, 1] + 0.1
+    tracker = Tracker(human32, camera, keypoint_settings(), extra=[KnownHeight(height)])
+    tracker.reset(subject)
+    posterior, likelihood = tracker.step(black, 0)
+    for mixture in (posterior, likelihood):
+        assert mixture.means[:, 1] == pytest.approx(np.full(len(mixture), height), abs=1e-3)
+        assert (mixture.covariances[:, 1, 1] < 1e-7).all()

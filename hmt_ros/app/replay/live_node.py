@@ -1,9 +1,9 @@
 """Real nodes in processes of their own, fed over DDS in lock step.
 
-Every message is published as it is in the bag; the next one follows when the node has told on
-`~/handled` what became of it and all that it published has arrived. Nothing is lost and nothing
-overtakes, so what comes out does not depend on how fast the machine is. The nodes run in the domain
-of their player, which nobody else uses.
+Each message is published as it is in the bag; the next one follows when the node has reported on
+`~/handled` how it handled the message and all that it published has arrived. No message is lost and
+none overtakes another, so the result does not depend on the speed of the machine. The nodes run in
+the domain of their player, which nobody else uses.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from typing import Any
 import hmt_ros
 from hmt_ros.app.replay.player import LiveNodeError, Player, environment
 from hmt_ros.sessions.declared_parameters import values_of
-from hmt_ros.sessions.handled import Handled
+from hmt_ros.sessions.handled import HANDLED, Handled, handled_of
 from hmt_ros.sessions.parameter_file import yaml_scalar
-from hmt_ros.sessions.published_topic import SUBSCRIBERS, PublishedTopic
+from hmt_ros.sessions.session import SUBSCRIBERS, PublishedTopic
 from msg_tools.messages.cdr import canonical, deserialise, serialise
 
-# Generous: they end a replay that hangs. A node that ends is noticed at once.
+# Long limits, which end a replay that hangs. The end of a node is noticed at once.
 START_SECONDS = 120.0
 MESSAGE_SECONDS = 600.0  # the first image may have to wait until kernels are compiled
 STOP_SECONDS = 20.0
@@ -37,17 +37,17 @@ class LiveNode:
     """A running node.
 
     Args:
-        player: who talks to it.
-        opened: ends it.
-        name: of the node, 'filter_node' for example.
-        parameters: of the node.
-        inputs: topic and type by source, of what is published for it.
-        topics: that it publishes.
-        sensors: topics that it would take from sensors, which may lose data; a replay may not.
-        latched: inputs of which a subscriber that comes late wants the last message.
-        namespace: of the node and of all its topics, '/humans/bodies/7' for example.
-        module: that runs it; empty: the one in `hmt_ros.nodes` with its name.
-        write: takes topic, stamp and bytes of all that the node publishes, in its order.
+        player: the participant that publishes for the node and subscribes to it.
+        opened: stack that ends the node.
+        name: name of the node, 'filter_node' for example.
+        parameters: parameters of the node.
+        inputs: topic and type of the messages for the node, by source.
+        topics: topics that the node publishes.
+        sensors: topics with the QoS of sensor data, which may lose messages; here they are
+            reliable.
+        namespace: namespace of the node and of all its topics, '/humans/bodies/7' for example.
+        module: module that runs the node; empty: the one in `hmt_ros.nodes` with its name.
+        write: takes topic, stamp and bytes of each message of the node, in its order.
 
     Raises:
         LiveNodeError: the node does not start.
@@ -63,7 +63,6 @@ class LiveNode:
         inputs: Mapping[str, tuple[str, str]],
         topics: Mapping[str, PublishedTopic],
         sensors: tuple[str, ...] = (),
-        latched: tuple[str, ...] = (),
         namespace: str = '',
         module: str = '',
         write: Callable[[str, int, bytes], None],
@@ -75,7 +74,7 @@ class LiveNode:
         self._arrived: dict[str, deque[bytes]] = {topic: deque() for topic in topics}
         self._answers: deque[bytes] = deque()
         self._process: subprocess.Popen[bytes] | None = None
-        self._open_topics(inputs, latched)
+        self._open_topics(inputs)
         opened.callback(self.stop)
         self._process = self._start(parameters, sensors)
 
@@ -84,34 +83,35 @@ class LiveNode:
         self.publish_bytes(source, serialise(message))
 
     def publish_bytes(self, source: str, data: bytes) -> None:
-        """Hands over what may be a message."""
+        """Hands over bytes, which need not be a message."""
         self._publishers[source].publish(data)
 
     @property
     def has_answered(self) -> bool:
-        """Whether `answer` would not wait for an answer."""
+        """Whether an answer has arrived, for which `answer` need not wait."""
         return bool(self._answers)
 
     def answer(self, source: str, seconds: float | None = None) -> Handled:
-        """Waits for what became of the next message, and writes what it led to.
+        """Waits until the next message is handled, and writes what the node has published.
 
         Args:
-            source: of the message.
-            seconds: that it may take; None: `MESSAGE_SECONDS`.
+            source: source of the message.
+            seconds: longest time to wait; None: `MESSAGE_SECONDS`.
 
         Raises:
             LiveNodeError: the node has ended, or does not answer.
         """
         patience = MESSAGE_SECONDS if seconds is None else seconds
-        handled = self._handled(self._next(self._answers, patience, f'an answer to a {source}'))
+        answer = self._next(self._answers, patience, f'an answer to a {source}')
+        handled = handled_of(deserialise(answer, HANDLED))
         for topic, stamp in handled.published:
             data = self._next(self._arrived[topic], START_SECONDS, f'{topic} of {stamp} ns')
-            # On its way a message may get bytes behind its end, up to a multiple of four.
+            # DDS may pad a message to a multiple of four bytes.
             self._write(topic, stamp, canonical(data, self._topics[topic].msgtype))
         return handled
 
     def deactivate(self) -> None:
-        """Has the node come to the end of what it does.
+        """Deactivates the node, which then finishes its work.
 
         Raises:
             LiveNodeError: it does not.
@@ -124,10 +124,10 @@ class LiveNode:
             raise LiveNodeError(f'the {self.title} can not be deactivated: {self._last_words()}')
 
     def call(self, kind: Any, service: str, **fields: Any) -> Any:
-        """The answer of one of its services, 'change_state' for example.
+        """The answer of a service of the node, 'change_state' for example.
 
         Raises:
-            LiveNodeError: none comes.
+            LiveNodeError: there is no answer.
         """
         client = self._player.node.create_client(kind, f'/{self.full_name}/{service}')
         try:
@@ -140,24 +140,24 @@ class LiveNode:
 
     @property
     def process(self) -> subprocess.Popen[bytes]:
-        """In which it runs."""
+        """The process of the node."""
         assert self._process is not None
         return self._process
 
     def output(self) -> str:
-        """All that it has written to its console."""
+        """All that the node has written to its console."""
         return self._output.read_text('utf-8', 'replace')
 
     @property
     def title(self) -> str:
-        """What one calls it."""
+        """Name of the node in messages."""
         return self.name.replace('_', ' ')
 
     def wait_until_active(self) -> None:
-        """Returns when the node is active and both sides know all topics of each other.
+        """Returns when the node is active and subscribes to all its inputs.
 
         Raises:
-            LiveNodeError: it does not get active.
+            LiveNodeError: it does not become active.
         """
         self._wait(self._state.service_is_ready, START_SECONDS, 'the node')
         label = ''
@@ -176,7 +176,7 @@ class LiveNode:
         )
 
     def wait_until_heard(self, sources: tuple[str, ...], count: int) -> None:
-        """Returns when so many nodes, this one among them, hear what is published for it.
+        """Returns when a number of nodes, including this one, subscribe to some of its inputs.
 
         Raises:
             LiveNodeError: they do not.
@@ -185,14 +185,14 @@ class LiveNode:
         self._wait(
             lambda: all(one.get_subscription_count() >= count for one in publishers),
             START_SECONDS,
-            f'who hears {", ".join(sources)}',
+            f'subscribers of {", ".join(sources)}',
         )
 
     def wait_for_subscribers(self, topics: tuple[str, ...], count: int) -> None:
-        """Returns when so many others, this player among them, are connected to topics of the node.
+        """Returns when a number of subscribers, including this player, are connected to topics.
 
-        The graph does not tell: who is known to it may not have met the publisher yet. The node
-        itself does, in its diagnostics.
+        The node itself reports the number in its diagnostics; the graph may list subscribers that
+        are not connected yet.
 
         Raises:
             LiveNodeError: they are not.
@@ -202,14 +202,10 @@ class LiveNode:
             values = self._player.diagnostics.get(self.full_name, {})
             return all(int(values.get(f'{SUBSCRIBERS}{x}', '0')) >= count for x in topics)
 
-        self._wait(
-            connected,
-            START_SECONDS,
-            f'who listens to {", ".join(topics)}',
-        )
+        self._wait(connected, START_SECONDS, f'subscribers of {", ".join(topics)}')
 
     def stop(self) -> int | None:
-        """Ends the node as the interrupt key would; its exit code."""
+        """Ends the node as the interrupt key does, and gives its exit code."""
         process = self._process
         if process is None:
             return None
@@ -225,7 +221,7 @@ class LiveNode:
         """Ends the node.
 
         Raises:
-            LiveNodeError: it does not end as it should.
+            LiveNodeError: its exit code is not 0.
         """
         code = self.stop()
         if code != 0:
@@ -233,7 +229,7 @@ class LiveNode:
 
     def _start(self, parameters: Any, sensors: tuple[str, ...]) -> subprocess.Popen[bytes]:
         values = {name: yaml_scalar(value) for name, value in values_of(parameters).items()}
-        # The last line that it says is to be the one that matters.
+        # Without status lines the last line of its output is the one that matters.
         values['status_interval'] = '0'
         for topic in sensors:
             values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
@@ -275,7 +271,7 @@ class LiveNode:
     def _topic(self, name: str) -> str:
         return name if name.startswith('/') else f'{self._namespace}/{name}'
 
-    def _open_topics(self, inputs: Mapping[str, tuple[str, str]], latched: tuple[str, ...]) -> None:
+    def _open_topics(self, inputs: Mapping[str, tuple[str, str]]) -> None:
         from lifecycle_msgs.srv import GetState
 
         player, node = self._player, self._player.node
@@ -283,7 +279,7 @@ class LiveNode:
             source: node.create_publisher(
                 player.classes[msgtype],
                 self._topic(topic),
-                player.latched if source in latched else player.reliable,
+                player.reliable,
             )
             for source, (topic, msgtype) in inputs.items()
         }
@@ -296,13 +292,13 @@ class LiveNode:
                 raw=True,
             )
         node.create_subscription(
-            player.classes['diagnostic_msgs/msg/DiagnosticStatus'],
+            player.classes[HANDLED],
             f'/{self.full_name}/handled',
             _into(self._answers),
             player.reliable,
             raw=True,
         )
-        # The last of all: discovery tells the node of the topics above before it tells of this.
+        # Created last: discovery announces the topics above to the node before this client.
         self._state = node.create_client(GetState, f'/{self.full_name}/get_state')
         self._state_request = GetState.Request()
 
@@ -327,25 +323,13 @@ class LiveNode:
                 )
 
     def _last_words(self) -> str:
-        """The last line that the node has written."""
+        """The last line of the output of the node."""
         lines = [line.strip() for line in self.output().splitlines() if line.strip()]
-        return lines[-1] if lines else 'it has said nothing'
-
-    def _handled(self, data: bytes) -> Handled:
-        """What a message on ~/handled says."""
-        message = deserialise(data, 'diagnostic_msgs/msg/DiagnosticStatus')
-        pairs = [(str(value.key), str(value.value)) for value in message.values]
-        return Handled(
-            source=str(message.name),
-            stamp_ns=int(dict(pairs)['stamp']),
-            faults=tuple(text for key, text in pairs if key == 'fault'),
-            warnings=tuple(text for key, text in pairs if key == 'warning'),
-            published=tuple((key, int(text)) for key, text in pairs if key in self._topics),
-        )
+        return lines[-1] if lines else 'it has written nothing'
 
 
 def _into(queue: deque[bytes]) -> Callable[[bytes], None]:
-    """A callback; rclpy wants one whose signature it can read."""
+    """A callback that appends to a queue; rclpy inspects its signature."""
 
     def receive(data: bytes) -> None:
         queue.append(data)

@@ -1,4 +1,4 @@
-"""Who talks to real nodes: a node of ROS in a domain that nobody else uses, on this machine."""
+"""The player, a ROS node that feeds the real nodes, in a domain of its own on this machine."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import Any
 
 
 class LiveNodeError(ValueError):
-    """A node did not start, or does not answer; one line."""
+    """A node did not start or does not answer; one line."""
 
 
 class Player:
-    """Somebody in a ROS domain of their own who talks to nodes.
+    """A ROS node in a domain of its own that publishes for other nodes and subscribes to them.
 
     Args:
-        opened: closes what is opened here.
+        opened: stack that closes it.
 
     Raises:
         LiveNodeError: there is no ROS.
@@ -30,8 +30,8 @@ class Player:
         self.domain = opened.enter_context(reserved_domain())
         try:
             import rclpy
-            from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-            from hmt_msgs.msg import Body, Keypoints2D, PoseMixture, TrajectoryMixture
+            from diagnostic_msgs.msg import DiagnosticArray
+            from hmt_msgs.msg import Body, Handled, Keypoints2D, PoseMixture, TrajectoryMixture
             from rclpy.executors import SingleThreadedExecutor
             from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
             from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
@@ -43,7 +43,7 @@ class Player:
                 f'--live needs a sourced ROS 2 workspace ({error}): source install/setup.bash'
             ) from error
         kinds = (
-            Body, CameraInfo, CompressedImage, DiagnosticStatus, Image, JointState, Keypoints2D,
+            Body, CameraInfo, CompressedImage, Handled, Image, JointState, Keypoints2D,
             MarkerArray, PoseMixture, String, TFMessage, TrajectoryMixture,
         )  # fmt: skip
         self.classes: dict[str, Any] = {
@@ -64,7 +64,7 @@ class Player:
         self.executor = SingleThreadedExecutor(context=context)
         opened.callback(self.executor.shutdown)
         self.executor.add_node(self.node)
-        # The values of the diagnostics of each node, by its name.
+        # Newest diagnostics of each node, by its name.
         self.diagnostics: dict[str, dict[str, str]] = {}
 
         def diagnosed(message: DiagnosticArray) -> None:
@@ -77,9 +77,9 @@ class Player:
 
 @contextmanager
 def reserved_domain() -> Iterator[int]:
-    """Number of a ROS domain that no other replay or test run on this machine uses.
+    """A ROS domain that no other replay or test run on this machine uses.
 
-    A domain is taken while port 32768 + domain is bound, as ament's domain_coordinator does it.
+    As in ament's domain_coordinator, a domain is in use while port 32768 + domain is bound.
     """
     for offset in range(100):
         domain = 1 + (os.getpid() + offset) % 100
@@ -94,13 +94,13 @@ def reserved_domain() -> Iterator[int]:
 
 
 def environment(domain: int) -> dict[str, str]:
-    """What a process needs to be in a domain, on this machine only."""
+    """Environment variables of a process in a domain, on this machine only."""
     return {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 
 
 @contextmanager
 def changed_environment(changes: dict[str, str]) -> Iterator[None]:
-    """This process with other environment variables for a while."""
+    """Changes environment variables of this process for a while."""
     before = {name: os.environ.get(name) for name in changes}
     os.environ.update(changes)
     try:

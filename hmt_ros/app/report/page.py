@@ -1,7 +1,7 @@
-"""One HTML page that shows the mixtures of a bag, and needs nothing but a browser.
+"""One HTML page that shows the mixtures in a bag, and needs nothing but a browser.
 
-Data, style and program stand in the page itself. Positions are whole numbers of a step, about the
-middle of all: 16 bits each, in base64. What stands in the data is told by `page_data`.
+Data, style and program are in the page itself. Positions are 16-bit multiples of a step, relative
+to the middle of all positions, in base64. `page_data` describes the data.
 """
 
 from __future__ import annotations
@@ -16,41 +16,38 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.app.bag_scores import TopicScores
 from hmt_ros.app.evaluate import as_json
-from hmt_ros.app.report.film_strip import FilmStrip
-from hmt_ros.app.report.pictures import BONES, LEFT, RIGHT
-from hmt_ros.app.report.recorded_mixtures import Layer, RecordedMixtures, Trajectories, Window
-from hmt_ros.app.report.recorded_track import mode_errors
-from hmt_ros.app.truth import Truth
-from hmt_ros.body import Camera
-from hmt_ros.evaluation.pose_scores import LOST, ORIGIN
+from hmt_ros.app.report.images import FilmStrip
+from hmt_ros.app.report.mixtures import Layer, Moment, RecordedMixtures, Window
+from hmt_ros.app.report.pictures import PROBABILITIES
+from hmt_ros.app.report.skeletons import LEFT, RIGHT, bones_of
+from hmt_ros.evaluation.pose_scores import LOST, ORIGIN, origin_joints
+from hmt_ros.evaluation.track_scores import TrackScores, Truth, mode_errors
 from hmt_ros.inference.calibration import coverage
 
 Array = NDArray[np.float64]
 
-# Positions are told no finer than this, m, and px as a share of the width of the image.
+# Least step of positions, m, and step of pixels as a fraction of the width of the image.
 FINEST = 5e-4
 _PIXEL = 1 / 8000
 _NOWHERE = -(2**15)  # a pixel of a point that can not be seen
 _LARGEST = 2**15 - 1
-PROBABILITIES = np.arange(1, 20) / 20
 _SIDES = {LEFT: 'left', RIGHT: 'right'}
 _SCRIPTS = ('data.js', 'view.js', 'charts.js', 'report.js')
 
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """What a page shows.
+    """The content of a page.
 
     Attributes:
-        title: of the page.
-        stamps: (T,) ns, of all that is shown, increasing.
-        mixtures: at these stamps.
-        images: at some of them.
-        truth: None: not known.
-        scores: by topic; empty: the truth is not known.
-        notes: sentences about what is not shown.
+        title: title of the page.
+        stamps: (T,) times that are shown, ns, increasing.
+        mixtures: mixtures at these times.
+        images: images at some of them.
+        truth: true joint positions; None if unknown.
+        scores: by topic; empty without truth.
+        notes: what the page does not show, and why.
     """
 
     title: str
@@ -58,21 +55,19 @@ class Content:
     mixtures: RecordedMixtures
     images: FilmStrip
     truth: Truth | None
-    scores: dict[str, TopicScores]
+    scores: dict[str, TrackScores]
     notes: list[str]
 
 
 def data_size(mixtures: RecordedMixtures) -> int:
-    """Bytes that mixtures take in a page, rather more than less."""
+    """Upper estimate of the bytes that mixtures take in a page."""
     size = 0
     for layer in mixtures.layers:
-        joints = len(layer.track.joint_names)
         # Positions of 6 bytes and pixels of 4 in base64; weight and error as text.
-        size += sum(
-            len(moment.weights) * (joints * 10 * 4 // 3 + 16) for moment in layer.track.moments
-        )
+        each = len(layer.joint_names) * 10 * 4 // 3 + 16
+        size += sum(len(moment.weights) * each for moment in layer.mixtures.values())
     for topic in mixtures.trajectories:
-        for window in topic.windows:
+        for window in topic.mixtures.values():
             ways = 0 if window.ways is None else window.ways[..., 0].size
             size += 8 * ways + 10 * len(window.weights) + 20 * len(window.free_energy)
             size += 24 * len(window.stamps_ns)
@@ -80,7 +75,7 @@ def data_size(mixtures: RecordedMixtures) -> int:
 
 
 def page_html(content: Content) -> str:
-    """The page."""
+    """The text of the page."""
     folder = resources.files('hmt_ros.app.report').joinpath('page')
     parts = {
         'title': html.escape(content.title),
@@ -102,10 +97,11 @@ def page_data(content: Content) -> dict[str, Any]:
 
     Positions are `origin + step * int16`, m, in the camera optical frame: of each layer (modes of
     all times in turn, joints, 3), of trajectories (component, time, end, 3). Pixels are `int16`
-    times 1/8000 of the width of the image, from the centre of the first pixel.
+    times 1/8000 of the width of the image, from the centre of the first pixel. The middle of the
+    joints `roots` of a skeleton is aligned with that of the others on demand.
     """
     grid = _Grid.around(content)
-    stamps = content.stamps
+    stamps, truth = content.stamps, content.truth
     start = stamps[0]
     return {
         'title': content.title,
@@ -120,7 +116,7 @@ def page_data(content: Content) -> dict[str, Any]:
         'trajectories': [
             _trajectories(topic, start, grid) for topic in content.mixtures.trajectories
         ],
-        'truth': None if content.truth is None else _truth(content.truth, content, grid),
+        'truth': None if truth is None else _truth(truth, content, grid),
         'images': _images(content),
         'scores': _scores(content),
     }
@@ -128,27 +124,24 @@ def page_data(content: Content) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """Where positions are rounded to."""
+    """The points to which positions are rounded, m."""
 
     origin: Array
     step: float
 
     @staticmethod
     def around(content: Content) -> _Grid:
-        parts = [
-            moment.joints.reshape(-1, 3)
-            for layer in content.mixtures.layers
-            for moment in layer.track.moments
-        ]
+        mixtures, truth = content.mixtures, content.truth
+        parts = [moment.joints for layer in mixtures.layers for moment in layer.mixtures.values()]
         parts += [
-            window.ways.reshape(-1, 3)
-            for topic in content.mixtures.trajectories
-            for window in topic.windows
+            window.ways
+            for topic in mixtures.trajectories
+            for window in topic.mixtures.values()
             if window.ways is not None
         ]
-        if content.truth is not None:
-            parts += [content.truth.joints[t] for t in content.stamps if t in content.truth.joints]
-        points = np.concatenate([np.zeros((1, 3)) if not parts else parts[0], *parts[1:]])
+        if truth is not None:
+            parts += [truth.joints[t] for t in content.stamps if t in truth.joints]
+        points = np.concatenate([part.reshape(-1, 3) for part in parts or [np.zeros((1, 3))]])
         low, high = points.min(0), points.max(0)
         step = max(FINEST, float((high - low).max()) / (2 * _LARGEST))
         return _Grid(np.round(0.5 * (low + high), 6), step)
@@ -157,17 +150,17 @@ class _Grid:
         return _base64(np.rint((positions - self.origin) / self.step))
 
 
-def _layer(layer: Layer, content: Content, grid: _Grid) -> dict[str, Any]:
-    moments = {moment.stamp_ns: moment for moment in layer.track.moments}
-    shown = [moments[stamp] for stamp in content.stamps if stamp in moments]
-    joints = len(layer.track.joint_names)
-    everything = np.concatenate([np.zeros((0, joints, 3)), *(moment.joints for moment in shown)])
-    errors = {} if content.truth is None else mode_errors(layer.track, content.truth)
-    camera, width = content.images.camera, content.images.size[0]
+def _layer(layer: Layer[Moment], content: Content, grid: _Grid) -> dict[str, Any]:
+    names, moments, truth = layer.joint_names, layer.mixtures, content.truth
+    shown = [moments[stamp].joints for stamp in content.stamps if stamp in moments]
+    everything = np.concatenate([np.zeros((0, len(names), 3)), *shown])
+    errors = {}
+    if truth is not None:
+        errors = mode_errors({t: moment.joints for t, moment in moments.items()}, names, truth)
     return {
         'topic': layer.topic,
         'kind': layer.kind,
-        **_skeleton(layer.track.joint_names),
+        **_skeleton(names, content),
         'weights': [
             [_rounded(x, 5) for x in moments[stamp].weights] if stamp in moments else []
             for stamp in content.stamps
@@ -179,31 +172,32 @@ def _layer(layer: Layer, content: Content, grid: _Grid) -> dict[str, Any]:
         if errors
         else None,
         'positions': grid.encoded(everything),
-        'pixels': None if camera is None else _pixels(camera, everything, width),
+        'pixels': _pixels(content.images, everything),
     }
 
 
-def _skeleton(names: tuple[str, ...]) -> dict[str, Any]:
+def _skeleton(names: tuple[str, ...], content: Content) -> dict[str, Any]:
+    origin: tuple[str, ...] = (ORIGIN,)
+    if content.truth is not None:
+        origin = origin_joints(content.truth.joint_names, content.truth.source)
     return {
         'joints': list(names),
-        'root': names.index(ORIGIN) if ORIGIN in names else 0,
-        'bones': [
-            [names.index(a), names.index(b), _SIDES.get(colour, 'trunk')]
-            for a, b, colour in BONES
-            if a in names and b in names
-        ],
+        'roots': [names.index(name) for name in origin if name in names] or [0],
+        'bones': [[a, b, _SIDES.get(colour, 'trunk')] for a, b, colour in bones_of(names)],
     }
 
 
-def _pixels(camera: Camera, positions: Array, width: int) -> str:
+def _pixels(images: FilmStrip, positions: Array) -> str | None:
+    if images.camera is None:
+        return None
     with np.errstate(invalid='ignore'):
-        pixels = np.rint(camera.project(positions) / (width * _PIXEL))
+        pixels = np.rint(images.camera.project(positions) / (images.size[0] * _PIXEL))
     hidden = ~(np.abs(pixels) <= _LARGEST).all(-1)
     pixels[hidden] = _NOWHERE
     return _base64(pixels)
 
 
-def _trajectories(topic: Trajectories, start: int, grid: _Grid) -> dict[str, Any]:
+def _trajectories(layer: Layer[Window], start: int, grid: _Grid) -> dict[str, Any]:
     def described(window: Window) -> dict[str, Any]:
         return {
             'times': [_rounded((stamp - start) * 1e-9, 6) for stamp in window.stamps_ns],
@@ -213,25 +207,22 @@ def _trajectories(topic: Trajectories, start: int, grid: _Grid) -> dict[str, Any
         }
 
     return {
-        'topic': topic.topic,
-        'ends': list(topic.ends),
-        'windows': [described(window) for window in topic.windows],
+        'topic': layer.topic,
+        'ends': list(layer.joint_names),
+        'windows': [described(window) for window in layer.mixtures.values()],
     }
 
 
 def _truth(truth: Truth, content: Content, grid: _Grid) -> dict[str, Any]:
-    known = [stamp in truth.joints for stamp in content.stamps]
-    joints = [truth.joints[stamp] for stamp in content.stamps if stamp in truth.joints]
-    positions = np.concatenate(
-        [np.zeros((0, len(truth.joint_names), 3)), *(x[None] for x in joints)]
-    )
-    camera, width = content.images.camera, content.images.size[0]
+    known = [stamp for stamp in content.stamps if stamp in truth.joints]
+    joints = [truth.joints[stamp][None] for stamp in known]
+    positions = np.concatenate([np.zeros((0, len(truth.joint_names), 3)), *joints])
     return {
         'source': truth.source,
-        **_skeleton(truth.joint_names),
-        'known': known,
+        **_skeleton(truth.joint_names, content),
+        'known': [stamp in truth.joints for stamp in content.stamps],
         'positions': grid.encoded(positions),
-        'pixels': None if camera is None else _pixels(camera, positions, width),
+        'pixels': _pixels(content.images, positions),
     }
 
 
@@ -268,7 +259,7 @@ def _scores(content: Content) -> dict[str, Any] | None:
 
 
 def _finite(value: Any) -> Any:
-    """JSON has no numbers that are none."""
+    """The value with None for the numbers that JSON does not have: infinity and NaN."""
     if isinstance(value, dict):
         return {key: _finite(each) for key, each in value.items()}
     if isinstance(value, list):

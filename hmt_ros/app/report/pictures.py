@@ -1,145 +1,104 @@
-"""Pictures of a track: on the images that it explains, from the side, and its weights over time.
-
-Left limbs are orange and right limbs blue, which colour-blind people tell apart; the lighter a
-mode, the smaller its weight.
-"""
+"""The pictures of a report: skeletons, weights and errors over time, calibration, free energy."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib import patheffects
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
-from PIL import Image as Picture
 
-from hmt_ros.app.report.recorded_track import Moment, RecordedTrack, mode_errors
-from hmt_ros.app.truth import Truth
-from hmt_ros.body import Camera
-from hmt_ros.evaluation.pose_scores import LOST, ORIGIN
+from hmt_ros.app.report.images import FilmStrip
+from hmt_ros.app.report.mixtures import Layer, Moment, RecordedMixtures, Window
+from hmt_ros.app.report.skeletons import (
+    STYLE,
+    draw_overlays,
+    draw_overview,
+    draw_side_views,
+    save_picture,
+)
+from hmt_ros.evaluation.pose_scores import LOST
+from hmt_ros.evaluation.track_scores import TrackScores, Truth, mode_errors
+from hmt_ros.inference.calibration import coverage
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
-# Okabe and Ito's palette.
-LEFT, RIGHT, TRUNK, TRUTH = '#e69f00', '#0072b2', '#666666', '#000000'
-LIMBS = ('hip', 'knee', 'ankle', 'toe'), ('shoulder', 'elbow', 'wrist', 'hand')
-BONES = (
-    *(('pelvis', 'neck', TRUNK), ('neck', 'head', TRUNK)),
-    *(
-        bone
-        for side, colour in (('left', LEFT), ('right', RIGHT))
-        for start, limb in (('pelvis', LIMBS[0]), ('neck', LIMBS[1]))
-        for bone in (
-            (start, f'{side}_{limb[0]}', colour),
-            *((f'{side}_{a}', f'{side}_{b}', colour) for a, b in pairwise(limb)),
-        )
-    ),
-)
-STYLE: Any = {
-    'font.size': 9.0,
-    'axes.spines.top': False,
-    'axes.spines.right': False,
-    'axes.titlesize': 9.0,
-    'savefig.facecolor': 'white',
+# Number of times in the overview and on the sheets.
+IN_OVERVIEW, ON_SHEETS = 4, 8
+PICTURES = {
+    'overview.png': 'images with the heaviest modes, and the same person from the side',
+    'overlays.png': 'the heaviest modes on more images',
+    'side_views.png': 'all modes from the side',
+    'weights.png': 'weights of the modes and errors over time',
+    'calibration.png': 'coverage of the regions of the mixtures over their probability',
+    'free_energy.png': 'free energy of the trajectory mixtures',
 }
-# Modes that are drawn on an image: more would hide it.
-ON_IMAGE = 3
-FAINTEST = 0.12
+PROBABILITIES = np.arange(1, 20) / 20
+_COLOURS = ('#0072b2', '#d55e00', '#009e73', '#cc79a7', '#e69f00', '#56b4e9', '#000000')
 
 
-def draw_overview(
-    path: Path, track: RecordedTrack, camera: Camera, images: dict[int, Image], truth: Truth | None,
-    *, width: float = 9.0, dpi: int = 110,
-) -> None:  # fmt: skip
-    """Images with the heaviest modes, and under each the same person from the side, all modes.
+def shown_in_pictures(track: Layer[Moment]) -> set[int]:
+    """Stamps of the images that `draw_pictures` needs."""
+    return {*track.spread(IN_OVERVIEW), *track.spread(ON_SHEETS)} if track.mixtures else set()
+
+
+def draw_pictures(
+    folder: Path,
+    mixtures: RecordedMixtures,
+    images: FilmStrip,
+    truth: Truth | None,
+    scores: dict[str, TrackScores],
+) -> list[str]:
+    """Draws all pictures for which there are data.
 
     Args:
-        path: of the PNG file.
-        track: mixtures; those whose stamps are in `images` are shown, in their order.
-        camera: that took the images.
-        images: by stamp.
-        truth: where the joints were, drawn from the side where it is known.
-        width: of the picture, inches.
-        dpi: pixels per inch.
+        folder: folder of the pictures.
+        mixtures: mixtures of the bag; of those over poses the first layer is drawn.
+        images: images at the stamps of `shown_in_pictures`, as far as there are any.
+        truth: true joint positions; None if unknown.
+        scores: by topic; empty without truth.
+
+    Returns:
+        Names of the files, keys of `PICTURES`.
     """
-    moments = _shown(track, images)
-    box = _crop(track, moments, camera)
-    bounds = _side_bounds(track, moments, truth)
-    ratios = (
-        (box[3] - box[1]) / (box[2] - box[0]),
-        (bounds[3] - bounds[2]) / (bounds[1] - bounds[0]),
-    )
-    cell = width / len(moments)
-    with mpl.rc_context(STYLE):
-        figure = Figure((width, cell * sum(ratios) + 1.0), dpi=dpi)
-        axes = figure.subplots(
-            2, len(moments), squeeze=False, gridspec_kw={'height_ratios': list(ratios)}
-        )
-        start = track.moments[0].stamp_ns
-        for column, moment in enumerate(moments):
-            above, below = axes[0, column], axes[1, column]
-            _draw_on_image(above, track, moment, camera, images[moment.stamp_ns], box)
-            above.set_title(f'{(moment.stamp_ns - start) * 1e-9:.2f} s')
-            _draw_from_side(below, track, moment, truth, bounds)
-            if column == 0:
-                above.set_ylabel('from the camera')
-                below.set_ylabel('from the side, m')
-            else:
-                below.set_yticklabels([])
-        axes[1, len(moments) // 2].set_xlabel('to the camera, m')
-        _add_legend(figure, truth is not None)
-        figure.subplots_adjust(
-            left=0.65 / width, right=1 - 0.1 / width, top=1 - 0.25 / figure.get_figheight(),
-            bottom=0.75 / figure.get_figheight(), wspace=0.06, hspace=0.06,
-        )  # fmt: skip
-        save_picture(figure, path)
+    drawn = []
+    if mixtures.layers:
+        track = mixtures.layers[0]
+        few, many = track.spread(IN_OVERVIEW), track.spread(ON_SHEETS)
+        chosen = [{t: images.kept[t] for t in own if t in images.kept} for own in (few, many)]
+        if images.camera is not None and chosen[0]:
+            draw_overview(folder / 'overview.png', track, images.camera, chosen[0], truth)
+            drawn.append('overview.png')
+        if images.camera is not None and chosen[1]:
+            draw_overlays(folder / 'overlays.png', track, images.camera, chosen[1])
+            drawn.append('overlays.png')
+        draw_side_views(folder / 'side_views.png', track, many, truth)
+        _draw_weights(folder / 'weights.png', track, truth)
+        drawn += ['side_views.png', 'weights.png']
+    if any(topic.scores.levels is not None for topic in scores.values()):
+        _draw_calibration(folder / 'calibration.png', scores)
+        drawn.append('calibration.png')
+    recorded = [
+        layer
+        for layer in mixtures.trajectories
+        if any(len(window.free_energy) for window in layer.mixtures.values())
+    ]
+    if recorded:
+        _draw_free_energy(folder / 'free_energy.png', recorded)
+        drawn.append('free_energy.png')
+    return drawn
 
 
-def draw_overlays(
-    path: Path, track: RecordedTrack, camera: Camera, images: dict[int, Image], columns: int = 4
-) -> None:
-    """A sheet of images with the heaviest modes on them."""
-    moments = _shown(track, images)
-    box = _crop(track, moments, camera)
-
-    def draw(axes: Any, moment: Moment) -> None:
-        _draw_on_image(axes, track, moment, camera, images[moment.stamp_ns], box)
-
-    _draw_sheet(
-        path, moments, columns, (box[3] - box[1]) / (box[2] - box[0]), track, draw,
-        f'the {ON_IMAGE} heaviest modes', truth=False,
-    )  # fmt: skip
-
-
-def draw_side_views(
-    path: Path, track: RecordedTrack, stamps: Sequence[int], truth: Truth | None, columns: int = 4
-) -> None:
-    """A sheet of the person from the side, all modes."""
-    moments = [moment for moment in track.moments if moment.stamp_ns in set(stamps)]
-    bounds = _side_bounds(track, moments, truth)
-    _draw_sheet(
-        path, moments, columns, (bounds[3] - bounds[2]) / (bounds[1] - bounds[0]), track,
-        lambda axes, moment: _draw_from_side(axes, track, moment, truth, bounds),
-        'all modes from the side; across: towards the camera, m', truth=truth is not None,
-    )  # fmt: skip
-
-
-def draw_weights(path: Path, track: RecordedTrack, truth: Truth | None) -> None:
-    """Weights of the modes over time and, where the truth is known, errors."""
-    start = track.moments[0].stamp_ns
-    seconds = np.array([(moment.stamp_ns - start) * 1e-9 for moment in track.moments])
-    most = max(len(moment.weights) for moment in track.moments)
+def _draw_weights(path: Path, track: Layer[Moment], truth: Truth | None) -> None:
+    """Weights of the modes over time and, with a truth, errors."""
+    moments = list(track.mixtures.values())
+    seconds = np.array([(stamp - moments[0].stamp_ns) * 1e-9 for stamp in track.mixtures])
+    most = max(len(moment.weights) for moment in moments)
     weights = np.zeros((most, len(seconds)))
-    for t, moment in enumerate(track.moments):
+    for t, moment in enumerate(moments):
         weights[: len(moment.weights), t] = moment.weights
     with mpl.rc_context(STYLE):
         known = truth is not None
@@ -153,20 +112,21 @@ def draw_weights(path: Path, track: RecordedTrack, truth: Truth | None) -> None:
         axes[0].set_title(f'weights of the {most} modes, heaviest at the bottom', loc='left')
         if truth is not None:
             _draw_errors(axes[1], track, truth, seconds)
-        axes[-1].set_xlabel('s')
+        axes[-1].set_xlabel('time, s')
         save_picture(figure, path)
 
 
-def _draw_errors(axes: Any, track: RecordedTrack, truth: Truth, seconds: Array) -> None:
-    errors = mode_errors(track, truth)
+def _draw_errors(axes: Any, track: Layer[Moment], truth: Truth, seconds: Array) -> None:
+    joints = {stamp: moment.joints for stamp, moment in track.mixtures.items()}
+    errors = mode_errors(joints, track.joint_names, truth)
     curves = np.full((3, len(seconds)), np.nan)
-    for t, moment in enumerate(track.moments):
-        if moment.stamp_ns in errors:
-            error = 1e3 * errors[moment.stamp_ns]
+    for t, (stamp, moment) in enumerate(track.mixtures.items()):
+        if stamp in errors:
+            error = 1e3 * errors[stamp]
             curves[:, t] = error[0], error.min(), moment.weights @ error
     styles = (
         ('heaviest mode', '#d55e00', '-'),
-        ('best of all', '#009e73', '-'),
+        ('best of all modes', '#009e73', '-'),
         ('expected', '#555555', ':'),
     )
     for curve, (label, colour, style) in zip(curves, styles, strict=True):
@@ -177,156 +137,44 @@ def _draw_errors(axes: Any, track: RecordedTrack, truth: Truth, seconds: Array) 
     axes.legend(frameon=False, ncols=3, loc='upper left', bbox_to_anchor=(0, 1.12))
 
 
-def _draw_sheet(
-    path: Path, moments: list[Moment], columns: int, ratio: float, track: RecordedTrack, draw: Any,
-    title: str, *, truth: bool,
-) -> None:  # fmt: skip
-    columns = min(columns, len(moments))
-    rows = -(-len(moments) // columns)
-    cell = 2.4
-    height = rows * (cell * ratio + 0.25) + 0.7
+def _draw_calibration(path: Path, scores: dict[str, TrackScores]) -> None:
+    """Coverage of the highest-density regions over their probability."""
     with mpl.rc_context(STYLE):
-        figure = Figure((columns * cell + 0.4, height), dpi=110)
-        grid = figure.subplots(rows, columns, squeeze=False)
-        start = track.moments[0].stamp_ns
-        for axes in grid.flat:
-            axes.set_axis_off()
-        for i, (axes, moment) in enumerate(zip(grid.flat, moments, strict=False)):
-            axes.set_axis_on()
-            draw(axes, moment)
-            axes.set_title(f'{(moment.stamp_ns - start) * 1e-9:.2f} s')
-            if i % columns:
-                axes.set_yticklabels([])
-            if i + columns < len(moments):
-                axes.set_xticklabels([])
-        figure.text(0.02, 1 - 0.1 / height, title, va='top', fontsize=10)
-        _add_legend(figure, truth)
-        figure.subplots_adjust(
-            left=0.04, right=0.99, top=1 - 0.5 / height, bottom=0.4 / height, wspace=0.08,
-            hspace=0.25 / (cell * ratio),
-        )  # fmt: skip
+        figure = Figure((7.6, 4.8), dpi=110, layout='constrained')
+        axes: Any = figure.subplots(1, 2, sharey=True)
+        for number, (name, topic) in enumerate(scores.items()):
+            pair = topic.scores.levels, topic.scores.joint_levels
+            for one, levels in zip(axes, pair, strict=True):
+                if levels is not None:
+                    covered = [coverage(levels, q) for q in PROBABILITIES]
+                    colour = _COLOURS[number % len(_COLOURS)]
+                    one.plot(PROBABILITIES, covered, color=colour, label=name, linewidth=1.6)
+        for one, title in zip(axes, ('all joints together', 'each joint alone'), strict=True):
+            one.plot([0, 1], [0, 1], color='#bbbbbb', linewidth=0.8, zorder=0)
+            one.set(title=title, xlim=(0, 1), ylim=(0, 1), aspect='equal')
+            one.set_xlabel('probability of the region')
+        axes[0].set_ylabel('fraction of true positions in it')
+        handles, labels = axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, frameon=False, loc='outside lower center', ncols=2)
         save_picture(figure, path)
 
 
-def _draw_on_image(
-    axes: Any, track: RecordedTrack, moment: Moment, camera: Camera, image: Image, box: Any
-) -> None:
-    axes.imshow(image[..., ::-1], interpolation='lanczos')
-    for rank in reversed(range(min(ON_IMAGE, len(moment.weights)))):
-        pixels = camera.project(moment.joints[rank])
-        share = moment.weights[rank] / moment.weights[0]
-        _add_skeleton(
-            axes, track.joint_names, pixels, 2.4 if rank == 0 else 1.4,
-            1.0 if rank == 0 else FAINTEST + 0.6 * share, halo=rank == 0,
-        )  # fmt: skip
-    left, top, right, bottom = box
-    axes.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[])
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
-def _draw_from_side(
-    axes: Any, track: RecordedTrack, moment: Moment, truth: Truth | None, bounds: Any
-) -> None:
-    for rank in reversed(range(len(moment.weights))):
-        share = moment.weights[rank] / moment.weights[0]
-        _add_skeleton(
-            axes, track.joint_names, _from_side(moment.joints[rank], track.joint_names),
-            2.2 if rank == 0 else 1.5, FAINTEST + (1 - FAINTEST) * share,
-        )  # fmt: skip
-    if truth is not None and moment.stamp_ns in truth.joints:
-        points = _from_side(truth.joints[moment.stamp_ns], truth.joint_names)
-        _add_skeleton(axes, truth.joint_names, points, 1.3, 1.0, colour=TRUTH, style=(0, (2, 1.2)))
-    axes.set(xlim=bounds[:2], ylim=bounds[2:], aspect='equal')
-    axes.tick_params(length=2, labelsize=7, color='#888888')
-    axes.grid(color='#eeeeee', linewidth=0.6)
-    axes.set_axisbelow(True)
-
-
-def _from_side(joints: Array, names: tuple[str, ...]) -> Array:
-    """(J, 2): towards the camera and up, from the pelvis, m."""
-    relative = joints - joints[names.index(ORIGIN)]
-    return np.stack([-relative[:, 2], -relative[:, 1]], axis=1)
-
-
-def _add_skeleton(
-    axes: Any, names: tuple[str, ...], points: Array, width: float, alpha: float,
-    *, colour: str | None = None, style: Any = 'solid', halo: bool = False,
-) -> None:  # fmt: skip
-    bones = [
-        (points[[names.index(a), names.index(b)]], own)
-        for a, b, own in BONES
-        if a in names and b in names
-    ]
-    bones = [(line, own) for line, own in bones if np.isfinite(line).all()]
-    lines = LineCollection(
-        [line for line, _ in bones],
-        colors=[colour or own for _, own in bones],
-        linewidths=width,
-        alpha=alpha,
-        linestyles=[style],
-        capstyle='round',
-    )
-    if halo:
-        lines.set_path_effects(
-            [patheffects.Stroke(linewidth=width + 1.6, foreground='white'), patheffects.Normal()]
-        )
-    axes.add_collection(lines)
-
-
-def _add_legend(figure: Figure, truth: bool) -> None:
-    entries = [
-        Line2D([], [], color=LEFT, linewidth=2.4, label='left limbs'),
-        Line2D([], [], color=RIGHT, linewidth=2.4, label='right limbs'),
-        Line2D([], [], color=RIGHT, linewidth=1.5, alpha=0.35, label='fainter: less probable'),
-    ]
-    if truth:
-        entries.append(
-            Line2D([], [], color=TRUTH, linewidth=1.3, linestyle=(0, (2, 1.2)), label='truth')
-        )
-    figure.legend(handles=entries, loc='lower center', ncols=len(entries), frameon=False)
-
-
-def _shown(track: RecordedTrack, images: dict[int, Image]) -> list[Moment]:
-    moments = [moment for moment in track.moments if moment.stamp_ns in images]
-    if not moments:
-        raise ValueError('none of the images belongs to the track')
-    return moments
-
-
-def _crop(track: RecordedTrack, moments: list[Moment], camera: Camera) -> tuple[float, ...]:
-    """Left, top, right, bottom of what the heaviest modes need, px."""
-    pixels = np.concatenate([camera.project(m.joints[:ON_IMAGE]).reshape(-1, 2) for m in moments])
-    pixels = pixels[np.isfinite(pixels).all(1)]
-    low, high = pixels.min(0), pixels.max(0)
-    margin = 0.12 * (high - low).max()
-    low = np.maximum(low - margin, -0.5)
-    high = np.minimum(high + margin, [camera.width - 0.5, camera.height - 0.5])
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
-def _side_bounds(
-    track: RecordedTrack, moments: list[Moment], truth: Truth | None
-) -> tuple[float, ...]:
-    """Limits across and up, m."""
-    points = [
-        _from_side(joints, track.joint_names) for moment in moments for joints in moment.joints
-    ]
-    if truth is not None:
-        points += [
-            _from_side(truth.joints[moment.stamp_ns], truth.joint_names)
-            for moment in moments
-            if moment.stamp_ns in truth.joints
-        ]
-    everything = np.concatenate(points)
-    low, high = everything.min(0) - 0.08, everything.max(0) + 0.08
-    return float(low[0]), float(high[0]), float(low[1]), float(high[1])
-
-
-def save_picture(figure: Figure, path: Path) -> None:
-    """Writes a PNG of 256 colours, a third of the size of one of all colours."""
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
-    picture = Picture.fromarray(np.ascontiguousarray(pixels))
-    picture.quantize(256, dither=Picture.Dither.NONE).save(path, format='PNG', optimize=True)
+def _draw_free_energy(path: Path, layers: Sequence[Layer[Window]]) -> None:
+    """Free energy of each window in the first and in the last iteration."""
+    start = min(min(layer.mixtures) for layer in layers)
+    with mpl.rc_context(STYLE):
+        figure = Figure((9.0, 2.8), dpi=110, layout='constrained')
+        axes: Any = figure.subplots()
+        for number, layer in enumerate(layers):
+            windows = [one for one in layer.mixtures.values() if len(one.free_energy)]
+            seconds = np.array([(window.stamp_ns - start) * 1e-9 for window in windows])
+            colour = _COLOURS[number % len(_COLOURS)]
+            for which, style, label in ((0, ':', 'first'), (-1, '-', 'last')):
+                values = [window.free_energy[which] for window in windows]
+                axes.plot(
+                    seconds, values, color=colour, linestyle=style, marker='.', markersize=3,
+                    label=f'{layer.topic}, {label} iteration',
+                )  # fmt: skip
+        axes.set(xlabel='end of the window, s', ylabel='free energy, nats')
+        axes.legend(frameon=False, fontsize=8)
+        save_picture(figure, path)

@@ -1,7 +1,7 @@
-"""A silhouette as a camera would see it that looks straight at the person, without distortion.
+"""The silhouette seen by a camera without distortion that looks straight at the person.
 
-Towards the border of an image a person is drawn out and leans, with a wide lens the more. Turned to
-the optical axis the same posture looks the same wherever it is, as its target does
+Towards the border of an image, most of all with a wide lens, a person is stretched and leans. Seen
+along the optical axis, one posture looks the same wherever it is, as its target does
 (`hmt_ros.experts.pose_encoding`).
 """
 
@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.camera import Camera
 from hmt_ros.experts.descriptor.contour import PersonBlob
+from hmt_ros.experts.pose_encoding import ray_rotations
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 SIDE = 192  # px, of the view
-FILLED = 0.8  # of it that the longer side of the person fills, roughly
-# A person so near to the axis that turning moves nothing by a pixel is left as it is.
-STRAIGHT = np.radians(2.0)
+FILLED = 0.8  # share of the view that the longer side of the person fills, roughly
+STRAIGHT = np.radians(2.0)  # angle to the axis below which a rotation moves nothing by a pixel
 
 
 def centred_view(blob: PersonBlob, camera: Camera) -> Bytes:
-    """The person (h, w), 1 inside, seen by the camera turned to the middle of its box.
+    """The person (h, w), 1 inside, seen by the camera turned to the middle of the box.
 
     Args:
-        blob: in the camera's image.
-        camera: that saw it.
+        blob: Person in the camera's image.
+        camera: Camera of the image.
     """
     left, top, right, bottom = blob.box
     middle = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
@@ -36,7 +36,7 @@ def centred_view(blob: PersonBlob, camera: Camera) -> Bytes:
     if not camera.distortion and axis[2] > np.cos(STRAIGHT):
         return blob.mask
     corners = np.array([[x, y] for x in (left, middle[0], right) for y in (top, middle[1], bottom)])
-    turn = _turned_to(axis)  # from the view to the camera
+    turn = ray_rotations(axis[None])[0]  # from the view to the camera
     seen = camera.rays(corners) @ turn
     reach = float(np.abs(seen[:, :2] / np.maximum(seen[:, 2:], 0.1)).max())
     focal = 0.5 * FILLED * SIDE / reach
@@ -61,10 +61,3 @@ def centred_view(blob: PersonBlob, camera: Camera) -> Bytes:
         )
     result: Bytes = (drawn > 127).astype(np.uint8)
     return result if result.any() else blob.mask
-
-
-def _turned_to(axis: Array) -> Array:
-    """The least rotation (3, 3) that turns the optical axis to a unit vector before the camera."""
-    a, b, c = axis
-    k = 1.0 / (1.0 + max(c, -0.99))
-    return np.array([[1 - k * a * a, -k * a * b, a], [-k * a * b, 1 - k * b * b, b], [-a, -b, c]])

@@ -1,9 +1,9 @@
-"""The person in a mask, and points spaced evenly along the outline (BME 3).
+"""The person in a mask, and points at equal distances along the outline (BME 3).
 
-A mask may show more than the person: other people, ghosts, pieces that subtraction tore off. One
-blob is taken for the person, together with the pieces that belong to it, and what was left out is
-counted, so that a caller can say it. A person whom the border of the image cuts is marked, side by
-side.
+A mask may show more than the person: other people, ghosts, pieces torn off by background
+subtraction. One blob is taken as the person, together with the pieces that belong to it; other
+blobs are counted so that callers can report them. The sides at which the border of the image cuts
+the person are marked.
 """
 
 from __future__ import annotations
@@ -18,32 +18,34 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 
-SMALLEST = 60  # px; fewer than these show no posture
-# A person is at most this many times wider than high, or higher than wide; whatever is longer is
-# the trace of something else. A person has limbs, and does not fill the box all around.
+SMALLEST = 60  # minimum area of a person, px
+# Maximum ratio of the sides of a person's bounding box, and maximum share of the box that a person
+# fills.
 LONGEST = 5.0
 FULLEST = 0.93
-# A smaller piece belongs to the person when it is near: share of the area, share of the height.
+# A piece belongs to the person below this share of the area and this gap in shares of the height.
 PIECE = 0.35
 GAP = 0.12
-NOTABLE = 0.02  # share of the person's area from which something left out is worth a word
-SMALLEST_HOLE = 0.004  # share of the area; the outline of a smaller hole is noise
+NOTABLE = 0.02  # share of the person's area from which a blob left out is reported
+SMALLEST_HOLE = 0.004  # share of the area below which a hole is noise
+SMOOTHING = 5  # points of an outline that are averaged, which removes the steps of the raster
 SIDES = ('left', 'top', 'right', 'bottom')
 
 
 class NoSilhouetteError(ValueError):
-    """A mask in which nobody is seen."""
+    """Raised for a mask without a person."""
 
 
 @dataclass(frozen=True, eq=False)
 class PersonBlob:
-    """The part of a mask that is taken for the person.
+    """The part of a mask that is taken as the person.
 
     Attributes:
-        mask: (h, w) uint8, 1 inside; cut out of the image at the bounding box.
-        left, top: of the bounding box in the image, px.
-        cut: whether the border of the image cuts the person: left, top, right, bottom.
-        left_out: number of other blobs that are notable, and not part of the person.
+        mask: (h, w) uint8, 1 inside; cropped to the bounding box.
+        left, top: Corner of the bounding box in the image, px.
+        cut: Whether the border of the image cuts the person: left, top, right, bottom. Where it
+            does, the edge of the box is not that of the person.
+        left_out: Number of other notable blobs.
     """
 
     mask: Bytes
@@ -54,18 +56,13 @@ class PersonBlob:
 
     @property
     def box(self) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom edge, px; half a pixel beyond the outermost centres."""
+        """Left, top, right and bottom edge, px; half a pixel beyond the outer pixel centres."""
         height, width = self.mask.shape
         return self.left - 0.5, self.top - 0.5, self.left + width - 0.5, self.top + height - 0.5
 
     @property
-    def area(self) -> int:
-        """Number of pixels."""
-        return int(np.count_nonzero(self.mask))
-
-    @property
     def remarks(self) -> tuple[str, ...]:
-        """What a user should know: blobs left out, sides on which the person is cut."""
+        """Remarks for a user: blobs that were left out, sides at which the person is cut."""
         result = []
         if self.left_out:
             result.append(
@@ -79,14 +76,14 @@ class PersonBlob:
 
 
 def person_blob(mask: ArrayLike) -> PersonBlob:
-    """The largest blob of a mask that looks like a person, and the pieces that belong to it.
+    """The largest blob of a mask that looks like a person, with the pieces that belong to it.
 
     Args:
-        mask: (H, W), not zero where something is seen.
+        mask: (H, W), not zero in the foreground.
 
     Raises:
-        NoSilhouetteError: nothing is seen, or only specks.
-        ValueError: an array that is no mask.
+        NoSilhouetteError: the mask is empty or has only specks.
+        ValueError: the array is not a mask.
     """
     array = np.asarray(mask)
     if array.ndim != 2:
@@ -114,7 +111,7 @@ def person_blob(mask: ArrayLike) -> PersonBlob:
 
 
 def _belonging(stats: NDArray[np.int32]) -> tuple[Mask, int]:
-    """Which of some blobs are the person, and how many notable ones are not."""
+    """Which blobs belong to the person (n,), and the number of other notable ones."""
     area = stats[:, cv2.CC_STAT_AREA].astype(float)
     width, height = (stats[:, i].astype(float) for i in (cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT))
     like = np.maximum(width / height, height / width) <= LONGEST
@@ -131,20 +128,20 @@ def _belonging(stats: NDArray[np.int32]) -> tuple[Mask, int]:
 
 
 def sample_contour(mask: Bytes, count: int = 100) -> tuple[Array, Array]:
-    """Points at equal distances along the outlines of a mask, and the direction in which they run.
+    """Points at equal distances along the outlines of a mask, and the directions of the outlines.
 
-    The outer outline of every piece and those of its holes share the points by their lengths. The
-    inside lies to the same hand everywhere.
+    The outer outlines of all pieces and those of holes share the points in proportion to their
+    lengths. The inside is on the same side of all outlines.
 
     Args:
         mask: (h, w) uint8, 1 inside.
-        count: of the points.
+        count: Number of points.
 
     Returns:
         points (count, 2), px, and directions (count,), rad.
 
     Raises:
-        NoSilhouetteError: no outline of notable length.
+        NoSilhouetteError: there is no outline of notable length.
     """
     bordered = cv2.copyMakeBorder(mask, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
     found, tree = cv2.findContours(bordered, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -160,7 +157,7 @@ def sample_contour(mask: Bytes, count: int = 100) -> tuple[Array, Array]:
         raise NoSilhouetteError('the silhouette has no outline')
     steps = [np.linalg.norm(np.roll(x, -1, axis=0) - x, axis=1) for x in outlines]
     lengths = np.array([x.sum() for x in steps])
-    # Whole outlines one after the other; a point is at a share of the total length.
+    # Positions of the points along all outlines, joined end to end.
     at = (np.arange(count) + 0.5) / count * lengths.sum()
     ends = np.cumsum(lengths)
     points, directions = np.empty((count, 2)), np.empty(count)
@@ -179,9 +176,6 @@ def sample_contour(mask: Bytes, count: int = 100) -> tuple[Array, Array]:
         )
         directions[mine] = np.arctan2(*(ahead - behind).T[::-1])
     return points, directions
-
-
-SMOOTHING = 5  # points of an outline that are averaged: the steps of the raster are no corners
 
 
 def _smooth(outline: Array) -> Array:

@@ -1,16 +1,16 @@
-"""What a silhouette looks like, as a vector that a pose is predicted from (BME 3).
+"""The descriptor of a silhouette: the vector from which a pose is predicted (BME 3).
 
-Four views of the same outline, brought to one size first:
+Four descriptions of one outline, brought to one size first:
 
-- the histogram of shape contexts over a codebook: which local shapes occur, wherever they are;
-- pairs of edges across the inside: how thick and how bent limbs are;
-- a map of the signed distance to the outline: where the limbs are;
+- the histogram of shape contexts over a codebook: which local shapes occur;
+- the histogram of edge pairs across the inside: how thick and how bent limbs are;
+- a map of the signed distance to the outline: where limbs are;
 - moments and proportions of the whole.
 
-All of them are unchanged by the place and the size of the person in the image; the pairs of edges
-alone are unchanged by rotation as well, because a camera stands upright and up means something. A
-silhouette and its mirror image have different descriptors. The parts are weighed against each other
-and projected on the directions in which the training silhouettes differ most.
+None of them changes with the position and the size of the person in the image. Edge pairs do not
+change with rotation either; the others do, because a camera stands upright and up has a meaning. A
+silhouette and its mirror image have different descriptors. The parts are weighted and projected on
+the principal components of the training silhouettes.
 """
 
 from __future__ import annotations
@@ -23,9 +23,13 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hmt_ros.experts.descriptor.contour import PersonBlob, person_blob, sample_contour
-from hmt_ros.experts.descriptor.edge_pairs import edge_pairs
-from hmt_ros.experts.descriptor.shape_context import ShapeContextCodebook, shape_contexts
+from hmt_ros.experts.descriptor.contour import person_blob, sample_contour
+from hmt_ros.experts.descriptor.contour_histograms import (
+    PAIR_BINS,
+    ShapeContextCodebook,
+    edge_pairs,
+    shape_contexts,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -33,49 +37,23 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-SIZE = 128  # px; longer side of the person before anything is measured
+SIZE = 128  # longer side of the person before anything is measured, px
 MAP = 16  # cells of a side of the map of distances
-EXTENT = 4.4  # width of the map in radii of gyration: arms and legs stretched out are inside
+EXTENT = 4.4  # width of the map in radii of gyration; stretched arms and legs are inside
 DEEPEST, FURTHEST = 0.25, 0.60  # limits of the distances inside and outside, radii of gyration
-FOR_CODEBOOK = 20_000  # shape contexts that are clustered at most
+MOMENTS = 12
+FIXED = PAIR_BINS + MAP * MAP + MOMENTS  # features besides those of the codebook
+FOR_CODEBOOK = 20_000  # maximum number of shape contexts that are clustered
 # Share of each part in the distance between two silhouettes.
 WEIGHTS = {'shape_contexts': 1.0, 'edge_pairs': 0.5, 'distances': 1.0, 'moments': 0.5}
-# Components are divided by their deviation to this power: 0 keeps the metric of the parts, 1 would
-# make noise as important as everything else.
+# Components are divided by their standard deviation to this power: 0 keeps the metric of the parts,
+# 1 would make noise as important as everything else.
 WHITENING = 0.3
-
-
-@dataclass(frozen=True)
-class PlaceAndSize:
-    """Where a person is in an image, and how large: what a descriptor does not tell.
-
-    Attributes:
-        box: left, top, right and bottom edge of the silhouette, px.
-        centre: centroid of the silhouette, px.
-        area: px^2.
-        cut: whether the border of the image cuts the person at the left, top, right, bottom; the
-            edge of the box is not that of the person there.
-        remarks: what a user should know: blobs left out, sides that are cut.
-    """
-
-    box: tuple[float, float, float, float]
-    centre: tuple[float, float]
-    area: float
-    cut: tuple[bool, bool, bool, bool]
-    remarks: tuple[str, ...] = ()
-
-
-def place_and_size(blob: PersonBlob) -> PlaceAndSize:
-    """Place and size of the person in a mask."""
-    moments = cv2.moments(blob.mask, binaryImage=True)
-    area = moments['m00']
-    centre = (moments['m10'] / area + blob.left, moments['m01'] / area + blob.top)
-    return PlaceAndSize(blob.box, centre, area, blob.cut, blob.remarks)
 
 
 @dataclass(frozen=True, eq=False)
 class SilhouetteParts:
-    """The views of one silhouette before they are weighed.
+    """The descriptions of one silhouette before they are weighted.
 
     Attributes:
         contexts: (n, 60) shape contexts of the points of the outline.
@@ -91,10 +69,14 @@ class SilhouetteParts:
 
 
 def silhouette_parts(mask: ArrayLike, points: int = 100) -> SilhouetteParts:
-    """The views of the person in a mask (H, W), with so many points on the outline.
+    """The descriptions of the person in a mask (H, W).
+
+    Args:
+        mask: (H, W), not zero in the foreground.
+        points: Number of points on the outline.
 
     Raises:
-        NoSilhouetteError: nobody is seen.
+        NoSilhouetteError: the mask has no person.
     """
     person = _at_one_size(person_blob(mask).mask)
     outline, directions = sample_contour(person, points)
@@ -105,19 +87,19 @@ def silhouette_parts(mask: ArrayLike, points: int = 100) -> SilhouetteParts:
 
 
 class SilhouetteDescriptor:
-    """Vectors of silhouettes; learns its codebook and its components from masks.
+    """Vectors of silhouettes; learns its codebook and its components from silhouettes.
 
     Args:
-        codebook_size: centres that shape contexts vote for.
-        points: on the outline.
-        components: of the vector, at most; fewer than the silhouettes it learns from.
-        seed: of the codebook.
+        codebook_size: Number of centres of the codebook.
+        points: Number of points on the outline.
+        components: Maximum number of components of the vector.
+        seed: Seed of the codebook.
 
     Attributes:
-        codebook_: of shape contexts.
-        centre_: (q,) mean of the weighed parts.
-        scale_: (q,) by which the parts are weighed.
-        basis_: (q, p) directions, scaled.
+        codebook_: Codebook of shape contexts.
+        centre_: (q,) mean of the weighted parts.
+        scale_: (q,) weights of the parts.
+        basis_: (q, p) principal directions, scaled.
     """
 
     def __init__(
@@ -128,16 +110,12 @@ class SilhouetteDescriptor:
         self.components = components
         self.seed = seed
 
-    def fit(self, masks: Iterable[ArrayLike]) -> Self:
-        """Learns from masks (H, W), in which everybody sees one person.
+    def fit(self, parts: list[SilhouetteParts]) -> Self:
+        """Learns from silhouettes.
 
         Raises:
-            ValueError: too few masks, or one in which nobody is seen.
+            ValueError: there are too few silhouettes.
         """
-        return self.fit_parts([silhouette_parts(mask, self.points) for mask in masks])
-
-    def fit_parts(self, parts: list[SilhouetteParts]) -> Self:
-        """Learns from the views of silhouettes; see `fit`."""
         if len(parts) < 2:
             raise ValueError(f'a descriptor needs 2 silhouettes at least, saw {len(parts)}')
         step = max(len(parts) * self.points // FOR_CODEBOOK, 1)
@@ -148,16 +126,7 @@ class SilhouetteDescriptor:
         rows = [self._features(part) for part in parts]
         names = list(rows[0])
         columns = {name: np.array([row[name] for row in rows]) for name in names}
-        self.scale_ = np.concatenate(
-            [
-                np.full(columns[name].shape[1], WEIGHTS[name] / _spread(columns[name]))
-                if name != 'moments'
-                else WEIGHTS[name]
-                / np.sqrt(columns[name].shape[1])
-                / np.maximum(columns[name].std(0), 1e-6)
-                for name in names
-            ]
-        )
+        self.scale_ = np.concatenate([_weights(name, columns[name]) for name in names])
         features = np.concatenate([columns[name] for name in names], axis=1) * self.scale_
         self.centre_ = features.mean(0)
         _, deviations, directions = np.linalg.svd(features - self.centre_, full_matrices=False)
@@ -169,10 +138,10 @@ class SilhouetteDescriptor:
         return self
 
     def with_components(self, count: int) -> SilhouetteDescriptor:
-        """The same with the first components alone, those in which silhouettes differ most.
+        """The descriptor with the first components alone, those of the largest variance.
 
         Raises:
-            ValueError: not between 1 and as many as there are.
+            ValueError: the number is not between 1 and the number of components.
         """
         if not 1 <= count <= self.size:
             raise ValueError(f'{count} components of a descriptor that has {self.size}')
@@ -186,24 +155,11 @@ class SilhouetteDescriptor:
         """Length of the vector, p."""
         return int(self.basis_.shape[1])
 
-    def describe(self, mask: ArrayLike) -> Array:
-        """The vector (p,) of the person in a mask (H, W).
-
-        Raises:
-            NoSilhouetteError: nobody is seen.
-        """
-        result: Array = self.describe_parts([silhouette_parts(mask, self.points)])[0]
-        return result
-
-    def describe_parts(self, parts: Iterable[SilhouetteParts]) -> Array:
-        """The vectors (n, p) of silhouettes whose views are known."""
+    def describe(self, parts: Iterable[SilhouetteParts]) -> Array:
+        """Vectors (n, p) of silhouettes."""
         features = np.array([np.concatenate(list(self._features(x).values())) for x in parts])
         result: Array = (features * self.scale_ - self.centre_) @ self.basis_
         return result
-
-    def context_histogram(self, parts: SilhouetteParts) -> Array:
-        """Votes (C,) of the shape contexts of a silhouette for the codebook."""
-        return self.codebook_.histogram(parts.contexts)
 
     def _features(self, parts: SilhouetteParts) -> dict[str, Array]:
         # Square roots of shares, as in the codebook.
@@ -224,7 +180,7 @@ class SilhouetteDescriptor:
         }
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """What it has learned, in single precision, for a file."""
+        """The learned arrays in single precision, for a file."""
         return {
             'codebook': self.codebook_.centres.astype(np.float32),
             'scale': self.scale_.astype(np.float32),
@@ -236,10 +192,10 @@ class SilhouetteDescriptor:
     def from_arrays(
         cls, parameters: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
     ) -> SilhouetteDescriptor:
-        """The descriptor that `parameters` and `to_arrays` gave.
+        """The descriptor that `parameters` and `to_arrays` stored.
 
         Raises:
-            ValueError, KeyError, TypeError: arrays that are missing or do not fit.
+            ValueError, KeyError, TypeError: arrays are missing or do not fit.
         """
         result = cls(**parameters)
         result.codebook_ = ShapeContextCodebook(np.asarray(arrays['codebook'], dtype=np.float64))
@@ -248,22 +204,25 @@ class SilhouetteDescriptor:
             if not np.isfinite(value).all():
                 raise ValueError(f'{name} of the descriptor must be finite')
             setattr(result, f'{name}_', value)
-        length = len(result.codebook_.centres) + _FIXED
+        length = len(result.codebook_.centres) + FIXED
         shapes = (result.scale_.shape, result.centre_.shape, result.basis_.shape[:1])
         if shapes != ((length,),) * 3 or result.basis_.ndim != 2:
             raise ValueError(f'arrays of the descriptor have shapes {shapes}, wanted ({length},)')
         return result
 
 
-_FIXED = 48 + MAP * MAP + 12  # features besides the codebook's
-
-
-def _spread(columns: Array) -> float:
-    return max(float(np.sqrt(columns.var(0).sum())), 1e-9)
+def _weights(name: str, columns: Array) -> Array:
+    """Weights (k,) of the features (N, k) of a part; moments are weighted one by one."""
+    if name == 'moments':
+        spread = np.sqrt(columns.shape[1]) * np.maximum(columns.std(0), 1e-6)
+    else:
+        spread = np.full(columns.shape[1], max(float(np.sqrt(columns.var(0).sum())), 1e-9))
+    result: Array = WEIGHTS[name] / spread
+    return result
 
 
 def _at_one_size(mask: Bytes) -> Bytes:
-    """The person with the longer side at SIZE pixels, by areas."""
+    """The person, resized so that the longer side has SIZE pixels."""
     factor = SIZE / max(mask.shape)
     height, width = (max(round(side * factor), 3) for side in mask.shape)
     how = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
@@ -273,13 +232,13 @@ def _at_one_size(mask: Bytes) -> Bytes:
 
 
 def _map_and_moments(mask: Bytes) -> tuple[Array, Array]:
-    """Signed distances (MAP * MAP,) around the centroid, and moments (12,)."""
+    """Signed distances (MAP * MAP,) around the centroid, and moments (MOMENTS,)."""
     m = cv2.moments(mask, binaryImage=True)
     area = m['m00']
     x, y = m['m10'] / area, m['m01'] / area
     radius = np.sqrt((m['mu20'] + m['mu02']) / area)
     half = 0.5 * EXTENT * radius
-    # As much room around the person as the map and its furthest distance want.
+    # Room around the person for the whole map.
     height, width = mask.shape
     left, top = (max(int(half - at) + 2, 2) for at in (x, y))
     right, bottom = (max(int(at + half) - side + 3, 2) for at, side in ((x, width), (y, height)))

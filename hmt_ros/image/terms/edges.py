@@ -1,31 +1,86 @@
-"""Likelihood of edges: visible contour points lie on image edges of their direction (KJS 2)."""
+"""Edges: visible contour points lie on image edges of their direction (KJS 2).
+
+    E(x) = w / V sum_i rho(d_o(i)(u_i(x)) / sigma)
+
+over the V visible contour points u_i, d_o the distance to the nearest edge of orientation o.
+"""
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
+import cv2
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from hmt_ros.image.sampling import sample_distance
-from hmt_ros.image.terms.accumulation import add_residual
-from hmt_ros.image.terms.robust_kernel import geman_mcclure
+from hmt_ros.image.sampling import ImageMap, sample_distance
+from hmt_ros.image.terms.image_term import (
+    NO_MAP,
+    ImageTerm,
+    ImageWindow,
+    Request,
+    TermSettings,
+    Weighting,
+)
+from hmt_ros.image.terms.residuals import add_residual, geman_mcclure
 
+ORIENTATIONS = 4
+# Canny's thresholds.
+EDGE_LOW, EDGE_HIGH = 40.0, 100.0
+# Edges further outside the silhouette than this belong to the background, px.
+MARGIN = 4
 # Fewer visible points than this do not make each of them count more.
 FEWEST = 20
 
 
-@njit(cache=True, nogil=True)
-def add_edges(edges, contour, part_segments, term, count, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
-    """Distances from visible contour points to the nearest edge, normalised; returns the energy.
+class EdgeInputs(NamedTuple):
+    """Weighting, and the distance to the nearest edge of each orientation, px."""
 
-    Args:
-        edges: distance to the nearest edge of each orientation bin, px.
-        contour: of one pose.
-        part_segments: (B,) segment of each part.
-        term: weight, sigma (px) and scale (sigmas) of the term; the scale truncates edges that were
-            not found.
-        count: number of points that the weight is for; 0: those that are visible.
-        wrenches, stiffnesses: sums of the segments, added to.
-    """
+    term: Weighting
+    distances: ImageMap
+
+
+def edge_distances(window: ImageWindow) -> ImageMap:
+    """Distance to the nearest edge whose normal falls into each orientation bin, px."""
+    grey = cv2.cvtColor(window.image, cv2.COLOR_BGR2GRAY)
+    grey = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    dx = cv2.Sobel(grey, cv2.CV_16S, 1, 0)
+    dy = cv2.Sobel(grey, cv2.CV_16S, 0, 1)
+    edges = cv2.Canny(dx, dy, EDGE_LOW, EDGE_HIGH) > 0
+    if window.signed_distance is not None:
+        edges &= window.signed_distance <= MARGIN
+    rows, columns = np.nonzero(edges)
+    angle = np.arctan2(dy[rows, columns], dx[rows, columns])
+    result = np.empty((ORIENTATIONS, *grey.shape), dtype=np.float32)
+    for k in range(ORIENTATIONS):
+        free = np.ones(grey.shape, dtype=np.uint8)
+        mine = _counts_for(angle, k)
+        free[rows[mine], columns[mine]] = 0
+        if mine.any():
+            result[k] = cv2.distanceTransform(free, cv2.DIST_L2, 3)
+        else:
+            result[k] = 1e3
+    return window.as_map(result)
+
+
+def _counts_for(angle: NDArray[np.float64], k: int) -> NDArray[np.bool_]:
+    """Edges within three quarters of a bin of the direction of bin k."""
+    width = np.pi / ORIENTATIONS
+    off = (angle - k * width + 0.5 * np.pi) % np.pi - 0.5 * np.pi
+    result: NDArray[np.bool_] = np.abs(off) <= 0.75 * width
+    return result
+
+
+def _inputs(term: Weighting, evidence: Any, _request: Request) -> EdgeInputs:
+    return EdgeInputs(term, evidence or NO_MAP)
+
+
+@njit(cache=True, nogil=True)
+def add_edges(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
+    """Distances from visible contour points to the nearest edge; see `ImageTerm.kernel`."""
+    edges, term, contour = inputs.distances, inputs.term, view.contour
+    count = view.contour_points * 6 // 10
     bins = edges.values.shape[0]
     if count == 0:
         for i in range(len(contour.parts)):
@@ -44,8 +99,19 @@ def add_edges(edges, contour, part_segments, term, count, wrenches, stiffnesses)
         j, p = contour.projections, contour.points
         gu, gv = gu / term.sigma, gv / term.sigma
         add_residual(
-            wrenches, stiffnesses, part_segments[contour.parts[i]], p[i, 0], p[i, 1], p[i, 2],
+            wrenches, stiffnesses, view.owners[contour.parts[i]], p[i, 0], p[i, 1], p[i, 2],
             gu * j[i, 0, 0] + gv * j[i, 1, 0], gu * j[i, 0, 1] + gv * j[i, 1, 1],
             gu * j[i, 0, 2] + gv * j[i, 1, 2], pull, curvature,
         )  # fmt: skip
     return energy
+
+
+EDGES = ImageTerm(
+    'edges',
+    'Distance of the visible contours from image edges.',
+    TermSettings(20.0, 2.5, 3.0),
+    edge_distances,
+    _inputs,
+    add_edges,
+    needs_contour=True,
+)

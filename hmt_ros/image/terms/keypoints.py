@@ -1,67 +1,133 @@
-"""Likelihood of image joints: squared distances to the projected joint centres (KJS 2 and 5.1)."""
+"""Keypoints: distances of projected joint centres from where joints were seen (KJS 2 and 5.1).
+
+    E(x) = sum_k c_k w sum_a rho([W_k (u_k(x) - p_k)]_a),      W_k' W_k = S_k^-1
+
+u_k projects the joint of keypoint k, which was seen at p_k with covariance S_k; a confidence c_k
+below 1 divides the precision.
+"""
 
 from __future__ import annotations
 
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames
 from hmt_ros.body.skeleton import Skeleton
-from hmt_ros.image.observation import Keypoints
 from hmt_ros.image.surface import lens_of, project
-from hmt_ros.image.terms.accumulation import Tree, add_residual, assemble_pose, tree_of
-from hmt_ros.image.terms.robust_kernel import geman_mcclure
+from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.residuals import add_residual, assemble_pose, geman_mcclure, tree_of
+from hmt_ros.inference.energy import Derivatives, Energy
 
 Array = NDArray[np.float64]
+Index = NDArray[np.intp]
 
+KEYPOINTS = TermSettings(1.0, 1.0, 5.0)
 # A joint behind the camera errs by this much, in standard deviations.
 BEHIND = 1e3
 
 
-def joint_energy(
-    frames: Frames, camera: Camera, keypoints: Keypoints, *, scale: float, weight: float
-) -> tuple[Array, Array, Array]:
-    """Energy (N,), gradient (N, d) and Gauss-Newton Hessian (N, d, d) of keypoints.
+@dataclass(frozen=True)
+class Keypoints:
+    """Image positions of joints, from any 2D detector or by hand.
 
-    Residuals are whitened by the covariances of the keypoints, with one Geman-McClure kernel an
-    axis. Keypoints that were not seen (NaN) or have no confidence do not count; a confidence below
-    1 divides the precision.
+    Attributes:
+        names: (n,) joints of the body.
+        pixels: (n, 2) column and row, px; NaN where a joint was not seen.
+        covariances: (n, 2, 2) px^2.
+        confidences: (n,) from 0, ignore, to 1, sure.
+    """
 
-    Args:
-        frames: of N poses.
-        camera: that looks.
-        keypoints: the joints.
-        scale: of the kernel, in standard deviations; inf: least squares.
-        weight: factor on the energy.
+    names: tuple[str, ...]
+    pixels: Array
+    covariances: Array
+    confidences: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        shapes = (self.pixels.shape, self.covariances.shape, self.confidences.shape)
+        if shapes != ((n, 2), (n, 2, 2), (n,)):
+            raise ValueError(f'{n} keypoints with arrays of shapes {shapes}')
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(n,) joints that have a position."""
+        return np.asarray(np.isfinite(self.pixels).all(1), dtype=np.bool_)
+
+    def __getitem__(self, which: Index) -> Keypoints:
+        """Some of them."""
+        names = tuple(self.names[i] for i in which)
+        return Keypoints(
+            names, self.pixels[which], self.covariances[which], self.confidences[which]
+        )
+
+    def named_for(self, body: Body) -> tuple[Keypoints, list[str]]:
+        """Those that are joints of a body, under the body's names, and the names of the others."""
+        names = [body.keypoint_aliases.get(name, name) for name in self.names]
+        strange = [name for name in names if name not in body.joint_names]
+        # A joint that a detector names twice counts once.
+        first = {name: i for i, name in reversed([*enumerate(names)]) if name not in strange}
+        which = np.array(sorted(first.values()), dtype=np.intp)
+        kept = self[which]
+        return replace(kept, names=tuple(names[i] for i in which)), strange
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointTerm:
+    """Minus the log-likelihood of keypoints; a `FrameTerm`.
+
+    Keypoints that were not seen (NaN) or have no confidence do not count.
+
+    Attributes:
+        skeleton, camera: who is seen by what.
+        keypoints: that were seen.
+        settings: weight w, factor on the standard deviations, and scale of the kernel; inf: least
+            squares.
 
     Raises:
         KeyError: a keypoint that is not a joint of the body.
     """
-    skeleton = frames.skeleton
-    seen = np.isfinite(keypoints.pixels).all(1) & (keypoints.confidences > 0)
-    names = [name for name, ok in zip(keypoints.names, seen, strict=True) if ok]
-    which = skeleton.joint_index(names)
-    precision = np.linalg.inv(keypoints.covariances[seen])
-    precision *= keypoints.confidences[seen][:, None, None]
-    whitener = np.linalg.cholesky(precision).transpose(0, 2, 1)  # W with W^T W = precision
-    joints = _Joints(
-        skeleton.joint_segments[which].astype(np.int64),
-        skeleton.joint_offsets[which],
-        keypoints.pixels[seen],
-        np.ascontiguousarray(whitener),
-    )
-    n, d = frames.count, skeleton.dimension
-    value, gradient, hessian = np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d))
-    _add_joints(
-        joints, _tree(skeleton), lens_of(camera), float(scale), float(weight), *frames.by_pose(),
-        *frames.dofs_by_pose(), value, gradient, hessian,
-    )  # fmt: skip
-    return value, gradient, hessian
+
+    skeleton: Skeleton
+    camera: Camera
+    keypoints: Keypoints
+    settings: TermSettings = KEYPOINTS
+
+    def energy(
+        self, frames: Frames, _rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `hmt_ros.body.pose_terms.FrameTerm`."""
+        n, d = frames.count, self.skeleton.dimension
+        poses = n if derivatives else 0
+        value, gradient, hessian = np.zeros(n), np.zeros((poses, d)), np.zeros((poses, d, d))
+        s = self.settings
+        _add_joints(
+            self._joints, tree_of(self.skeleton), lens_of(self.camera), float(s.scale),
+            float(s.weight / s.sigma**2), *frames.by_pose(), *frames.dofs_by_pose(), value,
+            gradient, hessian,
+        )  # fmt: skip
+        return Energy(value, gradient, hessian) if derivatives else Energy(value)
+
+    @cached_property
+    def _joints(self) -> _Joints:
+        k, skeleton = self.keypoints, self.skeleton
+        seen = k.seen & (k.confidences > 0)
+        which = skeleton.joint_index([name for name, ok in zip(k.names, seen, strict=True) if ok])
+        precision = np.linalg.inv(k.covariances[seen])
+        precision *= k.confidences[seen][:, None, None]
+        whitener = np.linalg.cholesky(precision).transpose(0, 2, 1)
+        return _Joints(
+            skeleton.joint_segments[which].astype(np.int64),
+            skeleton.joint_offsets[which],
+            k.pixels[seen],
+            np.ascontiguousarray(whitener),
+        )
 
 
 class _Joints(NamedTuple):
@@ -71,11 +137,6 @@ class _Joints(NamedTuple):
     offsets: Array
     pixels: Array
     whiteners: Array
-
-
-@lru_cache(maxsize=64)
-def _tree(skeleton: Skeleton) -> Tree:
-    return tree_of(skeleton)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -111,4 +172,7 @@ def _add_joints(  # type: ignore[no-untyped-def]
                 rho, pull, curvature = geman_mcclure(residual, scale, weight)
                 value[n] += rho
                 add_residual(wrenches, stiffnesses, s, x, y, z, a0, a1, a2, pull, curvature)
-        assemble_pose(tree, axes[n], dof_origins[n], wrenches, stiffnesses, gradient[n], hessian[n])
+        if len(hessian) > 0:
+            assemble_pose(
+                tree, axes[n], dof_origins[n], wrenches, stiffnesses, gradient[n], hessian[n]
+            )

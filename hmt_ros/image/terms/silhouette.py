@@ -1,19 +1,39 @@
-"""Likelihood of a silhouette, both ways (KJS 2; Sminchisescu and Triggs, IJRR 2003).
+"""The silhouette, both ways (KJS 2; Sminchisescu and Triggs, IJRR 2003).
 
-The model explains the silhouette when its contour lies inside, and when the outline of the
-silhouette lies on the contour of the model: the first alone would let the model shrink, the second
-alone would let limbs stick out.
+    containment   E(x) = w / C sum_i rho(max(d(u_i(x)), 0) / sigma)
+    coverage      E(x) = w / M sum_m rho(|u_i(m)(x) - s_m| / sigma)
+
+d is the signed distance to the outline of the silhouette, u_i are the C points of the model's
+contour, s_m M samples of the outline, and i(m) is the contour point nearest to sample m. The model
+explains the silhouette when its contour lies inside, and when the outline of the silhouette lies on
+the contour of the model: the first alone would let the model shrink, the second alone would let
+limbs stick out.
 """
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
+import cv2
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-from hmt_ros.image.sampling import sample_distance
-from hmt_ros.image.terms.accumulation import add_residual
-from hmt_ros.image.terms.robust_kernel import geman_mcclure
+from hmt_ros.image.sampling import ImageMap, sample_distance
+from hmt_ros.image.terms.image_term import (
+    NO_MAP,
+    ImageTerm,
+    ImageWindow,
+    Request,
+    TermSettings,
+    Weighting,
+)
+from hmt_ros.image.terms.residuals import add_residual, geman_mcclure
 
+Array = NDArray[np.float64]
+
+# Samples on the outline.
+OUTLINE_POINTS = 120
 # Pixels that opposite directions count like when outline and contour are matched, per unit.
 TURN = 12.0
 # Along the outline distances up to this, px, cost nothing: the contour's points stand that far
@@ -21,18 +41,109 @@ TURN = 12.0
 SPACING = 8.0
 
 
-@njit(cache=True, nogil=True)
-def add_containment(distance, contour, part_segments, term, each, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
-    """Contour points outside the silhouette pay their distance to it; returns the energy.
+class Outline(NamedTuple):
+    """M samples on the outline of a silhouette.
 
-    Args:
-        distance: signed distance to the outline, px, positive outside.
-        contour: of one pose.
-        part_segments: (B,) segment of each part.
-        term: weight, sigma (px) and scale (sigmas) of the term.
-        each: weight of one point.
-        wrenches, stiffnesses: sums of the segments, added to.
+    Attributes:
+        pixels: (M, 2).
+        normals: (M, 2) unit vectors out of the silhouette.
     """
+
+    pixels: Array
+    normals: Array
+
+
+class ContainmentInputs(NamedTuple):
+    """Weighting, and the signed distance to the outline, px, positive outside."""
+
+    term: Weighting
+    distance: ImageMap
+
+
+class CoverageInputs(NamedTuple):
+    """What the kernel of the coverage reads.
+
+    Attributes:
+        term: weighting.
+        outline: samples.
+        explained: (X, M) what samples cost at most; a row a pose, or one row for all.
+        costs: (N, M) result: what each sample costs.
+    """
+
+    term: Weighting
+    outline: Outline
+    explained: Array
+    costs: Array
+
+
+def distance_map(window: ImageWindow) -> ImageMap | None:
+    """Signed distance to the outline of the silhouette, px, positive outside."""
+    signed = window.signed_distance
+    return None if signed is None else window.as_map(signed[None])
+
+
+def outline(window: ImageWindow, count: int = OUTLINE_POINTS) -> Outline | None:
+    """Points spaced evenly along all outlines of the silhouette, holes included."""
+    mask = window.mask
+    if mask is None:
+        return None
+    contours, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    contours = [c[:, 0].astype(float) for c in contours if len(c) >= 12]
+    if not contours:
+        return NO_OUTLINE
+    steps = [np.linalg.norm(np.roll(c, -1, axis=0) - c, axis=1) for c in contours]
+    total = sum(x.sum() for x in steps)
+    points = []
+    for contour, step in zip(contours, steps, strict=True):
+        n = max(round(count * step.sum() / total), 3)
+        along = np.concatenate([[0.0], np.cumsum(step)])
+        closed = np.concatenate([contour, contour[:1]])
+        at = (np.arange(n) + 0.5) / n * along[-1]
+        points.append(np.stack([np.interp(at, along, closed[:, i]) for i in range(2)], axis=1))
+    pixels = np.concatenate(points)
+    # Out of the silhouette is against the gradient of the blurred mask.
+    blurred = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 2.0)
+    column, row = np.round(pixels).astype(int).T
+    normals = -np.stack(
+        [
+            cv2.Sobel(blurred, cv2.CV_32F, 1, 0)[row, column],
+            cv2.Sobel(blurred, cv2.CV_32F, 0, 1)[row, column],
+        ],
+        axis=1,
+    ).astype(float)
+    length = np.linalg.norm(normals, axis=1)
+    good = length > 1e-3
+    normals = normals[good] / length[good, None]
+    # The outline lies half a pixel outside the last pixels of the silhouette.
+    return Outline(pixels[good] + 0.5 * normals + np.array([window.left, window.top]), normals)
+
+
+NO_OUTLINE = Outline(np.zeros((0, 2)), np.zeros((0, 2)))
+
+
+def _containment_inputs(term: Weighting, evidence: Any, _request: Request) -> ContainmentInputs:
+    return ContainmentInputs(term, evidence or NO_MAP)
+
+
+def _coverage_inputs(term: Weighting, evidence: Any, request: Request) -> CoverageInputs:
+    found: Outline = evidence or NO_OUTLINE
+    samples = len(found.pixels)
+    if samples == 0:
+        term = term._replace(weight=0.0)
+    explained = request.explained
+    if explained is None:
+        explained = np.full((1, samples), np.inf)
+    return CoverageInputs(term, found, explained, np.zeros((request.poses, samples)))
+
+
+@njit(cache=True, nogil=True)
+def add_containment(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
+    """Contour points outside the silhouette pay their distance to it; see `ImageTerm.kernel`."""
+    distance, term, contour = inputs.distance, inputs.term, view.contour
+    points = view.contour_points
+    if points == 0:
+        points = len(contour.parts)
+    each = term.weight / points
     energy = 0.0
     for i in range(len(contour.parts)):
         if not contour.valid[i]:
@@ -45,7 +156,7 @@ def add_containment(distance, contour, part_segments, term, each, wrenches, stif
         j, p = contour.projections, contour.points
         gu, gv = gu / term.sigma, gv / term.sigma
         add_residual(
-            wrenches, stiffnesses, part_segments[contour.parts[i]], p[i, 0], p[i, 1], p[i, 2],
+            wrenches, stiffnesses, view.owners[contour.parts[i]], p[i, 0], p[i, 1], p[i, 2],
             gu * j[i, 0, 0] + gv * j[i, 1, 0], gu * j[i, 0, 1] + gv * j[i, 1, 1],
             gu * j[i, 0, 2] + gv * j[i, 1, 2], pull, curvature,
         )  # fmt: skip
@@ -53,23 +164,16 @@ def add_containment(distance, contour, part_segments, term, each, wrenches, stif
 
 
 @njit(cache=True, nogil=True)
-def add_coverage(  # type: ignore[no-untyped-def]
-    pixels, normals, contour, part_segments, term, each, explained, costs, wrenches, stiffnesses
-):
-    """Points on the outline pay their distance to the nearest contour of the model.
+def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
+    """Samples of the outline pay their distance to the nearest contour; see `ImageTerm.kernel`.
 
     Nearest by position and direction, among contour points that no other part covers.
-
-    Args:
-        pixels, normals: (M, 2) samples on the outline of the silhouette.
-        contour: of one pose.
-        part_segments: (B,) segment of each part.
-        term: weight, sigma (px) and scale (sigmas) of the term.
-        each: weight of one sample.
-        explained: (M,) what each sample costs at most, because something else explains it.
-        costs: (M,) what each sample costs, result.
-        wrenches, stiffnesses: sums of the segments, added to.
     """
+    pixels, normals = inputs.outline.pixels, inputs.outline.normals
+    term, contour, part_segments = inputs.term, view.contour, view.owners
+    each = term.weight / len(pixels)
+    explained = inputs.explained[view.number if len(inputs.explained) > 1 else 0]
+    costs = inputs.costs[view.number]
     count = len(contour.parts)
     use = np.empty(count, np.int64)
     used = 0
@@ -140,3 +244,23 @@ def add_coverage(  # type: ignore[no-untyped-def]
                 nx * j[i, 1, 2] - ny * j[i, 0, 2], curvature * beyond, curvature,
             )  # fmt: skip
     return energy
+
+
+CONTAINMENT = ImageTerm(
+    'containment',
+    "Distance of the model's contour from the inside of the silhouette.",
+    TermSettings(30.0, 3.0, 8.0),
+    distance_map,
+    _containment_inputs,
+    add_containment,
+    needs_contour=True,
+)
+COVERAGE = ImageTerm(
+    'coverage',
+    "Distance of the silhouette's outline from the model's contour.",
+    TermSettings(30.0, 3.0, 8.0),
+    outline,
+    _coverage_inputs,
+    add_coverage,
+    needs_contour=True,
+)

@@ -1,8 +1,8 @@
-// Curves over time, and others: a frame with ticks, what is drawn in it, and where a click leads to.
+// Charts: a frame with ticks, curves, and the time that a click selects.
 
 const MARGIN = { left: 52, right: 10, top: 10, bottom: 34 };
 
-/** Steps of 1, 2 or 5 times a power of ten between two limits, about as many as are wanted. */
+/** Steps of 1, 2 or 5 times a power of ten between two limits, about as many as wanted. */
 function ticks(low, high, count) {
   const rough = (high - low) / count;
   const power = 10 ** Math.floor(Math.log10(rough));
@@ -108,12 +108,12 @@ function curve(context, u, v, xs, values, look) {
   });
 }
 
-/** From the first time to the last, and something on both sides where there is but one. */
+/** Range of the times, widened if there is only one. */
 function timeRange() {
   return LAST > 0 ? [TIMES[0], TIMES[LAST]] : [TIMES[0] - 0.5, TIMES[0] + 0.5];
 }
 
-/** The present time, as an upright line. */
+/** A vertical line at the current time. */
 function drawNow(context, u, v, y) {
   context.strokeStyle = colour('ink');
   context.lineWidth = 1.2;
@@ -131,7 +131,7 @@ function rankColour(rank, count) {
   return `rgb(${from.map((x, c) => Math.round(x + share * (to[c] - x))).join(',')})`;
 }
 
-/** Weights over time of what is chosen: those of each time as a column, the heaviest at the bottom. */
+/** Weights of the chosen mixtures over time, one column per time, the heaviest at the bottom. */
 function weightsChart(weightsAt) {
   const x = timeRange();
   const y = [0, 1];
@@ -164,7 +164,7 @@ function weightsChart(weightsAt) {
 /** Errors of a layer over time. */
 const ERRORS = [
   { name: 'heaviest mode', series: 'series-1', dash: [] },
-  { name: 'best of all', series: 'series-2', dash: [] },
+  { name: 'best of all modes', series: 'series-2', dash: [] },
   { name: 'expected', series: 'muted', dash: [2, 3] },
 ];
 function errorCurves(layer) {
@@ -200,14 +200,14 @@ function errorsChart(layer) {
   };
 }
 
-/** A range about values, which need not differ. */
+/** A range around values, which may be equal. */
 function around(values) {
   const [low, high] = [Math.min(...values), Math.max(...values)];
   const room = 0.06 * (high - low) || 0.5;
   return [low - room, high + room];
 }
 
-/** Free energy of the windows of all topics when their iterations ended. */
+/** Free energy of the windows of all topics in their last iteration. */
 function freeEnergyChart() {
   const last = trajectories.map((topic) => topic.windows.filter((w) => w.free_energy.length).map((w) => ({
     time: w.times[w.times.length - 1], value: w.free_energy[w.free_energy.length - 1],
@@ -225,7 +225,7 @@ function freeEnergyChart() {
   };
 }
 
-/** Free energy in the iterations of the present windows. */
+/** Free energy over the iterations of the current windows. */
 function iterationsChart() {
   const traces = trajectories.map((topic) => (topic.at[shown.time] || { free_energy: [] }).free_energy);
   const values = traces.flat();
@@ -244,7 +244,7 @@ function iterationsChart() {
 /** Coverage of regions over their probability. */
 function calibrationChart(which) {
   return {
-    x: [0, 1], y: [0, 1], labels: ['probability of the region', 'share of truths in it'],
+    x: [0, 1], y: [0, 1], labels: ['probability of the region', 'fraction of true positions in it'],
     draw(context, u, v) {
       curve(context, u, v, [0, 1], [0, 1], { colour: colour('axis'), width: 1 });
       Object.values(report.scores.topics).forEach((topic, i) => {

@@ -1,10 +1,10 @@
 'use strict';
 
-// The data of the page, as arrays: what stands in it is told by hmt_ros.app.report.page.
+// The data of the page, as arrays: hmt_ros.app.report.page describes it.
 
 const report = JSON.parse(document.getElementById('data').textContent);
 
-/** Whole numbers of 16 bits, as they were written. */
+/** The 16-bit integers in a base64 text. */
 function integers(text) {
   const binary = atob(text);
   const bytes = new Uint8Array(binary.length);
@@ -29,7 +29,7 @@ function metres(text) {
 
 const NOWHERE = -32768;
 
-/** Pixels as shares of the width of the image; NaN where a point can not be seen. */
+/** Pixels as fractions of the width of the image; NaN where a point can not be seen. */
 function shares(text) {
   if (text === null) return null;
   return Float32Array.from(integers(text), (x) => (x === NOWHERE ? NaN : x * report.pixel));
@@ -92,7 +92,7 @@ function nearest(seconds) {
   return best;
 }
 
-/** A colour of the style sheet; those of the dark style where it is in use. */
+/** A colour of the style sheet, light or dark. */
 const colours = new Map();
 function colour(name) {
   if (!colours.has(name)) {

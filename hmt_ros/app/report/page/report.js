@@ -1,4 +1,4 @@
-// The page: what is chosen, what is told in words, and what happens when something changes.
+// The page: selections, texts, and the reactions to changes.
 
 const element = (id) => document.getElementById(id);
 
@@ -16,7 +16,7 @@ const fixed = (value, digits = 0) => (value === null ? '-' : value.toFixed(digit
 const space = new Space(element('space'));
 const film = report.images ? new Film(element('image')) : null;
 
-/** What weights can be shown of: layers, then mixtures over trajectories. */
+/** Mixtures whose weights can be shown: layers, then mixtures over trajectories. */
 const choices = [
   ...layers.map((layer, index) => ({
     name: `${layer.kind} (${layer.topic})`, layer, index, weightsAt: (t) => layer.weights[t], what: 'modes',
@@ -107,8 +107,8 @@ function tellModes() {
   const entropy = weights.reduce((sum, w) => sum - (w > 0 ? w * Math.log(w) : 0), 0);
   const more = weights.length > 16 ? `; ${weights.length - 16} more` : '';
   element('modes-caption').textContent = weights.length
-    ? `${weights.length} ${what}, which share the weight as ${Math.exp(entropy).toFixed(1)} equal ones would${more}`
-      + `${layer ? '. Press a number to see that mode alone.' : ''}`
+    ? `${weights.length} ${what}; effective number, by the entropy of the weights: ${Math.exp(entropy).toFixed(1)}${more}`
+      + `${layer ? '. Click a number to show that mode alone.' : ''}`
     : 'Nothing at this time.';
 }
 
@@ -117,7 +117,7 @@ function choose(index) {
   shown.alone = null;
   const { name, what } = chosen();
   element('weights').setAttribute('aria-label', `Weights of ${name} over time`);
-  element('weights-caption').textContent = `Weights of the ${what}, heaviest at the bottom. A click leads to its time.`;
+  element('weights-caption').textContent = `Weights of the ${what}, heaviest at the bottom. Click to select a time.`;
   element('errors-figure').hidden = !errorsKnown();
   if (errorsKnown()) {
     const keys = ERRORS.map(({ name: text, series }) => {
@@ -126,7 +126,7 @@ function choose(index) {
       return key;
     });
     element('errors-caption').replaceChildren(
-      ...keys, `of ${name}; pelvis on pelvis, mean over ${report.scores ? 'the evaluated' : 'the'} joints.`,
+      ...keys, `of ${name}: mean over the evaluated joints, pelvis on pelvis.`,
     );
     element('errors').setAttribute('aria-label', `Errors of ${name} over time`);
   }
@@ -143,7 +143,7 @@ function swatch(...names) {
   return result;
 }
 
-/** A box to tick. */
+/** A check box. */
 function box(id, text, ticked, colours_, change) {
   const label = made('label');
   const input = made('input', '', { type: 'checkbox', id });
@@ -166,7 +166,7 @@ function buildLayers() {
   if (trajectories.some((topic) => topic.windows.some((w) => w.ways))) {
     shown.trajectories = !layers.length;
     place.append(box(
-      'show-trajectories', 'ways along the trajectories', shown.trajectories, ['trajectories'],
+      'show-trajectories', 'paths of the trajectories', shown.trajectories, ['trajectories'],
       (ticked) => { shown.trajectories = ticked; },
     ));
   }
@@ -174,7 +174,7 @@ function buildLayers() {
     shown.truth = true;
     place.append(box('show-truth', 'truth', true, ['ink'], (ticked) => { shown.truth = ticked; }));
   }
-  place.append(made('span', 'Left limbs have the first colour, right limbs the second; the fainter a mode, the smaller its weight.', { class: 'muted' }));
+  place.append(made('span', 'First colour: left limbs, second colour: right limbs. The fainter a mode, the smaller its weight.', { class: 'muted' }));
 }
 
 function tell() {
@@ -187,8 +187,8 @@ function tell() {
   if (report.images) {
     element('with-modes').closest('div').hidden = report.images.drawn_on;
     element('image-caption').textContent = report.images.drawn_on
-      ? 'What the tracker drew: the heaviest modes on the image.'
-      : 'The modes on the image that they explain.';
+      ? 'Overlay of the tracker: the heaviest modes on the image.'
+      : 'The modes on the image from which they are estimated.';
   } else {
     element('image-figure').hidden = true;
     element('stage').classList.add('without-image');
@@ -202,12 +202,12 @@ function tellFreeEnergy() {
   element('free-energy-figures').hidden = !hasFreeEnergy;
   if (!hasFreeEnergy) {
     element('no-free-energy').hidden = false;
-    element('no-free-energy').textContent = 'None was recorded: the smoother took the most probable paths in closed form. '
-      + 'replay --set smoother.method=variational refines them, and records it.';
+    element('no-free-energy').textContent = 'None was recorded: the smoother computed the most probable paths in closed form. '
+      + 'replay --set smoother.method=variational refines them and records their free energy.';
   }
   element('free-energy').setAttribute('aria-label', 'Free energy of each window over time');
-  element('iterations').setAttribute('aria-label', 'Free energy in the iterations of the present window');
-  element('iterations-caption').textContent = 'In the iterations of the window at this time.';
+  element('iterations').setAttribute('aria-label', 'Free energy over the iterations of the current window');
+  element('iterations-caption').textContent = 'Free energy over the iterations of the window at this time.';
 }
 
 const COLUMNS = [
@@ -223,9 +223,9 @@ function tellScores() {
   element('scores-section').hidden = !report.scores;
   if (!report.scores) return;
   element('scores-about').textContent = `Against ${report.scores.truth}, ${report.scores.truth_frames} frames. `
-    + 'Errors are mean distances of joints, pelvis on pelvis. The last four columns tell how often the truth lies '
-    + 'in the smallest region that holds 50 or 90 percent of the probability: honest mixtures cover 50 and 90 percent, '
-    + 'less means too sure, more too vague.';
+    + 'Errors are mean distances of joints, pelvis on pelvis. The last four columns give the fraction of frames whose '
+    + 'truth lies in the smallest region with 50 or 90 percent of the probability: 50 and 90 percent for a calibrated '
+    + 'mixture, less for an overconfident one, more for a vague one.';
   const head = made('tr');
   ['topic', ...COLUMNS.map(([name]) => name)].forEach((name) => head.append(made('th', name, { scope: 'col' })));
   element('scores').tHead.append(head);
@@ -243,10 +243,10 @@ function tellScores() {
     key.append(line);
   });
   const line = made('div');
-  line.append(swatch('axis'), 'honest');
+  line.append(swatch('axis'), 'calibrated');
   key.append(line);
-  element('together').setAttribute('aria-label', 'Calibration for all joints together; the numbers stand in the table');
-  element('each').setAttribute('aria-label', 'Calibration for each joint alone; the numbers stand in the table');
+  element('together').setAttribute('aria-label', 'Calibration for all joints together; the table has the numbers');
+  element('each').setAttribute('aria-label', 'Calibration for each joint alone; the table has the numbers');
 }
 
 // Playing: a timer waits for the time of the next image; those that come too late are skipped.
@@ -254,7 +254,7 @@ function tellScores() {
 let timer = null;
 let due = 0;
 
-/** For how long a time is shown, ms. */
+/** Duration for which a time is shown, ms. */
 function duration(time) {
   const seconds = time < LAST ? TIMES[time + 1] - TIMES[time] : TIMES[LAST] / Math.max(LAST, 1) || 1;
   return (1000 * seconds) / Number(element('speed').value);
@@ -282,7 +282,7 @@ function step() {
   timer = setTimeout(step, due - performance.now());
 }
 
-/** What stands behind # in the address: frame=10&yaw=30&pitch=5&zoom=1.5&show=0,1,truth,trajectories. */
+/** Applies the part of the address behind #: frame=10&yaw=30&pitch=5&zoom=1.5&show=0,1,truth,trajectories. */
 function readAddress() {
   const given = new URLSearchParams(window.location.hash.slice(1));
   const number = (name, otherwise) => {

@@ -1,7 +1,7 @@
-// What is drawn of the person: skeletons in space, which turn, and skeletons on the image.
+// Skeletons in a 3D view that turns, and skeletons on the image.
 
 const FAINTEST = 0.12;
-// How far away one looks from, in radii of what is in sight.
+// Distance of the viewer, in radii of the visible room.
 const DISTANCE = 5;
 const DASHES = { likelihood: [5, 3], prediction: [2, 3] };
 
@@ -52,7 +52,7 @@ class Space {
     this.listen();
   }
 
-  /** Where the person is on the whole, and how much room all modes take, there and about the pelvis. */
+  /** The centre of all modes, and the room that they take, in space and around the pelvis. */
   measure() {
     const low = [Infinity, Infinity, Infinity];
     const high = [-Infinity, -Infinity, -Infinity];
@@ -61,7 +61,7 @@ class Space {
     const figure = layers[0] || truth;
     this.roots = TIMES.map((_, t) => {
       const offset = this.heaviest(figure, t);
-      return offset < 0 ? null : this.joint(figure, offset, figure.root);
+      return offset < 0 ? null : this.origin(figure, offset);
     });
     const include = (point) => point.forEach((x, axis) => {
       low[axis] = Math.min(low[axis], x);
@@ -107,13 +107,19 @@ class Space {
     return [...figure.positions.slice(i, i + 3)];
   }
 
+  /** The middle of the joints on which skeletons are aligned: the pelvis, or the hips. */
+  origin(figure, offset) {
+    const points = figure.roots.map((joint) => this.joint(figure, offset, joint));
+    return [0, 1, 2].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
+  }
+
   heaviest(figure, t) {
     if (!figure) return -1;
     if (figure === truth) return truth.starts[t];
     return figure.weights[t].length ? figure.starts[t] : -1;
   }
 
-  /** Half of what is in sight at zoom 1, m. */
+  /** Half of the visible room at zoom 1, m. */
   get radius() {
     return 1.12 * (this.follow && this.lastRoot() ? this.ownRoom : this.room);
   }
@@ -190,7 +196,7 @@ class Space {
     };
   }
 
-  /** Where the person is now, or was last seen. */
+  /** The present or last known origin of the person. */
   lastRoot() {
     for (let t = shown.time; t >= 0; t -= 1) if (this.roots[t]) return this.roots[t];
     return this.roots.find(Boolean) || null;
@@ -209,8 +215,8 @@ class Space {
       const { figure, offset } = mode;
       const joints = figure.joints.length;
       const points = [];
-      const first = (offset * joints + figure.root) * 3;
-      const shift = root.map((x, axis) => (this.together ? x - figure.positions[first + axis] : 0));
+      const own = this.origin(figure, offset);
+      const shift = root.map((x, axis) => (this.together ? x - own[axis] : 0));
       for (let joint = 0; joint < joints; joint += 1) {
         const i = (offset * joints + joint) * 3;
         points.push(project(...shift.map((x, axis) => x + figure.positions[i + axis])));
@@ -276,7 +282,7 @@ class Space {
     context.fillText('to the camera', u, v);
   }
 
-  /** The ways of hands, feet, head and pelvis along the trajectories of the present window. */
+  /** The paths of hands, feet, head and pelvis along the trajectories of the current window. */
   drawWays(context, project) {
     context.strokeStyle = colour('trajectories');
     context.fillStyle = colour('trajectories');
@@ -318,7 +324,7 @@ class Film {
     this.last = null;
   }
 
-  /** A picture, which may still be on its way; those that follow are fetched too. */
+  /** A picture, which may still be decoding; the following ones are prepared too. */
   picture(index) {
     const known = this.pictures.get(index);
     if (known) return known;

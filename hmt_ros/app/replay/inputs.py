@@ -1,0 +1,133 @@
+"""The input of the filter in a bag: images, their calibration, keypoints."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.filter_session import KEYPOINTS
+from msg_tools import BagError, BagMessage, BagReader, Topic
+from msg_tools.messages.pose_mixtures import POSE_MIXTURE
+
+RAW, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
+CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
+_KEYPOINTS = 'hmt_msgs/msg/Keypoints2D'
+
+# Names of topics that are preferred to all others.
+_USUAL = ('image/compressed', 'image')
+GROUND_TRUTH = 'ground_truth'
+
+
+@dataclass(frozen=True)
+class RecordedInput:
+    """The topics of a bag that a replay reads.
+
+    Attributes:
+        image: topic of the images.
+        camera_info: topic of their calibration.
+        keypoints: topic of 2D keypoints; None if the bag has none.
+        ground_truth: topic of the ground truth; None if the bag has none.
+    """
+
+    image: Topic
+    camera_info: Topic
+    keypoints: Topic | None
+    ground_truth: Topic | None
+
+    @property
+    def transport(self) -> str:
+        """Value of the parameter `image_transport`."""
+        return 'compressed' if self.image.msgtype == COMPRESSED else 'raw'
+
+    def messages(self, bag: BagReader) -> Generator[tuple[str, BagMessage], None, None]:
+        """(source, message) by log time; the source is one of the filter or `GROUND_TRUTH`.
+
+        Raises:
+            BagError: the bag is damaged here; the messages before the damage were yielded.
+        """
+        sources = {self.image.name: IMAGE, self.camera_info.name: CAMERA_INFO}
+        if self.keypoints is not None:
+            sources[self.keypoints.name] = KEYPOINTS
+        if self.ground_truth is not None:
+            sources[self.ground_truth.name] = GROUND_TRUTH
+        for stored in bag.messages(sources):
+            yield sources[stored.topic], stored
+
+
+def recorded_input(
+    bag: BagReader, image_topic: str | None = None, camera_info_topic: str | None = None
+) -> RecordedInput:
+    """Finds the topics.
+
+    Images come from `image/compressed`, else from `image`, else from the only topic of images.
+    Calibration comes from `camera_info` beside the images, else from the only topic of its type.
+
+    Args:
+        bag: an open bag.
+        image_topic, camera_info_topic: names that replace the automatic choice.
+
+    Raises:
+        BagError: there are no images, no camera_info, or several topics to choose from.
+    """
+    image = _image_topic(bag, image_topic)
+    return RecordedInput(
+        image,
+        _camera_info_topic(bag, image, camera_info_topic),
+        _named(bag, 'keypoints', (_KEYPOINTS,)),
+        _named(bag, GROUND_TRUTH, (POSE_MIXTURE,)),
+    )
+
+
+def _image_topic(bag: BagReader, name: str | None) -> Topic:
+    kinds = (COMPRESSED, RAW)
+    if name is not None:
+        return bag.find_topic(kinds, name)
+    for usual in _USUAL:
+        topic = _named(bag, usual, kinds)
+        if topic is not None:
+            return topic
+    return _the_only(bag, kinds, '--image-topic')
+
+
+def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
+    kinds = (CAMERA_INFO_TYPE,)
+    if name is not None:
+        return bag.find_topic(kinds, name)
+    # /camera/image_raw/compressed has its calibration in /camera/camera_info.
+    namespace = image.name.strip('/')
+    if image.msgtype == COMPRESSED:
+        namespace = namespace.removesuffix('/compressed')
+    namespace = namespace.rpartition('/')[0]
+    beside = _named(bag, f'{namespace}/camera_info'.lstrip('/'), kinds)
+    if beside is not None:
+        return beside
+    if bag.damage is None and not _with_messages(bag, kinds):
+        raise BagError(
+            f'{bag.path} has images on {image.name}, but no camera_info: without the calibration '
+            'of the camera images do not determine positions in space'
+        )
+    return _the_only(bag, kinds, '--camera-info-topic')
+
+
+def _with_messages(bag: BagReader, kinds: tuple[str, ...]) -> list[Topic]:
+    return [
+        topic for topic in bag.topics.values() if topic.msgtype in kinds and topic.message_count
+    ]
+
+
+def _named(bag: BagReader, name: str, kinds: tuple[str, ...]) -> Topic | None:
+    """The topic with a name and with messages of one of the types."""
+    for topic in _with_messages(bag, kinds):
+        if topic.name.lstrip('/') == name:
+            return topic
+    return None
+
+
+def _the_only(bag: BagReader, kinds: tuple[str, ...], option: str) -> Topic:
+    found = _with_messages(bag, kinds)
+    if len(found) > 1:
+        names = ', '.join(topic.name for topic in found)
+        what = ' or '.join(kind.rpartition('/')[2] for kind in kinds)
+        raise BagError(f'{bag.path} has several topics of {what}: name one of {names} by {option}')
+    return bag.find_topic(kinds)

@@ -1,0 +1,341 @@
+"""Replay of many bags, one after the other or through Dask; bags that are done are skipped.
+
+Each new bag `<name>` has `<name>.replay.json` beside it, which records what it was made from (sizes
+and times of the input files, all parameters, checksums of the files that they name, the version of
+this package) and whether it is complete. The record is written before and after the replay.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import importlib
+import json
+import logging
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tqdm import tqdm
+
+import hmt_ros
+from hmt_ros.app.command_line import INTERRUPTED
+from hmt_ros.app.replay.one_bag import Tell, replay_bag
+from hmt_ros.app.replay.options import ReplayOptions, parameters_of_bag
+from msg_tools import BagError
+from msg_tools.bags.bag_folder import unfinished_folders
+from msg_tools.bags.bag_metadata import FILE_NAME, SUFFIXES
+from msg_tools.files.error_line import error_line
+
+# Options that change the new bag, besides the parameters.
+_DECIDING = ('image_topic', 'camera_info_topic', 'with_images', 'keep_going')
+
+DONE, BEFORE, FAILED = 'done', 'done before', 'failed'
+
+# The scheduler that uses the cores of this machine.
+LOCAL = 'local'
+_PATIENCE = 10.0  # s, until a scheduler answers
+
+
+class Job(NamedTuple):
+    """The replay of one of many bags: name of the new bag in its folder, paths, options."""
+
+    name: str
+    source: Path
+    target: Path
+    options: ReplayOptions
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a job.
+
+    Attributes:
+        name: name of the job.
+        kind: `DONE`, `BEFORE` or `FAILED`.
+        text: one line about it.
+        told: lines for the user.
+    """
+
+    name: str
+    kind: str
+    text: str
+    told: tuple[str, ...] = ()
+
+
+def is_many(sources: Sequence[Path], scheduler: str | None) -> bool:
+    """Whether the command is about several bags."""
+    if scheduler is not None or len(sources) > 1:
+        return True
+    path = sources[0]
+    return path.is_dir() and not (path / FILE_NAME).exists() and any(_bags_in(path, None))
+
+
+def replay_many(
+    sources: Sequence[Path],
+    output: Path,
+    options: ReplayOptions,
+    tell: Tell,
+    scheduler: str | None = None,
+) -> int:
+    """Replays all bags.
+
+    Args:
+        sources: bags, and folders of bags.
+        output: folder of the new bags.
+        options: options of the command.
+        tell: receives lines for stderr.
+        scheduler: address of a Dask scheduler, or `LOCAL`; None: one bag after the other.
+
+    Returns:
+        The exit code: 0 all bags are done, 1 some failed, `INTERRUPTED`.
+
+    Raises:
+        ValueError: nothing can be started.
+    """
+    if options.live:
+        raise ValueError('--live replays one bag at a time; leave it out for several')
+    jobs = _jobs(sources, output, options)
+    counts = dict.fromkeys((DONE, BEFORE, FAILED), 0)
+    try:
+        with (
+            _alone_in(output),
+            tqdm(total=len(jobs), unit='bag', disable=True if options.quiet else None) as bar,
+        ):
+            outcomes = map(replay_job, jobs) if scheduler is None else _by_dask(jobs, scheduler)
+            for outcome in outcomes:
+                counts[outcome.kind] += 1
+                for line in outcome.told:
+                    tell(line)
+                if outcome.kind == FAILED:
+                    tell(f'{outcome.name}: {outcome.text}')
+                elif not options.quiet:
+                    tqdm.write(f'{outcome.name}: {outcome.text}')
+                bar.update()
+    except KeyboardInterrupt:
+        done = counts[DONE] + counts[BEFORE]
+        tell(f'interrupted, {done} of {len(jobs)} bags are done; the same command continues')
+        return INTERRUPTED
+    if not options.quiet:
+        print(
+            f'{output}: {counts[DONE]} replayed, {counts[BEFORE]} done before, '
+            f'{counts[FAILED]} failed'
+        )
+    return 1 if counts[FAILED] else 0
+
+
+def _by_dask(jobs: Sequence[Job], scheduler: str) -> Iterator[Outcome]:
+    """Outcomes of jobs in the order in which they end.
+
+    Raises:
+        ValueError: Dask is not installed, or the scheduler does not answer.
+    """
+    try:
+        distributed: Any = importlib.import_module('distributed')
+    except ImportError as error:
+        raise ValueError(
+            f'--scheduler needs Dask, which is not installed ({error_line(error)}): '
+            '`pip install distributed`, or leave --scheduler out'
+        ) from error
+    with ExitStack() as opened:
+        try:
+            address = scheduler
+            if scheduler == LOCAL:
+                address = opened.enter_context(
+                    distributed.LocalCluster(
+                        n_workers=max(1, min(len(jobs), len(os.sched_getaffinity(0)))),
+                        threads_per_worker=1,
+                        processes=True,
+                        host='127.0.0.1',
+                        dashboard_address=None,
+                        silence_logs=logging.CRITICAL,
+                    )
+                )
+            client = opened.enter_context(distributed.Client(address, timeout=_PATIENCE))
+        except (OSError, ValueError, RuntimeError) as error:
+            raise ValueError(f'--scheduler {scheduler}: {error_line(error)}') from error
+        job_of = {client.submit(replay_job, job, pure=False): job for job in jobs}
+        for future in distributed.as_completed(job_of):
+            # An error of the future is one of Dask, for example a killed worker.
+            fault = future.exception()
+            yield future.result() if fault is None else _failed(job_of[future], fault, ())
+
+
+def replay_job(job: Job) -> Outcome:
+    """Replays one bag of many, unless it is done."""
+    told: list[str] = []
+    try:
+        kind, text = _replayed_once(job, told.append)
+    except Exception as error:  # noqa: BLE001 - the other bags are replayed after any error
+        return _failed(job, error, told)
+    return Outcome(job.name, kind, text, tuple(told))
+
+
+def _failed(job: Job, error: BaseException, told: Sequence[str]) -> Outcome:
+    text = error_line(error)
+    if not isinstance(error, (ValueError, OSError)):
+        text = f'{type(error).__name__}: {text}'
+    return Outcome(job.name, FAILED, text, tuple(told))
+
+
+def _replayed_once(job: Job, tell: Tell) -> tuple[str, str]:
+    target, options = job.target, job.options
+    record = target.with_name(f'{target.name}.replay.json')
+    made_from = _made_from(job)
+    known = _read_record(record)
+    if known.get('made_from') == made_from:
+        if known.get('done') and known.get('files') == _sizes(target):
+            return BEFORE, 'done before'
+        # This command has started the bag and did not complete it: its remains are ours.
+        options = replace(options, overwrite=True)
+        for folder in unfinished_folders(target):
+            shutil.rmtree(folder, ignore_errors=True)
+    elif os.path.lexists(target) and not options.overwrite:
+        raise BagError(
+            f'{target} exists, made from other input or with other parameters; --overwrite '
+            'replaces it, or give another folder'
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    _write_record(record, {'done': False, 'made_from': made_from})
+    replayed = replay_bag(job.source, target, options, tell)
+    _write_record(
+        record,
+        {
+            'done': True,
+            'images': replayed.images,
+            'tracked': replayed.tracked,
+            'files': _sizes(target),
+            'made_from': made_from,
+        },
+    )
+    return DONE, str(replayed)
+
+
+# What a bag was made from
+
+
+def _made_from(job: Job) -> dict[str, Any]:
+    source, options = job.source, job.options
+    parameters = {
+        node: None if values is None else _without_paths(asdict(values))
+        for node, values in parameters_of_bag(source, options)._asdict().items()
+    }
+    files = sorted(source.iterdir()) if source.is_dir() else [source]
+    made_from = {
+        'version': hmt_ros.__version__,
+        'input': {
+            path.name: [path.stat().st_size, path.stat().st_mtime_ns]
+            for path in files
+            if path.name == FILE_NAME or path.name.endswith(SUFFIXES)
+        },
+        'parameters': parameters,
+        'options': {name: getattr(options, name) for name in _DECIDING},
+    }
+    # With the types that reading it again gives.
+    result: dict[str, Any] = json.loads(json.dumps(made_from, default=str))
+    return result
+
+
+def _without_paths(value: Any) -> Any:
+    """The value with checksums of files in place of their names."""
+    if isinstance(value, dict):
+        return {key: _without_paths(entry) for key, entry in value.items()}
+    if isinstance(value, str) and value and len(value) < 4096 and Path(value).is_file():
+        return f'sha256:{hashlib.sha256(Path(value).read_bytes()).hexdigest()}'
+    return value
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    return {p.name: p.stat().st_size for p in sorted(folder.iterdir())} if folder.is_dir() else {}
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    """A record; empty if the file is missing or not one."""
+    with suppress(OSError, ValueError):
+        content = json.loads(path.read_text('utf-8'))
+        if isinstance(content, dict):
+            return content
+    return {}
+
+
+def _write_record(path: Path, content: dict[str, Any]) -> None:
+    partial = path.with_name(f'.{path.name}.partial')
+    with partial.open('w', encoding='utf-8') as file:
+        json.dump(content, file, indent=1)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+# Which bags
+
+
+def _jobs(sources: Sequence[Path], output: Path, options: ReplayOptions) -> list[Job]:
+    """The jobs of the command, with absolute paths."""
+    found: dict[str, Path] = {}
+    for path in sources:
+        several = path.is_dir() and not (path / FILE_NAME).exists()
+        if several and path.resolve() == output.resolve():
+            raise ValueError(f'{path} is the folder that is read; give another name')
+        bags = dict(_bags_in(path, output)) if several else {_name(path): path}
+        if not bags:
+            raise BagError(f'{path} has no bags in it')
+        for name, bag in bags.items():
+            if found.setdefault(name, bag) != bag:
+                raise ValueError(f'{found[name]} and {bag} would both become {output / name}')
+    jobs = []
+    for name, bag in found.items():
+        source = bag.absolute()
+        own = replace(options.of_bag(source).with_absolute_paths(), quiet=True)
+        jobs.append(Job(name, source, output.absolute() / name, own))
+    return jobs
+
+
+def _bags_in(folder: Path, output: Path | None) -> Iterator[tuple[str, Path]]:
+    """Names and paths of the bags in a folder, at any depth, except those in the output."""
+    avoided = None if output is None else output.resolve()
+    for here, folders, files in os.walk(folder):
+        place = Path(here)
+        inside = []
+        for name in sorted(folders):
+            path = place / name
+            if name.startswith('.') or path.resolve() == avoided:
+                continue
+            if (path / FILE_NAME).is_file():
+                yield str(path.relative_to(folder)), path
+            else:
+                inside.append(name)
+        folders[:] = inside
+        for name in sorted(files):
+            if name.endswith(SUFFIXES) and not name.startswith('.'):
+                path = place / name
+                yield str(path.relative_to(folder).with_name(_name(path))), path
+
+
+def _name(path: Path) -> str:
+    name = path.resolve().name
+    for suffix in ('.zstd', '.mcap', '.db3') if path.is_file() else ():
+        name = name.removesuffix(suffix)
+    return name
+
+
+@contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Locks a folder: another command would take unfinished bags for its own remains."""
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ValueError(f'another replay writes into {folder}') from None
+        except OSError:
+            # A file system without locks, for example of a network: assume that nobody else writes.
+            pass
+        yield
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,212 @@
+"""Replay of one bag into a new one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from hmt_ros.app.replay.background import ReadAhead, WriteBehind
+from hmt_ros.app.replay.inputs import COMPRESSED, GROUND_TRUTH, RecordedInput, recorded_input
+from hmt_ros.app.replay.options import ReplayOptions, node_parameters
+from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PlayedTrack
+from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.filter_session import KEYPOINTS
+from hmt_ros.sessions.handled import Handled
+from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.tracking import Subject
+from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
+from msg_tools.messages.headers import header_message, time_ns
+from msg_tools.messages.images import ImageError, decode_image, image_message
+
+Tell = Callable[[str], None]
+
+
+@dataclass
+class Replayed:
+    """The outcome of a replay.
+
+    Attributes:
+        images: number of images that were read.
+        tracked: number of images in which the person was tracked.
+        last_stamp: stamp of the last image, ns.
+        last_fault: text of the newest fault; '' without faults.
+    """
+
+    images: int = 0
+    tracked: int = 0
+    last_stamp: int = 0
+    last_fault: str = ''
+
+    def __str__(self) -> str:
+        return f'{self.tracked} of {self.images} images tracked'
+
+
+def replay_bag(source: Path, target: Path, options: ReplayOptions, tell: Tell) -> Replayed:
+    """Replays a bag into a new one, which is written completely or not at all.
+
+    Args:
+        source: path of the bag.
+        target: folder of the new bag.
+        options: options of the command, for this bag.
+        tell: receives lines for the user.
+
+    Raises:
+        ValueError: bad input.
+    """
+    if target.exists() and target.resolve() in (source.resolve(), source.resolve().parent):
+        raise ValueError(f'{target} is the bag that is read; give another name')
+    with BagReader(source) as bag:
+        if not options.keep_going:
+            bag.raise_damage()
+        recorded = recorded_input(bag, options.image_topic, options.camera_info_topic)
+        parameters = node_parameters(options, recorded)
+        # The files that the parameters name are read before a node starts.
+        subject = prepare_start(parameters.filter).initial
+        if subject is None and not options.quiet:
+            tell(f'no --subject: the track starts from a prediction{_subject_hint(source)}')
+        with_keypoints = parameters.filter.use_keypoints
+        if not with_keypoints:
+            recorded = replace(recorded, keypoints=None)
+        with BagWriter(target, overwrite=options.overwrite) as out:
+            topics = dict(track_messages.TOPICS)
+            if parameters.smoother is not None:
+                topics.update(smoothed_messages.TOPICS)
+            if parameters.bme is not None:
+                topics.update(bme_session.TOPICS)
+            for topic, published in topics.items():
+                out.add_topic(topic, published.msgtype, latched=published.latched)
+            way = LiveTrack if options.live else OfflineTrack
+            # Bytes are compressed and images decoded while the next image is tracked.
+            with WriteBehind() as behind:
+                write = partial(behind.call, out.write_serialised)
+                with (
+                    way(parameters, write) as track,
+                    tqdm(
+                        total=recorded.image.message_count,
+                        unit='image',
+                        desc=str(target),
+                        disable=options.quiet or None,  # None: shown where stderr is a terminal
+                    ) as bar,
+                ):
+                    result = _play(
+                        options, bag, recorded, track, out, behind, bar, tell,
+                        with_keypoints=with_keypoints,
+                    )  # fmt: skip
+            if not result.tracked:
+                raise ValueError(f'{source}: {_why_nothing(result, subject)}')
+    return result
+
+
+def _subject_hint(bag: Path) -> str:
+    beside = (bag if bag.is_dir() else bag.parent) / 'subject.yaml'
+    return f'; there is {beside} beside the bag' if beside.is_file() else ''
+
+
+def _play(
+    options: ReplayOptions, bag: BagReader, recorded: RecordedInput, track: PlayedTrack,
+    out: BagWriter, behind: WriteBehind, bar: tqdm, tell: Tell, *, with_keypoints: bool,
+) -> Replayed:  # fmt: skip
+    """Hands the messages of the bag to the nodes, and copies those that the new bag keeps."""
+    result = Replayed()
+    copied = {GROUND_TRUTH, IMAGE, CAMERA_INFO} if options.with_images else {GROUND_TRUTH}
+
+    def check(handled: Handled) -> None:
+        behind.check()
+        result.tracked += sum(topic == 'pose_mixture' for topic, _ in handled.published)
+        if handled.faults:
+            result.last_fault = handled.faults[-1]
+            if not options.keep_going:
+                raise ValueError(
+                    f'{bag.path}: {handled.faults[0]} (--keep-going skips such messages)'
+                )
+        for text in handled.warnings:
+            tell(f'{bag.path}: {text}')
+
+    messages = recorded.messages(bag)
+    with ReadAhead(partial(_read, messages, not options.live), messages.close) as ahead:
+        for source, stored, given in _readable(ahead, options.keep_going, tell):
+            if source in copied:
+                behind.call(out.write, stored.topic, stored.log_time_ns, stored.message)
+            if source == GROUND_TRUTH:
+                continue
+            check(track.take(source, given))
+            if source == IMAGE:
+                result.images += 1
+                result.last_stamp = time_ns(stored.message.header.stamp)
+                bar.update()
+        if with_keypoints:
+            # The last images need not wait any longer.
+            check(track.take(KEYPOINTS, _nobody(result.last_stamp)))
+        check(track.finish())
+    return result
+
+
+def _read(messages: Iterator[tuple[str, BagMessage]], decode: bool) -> tuple[str, BagMessage, Any]:
+    """Source and message of the next message, and what the nodes get: images may be decoded.
+
+    Raises:
+        BagError: its bytes are not a message; the next one can still be read.
+        StopIteration: there is none.
+    """
+    source, stored = next(messages)
+    given = stored.message
+    if decode and source == IMAGE and stored.msgtype == COMPRESSED:
+        try:
+            picture = decode_image(given)
+        except ImageError:
+            # The node that gets it reports the fault.
+            return source, stored, given
+        given = image_message(
+            RosbagsMessages(), picture, time_ns(given.header.stamp), str(given.header.frame_id)
+        )
+    return source, stored, given
+
+
+def _readable(
+    messages: Iterator[tuple[str, BagMessage, Any]], keep_going: bool, tell: Tell
+) -> Iterator[tuple[str, BagMessage, Any]]:
+    """The messages that can be read, up to a damaged place.
+
+    Raises:
+        BagError: a message can not be read, and the replay is not to keep going.
+    """
+    while True:
+        try:
+            found = next(messages)
+        except StopIteration:
+            return
+        except BagError as error:
+            if not keep_going:
+                raise
+            tell(str(error))
+            continue
+        yield found
+
+
+def _nobody(stamp_ns: int) -> Any:
+    """hmt_msgs/Keypoints2D of an image without joints."""
+    messages = RosbagsMessages()
+    return messages.create(
+        'hmt_msgs/msg/Keypoints2D', header=header_message(messages, stamp_ns, '')
+    )
+
+
+def _why_nothing(result: Replayed, subject: object) -> str:
+    if isinstance(subject, Subject) and result.images and subject.stamp_ns > result.last_stamp:
+        return (
+            f'the joints of the subject file were seen at {subject.stamp_ns} ns, after the last '
+            f'image, at {result.last_stamp} ns: is it the file of another bag?'
+        )
+    if subject is None and not result.last_fault:
+        return (
+            f'nobody is seen in its {result.images} images: give an image of the empty scene by '
+            '--background FILE, or the joints of the person in one image by --subject FILE'
+        )
+    why = f': {result.last_fault}' if result.last_fault else ''
+    return f'none of its {result.images} images was tracked{why}'

@@ -1,0 +1,187 @@
+"""Options of a replay, and the parameters of the nodes that follow from them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from hmt_ros.app.replay.inputs import RecordedInput, recorded_input
+from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.parameter_file import read_parameter_file
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from msg_tools import BagReader
+from msg_tools.files.error_line import error_line
+from msg_tools.files.plain_yaml import load_plain_yaml
+
+FILTER, SMOOTHER, BME = 'filter_node', 'smoother_node', 'bme_node'
+# Prefixes of the parameters of a node in --set.
+_PREFIXES = {SMOOTHER: 'smoother.', BME: 'bme.', FILTER: ''}
+# Parameters that the bag and the command decide, whatever a parameter file says.
+_DECIDED_HERE = ('image_transport', 'autostart')
+# Parameters that ROS gives every node.
+_OF_ROS = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
+# Stands for the folder of a bag in the options that name files of one person.
+_BAG = '{bag}'
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """Arguments of the command, see its help, except its bags.
+
+    `with_smoother` is false for --no-smoother, `settings` are the values of --set, and an empty
+    `bme` selects the model that comes with the package.
+    """
+
+    overwrite: bool = False
+    quiet: bool = False
+    live: bool = False
+    with_smoother: bool = True
+    keep_going: bool = False
+    subject: Path | None = None
+    bme: str | None = None
+    background: Path | None = None
+    body: str | None = None
+    config: Sequence[Path] = ()
+    settings: Sequence[str] = ()
+    seed: int | None = None
+    image_topic: str | None = None
+    camera_info_topic: str | None = None
+    with_images: bool = False
+
+    def of_bag(self, source: Path) -> ReplayOptions:
+        """The options for one bag: `{bag}` in names of files becomes its folder."""
+        folder = str(source if source.is_dir() else source.parent)
+        return self._renamed(lambda name: name.replace(_BAG, folder))
+
+    def with_absolute_paths(self) -> ReplayOptions:
+        """The options with names of files that are valid in any working directory."""
+
+        def absolute(name: str) -> str:
+            return str(Path(name).absolute()) if Path(name).is_file() else name
+
+        config = [file.absolute() for file in self.config]
+        return replace(self._renamed(absolute), config=config)
+
+    def _renamed(self, rename: Callable[[str], str]) -> ReplayOptions:
+        """The options with other names of the files of a person."""
+
+        def path(value: Path | None) -> Path | None:
+            return None if value is None else Path(rename(str(value)))
+
+        return replace(
+            self,
+            subject=path(self.subject),
+            background=path(self.background),
+            bme=self.bme and rename(self.bme),
+            body=self.body and rename(self.body),
+        )
+
+
+class NodeParameters(NamedTuple):
+    """Parameters of the nodes; None for a node that does not take part."""
+
+    filter: FilterParameters
+    smoother: SmootherParameters | None = None
+    bme: BmeParameters | None = None
+
+
+def parameters_of_bag(source: Path, options: ReplayOptions) -> NodeParameters:
+    """Parameters of the nodes for a bag.
+
+    Raises:
+        ValueError: bad input.
+    """
+    with BagReader(source) as bag:
+        recorded = recorded_input(bag, options.image_topic, options.camera_info_topic)
+    return node_parameters(options, recorded)
+
+
+def node_parameters(options: ReplayOptions, recorded: RecordedInput) -> NodeParameters:
+    """Parameters of the nodes for the topics of a bag.
+
+    Raises:
+        ValueError: unknown parameters or values.
+    """
+    tracking = _filter_parameters(options, recorded)
+    smoothing = _smoother_parameters(options) if options.with_smoother else None
+    predicting = None
+    if options.bme is not None or not tracking.subject_file:
+        predicting = _bme_parameters(options, recorded, tracking)
+        tracking = replace(tracking, use_predictions=True)
+    else:
+        for text in options.settings:
+            if text.startswith(_PREFIXES[BME]):
+                raise ValueError(f'--set {text}: nothing is predicted without --bme')
+    return NodeParameters(tracking, smoothing, predicting)
+
+
+def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> FilterParameters:
+    values = _given_values(options, FILTER)
+    given = {
+        'random_seed': options.seed,
+        'body_model': options.body,
+        'subject_file': options.subject,
+        'background_file': options.background,
+    }
+    for name, value in given.items():
+        if value is not None:
+            values[name] = str(value) if isinstance(value, Path) else value
+    values.setdefault('use_keypoints', recorded.keypoints is not None)
+    values['image_transport'] = recorded.transport
+    return with_values(FilterParameters(), values)
+
+
+def _smoother_parameters(options: ReplayOptions) -> SmootherParameters:
+    values = _given_values(options, SMOOTHER)
+    if options.seed is not None:
+        values['random_seed'] = options.seed
+    if options.body is not None:
+        # The name in the messages does not lead to the file of the body.
+        values['body_model'] = options.body
+    return with_values(SmootherParameters(), values)
+
+
+def _bme_parameters(
+    options: ReplayOptions, recorded: RecordedInput, tracking: FilterParameters
+) -> BmeParameters:
+    values = {
+        'background_file': tracking.background_file,
+        **_given_values(options, BME),
+        'image_transport': recorded.transport,
+    }
+    if options.bme:
+        values['model_file'] = options.bme
+    return with_values(BmeParameters(background=tracking.background), values)
+
+
+def _given_values(options: ReplayOptions, node: str) -> dict[str, Any]:
+    """Values from --config and --set for a node, by name."""
+    values: dict[str, Any] = {}
+    for file in options.config:
+        # Sections for all nodes go to the filter: many names mean something else to the smoother.
+        read = read_parameter_file(file, node, by_name=node != FILTER)
+        values.update(
+            (name, value)
+            for name, value in read.items()
+            if not name.startswith(_OF_ROS) and name not in _DECIDED_HERE
+        )
+    for text in options.settings:
+        name, equals, value = text.partition('=')
+        owner = next(owner for owner, prefix in _PREFIXES.items() if name.startswith(prefix))
+        name = name.removeprefix(_PREFIXES[owner])
+        if not equals or name in _DECIDED_HERE:
+            why = f'{name} is decided by replay' if equals else 'wanted NAME=VALUE'
+            raise ValueError(f'--set {text}: {why}')
+        if owner != node:
+            continue
+        try:
+            values[name] = load_plain_yaml(value)
+        except ValueError as error:
+            raise ValueError(f'--set {text}: {error_line(error)}') from error
+        if values[name] is None:
+            values[name] = value
+    return values

@@ -1,0 +1,202 @@
+"""BME, filter and smoother take the messages of a bag, offline or as real nodes.
+
+The BME takes each image before the filter, which takes the `pose_prediction` of the BME; the
+smoother takes the `likelihood_mixture` of the filter; then the next message follows. At the end of
+the bag the smoother finishes: no message tells the node, so it is deactivated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
+from functools import partial
+from typing import Any, Protocol
+
+from hmt_ros.app.replay.live_node import LiveNode
+from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER, NodeParameters
+from hmt_ros.app.replay.player import Player
+from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
+from hmt_ros.sessions.bme_session import BmeSession
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
+from hmt_ros.sessions.handled import Handled, Output
+from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
+from msg_tools.messages.cdr import deserialise
+
+# Topics of the filter that the smoother takes, as sources of the same names.
+HANDED_ON = (MIXTURE,)
+# Sources in the bag that the BME takes.
+SEEN_BY_BME = (CAMERA_INFO, IMAGE)
+
+Write = Callable[[str, int, bytes], None]
+
+
+class PlayedTrack(AbstractContextManager['PlayedTrack'], Protocol):
+    """Takes the messages of a bag one after the other; a context manager."""
+
+    def take(self, source: str, message: Any) -> Handled:
+        """Hands a message over and returns when all its results are written."""
+
+    def finish(self) -> Handled:
+        """Returns when the results that waited for more messages are written."""
+
+
+class OfflineTrack(PlayedTrack):
+    """Without ROS.
+
+    Args:
+        parameters: parameters of the nodes.
+        write: takes topic, stamp and bytes of each published message.
+
+    Raises:
+        ValueError: the parameters name a file that can not be used.
+    """
+
+    def __init__(self, parameters: NodeParameters, write: Write) -> None:
+        self._write = write
+        self._predicted: list[Output] = []
+        self._handed: list[Output] = []
+        self._bme = self._smoother = None
+        if parameters.bme is not None:
+            self._bme = BmeSession(parameters.bme, self._predict)
+        self._filter = FilterSession(parameters.filter, self._filtered)
+        if parameters.smoother is not None:
+            self._smoother = SmootherSession(parameters.smoother, lambda output: write(*output))
+
+    def __exit__(self, *_: object) -> None:
+        """See `PlayedTrack`; nothing is open."""
+
+    def take(self, source: str, message: Any) -> Handled:
+        """See `PlayedTrack`."""
+        result = None
+        if self._bme is not None and source in SEEN_BY_BME:
+            result = self._bme.take(source, message)
+            predicted, self._predicted = self._predicted, []
+            for topic, _, data in predicted:
+                read = deserialise(data, bme_session.TOPICS[topic].msgtype)
+                result = _together(result, self._filter.take(PREDICTION, read))
+        result = _together(result, self._filter.take(source, message))
+        handed, self._handed = self._handed, []
+        if self._smoother is not None:
+            for topic, _, data in handed:
+                read = deserialise(data, track_messages.TOPICS[topic].msgtype)
+                result = _together(result, self._smoother.take(topic, read))
+        return result
+
+    def finish(self) -> Handled:
+        """See `PlayedTrack`."""
+        if self._smoother is None:
+            return Handled(FINISH, 0, (), (), ())
+        return self._smoother.finish()
+
+    def _predict(self, output: Output) -> None:
+        self._write(*output)
+        self._predicted.append(output)
+
+    def _filtered(self, output: Output) -> None:
+        self._write(*output)
+        if output.topic in HANDED_ON:
+            self._handed.append(output)
+
+
+class LiveTrack(PlayedTrack):
+    """The real nodes, over DDS in lock step.
+
+    Args:
+        parameters: parameters of the nodes.
+        write: takes topic, stamp and bytes of each published message, in the order of the nodes.
+
+    Raises:
+        LiveNodeError: there is no ROS, or a node does not start, answer or end.
+    """
+
+    def __init__(self, parameters: NodeParameters, write: Write) -> None:
+        self._parameters, self._write = parameters, write
+        self._bme: LiveNode | None = None
+        self._smoother: LiveNode | None = None
+
+    def __enter__(self) -> LiveTrack:
+        with ExitStack() as opened:
+            player = Player(opened)
+            kind, topic = 'Image', 'image'
+            if self._parameters.filter.image_transport == 'compressed':
+                kind, topic = 'CompressedImage', 'image/compressed'
+            inputs = {
+                CAMERA_INFO: ('camera_info', 'sensor_msgs/msg/CameraInfo'),
+                KEYPOINTS: ('keypoints', 'hmt_msgs/msg/Keypoints2D'),
+                IMAGE: (topic, f'sensor_msgs/msg/{kind}'),
+            }
+            live = partial(LiveNode, player, opened, write=self._write)
+            sensors = (f'/{topic}', '/camera_info')
+            if self._parameters.bme is not None:
+                self._bme = live(
+                    BME, self._parameters.bme, inputs={}, topics=bme_session.TOPICS, sensors=sensors
+                )
+            self._filter = live(
+                FILTER,
+                self._parameters.filter,
+                inputs=inputs,
+                topics=track_messages.TOPICS,
+                sensors=(*sensors, '/keypoints'),
+            )
+            if self._parameters.smoother is not None:
+                self._smoother = live(
+                    SMOOTHER, self._parameters.smoother, inputs={}, topics=smoothed_messages.TOPICS
+                )
+            self._filter.wait_until_active()
+            if self._bme is not None:
+                self._bme.wait_until_active()
+                self._bme.wait_for_subscribers((PREDICTION,), 2)
+                self._filter.wait_until_heard(SEEN_BY_BME, 2)
+            if self._smoother is not None:
+                self._smoother.wait_until_active()
+                self._filter.wait_for_subscribers(HANDED_ON, 2)
+            self._opened = opened.pop_all()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        with self._opened:
+            if kind is None:
+                for node in (self._bme, self._filter, self._smoother):
+                    if node is not None:
+                        node.stop_well()
+
+    def take(self, source: str, message: Any) -> Handled:
+        """See `PlayedTrack`.
+
+        Raises:
+            LiveNodeError: a node has ended, or does not answer.
+        """
+        self._filter.publish(source, message)
+        result = None
+        if self._bme is not None and source in SEEN_BY_BME:
+            result = self._bme.answer(source)
+            # The filter gets the prediction as well, before or after its image.
+            for topic, _ in result.published:
+                result = _together(result, self._filter.answer(topic))
+        result = _together(result, self._filter.answer(source))
+        if self._smoother is not None:
+            handed = [topic for topic, _ in result.published if topic in HANDED_ON]
+            for topic in handed:
+                result = _together(result, self._smoother.answer(topic))
+        return result
+
+    def finish(self) -> Handled:
+        """See `PlayedTrack`."""
+        if self._smoother is None:
+            return Handled(FINISH, 0, (), (), ())
+        self._smoother.deactivate()
+        return self._smoother.answer(FINISH)
+
+
+def _together(one: Handled | None, other: Handled) -> Handled:
+    """The handling of a message and of one that it led to, in one record."""
+    if one is None:
+        return other
+    return Handled(
+        one.source,
+        one.stamp_ns,
+        one.faults + other.faults,
+        one.warnings + other.warnings,
+        one.published + other.published,
+    )

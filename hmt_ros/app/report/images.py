@@ -1,0 +1,182 @@
+"""Images of a bag as JPEGs that together are small enough for a page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.app.replay.inputs import CAMERA_INFO_TYPE, COMPRESSED, RAW, recorded_input
+from hmt_ros.body import Camera
+from msg_tools import BagReader
+from msg_tools.messages.camera_info import camera_from_info
+from msg_tools.messages.headers import time_ns
+from msg_tools.messages.images import decode_image, encode_jpeg
+
+Image = NDArray[np.uint8]
+
+# The end of the name of the topic on which the tracker publishes its drawings.
+OVERLAY = 'overlay/compressed'
+# Width in px and quality, from the best to the smallest.
+_LEVELS = (
+    (640, 80), (640, 65), (480, 65), (480, 50), (360, 50), (320, 40), (240, 35), (160, 30),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ImageSource:
+    """The place of the images of a report.
+
+    Attributes:
+        bag: path of their bag.
+        topic: topic of the images.
+        camera_info: topic of their calibration; None: the modes are already drawn on them.
+    """
+
+    bag: Path
+    topic: str
+    camera_info: str | None
+
+
+@dataclass(eq=False)
+class FilmStrip:
+    """Images by stamp.
+
+    Attributes:
+        camera: camera of the images; None if unknown.
+        size: (width, height) of the images in the bag, px; (0, 0) without images.
+        jpegs: JPEG files, scaled down.
+        kept: some of the images at their full size, (H, W, 3) BGR.
+    """
+
+    camera: Camera | None = None
+    size: tuple[int, int] = (0, 0)
+    jpegs: dict[int, bytes] = field(default_factory=dict)
+    kept: dict[int, Image] = field(default_factory=dict)
+
+
+def image_source(
+    out: Path, images: Path | None, image_topic: str | None, camera_info_topic: str | None
+) -> ImageSource | None:
+    """The place of the images that belong to a bag of mixtures; None: there are none.
+
+    The images in the bag `images`; else those in `out`, with calibration; else the drawings of the
+    tracker in `out`.
+
+    Args:
+        out: bag of the mixtures.
+        images: bag of the images; None if unknown.
+        image_topic, camera_info_topic: names that replace the automatic choice.
+
+    Raises:
+        BagError: wanted images or calibration are missing, or there are several to choose from.
+    """
+    path = out if images is None else images
+    with BagReader(path) as bag:
+        bag.raise_damage()
+        if images is None and image_topic is None:
+            found = [
+                topic.name
+                for topic in bag.topics.values()
+                if topic.msgtype in (RAW, COMPRESSED) and topic.message_count
+            ]
+            drawn = [name for name in found if name.endswith(OVERLAY)]
+            recorded = [name for name in found if name not in drawn]
+            calibrated = any(
+                topic.msgtype == CAMERA_INFO_TYPE and topic.message_count
+                for topic in bag.topics.values()
+            )
+            if not recorded or not calibrated:
+                return ImageSource(path, drawn[0], None) if drawn else None
+            if len(recorded) == 1:
+                image_topic = recorded[0]
+        chosen = recorded_input(bag, image_topic, camera_info_topic)
+        return ImageSource(path, chosen.image.name, chosen.camera_info.name)
+
+
+def film_strip(
+    source: ImageSource,
+    stamps: Collection[int],
+    allowed: int,
+    *,
+    keep: Collection[int] = (),
+    progress: Callable[[int], object] | None = None,
+) -> FilmStrip:
+    """The images at some stamps.
+
+    Each gets an equal part of the bytes; the first one that does not fit makes all later ones
+    smaller.
+
+    Args:
+        source: place of the images.
+        stamps: stamps of the wanted images.
+        allowed: size of all JPEGs together, bytes.
+        keep: stamps of the images that are also wanted at full size.
+        progress: called with the number of images that were read.
+
+    Raises:
+        ValueError: no image has such a stamp, one can not be decoded, or they differ in size.
+    """
+    wanted = set(stamps)
+    result = FilmStrip()
+    seen: list[int] = []
+    level, left = 0, allowed
+    with BagReader(source.bag) as bag:
+        for stored in bag.messages([source.topic]):
+            if progress is not None:
+                progress(1)
+            message = stored.message
+            stamp = time_ns(message.header.stamp)
+            seen.append(stamp)
+            if stamp not in wanted or stamp in result.jpegs:
+                continue
+            try:
+                image = decode_image(message)
+            except ValueError as error:
+                where = f'{source.bag}: {source.topic} at {stored.log_time_ns} ns'
+                raise ValueError(f'{where}: {error}') from error
+            size = image.shape[1], image.shape[0]
+            if result.size not in ((0, 0), size):
+                raise ValueError(
+                    f'{source.bag}: images on {source.topic} have sizes {result.size[0]}x'
+                    f'{result.size[1]} and {size[0]}x{size[1]}, wanted one'
+                )
+            result.size = size
+            if stamp in keep:
+                result.kept[stamp] = image
+            jpeg, level = _small(image, allowed // len(wanted), level)
+            if len(jpeg) <= left:
+                result.jpegs[stamp] = jpeg
+                left -= len(jpeg)
+        if result.size == (0, 0):
+            raise ValueError(
+                f'{source.bag}: none of the images on {source.topic}, '
+                f'{min(seen)} to {max(seen)} ns, has the stamp of a mixture, '
+                f'{min(wanted)} to {max(wanted)} ns: is this the bag that was tracked?'
+            )
+        if source.camera_info is not None:
+            info = next(bag.messages([source.camera_info])).message
+            try:
+                result.camera = camera_from_info(info, result.size)
+            except ValueError as error:
+                raise ValueError(f'{source.bag}: {source.camera_info}: {error}') from error
+    return result
+
+
+def _small(image: Image, allowed: int, level: int) -> tuple[bytes, int]:
+    """The best JPEG of an image within the bytes, or else the smallest, and its level."""
+    while True:
+        width, quality = _LEVELS[level]
+        scaled = image
+        if image.shape[1] > width:
+            height = max(round(image.shape[0] * width / image.shape[1]), 1)
+            resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+            scaled = np.asarray(resized, dtype=np.uint8)
+        jpeg = encode_jpeg(scaled, quality)
+        if len(jpeg) <= allowed or level == len(_LEVELS) - 1:
+            return jpeg, level
+        level += 1

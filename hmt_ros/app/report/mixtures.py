@@ -1,0 +1,228 @@
+"""The mixtures in a bag as joint positions over time, which a report shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.app.bag_scores import chosen_topics
+from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
+from msg_tools import BagMessage, BagReader
+from msg_tools.messages.message_error import MessageError
+from msg_tools.messages.pose_mixtures import POSE_MIXTURE, pose_mixture_of
+from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
+
+Array = NDArray[np.float64]
+
+# Joints whose paths are drawn of trajectories, and how many trajectories are kept.
+ENDS = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
+KEPT_TRAJECTORIES = 8
+_TRAJECTORIES = 'trajectories'
+_ORDER = ('posterior', 'smoothed', 'likelihood', 'prediction', 'ground_truth', _TRAJECTORIES)
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A mixture over poses.
+
+    Attributes:
+        stamp_ns: time of the poses.
+        weights: (K,) heaviest first.
+        joints: (K, J, 3) camera optical frame, m.
+    """
+
+    stamp_ns: int
+    weights: Array
+    joints: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A mixture over trajectories.
+
+    Attributes:
+        stamp_ns: end of the window.
+        stamps_ns: (T,) times of the poses.
+        weights: (M,) of all trajectories, heaviest first.
+        free_energy: (I,) per iteration, nats; empty if not recorded.
+        ways: (at most `KEPT_TRAJECTORIES`, T, J, 3) paths of the `ENDS` that the body has, m,
+            heaviest trajectory first; None if the body is unknown.
+    """
+
+    stamp_ns: int
+    stamps_ns: tuple[int, ...]
+    weights: Array
+    free_energy: Array
+    ways: Array | None
+
+
+Mixture = TypeVar('Mixture', Moment, Window)
+
+
+@dataclass(frozen=True, eq=False)
+class Layer(Generic[Mixture]):
+    """The mixtures on one topic.
+
+    Attributes:
+        topic: name of the topic.
+        kind: kind of the mixtures, e.g. 'posterior', or 'trajectories'.
+        frame_id: frame of the positions.
+        joint_names: (J,) of the positions.
+        mixtures: by stamp in ns, in the order of time.
+    """
+
+    topic: str
+    kind: str
+    frame_id: str
+    joint_names: tuple[str, ...]
+    mixtures: dict[int, Mixture]
+
+    def at(self, stamps: Collection[int]) -> Layer[Mixture]:
+        """The mixtures at some times only."""
+        chosen = {stamp: one for stamp, one in self.mixtures.items() if stamp in stamps}
+        return replace(self, mixtures=chosen)
+
+    def spread(self, count: int) -> list[int]:
+        """Stamps that are spread evenly over all times."""
+        last = len(self.mixtures) - 1
+        chosen = np.unique(np.rint((np.arange(count) + 0.5) / count * last).astype(int))
+        stamps = list(self.mixtures)
+        return [stamps[i] for i in chosen]
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedMixtures:
+    """The mixtures in a bag.
+
+    Attributes:
+        layers: mixtures over poses, those of the posterior first.
+        trajectories: mixtures over trajectories.
+    """
+
+    layers: list[Layer[Moment]]
+    trajectories: list[Layer[Window]]
+
+    @property
+    def stamps(self) -> list[int]:
+        """All times of poses and ends of windows, increasing; without poses all of the windows."""
+        stamps = {stamp for layer in self.layers for stamp in layer.mixtures}
+        for layer in self.trajectories:
+            stamps.update(layer.mixtures)
+            if not self.layers:
+                stamps.update(stamp for one in layer.mixtures.values() for stamp in one.stamps_ns)
+        return sorted(stamps)
+
+    def at(self, stamps: Iterable[int]) -> RecordedMixtures:
+        """The mixtures at some times only; the windows that end then, or else the last."""
+        wanted = set(stamps)
+        return RecordedMixtures(
+            [layer.at(wanted) for layer in self.layers],
+            [
+                layer.at(wanted if wanted & layer.mixtures.keys() else {max(layer.mixtures)})
+                for layer in self.trajectories
+            ],
+        )
+
+
+def read_mixtures(
+    path: Path,
+    *,
+    topics: Sequence[str] = (),
+    body_model: str | None = None,
+    progress: Callable[[int], object] | None = None,
+) -> RecordedMixtures:
+    """The mixtures in a bag; of several on one topic with the same stamp, the first.
+
+    Args:
+        path: path of the bag.
+        topics: names of the topics to read; empty: all with mixtures except ground truth.
+        body_model: name or file of the body model, for a bag whose own name for it is unknown.
+        progress: called with the number of messages that were read.
+
+    Raises:
+        ValueError: no mixtures, messages that can not be understood, or several frames.
+    """
+    found: dict[str, Layer[Any]] = {}
+    with BagReader(path) as bag:
+        names = chosen_topics(bag, topics)
+        bodies = RecordedBodies(body_model)
+        for stored in bag.messages([*body_topics(bag), *names]):
+            if stored.msgtype == BODY:
+                bodies.learn(stored)
+            else:
+                _take(found, stored, bodies)
+            if progress is not None:
+                progress(1)
+    for name, layer in found.items():
+        found[name] = replace(layer, mixtures=dict(sorted(layer.mixtures.items())))
+    layers = [found[name] for name in names if name in found]
+    layers.sort(key=lambda layer: _ORDER.index(layer.kind))
+    poses = [layer for layer in layers if layer.kind != _TRAJECTORIES]
+    result = RecordedMixtures(poses, layers[len(poses) :])
+    if not result.stamps:
+        raise ValueError(f'{path}: nobody is seen in any mixture on {", ".join(names)}')
+    first = layers[0]
+    for layer in layers:
+        if layer.frame_id != first.frame_id:
+            raise ValueError(
+                f'{path}: {layer.topic} is in the frame {layer.frame_id!r}, {first.topic} in '
+                f'{first.frame_id!r}: name those of one camera by --topic'
+            )
+    return result
+
+
+def _take(found: dict[str, Layer[Any]], stored: BagMessage, bodies: RecordedBodies) -> None:
+    """Adds a message to the layer of its topic."""
+    try:
+        if stored.msgtype == POSE_MIXTURE:
+            new: Layer[Any] | None = _pose_layer(stored.topic, stored.message)
+        else:
+            new = _trajectory_layer(stored.topic, stored.message, bodies)
+        if new is None:
+            return
+        known = found.setdefault(stored.topic, new)
+        pairs: tuple[tuple[str, object, object], ...] = (
+            ('kind', known.kind, new.kind),
+            ('frame', known.frame_id, new.frame_id),
+            ('joints', known.joint_names, new.joint_names),
+        )
+        for what, was, seen in pairs:
+            if was != seen:
+                raise MessageError(f'mixture has the {what} {seen!r}, before it was {was!r}')
+    except ValueError as error:
+        raise ValueError(f'{stored.topic} at {stored.log_time_ns} ns: {error}') from error
+    for stamp, mixture in new.mixtures.items():
+        known.mixtures.setdefault(stamp, mixture)
+
+
+def _pose_layer(topic: str, message: Any) -> Layer[Moment] | None:
+    """A layer of one mixture; None: nobody was seen."""
+    content = pose_mixture_of(message)
+    if not len(content.weights):
+        return None
+    order = np.argsort(-content.weights, kind='stable')
+    stamp, kind = content.stamp_ns, content.kind.name.lower()
+    moment = Moment(stamp, content.weights[order], content.joint_positions[order])
+    return Layer(topic, kind, content.frame_id, content.joint_names, {stamp: moment})
+
+
+def _trajectory_layer(topic: str, message: Any, bodies: RecordedBodies) -> Layer[Window]:
+    """A layer of one window."""
+    content = trajectory_mixture_of(message)
+    body = bodies.of(topic, content)
+    ends = () if body is None else tuple(x for x in ENDS if x in body.joint_names)
+    order = np.argsort(-content.weights, kind='stable')
+    ways = None
+    if body is not None:
+        means = content.means[order[:KEPT_TRAJECTORIES]]
+        joints = body.joint_positions(means.reshape(-1, body.dimension))
+        ways = joints[:, body.skeleton.joint_index(ends)]
+        ways = ways.reshape(*means.shape[:2], len(ends), 3)
+    stamp = content.stamps_ns[-1]
+    window = Window(stamp, content.stamps_ns, content.weights[order], content.free_energy, ways)
+    return Layer(topic, _TRAJECTORIES, content.frame_id, ends, {stamp: window})

@@ -1,0 +1,285 @@
+"""Scores of a track, which is a mixture at each of many times, against the true joint positions.
+
+Estimates are scored in batches as they come: memory does not grow with the length of the track.
+Estimate and truth belong together where their stamps are equal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.evaluation.pose_scores import (
+    BATCH,
+    EVALUATED_JOINTS,
+    MODEL_SIGMA,
+    JointMixture,
+    Scores,
+    joint_mixtures,
+    origin_joints,
+    relative_positions,
+    score,
+)
+from hmt_ros.inference.mixture import GaussianMixture
+
+Array = NDArray[np.float64]
+
+# Fewer joints than this are no pose.
+_FEWEST_JOINTS = 4
+# Recorded joint positions agree with the kinematics of their body up to this distance, m.
+_SAME_PLACE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """True positions of the joints of a person.
+
+    Attributes:
+        source: where the truth comes from, for messages.
+        joint_names: (J,).
+        joints: stamp in ns -> (J, 3) m, camera optical frame.
+        frame_id: frame of the positions; '' if unknown.
+
+    Raises:
+        ValueError: no frames, or positions that do not fit the names or are not finite.
+    """
+
+    source: str
+    joint_names: tuple[str, ...]
+    joints: dict[int, Array]
+    frame_id: str = ''
+
+    def __post_init__(self) -> None:
+        if not self.joints:
+            raise ValueError(f'{self.source} has no frames')
+        wanted = (len(self.joint_names), 3)
+        for stamp, positions in self.joints.items():
+            if positions.shape != wanted:
+                raise ValueError(
+                    f'{self.source}: joints at {stamp} ns have shape {positions.shape}, '
+                    f'wanted {wanted}'
+                )
+            if not np.isfinite(positions).all():
+                raise ValueError(f'{self.source}: joints at {stamp} ns are not finite')
+
+    def span(self) -> str:
+        """First and last stamp, for messages."""
+        return f'{min(self.joints)} to {max(self.joints)} ns'
+
+    def evaluated_joints(self) -> tuple[str, ...]:
+        """Those of `EVALUATED_JOINTS` that the truth knows.
+
+        Raises:
+            ValueError: fewer than four.
+        """
+        known = tuple(name for name in EVALUATED_JOINTS if name in self.joint_names)
+        if len(known) < _FEWEST_JOINTS:
+            raise ValueError(
+                f'{self.source} knows {list(known)} of the evaluated joints, wanted at least '
+                f'{_FEWEST_JOINTS} of {list(EVALUATED_JOINTS)}'
+            )
+        return known
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A mixture over poses at one time, or what is known of it.
+
+    Attributes:
+        stamp_ns: time of the poses.
+        weights: (K,) sum to 1.
+        mixture: over poses (d,); None without covariances.
+        positions: (K, J, 3) of the joints at the means, m; None if unknown.
+        joint_names: (J,) of `positions`.
+        body: the body that the poses are of; None if unknown.
+    """
+
+    stamp_ns: int
+    weights: Array
+    mixture: GaussianMixture | None
+    positions: Array | None
+    joint_names: tuple[str, ...]
+    body: Body | None
+
+
+@dataclass(frozen=True)
+class TrackScores:
+    """Scores of a track.
+
+    Attributes:
+        kind: kind of its mixtures, e.g. 'posterior'.
+        scores: of the frames with a truth.
+        missing: number of true frames without an estimate.
+        without_truth: number of estimates without a truth.
+        note: why there are no densities; '' where there are.
+    """
+
+    kind: str
+    scores: Scores
+    missing: int
+    without_truth: int
+    note: str
+
+
+class TrackScorer:
+    """Collects the estimates of a track and scores them in batches.
+
+    Args:
+        name: name of the track, for messages.
+        truth: true joint positions.
+        model_sigma: standard deviation of a coordinate that the body model gets wrong, m.
+        seed: of the samples from which coverage is estimated.
+
+    Attributes:
+        kind: kind of the mixtures, to be set by the reader of the track.
+
+    Raises:
+        ValueError: the truth has neither a pelvis nor both hips, or too few joints.
+    """
+
+    def __init__(
+        self, name: str, truth: Truth, *, model_sigma: float = MODEL_SIGMA, seed: int = 0
+    ) -> None:
+        self.name, self.truth, self.kind = name, truth, ''
+        self._model_sigma, self._rng = model_sigma, np.random.default_rng(seed)
+        self._origin = origin_joints(truth.joint_names, truth.source)
+        self._joints = truth.evaluated_joints()
+        self._note, self._without_truth = '', 0
+        self._seen: set[int] = set()
+        self._waiting: list[Estimate] = []
+        self._window: dict[int, Estimate] = {}
+        self._parts: list[Scores] = []
+
+    def take(self, estimate: Estimate) -> None:
+        """Takes an estimate that will not be revised; of several with one stamp the first counts.
+
+        Raises:
+            ValueError: it lacks joints of the truth.
+        """
+        if estimate.stamp_ns in self._seen:
+            return
+        if estimate.stamp_ns not in self.truth.joints:
+            self._without_truth += 1
+            return
+        self._seen.add(estimate.stamp_ns)
+        if self._waiting and self._waiting[-1].body is not estimate.body:
+            self._score_waiting()
+        self._waiting.append(estimate)
+        if len(self._waiting) == BATCH:
+            self._score_waiting()
+
+    def take_window(self, estimates: Sequence[Estimate]) -> None:
+        """Takes the estimates of a window, by time; those of older windows hold before it.
+
+        Raises:
+            ValueError: see `take`.
+        """
+        for stamp in sorted(self._window):
+            if stamp < estimates[0].stamp_ns:
+                self.take(self._window.pop(stamp))
+        self._window.update((estimate.stamp_ns, estimate) for estimate in estimates)
+
+    def finish(self) -> TrackScores:
+        """All scores.
+
+        Raises:
+            ValueError: no frame has a truth, or see `take`.
+        """
+        for stamp in sorted(self._window):
+            self.take(self._window[stamp])
+        self._score_waiting()
+        if not self._parts:
+            raise ValueError(
+                f'no stamp of {self.name} is among those of {self.truth.source}, '
+                f'{self.truth.span()}'
+            )
+        missing = len(self.truth.joints) - len(self._seen)
+        return TrackScores(
+            self.kind, Scores.concatenate(self._parts), missing, self._without_truth, self._note
+        )
+
+    def _score_waiting(self) -> None:
+        """Scores the estimates that wait; they have the same body."""
+        estimates, self._waiting = self._waiting, []
+        if not estimates:
+            return
+        body = estimates[0].body
+        mixtures = [one.mixture for one in estimates if one.mixture is not None]
+        if len(mixtures) < len(estimates) or body is None:
+            why = 'its body is unknown' if len(mixtures) == len(estimates) else 'no covariances'
+            self._note = self._note or why
+            body = None
+        elif _is_elsewhere(body, estimates[0]):
+            self._note = f'joint positions are not those of the body {body.name} of the bag'
+            body = None
+        if body is None:
+            found = [self._bare(one) for one in estimates]
+        else:
+            positions = [one.positions for one in estimates if one.positions is not None]
+            found = joint_mixtures(
+                body,
+                mixtures,
+                self._joints,
+                model_sigma=self._model_sigma,
+                positions=positions or None,
+                origin=self._origin,
+            )
+        true = relative_positions(
+            np.array([self.truth.joints[one.stamp_ns] for one in estimates]),
+            self.truth.joint_names,
+            self._joints,
+            self._origin,
+        )
+        self._parts.append(score(found, true, self._joints, seed=self._rng))
+
+    def _bare(self, estimate: Estimate) -> JointMixture:
+        """Joint positions alone."""
+        if estimate.positions is None:
+            raise ValueError(f'{self.name}: trajectories need the body, and the bag has none')
+        try:
+            joints = relative_positions(
+                estimate.positions, estimate.joint_names, self._joints, self._origin
+            )
+        except ValueError as error:
+            raise ValueError(f'{self.name}: {error}') from error
+        return JointMixture(estimate.weights, joints)
+
+
+def _is_elsewhere(body: Body, estimate: Estimate) -> bool:
+    """Whether recorded joint positions are not those of the body."""
+    if estimate.positions is None or estimate.mixture is None:
+        return False
+    if estimate.joint_names != body.joint_names:
+        return True
+    computed = body.joint_positions(estimate.mixture.means)
+    return bool(np.abs(computed - estimate.positions).max() > _SAME_PLACE)
+
+
+def mode_errors(
+    joints: Mapping[int, Array], names: Sequence[str], truth: Truth
+) -> dict[int, Array]:
+    """Mean joint error (K,) of each mode, m, by stamp, where the truth is known.
+
+    Args:
+        joints: stamp in ns -> (K, J, 3) of the modes, m.
+        names: (J,) of the joints.
+        truth: true joint positions.
+
+    Returns:
+        Nothing where modes and truth share no evaluated joints, or no origin.
+    """
+    shared = [x for x in EVALUATED_JOINTS if x in truth.joint_names and x in names]
+    origin = origin_joints(truth.joint_names, truth.source)
+    if not shared or not set(origin) <= set(names):
+        return {}
+    result = {}
+    for stamp, modes in joints.items():
+        if stamp in truth.joints:
+            own = relative_positions(modes, names, shared, origin)
+            true = relative_positions(truth.joints[stamp], truth.joint_names, shared, origin)
+            result[stamp] = np.linalg.norm(own - true, axis=2).mean(1)
+    return result

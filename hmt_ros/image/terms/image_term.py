@@ -1,0 +1,156 @@
+"""What a term of the image likelihood is made of.
+
+A term is one file: its default settings, what it takes from an image (the evidence), its compiled
+kernel, and one `ImageTerm` that names them. `registry` lists the terms; nothing else knows them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.surface import Contour, Lens
+from hmt_ros.image.texture import Textures
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+
+NO_MAP = ImageMap(np.zeros((2, 2, 2), np.float32))
+
+
+@dataclass(frozen=True)
+class TermSettings:
+    """Settings of one term of the likelihood.
+
+    Attributes:
+        weight: Number of independent measurements that the term counts for (a plain factor for
+            keypoints); 0 switches the term off.
+        sigma: Standard deviation of one measurement, px (grey levels for the intensity, a factor on
+            the detector's own deviation for keypoints).
+        scale: Width of the Geman-McClure kernel, in standard deviations.
+    """
+
+    weight: float
+    sigma: float
+    scale: float
+
+    def __post_init__(self) -> None:
+        if not (self.weight >= 0 and self.sigma > 0 and self.scale > 0):
+            raise ValueError(f'a term needs weight >= 0, sigma > 0 and scale > 0, saw {self}')
+
+
+@dataclass(frozen=True, eq=False)
+class ImageWindow:
+    """The part of an image that evidence is taken from.
+
+    Attributes:
+        image: (h, w, 3) BGR.
+        left, top: column and row of its first pixel in the whole image.
+        mask: (h, w) silhouette, 0 or 1; None: unknown.
+        last_image: (h, w, 3) the same part of the image before; None: there is none.
+    """
+
+    image: Image
+    left: int
+    top: int
+    mask: Image | None
+    last_image: Image | None
+
+    @cached_property
+    def signed_distance(self) -> NDArray[np.float32] | None:
+        """Distance (h, w) to the outline of the silhouette, px, positive outside."""
+        if self.mask is None:
+            return None
+        outside = cv2.distanceTransform(1 - self.mask, cv2.DIST_L2, 5)
+        inside = cv2.distanceTransform(self.mask, cv2.DIST_L2, 5)
+        # The outline lies between the pixels: half a pixel from either side.
+        result: NDArray[np.float32] = np.where(self.mask > 0, 0.5 - inside, outside - 0.5)
+        return result
+
+    def as_map(self, channels: NDArray[np.float32]) -> ImageMap:
+        """Values (C, h, w) of the window as a map of the whole image."""
+        return ImageMap(channels, self.left, self.top)
+
+
+class Weighting(NamedTuple):
+    """`TermSettings` as compiled code reads them; weight 0: off."""
+
+    weight: float
+    sigma: float
+    scale: float
+
+
+class PoseView(NamedTuple):
+    """One pose as the kernels of the terms see it.
+
+    Attributes:
+        number: n, of the poses of this call.
+        texture_row: row of the textures that the pose carries; negative: none.
+        textures: of the last image.
+        contour: occluding contour, traced if some term asks for it.
+        contour_points: number of contour points that a weight is shared among; 0: those there are.
+        owners: (B,) segment of each part of the flesh.
+        textured: (S,) segments whose texture is compared.
+        lens: the camera.
+        columns, origins: (S, 3, 3), (S, 3) frames of the segments.
+    """
+
+    number: int
+    texture_row: int
+    textures: Textures
+    contour: Contour
+    contour_points: int
+    owners: NDArray[np.int64]
+    textured: Mask
+    lens: Lens
+    columns: Array
+    origins: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """What else a term is asked for by a call.
+
+    Attributes:
+        poses: number of poses, N.
+        explained: (N, M) or (1, M) what each sample of the outline costs at most, because something
+            else explains it; None: nothing does.
+    """
+
+    poses: int
+    explained: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ImageTerm:
+    """One term of the image likelihood.
+
+    Attributes:
+        name: of the term, of its settings and of its evidence.
+        meaning: what it compares, which opens the descriptions of its parameters.
+        settings: defaults.
+        evidence: takes from an image what the term compares poses with; None: the image lacks it.
+        inputs: what the kernel reads: a NamedTuple whose first field is the `Weighting`. Without
+            evidence (None) it has weight 0 and empty arrays of the same types.
+        kernel: compiled `kernel(view, inputs, wrenches, stiffnesses)`: adds the residuals of one
+            pose to the sums of the segments, returns the energy.
+        needs_contour: whether the contour has to be traced.
+        needs_texture: whether poses without texture are passed over.
+    """
+
+    name: str
+    meaning: str
+    settings: TermSettings
+    evidence: Callable[[ImageWindow], Any]
+    inputs: Callable[[Weighting, Any, Request], Any]
+    kernel: Any
+    needs_contour: bool = False
+    needs_texture: bool = False

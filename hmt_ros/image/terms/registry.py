@@ -1,0 +1,132 @@
+"""All terms of the image likelihood, and the compiled pass that runs them pose by pose.
+
+    E_image(x) = sum_t E_t(x)        over the terms t of the registry
+
+A new term is a file beside this one and a line in `TERMS`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from hmt_ros.image.surface import (
+    FleshTable,
+    Lens,
+    empty_contour,
+    mark_visibility,
+    trace_contour,
+)
+from hmt_ros.image.terms.edges import EDGES
+from hmt_ros.image.terms.image_term import ImageTerm, PoseView
+from hmt_ros.image.terms.residuals import Tree, assemble_pose
+from hmt_ros.image.terms.silhouette import CONTAINMENT, COVERAGE
+from hmt_ros.image.terms.texture import INTENSITY, MOTION
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TERMS: tuple[ImageTerm, ...] = (CONTAINMENT, COVERAGE, EDGES, INTENSITY, MOTION)
+
+
+class Model(NamedTuple):
+    """What the compiled code reads of the body and the camera.
+
+    Attributes:
+        tree, flesh, lens: skeleton, parts and rings, camera.
+        traced: (B,) parts whose contour is compared with the image.
+        occluders: (B,) parts that can hide others.
+        textured: (S,) segments whose texture is compared.
+        contour_points: number of contour points that the weights are for; 0: those there are.
+    """
+
+    tree: Tree
+    flesh: FleshTable
+    lens: Lens
+    traced: Mask
+    occluders: Mask
+    textured: Mask
+    contour_points: int
+
+
+class Placement(NamedTuple):
+    """Frames of N poses: columns (N, S, 3, 3), origins (N, S, 3); axes, dof origins (N, d, 3)."""
+
+    columns: Array
+    origins: Array
+    axes: Array
+    dof_origins: Array
+
+
+def _one_after_the_other(terms: tuple[ImageTerm, ...]) -> Any:
+    """One compiled function that runs the kernels of all terms on a pose.
+
+    It calls the first kernel with the first inputs and hands the rest on to the function of the
+    other terms: the compiler unrolls the list, and every term keeps its own type of inputs.
+    """
+    if not terms:
+
+        @njit(nogil=True)
+        def nothing(view, inputs, column, energies, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
+            return
+
+        return nothing
+    kernel, needs_texture = terms[0].kernel, terms[0].needs_texture
+    others = _one_after_the_other(terms[1:])
+
+    @njit(nogil=True)
+    def first_and_others(view, inputs, column, energies, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
+        own = inputs[0]
+        if own[0].weight > 0.0 and (view.texture_row >= 0 or not needs_texture):
+            energies[column] = kernel(view, own, wrenches, stiffnesses)
+        others(view, inputs[1:], column + 1, energies, wrenches, stiffnesses)
+
+    return first_and_others
+
+
+_run_terms = _one_after_the_other(TERMS)
+
+
+@njit(cache=True, nogil=True)
+def add_energies(  # type: ignore[no-untyped-def]
+    first, last, model, inputs, shape, textures, texture_rows, placement,
+    energies, gradients, hessians,
+):  # fmt: skip
+    """Energies, gradients and Hessians of the poses first to last - 1.
+
+    Args:
+        first, last: range of poses.
+        model, placement: what is compared with the image.
+        inputs: of the kernels, one entry a term, in the order of `TERMS`.
+        shape: whether the contour is traced.
+        textures, texture_rows: (N,) row of the textures of each pose; negative: none.
+        energies: (N, terms) result.
+        gradients, hessians: (N, d), (N, d, d), added to; hessians of no pose: no derivatives
+            wanted.
+    """
+    segments = len(model.tree.parents)
+    wrenches, stiffnesses = np.empty((segments, 6)), np.empty((segments, 6, 6))
+    contour = empty_contour(len(model.flesh.ring_parts))
+    for n in range(first, last):
+        wrenches[:] = 0.0
+        stiffnesses[:] = 0.0
+        columns, origins = placement.columns[n], placement.origins[n]
+        if shape:
+            trace_contour(model.flesh, model.traced, model.lens, columns, origins, contour)
+            mark_visibility(
+                model.flesh, model.occluders, columns, origins, contour.parts, contour.points,
+                contour.valid, contour.covered, contour.hidden,
+            )  # fmt: skip
+        view = PoseView(
+            n, texture_rows[n], textures, contour, model.contour_points,
+            model.flesh.part_segments, model.textured, model.lens, columns, origins,
+        )  # fmt: skip
+        _run_terms(view, inputs, 0, energies[n], wrenches, stiffnesses)
+        if len(hessians) > 0:
+            assemble_pose(
+                model.tree, placement.axes[n], placement.dof_origins[n], wrenches, stiffnesses,
+                gradients[n], hessians[n],
+            )  # fmt: skip

@@ -1,0 +1,59 @@
+"""K-means: scipy's iterations from k-means++ seeds.
+
+min over c_1 ... c_K of sum_n min_k |x_n - c_k|^2
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+def k_means(
+    points: Array, count: int, rng: np.random.Generator, iterations: int = 25
+) -> tuple[Array, Index]:
+    """Clusters of points (N, p), at most `count` of them, fewer where fewer points differ.
+
+    The seeds are those of `spread_points`: scipy's own k-means++ takes the square of the number of
+    clusters, and its argument for a generator has a different name in each of its versions.
+
+    Returns:
+        centres (K, p) and labels (N,). A cluster that loses all its points keeps its centre.
+    """
+    seeds = points[spread_points(points, count, rng)]
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', UserWarning)  # a cluster without points
+        centres, labels = kmeans2(points, seeds, iterations, minit='matrix', check_finite=False)
+    return np.asarray(centres), np.asarray(labels, dtype=np.intp)
+
+
+def spread_points(points: Array, count: int, rng: np.random.Generator) -> Index:
+    """Indices of at most `count` of the points (N, p), spread like the data.
+
+    The seeds of k-means++ [Arthur and Vassilvitskii, SODA 2007]: each next point is drawn in
+    proportion to its squared distance to the points before. The first few are spread as well. Of
+    equal points one is taken.
+    """
+    chosen = [int(rng.integers(len(points)))]
+    distance = np.full(len(points), np.inf)
+    floor = 1e-12 * max(float((points**2).sum(1).max()), 1e-300)
+    while len(chosen) < min(count, len(points)):
+        distance = np.minimum(distance, ((points - points[chosen[-1]]) ** 2).sum(1))
+        distance[distance <= floor] = 0.0
+        total = distance.sum()
+        if total <= 0:
+            break
+        chosen.append(int(np.searchsorted(np.cumsum(distance), total * rng.random())))
+    return np.array(chosen)
+
+
+def squared_distances(a: Array, b: Array) -> Array:
+    """Squared distances (N, M) between points (N, p) and (M, p)."""
+    result: Array = (a * a).sum(1)[:, None] - 2.0 * a @ b.T + (b * b).sum(1)
+    return np.maximum(result, 0.0, out=result)

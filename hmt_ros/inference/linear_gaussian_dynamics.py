@@ -1,0 +1,315 @@
+"""Linear Gaussian dynamics in continuous time, and the prior over trajectories that they imply.
+
+    dx = F x dt + dw,  E[dw dw'] = Qc dt     =>     p(x_{t+1} | x_t) = N(A x_t, Q)
+    A = exp(F dt),  Q = int_0^dt exp(F s) Qc exp(F s)' ds                       [Van Loan 1978]
+
+so that gaps and uneven intervals need no further rule: the prediction over two intervals is that
+over their sum. The random walk has F = 0; at constant velocity the state is the pose and its
+velocity, and what is white is the acceleration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import expm, logm
+
+from hmt_ros.inference.block_tridiagonal import BlockTridiagonal
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryPrior:
+    """-log p(X) = 1/2 X'PX - h'X + c over states X (T, n).
+
+    Attributes:
+        precision: P.
+        information: (T, n) h.
+        constant: c, nats; where nothing is known of the first pose its density is taken as 1.
+        dimension: d, the first variables of each state are the pose.
+    """
+
+    precision: BlockTridiagonal
+    information: Array
+    constant: float
+    dimension: int
+
+    def energy(self, states: Array) -> tuple[Array, Array]:
+        """-log p (N,) and its gradient (N, T, n) at trajectories (N, T, n)."""
+        product = self.precision.product(states)
+        value = np.einsum('...ti,...ti->...', states, 0.5 * product - self.information)
+        return value + self.constant, product - self.information
+
+    def between(self, first: int, last: int, states: Array) -> TrajectoryPrior:
+        """The density of the states first <= t < last given the others, of one trajectory (T, n).
+
+        Up to a factor: its constant is 0.
+        """
+        information = self.information[first:last].copy()
+        if first > 0:
+            information[0] -= self.precision.lower[first - 1] @ states[first - 1]
+        if last < len(states):
+            information[-1] -= self.precision.lower[last - 1].T @ states[last]
+        precision = BlockTridiagonal(
+            self.precision.diagonal[first:last], self.precision.lower[first : last - 1]
+        )
+        return TrajectoryPrior(precision, information, 0.0, self.dimension)
+
+
+@dataclass(frozen=True, eq=False)
+class LinearGaussianDynamics:
+    """Dynamics of a state of n variables, of which the first d are the pose.
+
+    Use `random_walk`, `constant_velocity` or `discrete`.
+
+    Attributes:
+        drift: (n, n) F, per second.
+        diffusion: (n, n) Qc, variance gained per second.
+        dimension: d, how many variables are observed; the others are velocities.
+        initial_mean: (n,) of the first state.
+        initial_precision: (n, n) of the first state; zeros: nothing is known.
+        step: interval between observations that come without stamps, s.
+
+    Raises:
+        ValueError: shapes that do not fit, values that are not finite, a diffusion that is not
+            positive semi-definite.
+    """
+
+    drift: Array
+    diffusion: Array
+    dimension: int
+    initial_mean: Array
+    initial_precision: Array
+    step: float = 1.0
+
+    def __post_init__(self) -> None:
+        n = len(np.atleast_1d(self.initial_mean))
+        shapes = {
+            'drift': (n, n),
+            'diffusion': (n, n),
+            'initial_mean': (n,),
+            'initial_precision': (n, n),
+        }
+        for name, shape in shapes.items():
+            value = np.array(getattr(self, name), dtype=np.float64)
+            if value.shape != shape:
+                raise ValueError(f'dynamics: {name} has shape {value.shape}, wanted {shape}')
+            if not np.isfinite(value).all():
+                raise ValueError(f'dynamics: {name} has values that are not finite')
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        if not 0 < self.dimension <= n:
+            raise ValueError(f'dynamics: {self.dimension} of {n} variables are observed')
+        if not self.step > 0:
+            raise ValueError(f'dynamics: step must be positive, saw {self.step}')
+        for name in ('diffusion', 'initial_precision'):
+            value = getattr(self, name)
+            smallest = float(np.linalg.eigvalsh(value)[0])
+            if smallest < -1e-9 * np.abs(value).max() or not np.allclose(value, value.T):
+                raise ValueError(
+                    f'dynamics: {name} is not symmetric and positive semi-definite: its smallest '
+                    f'eigenvalue is {smallest:.3g}'
+                )
+
+    @classmethod
+    def random_walk(
+        cls,
+        rates: ArrayLike,
+        *,
+        initial_mean: ArrayLike | None = None,
+        initial_covariance: ArrayLike | None = None,
+        step: float = 1.0,
+    ) -> LinearGaussianDynamics:
+        """First-order dynamics, x_{t+1} = x_t + noise.
+
+        Args:
+            rates: (d,) variances, or (d, d) covariance, that the pose gains per second.
+            initial_mean, initial_covariance: (d,) and (d, d) of the first pose; None: unknown.
+            step: interval between observations without stamps, s.
+        """
+        diffusion = _matrix(rates)
+        d = len(diffusion)
+        mean, precision = _initial(d, initial_mean, initial_covariance)
+        return cls(np.zeros((d, d)), diffusion, d, mean, precision, step)
+
+    @classmethod
+    def constant_velocity(
+        cls,
+        rates: ArrayLike,
+        velocity_sigma: ArrayLike,
+        *,
+        initial_mean: ArrayLike | None = None,
+        initial_covariance: ArrayLike | None = None,
+        step: float = 1.0,
+    ) -> LinearGaussianDynamics:
+        """Second-order dynamics; the state is the pose and its velocity.
+
+        Args:
+            rates: (d,) variances, or (d, d) covariance, that the velocity gains per second.
+            velocity_sigma: (d,) or scalar, standard deviation of the first velocity, per second.
+            initial_mean, initial_covariance: (d,) and (d, d) of the first pose; None: unknown.
+            step: interval between observations without stamps, s.
+        """
+        white = _matrix(rates)
+        d = len(white)
+        sigma = np.broadcast_to(np.asarray(velocity_sigma, dtype=np.float64), (d,))
+        if not (sigma > 0).all():
+            raise ValueError(f'dynamics: velocity_sigma must be positive, saw {sigma.min()}')
+        drift, diffusion = np.zeros((2, 2 * d, 2 * d))
+        drift[:d, d:] = np.eye(d)
+        diffusion[d:, d:] = white
+        mean, precision = np.zeros(2 * d), np.zeros((2 * d, 2 * d))
+        mean[:d], precision[:d, :d] = _initial(d, initial_mean, initial_covariance)
+        precision[d:, d:] = np.diag(sigma**-2.0)
+        return cls(drift, diffusion, d, mean, precision, step)
+
+    @classmethod
+    def discrete(
+        cls,
+        transition: ArrayLike,
+        covariance: ArrayLike,
+        *,
+        initial_mean: ArrayLike | None = None,
+        initial_covariance: ArrayLike | None = None,
+        step: float = 1.0,
+    ) -> LinearGaussianDynamics:
+        """The dynamics with x_{t+1} = A x_t + N(0, Q) over one step.
+
+        Args:
+            transition: (d, d) A.
+            covariance: (d, d) Q.
+            initial_mean, initial_covariance: (d,) and (d, d) of the first pose; None: unknown.
+            step: interval that A and Q belong to, s.
+
+        Raises:
+            ValueError: no process in continuous time has this transition.
+        """
+        a, q = np.asarray(transition, dtype=np.float64), _matrix(covariance)
+        d = len(q)
+        inverse = np.linalg.inv(a)
+        # exp of [[-F, Qc], [0, F']] dt is [[A^-1, A^-1 Q], [0, A']].
+        both = logm(np.block([[inverse, inverse @ q], [np.zeros((d, d)), a.T]]))
+        if np.abs(np.imag(both)).max() > 1e-9:
+            raise ValueError('dynamics: the transition has no real logarithm')
+        both = np.real(both) / step
+        mean, precision = _initial(d, initial_mean, initial_covariance)
+        diffusion = 0.5 * (both[:d, d:] + both[:d, d:].T)
+        return cls(both[d:, d:].T, diffusion, d, mean, precision, step)
+
+    @property
+    def state_dimension(self) -> int:
+        """n."""
+        return len(self.drift)
+
+    def transition(self, interval: float) -> tuple[Array, Array]:
+        """A and Q, both (n, n), over an interval in seconds."""
+        n = self.state_dimension
+        if not self.drift.any():
+            return np.eye(n), self.diffusion * interval
+        block = np.zeros((2 * n, 2 * n))
+        block[:n, :n] = -self.drift
+        block[:n, n:] = self.diffusion
+        block[n:, n:] = self.drift.T
+        both = expm(block * interval)
+        a = both[n:, n:].T
+        q = a @ both[:n, n:]
+        return a, 0.5 * (q + q.T)
+
+    def predict(self, means: Array, covariances: Array, interval: float) -> tuple[Array, Array]:
+        """Means (K, n) and covariances (K, n, n) of states after an interval in seconds."""
+        a, q = self.transition(interval)
+        if not self.drift.any():
+            return means, covariances + q
+        return means @ a.T, a @ covariances @ a.T + q
+
+    def transitions(self, intervals: Array) -> tuple[Array, Array]:
+        """A and Q, both (T-1, n, n), over intervals (T-1,) in seconds."""
+        different, which = np.unique(intervals, return_inverse=True)
+        n = self.state_dimension
+        a, q = np.empty((2, len(different), n, n))
+        for i, interval in enumerate(different):
+            a[i], q[i] = self.transition(float(interval))
+        return a[which], q[which]
+
+    def prior(self, intervals: Array, *, initial: bool = True) -> TrajectoryPrior:
+        """The density of trajectories with these intervals (T-1,) between their states, s.
+
+        Args:
+            intervals: (T-1,).
+            initial: whether what is known of the first state is part of it.
+
+        Raises:
+            ValueError: the noise over an interval is not positive definite.
+        """
+        n = self.state_dimension
+        times = len(intervals) + 1
+        diagonal = np.zeros((times, n, n))
+        lower = np.zeros((times - 1, n, n))
+        information = np.zeros((times, n))
+        start = self.initial_precision if initial else np.zeros((n, n))
+        diagonal[0] = start
+        information[0] = start @ self.initial_mean
+        known = np.linalg.eigvalsh(start)
+        known = known[known > 1e-12 * max(float(known[-1]), 1e-300)]
+        constant = 0.5 * (
+            len(known) * np.log(2 * np.pi)
+            - np.log(known).sum()
+            + self.initial_mean @ information[0]
+        )
+        different, which = np.unique(intervals, return_inverse=True)
+        for i, interval in enumerate(different):
+            a, q = self.transition(float(interval))
+            inverse, log_det = _precision_of(q)
+            at = np.flatnonzero(which == i)
+            forth = inverse @ a
+            diagonal[at] += a.T @ forth
+            diagonal[at + 1] += inverse
+            lower[at] = -forth
+            constant += 0.5 * len(at) * (n * np.log(2 * np.pi) + log_det)
+        precision = BlockTridiagonal(diagonal, lower)
+        return TrajectoryPrior(precision, information, float(constant), self.dimension)
+
+
+def _precision_of(covariance: Array) -> tuple[Array, float]:
+    """Inverse and log determinant; a diagonal covariance has an exactly diagonal inverse."""
+    diagonal = np.diagonal(covariance)
+    if not (covariance - np.diag(diagonal)).any() and (diagonal > 0).all():
+        return np.diag(1.0 / diagonal), float(np.log(diagonal).sum())
+    try:
+        factor = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            'dynamics: the noise over an interval is not positive definite; every variable needs '
+            'a positive rate'
+        ) from None
+    inverse = np.linalg.inv(factor)
+    # Exact zeros keep the band narrow.
+    precision = inverse.T @ inverse
+    precision[covariance == 0] = np.where(
+        np.abs(precision[covariance == 0]) < 1e-14 * np.abs(precision).max(),
+        0.0,
+        precision[covariance == 0],
+    )
+    return precision, float(2.0 * np.log(np.diagonal(factor)).sum())
+
+
+def _matrix(rates: ArrayLike) -> Array:
+    value = np.atleast_1d(np.asarray(rates, dtype=np.float64))
+    return np.diag(value) if value.ndim == 1 else value
+
+
+def _initial(d: int, mean: ArrayLike | None, covariance: ArrayLike | None) -> tuple[Array, Array]:
+    if (mean is None) != (covariance is None):
+        raise ValueError('dynamics: give both initial_mean and initial_covariance, or neither')
+    if mean is None or covariance is None:
+        return np.zeros(d), np.zeros((d, d))
+    matrix = _matrix(covariance)
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        raise ValueError('dynamics: initial_covariance is not positive definite') from None
+    precision = np.linalg.inv(matrix)
+    return np.asarray(mean, dtype=np.float64), 0.5 * (precision + precision.T)

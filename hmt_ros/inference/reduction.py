@@ -1,0 +1,240 @@
+"""Mixtures of fewer components that stand for the same density.
+
+Components are merged into one Gaussian with their weight, mean and covariance,
+
+    w = sum_i w_i,   m = sum_i w_i m_i / w,   S = sum_i w_i (S_i + (m_i - m) (m_i - m)') / w,
+
+so that the mean and the covariance of the whole mixture stay. What is merged differs:
+
+- `merged_pairwise`: the pair that costs least by the upper bound on the Kullback-Leibler divergence
+  that its merge causes [Runnalls, IEEE TAES 2007], until few are left,
+
+      B(i, j) = 1/2 ((w_i + w_j) log|S_ij| - w_i log|S_i| - w_j log|S_j|);
+
+- `merged_if_close`: the closest pair, until none is closer than a distance;
+- `merged_if_alike`: what lies near a component and has its size;
+- `reduced`: clusters of means, which then descend a bound on the divergence from the large mixture
+  to the small one [Goldberger and Roweis, NIPS 2004].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.inference.gaussian_pairs import pair_distances
+from hmt_ros.inference.mixture import GaussianMixture
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# Components with a smaller share than this of the weight are dropped by `reduced`.
+NEGLIGIBLE = 1e-8
+
+
+def merged(mixture: GaussianMixture, share: Array) -> GaussianMixture:
+    """The mixture whose components have the moments of what they stand for.
+
+    Args:
+        mixture: K components.
+        share: (K, B) share of each component that goes to each of B new ones; a new one that gets
+            nothing is left out.
+    """
+    mass = share * mixture.weights[:, None]
+    total = mass.sum(0)
+    mass, total = mass[:, total > 0], total[total > 0]
+    mass = mass / total
+    means = mass.T @ mixture.means
+    offsets = mixture.means[:, None] - means
+    covariances = (mass.T @ mixture.covariances.reshape(len(mixture), -1)).reshape(
+        -1, mixture.dimension, mixture.dimension
+    )
+    offsets = np.swapaxes(offsets, 0, 1)
+    covariances += np.swapaxes(offsets * mass.T[:, :, None], 1, 2) @ offsets
+    return GaussianMixture(total, means, 0.5 * (covariances + np.swapaxes(covariances, 1, 2)))
+
+
+def merged_pairwise(mixture: GaussianMixture, count: int) -> GaussianMixture:
+    """At most `count` components, by merging the pair that costs least.
+
+    Raises:
+        ValueError: count < 1.
+    """
+    if count < 1:
+        raise ValueError(f'k must be at least 1, saw {count}')
+    return _merged_pairs(mixture, _divergence_costs, lambda left, _: left > count)
+
+
+def merged_if_close(mixture: GaussianMixture, distance: float) -> GaussianMixture:
+    """The mixture with components merged, the closest first, until none are closer than a distance.
+
+    Args:
+        mixture: any.
+        distance: between means, in standard deviations of the average of two covariances.
+    """
+    return _merged_pairs(mixture, _squared_distances, lambda _, cost: cost < distance**2)
+
+
+def merged_if_alike(
+    mixture: GaussianMixture, distance: float, log_determinant: float
+) -> GaussianMixture:
+    """The mixture with each component merged with those after it that are nearly the same.
+
+    Args:
+        mixture: any, those first that others are compared with.
+        distance: between means, in standard deviations of the one compared with.
+        log_determinant: between the logarithms of the determinants of covariances.
+    """
+    whiteners = np.linalg.inv(mixture.cholesky())
+    log_det = -2.0 * np.log(np.diagonal(whiteners, axis1=1, axis2=2)).sum(1)
+    owner: Index = np.full(len(mixture), -1)
+    for i in range(len(mixture)):
+        if owner[i] >= 0:
+            continue
+        at = np.flatnonzero(owner < 0)
+        white = (mixture.means[at] - mixture.means[i]) @ whiteners[i].T
+        near = (white * white).sum(1) < distance**2
+        near &= np.abs(log_det[at] - log_det[i]) < log_determinant
+        owner[at[near]] = i
+    return merged(mixture, (owner[:, None] == np.unique(owner)).astype(np.float64))
+
+
+# cost(weights, means, covariances, log determinants, i, j) of merging i with each of j (J,)
+PairCosts = Callable[[Array, Array, Array, Array, int, Index], Array]
+
+
+def _merged_pairs(
+    mixture: GaussianMixture, cost: PairCosts, go_on: Callable[[int, float], bool]
+) -> GaussianMixture:
+    """Merges the pair of least cost while the number left and that cost say so."""
+    mixture = mixture[mixture.weights > 0] if (mixture.weights == 0).any() else mixture
+    w, m, s = (np.array(x) for x in (mixture.weights, mixture.means, mixture.covariances))
+    count = len(w)
+    log_det = np.linalg.slogdet(s)[1]
+    costs, active = np.full((count, count), np.inf), np.ones(count, dtype=bool)
+    if go_on(count, 0.0):
+        for i in range(count - 1):
+            costs[i, i + 1 :] = cost(w, m, s, log_det, i, np.arange(i + 1, count))
+    for left in range(count, 1, -1):
+        i, j = (int(x) for x in np.unravel_index(int(np.argmin(costs)), costs.shape))
+        if not go_on(left, float(costs[i, j])):
+            break
+        total, mean, covariance = _pair_moments(w, m, s, i, np.array([j]))
+        w[i], m[i], s[i] = total[0], mean[0], covariance[0]
+        log_det[i] = np.linalg.slogdet(s[i])[1]
+        active[j] = False
+        costs[j, :] = costs[:, j] = np.inf
+        others = np.flatnonzero(active & (np.arange(count) != i))
+        if len(others):
+            costs[np.minimum(i, others), np.maximum(i, others)] = cost(w, m, s, log_det, i, others)
+    return GaussianMixture(w[active], m[active], s[active])
+
+
+def _pair_moments(w: Array, m: Array, s: Array, i: int, j: Index) -> tuple[Array, Array, Array]:
+    """Weight, mean and covariance of component i with each of the components j."""
+    total = w[i] + w[j]
+    a, b = w[i] / total, w[j] / total
+    offset = m[j] - m[i]
+    mean = m[i] + b[:, None] * offset
+    spread = (a * b)[:, None, None] * offset[:, :, None] * offset[:, None, :]
+    return total, mean, a[:, None, None] * s[i] + b[:, None, None] * s[j] + spread
+
+
+def _divergence_costs(w: Array, m: Array, s: Array, log_det: Array, i: int, j: Index) -> Array:
+    total, _, covariance = _pair_moments(w, m, s, i, j)
+    result: Array = 0.5 * (
+        total * np.linalg.slogdet(covariance)[1] - w[i] * log_det[i] - w[j] * log_det[j]
+    )
+    return result
+
+
+def _squared_distances(w: Array, m: Array, s: Array, log_det: Array, i: int, j: Index) -> Array:
+    pairs = np.stack([np.full(len(j), i), j], axis=1)
+    return pair_distances(m, s, np.full(len(m), 0.5), pairs)
+
+
+def reduced(mixture: GaussianMixture, count: int, iterations: int = 10) -> GaussianMixture:
+    """At most `count` components: clusters of means, then descent of `divergence_bound`.
+
+    Where pairwise merging opens with a lower bound than the clusters, it is what descends.
+
+    Raises:
+        ValueError: count < 1.
+    """
+    if count < 1:
+        raise ValueError(f'{count} components asked for, wanted at least 1')
+    mixture = mixture.normalised()
+    if len(mixture) <= count:
+        return mixture
+    large = mixture[mixture.weights > NEGLIGIBLE].normalised()
+    if len(large) <= count:
+        return large
+    starts = clustered(large, count), merged_pairwise(large, count)
+    bound, share, small = min(
+        ((*_assignment(large, start), start) for start in starts), key=lambda one: one[0]
+    )
+    for _ in range(iterations):
+        better = merged(large, share)
+        new_bound, share = _assignment(large, better)
+        if bound - new_bound < 1e-4:
+            break
+        bound, small = new_bound, better
+    return small
+
+
+def clustered(mixture: GaussianMixture, count: int, iterations: int = 20) -> GaussianMixture:
+    """Components merged by clusters of their means, in the metric of the mean covariance."""
+    average = np.einsum('k,kij->ij', mixture.weights / mixture.weights.sum(), mixture.covariances)
+    points = np.linalg.solve(np.linalg.cholesky(average), mixture.means.T).T
+    chosen = [int(np.argmax(mixture.weights))]
+    for _ in range(count - 1):
+        distance = ((points[:, None] - points[chosen]) ** 2).sum(2).min(1)
+        chosen.append(int(np.argmax(mixture.weights * distance)))
+    centres = points[chosen]
+    labels: Index = np.full(len(points), -1)
+    for _ in range(iterations):
+        new = np.argmin(((points[:, None] - centres) ** 2).sum(2), axis=1)
+        if (new == labels).all():
+            break
+        labels = new
+        member = (labels[:, None] == np.arange(len(centres))) * mixture.weights[:, None]
+        total = member.sum(0)
+        full = total > 0
+        centres[full] = (member.T @ points)[full] / total[full, None]
+    share = (labels[:, None] == np.arange(len(centres))).astype(np.float64)
+    return merged(mixture, share)
+
+
+def divergence_bound(large: GaussianMixture, small: GaussianMixture) -> float:
+    """sum_a w_a min_b KL(large_a || small_b) >= KL(large || small), nats.
+
+    It bounds the divergence where the weight of each small component is the sum of the weights that
+    it stands for, as `refined` leaves them [Goldberger & Roweis, NIPS 2004].
+    """
+    return _assignment(large, small)[0]
+
+
+def refined(large: GaussianMixture, small: GaussianMixture) -> GaussianMixture:
+    """One descent of `divergence_bound`: components to the closest, then their moments."""
+    return merged(large, _assignment(large, small)[1])
+
+
+def _assignment(large: GaussianMixture, small: GaussianMixture) -> tuple[float, Array]:
+    """The bound, and which large component goes to which small one, (A, B) of 0 and 1."""
+    divergences = gaussian_divergences(large, small)
+    share = np.zeros_like(divergences)
+    share[np.arange(len(large)), np.argmin(divergences, axis=1)] = 1.0
+    return float(large.weights @ divergences.min(axis=1)), share
+
+
+def gaussian_divergences(a: GaussianMixture, b: GaussianMixture) -> Array:
+    """KL(a_i || b_j), (A, B), between components."""
+    inverse = np.linalg.inv(b.covariances)
+    trace = a.covariances.reshape(len(a), -1) @ inverse.reshape(len(b), -1).T
+    offsets = a.means - b.means[:, None]
+    square = ((offsets @ inverse) * offsets).sum(2).T
+    log_det = np.linalg.slogdet(b.covariances)[1] - np.linalg.slogdet(a.covariances)[1][:, None]
+    result: Array = 0.5 * (trace + square + log_det - a.dimension)
+    return result

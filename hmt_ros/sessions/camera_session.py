@@ -1,0 +1,217 @@
+"""Sessions that estimate from the images of one camera.
+
+Images are taken in the order of their stamps. They wait until a calibrated camera_info has come; at
+most `queue_size` wait, the oldest are dropped.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body import Camera
+from hmt_ros.sessions.handled import Fault, Output
+from hmt_ros.sessions.session import Order, Parameters, Session, State, everything
+from msg_tools.files.bounded_file import read_bytes
+from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
+from msg_tools.messages.images import ImageError, decode_image, decode_picture
+
+CAMERA_INFO, IMAGE = 'camera_info', 'image'
+FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a frame
+
+Image = NDArray[np.uint8]
+T = TypeVar('T')
+
+# Stamps that `StampedInputs` remembers.
+_REMEMBERED = 256
+_LARGEST_PICTURE_FILE = 2**28  # bytes
+
+
+class WaitingImage(NamedTuple):
+    """An image that has come.
+
+    Attributes:
+        image: (H, W, 3) BGR.
+        stamp_ns: of the image.
+        frame_id: optical frame of the camera.
+    """
+
+    image: Image
+    stamp_ns: int
+    frame_id: str
+
+
+class CameraSession(Session[Parameters, State]):
+    """A session that estimates from images; see `Session` for arguments and attributes."""
+
+    COUNTED = IMAGE
+    UNIT = 'image'
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        publish: Callable[[Output], None],
+        wanted: Callable[[str], bool] = everything,
+    ) -> None:
+        super().__init__(parameters, publish, wanted)
+        self._camera: Camera | None = None
+        self._frame = ''
+        self._waiting: deque[WaitingImage] = deque()
+        self._newest: int | None = None
+
+    @abstractmethod
+    def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
+        """Estimates from an image of the size that the camera has."""
+
+    @abstractmethod
+    def _status(self) -> tuple[str, str]:
+        """Status and wants of the state, once the camera is known."""
+
+    def _is_ready(self, stamp: int) -> bool:
+        """Whether an image need not wait for anything but a camera_info."""
+        return True
+
+    def _report_dropped(self, stamp: int) -> None:
+        """Reports an image that is dropped while it waits for something else."""
+
+    def _forget_inputs(self) -> None:
+        """Drops what belongs to the images before a jump in time."""
+
+    def _take(self, source: str, message: Any, stamp: int) -> None:
+        if source == CAMERA_INFO:
+            self._take_camera_info(message)
+        else:
+            self._take_image(message, stamp)
+        self._estimate_what_is_ready()
+
+    def _take_camera_info(self, message: Any) -> None:
+        try:
+            camera = camera_from_info(message)
+        except CameraInfoError as error:
+            self._log.fault(Fault.CAMERA_INFO, str(error))
+            return
+        self._frame = str(message.header.frame_id)
+        known, self._camera = self._camera, camera
+        if known is not None and camera != known:
+            text = f'camera_info changes: {self.ESTIMATE} starts anew'
+            self._log.note(Fault.CALIBRATION, text)
+            self._start_anew()
+
+    def _take_image(self, message: Any, stamp: int) -> None:
+        order = self._order(stamp, self._newest)
+        if order is Order.SKIPPED:
+            return
+        if order is Order.JUMP:
+            # What an image waits for will not come any more.
+            while self._waiting and self._camera is not None:
+                self._estimate_next(self._camera)
+            self._log.counts['dropped'] += len(self._waiting)
+            self._waiting.clear()
+            self._newest = None
+            self._forget_inputs()
+            self._start_anew()
+        try:
+            image = decode_image(message)
+        except ImageError as error:
+            self._log.skip(Fault.IMAGE, str(error))
+            return
+        self._newest = stamp
+        self._waiting.append(WaitingImage(image, stamp, str(message.header.frame_id)))
+
+    def _start_anew(self) -> None:
+        self.restart()
+
+    def _estimate_what_is_ready(self) -> None:
+        while (
+            self._waiting and self._camera is not None and self._is_ready(self._waiting[0].stamp_ns)
+        ):
+            self._estimate_next(self._camera)
+        while len(self._waiting) > self.parameters.queue_size:
+            stamp = self._waiting.popleft().stamp_ns
+            self._log.counts['dropped'] += 1
+            if self._camera is None:
+                # An uncalibrated camera_info has been reported already.
+                self._log.fault(
+                    Fault.CAMERA_INFO,
+                    f'image of {stamp} ns is dropped: it waited for a calibrated camera_info',
+                )
+            else:
+                self._report_dropped(stamp)
+
+    def _estimate_next(self, camera: Camera) -> None:
+        waiting = self._waiting.popleft()
+        try:
+            check_size(waiting.image, camera)
+        except ValueError as error:
+            self._log.skip(Fault.IMAGE_SIZE, str(error))
+            return
+        frame = waiting.frame_id or self._frame or FRAME_ID
+        self._estimate(waiting._replace(frame_id=frame), camera)
+
+    def _status_and_wants(self) -> tuple[str, str]:
+        if self._camera is None:
+            return 'no camera', 'a calibrated camera_info'
+        return self._status()
+
+
+class StampedInputs(Generic[T]):
+    """Inputs that belong to the image of exactly their stamp; of several the last counts.
+
+    None stands for an input that says nothing, as of a detector that saw nobody.
+    """
+
+    def __init__(self) -> None:
+        self._content: dict[int, T | None] = {}
+        self._newest = -1
+
+    def put(self, stamp_ns: int, content: T | None) -> None:
+        """Keeps an input for its image."""
+        self._newest = max(self._newest, stamp_ns)
+        self._content[stamp_ns] = content
+        while len(self._content) > _REMEMBERED:
+            del self._content[min(self._content)]
+
+    def is_settled(self, stamp_ns: int) -> bool:
+        """Whether the input for an image has come, or a later one."""
+        return stamp_ns in self._content or self._newest > stamp_ns
+
+    def take(self, stamp_ns: int) -> T | None:
+        """The input for an image, None where there is none; drops it and all that are older."""
+        result = self._content.get(stamp_ns)
+        for stamp in [stamp for stamp in self._content if stamp <= stamp_ns]:
+            del self._content[stamp]
+        return result
+
+    def clear(self) -> None:
+        """Drops all inputs."""
+        self._content.clear()
+        self._newest = -1
+
+
+def check_size(image: Image, camera: Camera) -> None:
+    """Raises ValueError where an image has not the size that the camera has."""
+    height, width = image.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise ValueError(
+            f'image has {width}x{height} pixels, wanted the {camera.width}x{camera.height} of '
+            'camera_info'
+        )
+
+
+def read_picture(file: str) -> Image:
+    """The picture (H, W, 3), BGR, in a PNG or JPEG file that a parameter names.
+
+    Raises:
+        ValueError: there is none in the file, or one that is too large.
+    """
+    try:
+        return decode_picture(read_bytes(file, _LARGEST_PICTURE_FILE))
+    except ImageError as error:
+        raise ValueError(f'{file}: not a picture ({error})') from error
+    except ValueError as error:
+        raise ValueError(f'{file}: {error}') from error

@@ -1,0 +1,423 @@
+"""Mixture density propagation: the five steps from image to image (KJS figure 4).
+
+predict     x_k | ancestor       motion prior, optical flow                       prediction
+propose     x_k^0                jumps, samples, predictions of others            proposals
+optimise    x_k = argmin E(x)    bounded Newton from x_k^0                        posterior
+weigh       log w_k = log p(ancestor) + log p(jumps) - beta E(x_k)                weighting
+select      K of N hypotheses    the least expected distance to one that is kept  selection
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.pose_terms import FrameTerm
+from hmt_ros.image.observation import Observation
+from hmt_ros.inference.bounded_newton import Minimum, resting
+from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.flesh_fitting import FleshFit
+from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses, relative_joints
+from hmt_ros.tracking.loss import unexplained_share
+from hmt_ros.tracking.posterior import Posterior, free_covariances
+from hmt_ros.tracking.prediction import follow_flow, predict, updated_velocities
+from hmt_ros.tracking.proposals import PROPOSALS, PredictedPoses, Proposal
+from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples
+from hmt_ros.tracking.selection import choose_hypotheses
+from hmt_ros.tracking.settings import TrackerSettings
+from hmt_ros.tracking.weighting import at_least, inherited_log_weights, normalised, weigh
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# How far the usual energy follows that of the last image.
+USUAL_GAIN = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Optimised:
+    """Hypotheses at their optima.
+
+    Attributes:
+        hypotheses: N of them; their poses are where they started from.
+        minima: N rows; Hessians are those of the Gaussian posterior.
+    """
+
+    hypotheses: Hypotheses
+    minima: Minimum
+
+    def __getitem__(self, rows: Index) -> Optimised:
+        return Optimised(self.hypotheses[rows], self.minima[rows])
+
+    def joined(self, other: Optimised) -> Optimised:
+        """These and others."""
+        return Optimised(self.hypotheses.joined(other.hypotheses), self.minima.joined(other.minima))
+
+
+class MixtureFilter:
+    """The posterior over the poses of one person, as a mixture that images move on.
+
+    Args:
+        body: of the person.
+        camera: that sees the person.
+        settings: how.
+        seed: of all randomness.
+        extra: further energy terms.
+
+    Attributes:
+        body: with the widths that have been estimated.
+        misfit: share of the last image that no mode explains.
+        log_evidence: sum over images of -beta times the least energy, for comparison with another
+            filter of the same images.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        camera: Camera,
+        settings: TrackerSettings,
+        seed: int,
+        extra: tuple[FrameTerm, ...] = (),
+    ) -> None:
+        self.body = body
+        self.camera = camera
+        self.settings = settings
+        self.misfit = 0.0
+        self.log_evidence = 0.0
+        self._seed = seed
+        self._rng = np.random.default_rng(seed)
+        self._modes: Modes | None = None
+        self._flesh = FleshFit(body)
+        self._usual_energy = np.inf
+        self._outline_costs = np.empty((0, 0))
+        self._bad_images = 0
+        self._posterior = Posterior(body, camera, settings, extra)
+        self._proposal = PROPOSALS[settings.proposals](self._posterior)
+
+    @property
+    def evaluations(self) -> int:
+        """Number of evaluations of the likelihood since it was last set."""
+        return self._posterior.evaluations
+
+    @evaluations.setter
+    def evaluations(self, count: int) -> None:
+        self._posterior.evaluations = count
+
+    @property
+    def modes(self) -> Modes:
+        """The present modes, heaviest first.
+
+        Raises:
+            ValueError: there is no track.
+        """
+        if self._modes is None:
+            raise ValueError('there is no track yet')
+        return self._modes
+
+    @property
+    def begun(self) -> bool:
+        """Whether there are modes."""
+        return self._modes is not None
+
+    @property
+    def lost(self) -> bool:
+        """Whether the last images were explained too badly."""
+        return self._bad_images >= self.settings.lost_images
+
+    # The start.
+
+    def begin(
+        self,
+        body: Body,
+        poses: Array,
+        log_weights: Array,
+        precisions: Array,
+        observation: Observation,
+    ) -> Minimum:
+        """Starts from expected poses (N, d); returns the minimum that each of them led to.
+
+        Args:
+            body: of the person; its widths are fitted.
+            poses: (N, d).
+            log_weights: (N,).
+            precisions: (N, d, d) of the poses.
+            observation: of the first image.
+        """
+        self._use_body(body)
+        self._flesh = FleshFit(body)
+
+        def settle(starts: Array, iterations: int) -> Minimum:
+            term = self._posterior.around(observation, poses, precisions)
+            solved = self._posterior.minimise(term, starts, iterations)
+            self.hold(solved, log_weights, observation)
+            return solved
+
+        solved = settle(poses, 3 * self.settings.iterations)
+        for _ in range(3):
+            if not self._fit_flesh(observation):
+                break
+            solved = settle(solved.x, self.settings.iterations)
+        return solved
+
+    def begin_anew(self, poses: Array, observation: Observation) -> Minimum:
+        """Starts from an image and poses (N, d) to search from; returns the minima."""
+        term = self._posterior.of_image(observation)
+        solved = self._posterior.minimise(term, poses, 3 * self.settings.iterations)
+        self.hold(solved, np.zeros(len(poses)), observation)
+        self._bad_images = 0
+        return solved
+
+    def hold(self, solved: Minimum, log_weights: Array, observation: Observation) -> None:
+        """Makes modes at rest from minima and their log prior weights (N,)."""
+        optimised = Optimised(new_hypotheses(solved.x, log_weights), solved)
+        least = self._weigh_and_select(optimised, np.zeros_like(solved.x), observation)
+        self.log_evidence = -self.settings.inverse_temperature * least
+
+    def twin(self) -> MixtureFilter:
+        """Another filter of the same person, without modes, with random numbers of its own."""
+        extra = self._posterior.extra
+        other = MixtureFilter(self.body, self.camera, self.settings, self._seed + 1, extra)
+        other._flesh = deepcopy(self._flesh)
+        return other
+
+    def absorb(self, modes: Modes, observation: Observation) -> None:
+        """Takes over modes; their textures are taken from the image anew."""
+        textures = self._posterior.textures(modes.poses, observation)
+        self._modes = replace(modes, textures=textures, texture_rows=np.arange(len(modes)))
+
+    # One image after another.
+
+    def propagate(
+        self, observation: Observation, dt: float, expected: GaussianMixture | None
+    ) -> None:
+        """Moves the mixture on to the next image.
+
+        Args:
+            observation: of the image.
+            dt: since the last image, s.
+            expected: pose hypotheses from an external predictor, if any.
+        """
+        s, modes, posterior = self.settings, self.modes, self._posterior
+        predicted, covariances = predict(modes, self.body, dt, s.velocity_kept)
+        precisions = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
+        predicted = follow_flow(predicted, precisions, observation, posterior)
+        base = posterior.minimise(
+            posterior.given(observation, predicted, precisions), predicted.poses, s.base_iterations
+        )
+        proposals: list[Proposal] = [self._proposal]
+        if expected is not None:
+            elsewhere = PredictedPoses(self.body, expected, s.prediction_probability)
+            proposals = [elsewhere, *proposals]
+        found = [x.propose(base, predicted, covariances, observation, self._rng) for x in proposals]
+        candidates = found[0] if len(found) == 1 else found[0].joined(found[1])
+        optimised = self._optimise(candidates, precisions, observation)
+        if self._proposal.iterated:
+            optimised = self._search_again(optimised, covariances, precisions, observation)
+        self._learn_usual_energy(float(optimised.minima.value.min()))
+        hypotheses, solved = optimised.hypotheses, optimised.minima
+        ancestors = hypotheses.ancestors
+        velocities = updated_velocities(
+            modes.velocities[ancestors], modes.poses[ancestors], solved.x, dt, s.velocity_gain
+        )
+        # Where a limb has jumped, its displacement is no motion.
+        velocities = np.where(hypotheses.jumped, 0.0, velocities)
+        before = None
+        if s.reweighting == 'bhattacharyya':
+            hypotheses = replace(hypotheses, log_weights=np.zeros(len(hypotheses)))
+            before = GaussianMixture(np.exp(modes.log_weights), predicted.poses, covariances)
+        least = self._weigh_and_select(
+            Optimised(hypotheses, solved), velocities, observation, before
+        )
+        self.log_evidence -= s.inverse_temperature * least
+        self._fit_flesh(observation)
+
+    def assess(self, observation: Observation) -> None:
+        """Takes in how much of an image no mode explains, and whether the track is lost."""
+        self.misfit = unexplained_share(
+            self.body, self.camera, self.modes.poses, observation, self._outline_costs,
+            self.settings.likelihood,
+        )  # fmt: skip
+        self._bad_images = self._bad_images + 1 if self.misfit > self.settings.lost_misfit else 0
+
+    def likelihood_mixture(self, modes: Modes, observation: Observation) -> GaussianMixture:
+        """The modes of the likelihood alone, without what was known from the images before.
+
+        Around each mode of the posterior the energy of the image and of the body's prior is a
+        parabola; its minimum and curvature make a component, its depth the weight.
+        """
+        body, poses = self.body, modes.poses
+        fit = self._posterior.fit(poses, observation)
+        gradient, hessian = fit.energy.derivatives()
+        free = ~resting(poses, gradient, body.lower, body.upper)
+        covariances = free_covariances(hessian, free)
+        step = -np.einsum('kij,kj->ki', covariances, np.where(free, gradient, 0.0))
+        limit = 3.0 * np.sqrt(np.einsum('kii->ki', modes.covariances))
+        step = np.clip(step, -limit, limit)
+        means = np.clip(poses + step, body.lower, body.upper)
+        if observation.evidence:
+            covariances = self._posterior.covariances(fit, free)
+        nothing = np.zeros(len(poses))
+        weights = np.exp(
+            normalised(weigh(nothing, fit.energy.value, self.settings.inverse_temperature))
+        )
+        return GaussianMixture(weights, means, covariances).sorted()
+
+    # The steps.
+
+    def _optimise(
+        self, hypotheses: Hypotheses, precisions: Array, observation: Observation
+    ) -> Optimised:
+        term = self._posterior.given(observation, hypotheses, precisions)
+        solved = self._posterior.minimise(term, hypotheses.poses, self.settings.iterations)
+        hessian = self._posterior.gaussian_hessians(solved, hypotheses, precisions)
+        return Optimised(hypotheses, replace(solved, hessian=hessian))
+
+    def _search_again(
+        self,
+        optimised: Optimised,
+        covariances: Array,
+        precisions: Array,
+        observation: Observation,
+    ) -> Optimised:
+        """Further rounds of jumps, while the least energy is unusually high."""
+        for _ in range(self.settings.rounds - 1):
+            if optimised.minima.value.min() < self._usual_energy + self.settings.energy_rise:
+                break
+            around = self._sources_around(optimised, covariances, precisions, observation)
+            more = self._proposal.propose(
+                around.minima, around.hypotheses, covariances, observation, self._rng
+            )
+            optimised = optimised.joined(self._optimise(more, precisions, observation))
+        return optimised
+
+    def _sources_around(
+        self,
+        optimised: Optimised,
+        covariances: Array,
+        precisions: Array,
+        observation: Observation,
+    ) -> Optimised:
+        """What a further round of jumps starts from: the best optima, and samples near the best.
+
+        Jumps change limbs; a trunk that was predicted badly needs covariance-scaled samples.
+        """
+        s, h = self.settings, optimised.hypotheses
+        order = np.argsort(optimised.minima.value, kind='stable')
+        best = order[: max(s.max_hypotheses // 2, 1)]
+        lead = best[:1]
+        drawn = covariance_scaled_samples(
+            self.body, optimised.minima.x[lead], covariances[h.ancestors[lead]], s.samples,
+            s.sample_scale, self._rng,
+        )[0]  # fmt: skip
+        rows = np.full(len(drawn), h.texture_rows[lead[0]])
+        value = self._posterior.values(drawn, observation, h.textures, rows)
+        drawn = drawn[np.argsort(value, kind='stable')[: s.max_hypotheses]]
+        n = len(drawn)
+        sampled = Hypotheses(
+            drawn,
+            np.full(n, h.log_weights[lead[0]] + np.log(s.jump_probability)),
+            np.full(n, h.ancestors[lead[0]]),
+            drawn,
+            np.ones(drawn.shape, dtype=np.bool_),
+            h.textures,
+            rows[:n],
+        )
+        return optimised[best].joined(self._optimise(sampled, precisions, observation))
+
+    def _weigh_and_select(
+        self,
+        optimised: Optimised,
+        velocities: Array,
+        observation: Observation,
+        before: GaussianMixture | None = None,
+    ) -> float:
+        """Makes the modes of this image; returns the least energy.
+
+        Args:
+            optimised: hypotheses at their optima.
+            velocities: (N, d) of them, per second.
+            observation: of the image.
+            before: the prediction that modes inherit their weights from; None: from ancestors.
+        """
+        s, solved = self.settings, optimised.minima
+        usable = np.flatnonzero(np.isfinite(solved.value))
+        if len(usable) == 0:
+            raise ValueError('no hypothesis has a finite energy')
+        log_weights = weigh(
+            optimised.hypotheses.log_weights[usable], solved.value[usable], s.inverse_temperature
+        )
+        kept = choose_hypotheses(
+            relative_joints(self.body, solved.x[usable]),
+            log_weights,
+            s.max_hypotheses,
+            same=s.hypothesis_merge_distance,
+        )
+        rows = usable[kept.chosen]
+        weights = normalised(kept.log_weights)
+        filtered = free_covariances(solved.hessian[rows], solved.free[rows])
+        if before is not None:
+            order = np.argsort(-weights, kind='stable')
+            weights = normalised(
+                weights + inherited_log_weights(solved.x[rows], filtered, order, before)
+            )
+        weights = at_least(weights, s.least_log_weight)
+        order = np.argsort(-weights, kind='stable')
+        rows, filtered = rows[order], filtered[order]
+        poses = solved.x[rows]
+        fit = self._posterior.fit(poses, observation)
+        covariances = filtered
+        if observation.evidence:
+            covariances = self._posterior.covariances(fit, solved.free[rows])
+        h = optimised.hypotheses[rows]
+        self._modes = Modes(
+            poses=poses,
+            log_weights=weights[order],
+            ancestors=h.ancestors,
+            expected=h.expected,
+            jumped=h.jumped,
+            textures=self._posterior.textures(poses, observation),
+            texture_rows=np.arange(len(rows)),
+            velocities=velocities[rows],
+            covariances=covariances,
+            filtered=filtered,
+            log_likelihoods=-fit.image_energy,
+        )
+        self._outline_costs = fit.outline_costs
+        return float(solved.value[usable].min())
+
+    # What is learned.
+
+    def _learn_usual_energy(self, energy: float) -> None:
+        usual = self._usual_energy
+        if not np.isfinite(usual):
+            self._usual_energy = energy
+        else:
+            # What is unusual is not learned at once.
+            change = min(energy - usual, self.settings.energy_rise)
+            self._usual_energy = usual + USUAL_GAIN * change
+
+    def _fit_flesh(self, observation: Observation) -> bool:
+        """Moves the widths of the flesh by what an image says; False where it says nothing more."""
+        if self._flesh.images >= self.settings.flesh_images or observation.outline is None:
+            return False
+        m = self.modes
+        poses, weights = m.poses[:4], np.exp(m.log_weights[:4])
+        body = self._flesh.update(
+            self._posterior.likelihood, observation, poses, weights / weights.sum()
+        )
+        self._posterior.evaluations += len(poses) * (2 * len(self._flesh.widths) + 1)
+        self._use_body(body)
+        return True
+
+    def _use_body(self, body: Body) -> None:
+        """Goes on with a body of the same degrees of freedom."""
+        self.body = body
+        evaluations = self._posterior.evaluations
+        self._posterior = Posterior(body, self.camera, self.settings, self._posterior.extra)
+        self._posterior.evaluations = evaluations
+        self._proposal = PROPOSALS[self.settings.proposals](self._posterior)

@@ -1,0 +1,104 @@
+"""Hypotheses about the pose, from one image to the next: the record that the five steps share.
+
+    predict -> propose -> optimise -> weigh -> select
+
+A hypothesis is born with a prior: its ancestor, its jumps, and where it is expected. It gets a pose
+that is locally optimal and a weight; if it is selected it is a mode, with covariances and texture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.image.texture import Textures
+from hmt_ros.inference.mixture import GaussianMixture
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """N weighted poses, and how they came about.
+
+    Attributes:
+        poses: (N, d).
+        log_weights: (N,) log prior probabilities; of modes log posterior probabilities.
+        ancestors: (N,) mode of the image before that each comes from.
+        expected: (N, d) pose that the motion prior is centred at.
+        jumped: (N, d) degrees of freedom that did not move there, but jumped.
+        textures: of the last image, of modes of the present one; None: there are none.
+        texture_rows: (N,) row of the textures that each carries.
+    """
+
+    poses: Array
+    log_weights: Array
+    ancestors: Index
+    expected: Array
+    jumped: NDArray[np.bool_]
+    textures: Textures | None
+    texture_rows: Index
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def __getitem__(self, rows: Index) -> Self:
+        """Some of them; all keep their textures."""
+        parts: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._by_row()}
+        return replace(self, **parts)
+
+    def joined(self, other: Self) -> Self:
+        """These and others, whose textures contain those of these."""
+        parts: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), getattr(other, name)])
+            for name in self._by_row()
+        }
+        return replace(other, **parts)
+
+    @classmethod
+    def _by_row(cls) -> list[str]:
+        return [field.name for field in fields(cls) if field.name != 'textures']
+
+
+@dataclass(frozen=True, eq=False)
+class Modes(Hypotheses):
+    """Hypotheses that were optimised, weighed and selected: the mixture that is carried on.
+
+    Attributes:
+        velocities: (N, d) per second.
+        covariances: (N, d, d) of the posterior.
+        filtered: (N, d, d) covariances that are propagated, as if errors were independent from
+            image to image.
+        log_likelihoods: (N,) of the image.
+    """
+
+    velocities: Array
+    covariances: Array
+    filtered: Array
+    log_likelihoods: Array
+
+    @property
+    def mixture(self) -> GaussianMixture:
+        """The modes as a mixture over poses."""
+        return GaussianMixture(np.exp(self.log_weights), self.poses, self.covariances)
+
+
+def new_hypotheses(poses: Array, log_weights: Array) -> Hypotheses:
+    """Hypotheses (N, d) that come from nothing before: each its own ancestor, without texture."""
+    everyone = np.arange(len(poses))
+    still = np.zeros(poses.shape, dtype=np.bool_)
+    return Hypotheses(poses, log_weights, everyone, poses, still, None, everyone)
+
+
+def relative_joints(body: Body, poses: Array) -> Array:
+    """Joints (N, J, 3) of poses relative to the first, m: what hypotheses are compared by."""
+    joints = body.joint_positions(poses)
+    return joints - joints[:, :1]

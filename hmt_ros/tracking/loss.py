@@ -1,0 +1,84 @@
+"""How much of an image no mode explains: whether a track is lost.
+
+    misfit = max(share of the outline's samples, share of the keypoints)
+
+A sample or keypoint is unexplained when it is further than 4 sigmas from where it should be.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.image.likelihood import LikelihoodSettings
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.keypoints import Keypoints
+
+Array = NDArray[np.float64]
+
+# A sample of the outline or a keypoint further away than this from where it should be is
+# unexplained, in sigmas.
+UNEXPLAINED = 4.0
+
+
+def unexplained_share(
+    body: Body,
+    camera: Camera,
+    poses: Array,
+    observation: Observation,
+    outline_costs: Array,
+    settings: LikelihoodSettings,
+) -> float:
+    """Share of an image that the best of poses (K, d) does not explain.
+
+    Args:
+        body, camera: who is seen by what.
+        poses: (K, d).
+        observation: of the image.
+        outline_costs: (K, M) what each sample of the outline costs each pose.
+        settings: of the terms.
+    """
+    share = unexplained_outline(outline_costs, settings.coverage)
+    keypoints = observation.keypoints
+    if keypoints is None:
+        return share
+    sigma = settings.keypoints.sigma
+    return max(share, unexplained_keypoints(body, camera, poses, keypoints, sigma))
+
+
+def unexplained_outline(costs: Array, term: TermSettings) -> float:
+    """Share of the samples of the silhouette's outline that the best mode does not explain.
+
+    Args:
+        costs: (K, M) what each sample costs each mode.
+        term: that they cost it by: its weight, shared among the samples, and its kernel.
+    """
+    if costs.size == 0:
+        return 0.0
+    most = 0.5 * term.weight / costs.shape[1] * term.scale**2
+    limit = UNEXPLAINED**2 / (UNEXPLAINED**2 + term.scale**2)
+    return float((costs > limit * most).mean(1).min())
+
+
+def unexplained_keypoints(
+    body: Body, camera: Camera, poses: Array, keypoints: Keypoints, sigma: float
+) -> float:
+    """Share of the keypoints that the best of poses (K, d) does not explain.
+
+    Args:
+        body, camera: who is seen by what.
+        poses: (K, d).
+        keypoints: those that were not seen do not count.
+        sigma: factor on their standard deviations.
+    """
+    seen = np.flatnonzero(np.isfinite(keypoints.pixels).all(1))
+    if len(seen) == 0:
+        return 0.0
+    which = body.skeleton.joint_index([keypoints.names[i] for i in seen])
+    error = camera.project(body.joint_positions(poses)[:, which]) - keypoints.pixels[seen]
+    precisions = np.linalg.inv(keypoints.covariances[seen])
+    distance = np.einsum('kna,nab,knb->kn', error, precisions, error) / sigma**2
+    return float((~(distance < UNEXPLAINED**2)).mean(1).min())

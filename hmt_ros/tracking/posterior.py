@@ -1,0 +1,223 @@
+"""The energy of a pose given one image and where it was expected (KJS 2).
+
+    E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_motion(x) + E_extra(x)
+
+E_motion is a Student prior around the expected pose: a Gaussian motion prior with heavy tails.
+E_extra are terms that the user of a tracker adds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.pose_terms import FrameTerm, Posed
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.texture import Textures, capture_textures
+from hmt_ros.inference.bounded_newton import Minimum, minimise
+from hmt_ros.inference.energy import (
+    Derivatives,
+    Energy,
+    EnergyTerm,
+    Quadratic,
+    Student,
+    Sum,
+    add_energies,
+)
+from hmt_ros.tracking.hypotheses import Hypotheses
+
+if TYPE_CHECKING:
+    from hmt_ros.tracking.settings import TrackerSettings
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+# Largest standard deviation of a mode: where an image shows nothing, rad or m.
+WIDEST = 2.0
+# Standard deviation of a variable that rests on its limit, rad or m: 3 degrees.
+AT_LIMIT = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFit:
+    """How poses (K, d) explain an image, without regard to what was expected.
+
+    Attributes:
+        energy: with the priors of the body.
+        image_energy: (K,) of the image and the keypoints alone.
+        image_hessian: (K, d, d) of the image terms alone, keypoints apart.
+        outline_costs: (K, M) of the samples of the silhouette's outline.
+    """
+
+    energy: Energy
+    image_energy: Array
+    image_hessian: Array
+    outline_costs: Array
+
+
+class Posterior:
+    """Energies of poses of one body before one camera, and their minima.
+
+    Args:
+        body, camera: who is seen by what.
+        settings: of the tracker.
+        extra: further terms, such as what is known of the floor.
+
+    Attributes:
+        evaluations: of the likelihood, so far.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        camera: Camera,
+        settings: TrackerSettings,
+        extra: tuple[FrameTerm, ...] = (),
+    ) -> None:
+        self.body, self.camera, self.settings, self.extra = body, camera, settings, extra
+        self.evaluations = 0
+        self._step_scale = np.where(body.skeleton.dof_is_rotation, 0.3, 0.2)
+        self._last_fit: tuple[Array, Observation, ImageFit] | None = None
+
+    @cached_property
+    def likelihood(self) -> ImageLikelihood:
+        """Of images."""
+        return ImageLikelihood(self.body, self.camera, self.settings.likelihood)
+
+    @cached_property
+    def flow_likelihood(self) -> ImageLikelihood:
+        """Of the optical flow alone."""
+        flow = LikelihoodSettings.of_terms(motion=self.settings.likelihood.motion)
+        return ImageLikelihood(self.body, self.camera, flow)
+
+    def of_image(
+        self,
+        observation: Observation,
+        textures: Textures | None = None,
+        texture_rows: Index | None = None,
+    ) -> EnergyTerm:
+        """The energy without what was expected; its evaluations are counted."""
+        terms = self.likelihood.given(observation, textures, texture_rows).terms
+        return _Counted(Posed(self.body.skeleton, (*terms, *self.extra)), self)
+
+    def around(self, observation: Observation, centres: Array, precisions: Array) -> EnergyTerm:
+        """With a Gaussian prior of precisions (N, d, d) around centres (N, d)."""
+        return Sum((self.of_image(observation), Quadratic(centres, precisions)))
+
+    def given(
+        self, observation: Observation, hypotheses: Hypotheses, precisions: Array
+    ) -> EnergyTerm:
+        """With the motion prior of hypotheses, whose ancestors have precisions (K, d, d)."""
+        h = hypotheses
+        image = self.of_image(observation, h.textures, h.texture_rows)
+        return Sum((image, self._motion_prior(h, precisions)))
+
+    def values(
+        self, poses: Array, observation: Observation, textures: Textures | None, rows: Index
+    ) -> Array:
+        """Energies (N,) of poses (N, d), with rows (N,) of the textures, by image alone."""
+        image = self.of_image(observation, textures, rows)
+        return image.energy(poses, np.arange(len(poses)), derivatives=Derivatives.NONE).value
+
+    def minimise(self, term: EnergyTerm, poses: Array, iterations: int) -> Minimum:
+        """Minima from poses (N, d) within the limits of the body."""
+        return minimise(
+            term, poses, self.body.lower, self.body.upper, step_scale=self._step_scale,
+            damping=1.0, max_iterations=iterations, tolerance=0.02,
+        )  # fmt: skip
+
+    def gaussian_hessians(
+        self, solved: Minimum, hypotheses: Hypotheses, precisions: Array
+    ) -> Array:
+        """Hessians (N, d, d) at minima, with the motion prior as sharp as its covariance.
+
+        A Student density is sharper at its centre than its covariance says.
+        """
+        own = precisions[hypotheses.ancestors]
+        offset = solved.x - hypotheses.expected
+        distance = np.einsum('ni,nij,nj->n', offset, own, offset)
+        prior = self._motion_prior(hypotheses, precisions)
+        shrinkage = prior.shrinkage(distance, self.body.dimension)
+        return np.asarray(solved.hessian - (shrinkage - 1.0)[:, None, None] * own)
+
+    def fit(self, poses: Array, observation: Observation) -> ImageFit:
+        """How poses (K, d) explain an image."""
+        last = self._last_fit
+        if last is not None and last[0] is poses and last[1] is observation:
+            return last[2]
+        frames, rows = forward(self.body.skeleton, poses), np.arange(len(poses))
+        image = self.likelihood.energies(frames, observation)
+        assert image.hessian is not None
+        _, *keypoints = self.likelihood.seen(observation)
+        seen = add_energies(
+            [
+                Energy(image.value, image.gradient, image.hessian),
+                *(term.energy(frames, rows) for term in keypoints),
+            ]
+        )
+        known = (*self.likelihood.priors, *self.extra)
+        priors = [term.energy(frames, rows) for term in known]
+        fit = ImageFit(add_energies([seen, *priors]), seen.value, image.hessian, image.costs)
+        self._last_fit = (poses, observation, fit)
+        return fit
+
+    def covariances(self, fit: ImageFit, free: Mask) -> Array:
+        """Covariances (K, d, d) that an image alone leaves, on the free variables (K, d).
+
+        Of the image only a share is believed: shapes, shadows and clothes differ from the model's
+        in much the same way in image after image, and such errors do not average out, over pixels
+        or over time.
+        """
+        _, hessian = fit.energy.derivatives()
+        disbelief = 1.0 - self.settings.image_information
+        return free_covariances(hessian - disbelief * fit.image_hessian, free)
+
+    def textures(self, poses: Array, observation: Observation) -> Textures | None:
+        """What an image shows on the surfaces of poses (K, d)."""
+        if observation.intensity is None:
+            return None
+        frames = forward(self.body.skeleton, poses)
+        return capture_textures(self.body, self.camera, frames, observation.intensity)
+
+    def _motion_prior(self, hypotheses: Hypotheses, precisions: Array) -> Student:
+        own = precisions[hypotheses.ancestors]
+        return Student(hypotheses.expected, own, self.settings.tails)
+
+
+@dataclass(frozen=True, eq=False)
+class _Counted:
+    """A term whose evaluations a posterior counts."""
+
+    term: Posed
+    counter: Posterior
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        self.counter.evaluations += len(x)
+        return self.term.energy(x, rows, derivatives=derivatives)
+
+
+def free_covariances(hessians: Array, free: Mask) -> Array:
+    """Inverses (K, d, d) of Hessians (K, d, d) on the free variables (K, d).
+
+    A variable at its limit has the deviation `AT_LIMIT`, and none one above `WIDEST`.
+    """
+    h = hessians.copy()
+    rows, dofs = np.nonzero(~free)
+    h[rows, dofs, :] = 0.0
+    h[rows, :, dofs] = 0.0
+    h[rows, dofs, dofs] = AT_LIMIT**-2.0
+    diagonal = np.arange(h.shape[1])
+    h[:, diagonal, diagonal] += WIDEST**-2.0
+    result = np.linalg.inv(0.5 * (h + h.transpose(0, 2, 1)))
+    return 0.5 * (result + result.transpose(0, 2, 1))

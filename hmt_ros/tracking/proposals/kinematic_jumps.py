@@ -1,0 +1,325 @@
+"""Kinematic jump sampling: other configurations of the limbs and of the trunk (KJS 3, 4).
+
+For each trunk that the modes have, every limb has alternatives: those of the modes, all their
+flips, and what a search of the image found. Combinations of alternatives are rated on the trunk as
+it is, with limbs exchanged that were taken for each other, and with the torso flipped; the best
+that stand for all become candidates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.skeleton import other_side
+from hmt_ros.flips.best_combinations import Alternatives, best_combinations, distinct_alternatives
+from hmt_ros.flips.interpretation_tree import enumerate_flips, rehang_chain
+from hmt_ros.flips.torso_flips import flip_torso
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.texture import Textures, with_swapped_sides
+from hmt_ros.inference.bounded_newton import Minimum
+from hmt_ros.tracking.hypotheses import Hypotheses, relative_joints
+from hmt_ros.tracking.posterior import Posterior
+from hmt_ros.tracking.proposals.chain_votes import chain_votes
+from hmt_ros.tracking.proposals.limb_search import LimbSearch
+from hmt_ros.tracking.selection import choose_hypotheses
+from hmt_ros.tracking.weighting import weigh
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# Groups of modes with a trunk of their own whose products are rated.
+MOST_GROUPS = 3
+# Modes have the same trunk when its joints are nowhere further apart, m.
+SAME_TRUNK = 0.06
+# Configurations of a limb are distinct when some joint is further apart, m.
+DISTINCT = 0.08
+
+
+@dataclass(frozen=True, eq=False)
+class _Lead:
+    """The pose of a trunk, and the image in which its limbs are rated.
+
+    Attributes:
+        pose: (d,).
+        covariance: (d, d) of its prediction.
+        observation: of the image.
+        textures: of the last image.
+        row: of the textures, which the pose carries.
+    """
+
+    pose: Array
+    covariance: Array
+    observation: Observation
+    textures: Textures | None
+    row: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Product:
+    """A trunk, configurations of each limb, and what they cost.
+
+    Attributes:
+        modes, members, log_weights: (G, d), (G,), (G,) of the modes with this trunk.
+        alternatives: one entry a chain.
+        changes: energy change that each alternative makes alone.
+        energy: of the first mode.
+        row: of the textures.
+    """
+
+    modes: Array
+    members: Index
+    log_weights: Array
+    alternatives: list[Alternatives]
+    changes: list[Array]
+    energy: float
+    row: int
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicJumps:
+    """Proposes poses far from those that are known, which fit the image as well.
+
+    Attributes:
+        posterior: of the body before the camera.
+    """
+
+    posterior: Posterior
+    iterated: ClassVar[bool] = True
+
+    def propose(
+        self,
+        base: Minimum,
+        sources: Hypotheses,
+        covariances: Array,
+        observation: Observation,
+        rng: np.random.Generator,
+    ) -> Hypotheses:
+        """See `Proposal`."""
+        s, textures = self.posterior.settings, sources.textures
+        everything: list[tuple[Array, Index, Array, Array, Index]] = []
+        for group in self._groups(base)[:MOST_GROUPS]:
+            lead = _Lead(
+                base.x[group[0]], covariances[sources.ancestors[group[0]]], observation, textures,
+                int(sources.texture_rows[group[0]]),
+            )  # fmt: skip
+            found = self._search(lead, base.x, rng)
+            alternatives = [
+                self._alternatives(base.x[group], chain, found.get(chain))
+                for chain in self.posterior.body.chains
+            ]
+            products, textures = self._products(
+                lead, base.x[group], group, sources.log_weights[group], alternatives
+            )
+            for product in products:
+                combined = best_combinations(
+                    self.posterior.body, product.modes, product.log_weights, product.energy,
+                    product.alternatives, product.changes, s.inverse_temperature, s.combinations,
+                )  # fmt: skip
+                members = product.members[combined.parents]
+                rows = np.full(len(members), product.row)
+                if product.row == lead.row:
+                    rows = sources.texture_rows[members]
+                everything.append(
+                    (combined.poses, members, combined.log_priors, combined.energies, rows)
+                )
+        poses, members, log_priors, energies, rows = (
+            np.concatenate([part[i] for part in everything]) for i in range(5)
+        )
+        kept = choose_hypotheses(
+            relative_joints(self.posterior.body, poses),
+            s.exploration * weigh(log_priors, energies, s.inverse_temperature),
+            s.candidates,
+            same=s.hypothesis_merge_distance,
+        ).chosen
+        poses, members = poses[kept], members[kept]
+        # A chain that jumped is expected where it landed, the rest where it was predicted.
+        changed = np.abs(poses - base.x[members]) > 1e-9
+        return Hypotheses(
+            poses,
+            log_priors[kept],
+            sources.ancestors[members],
+            np.where(changed, poses, sources.expected[members]),
+            changed | sources.jumped[members],
+            textures,
+            rows[kept],
+        )
+
+    @cached_property
+    def _searches(self) -> dict[str, LimbSearch]:
+        pairs = self.posterior.body.chain_pairs
+        return {chain: LimbSearch(self.posterior, chain) for pair in pairs for chain in pair}
+
+    def _groups(self, base: Minimum) -> list[Index]:
+        """Modes with nearly the same trunk, each group with its best mode first."""
+        which = self.posterior.body.skeleton.joint_index(self.posterior.body.trunk_joints)
+        trunk = self.posterior.body.joint_positions(base.x)[:, which]
+        left = list(np.argsort(base.value, kind='stable'))
+        groups = []
+        while left:
+            gaps = np.linalg.norm(trunk[left] - trunk[left[0]], axis=2).max(1)
+            near = gaps < SAME_TRUNK
+            groups.append(np.array([i for i, ok in zip(left, near) if ok], dtype=np.intp))
+            left = [i for i, ok in zip(left, near) if not ok]
+        return groups
+
+    def _products(
+        self,
+        lead: _Lead,
+        modes: Array,
+        members: Index,
+        log_weights: Array,
+        alternatives: list[Alternatives],
+    ) -> tuple[list[_Product], Textures | None]:
+        """The product of a group, those with limbs exchanged, and those with the torso flipped.
+
+        Args:
+            lead: first mode of the group.
+            modes, members, log_weights: (G, d), (G,), (G,) of the group.
+            alternatives: one entry a chain.
+
+        Returns:
+            The products, and the textures of which they have rows.
+        """
+        changes, energy = self._rate(lead, alternatives)
+        products = [_Product(modes, members, log_weights, alternatives, changes, energy, lead.row)]
+        weight = np.array(
+            [np.logaddexp.reduce(log_weights) + np.log(self.posterior.settings.jump_probability)]
+        )
+        for pair in self.posterior.body.chain_pairs:
+            swapped = self._swap(lead, pair)
+            if swapped is None:
+                continue
+            other, hung = swapped
+            lead = replace(lead, textures=other.textures)
+            rated, energy = self._rate(other, hung)
+            choices, joined = [], []
+            for chain, change in zip(alternatives, changes, strict=True):
+                if chain.chain in pair:
+                    i = pair.index(chain.chain)
+                    choices.append(hung[i])
+                    joined.append(rated[i])
+                else:
+                    choices.append(Alternatives(chain.chain, chain.angles, chain.penalties[:1]))
+                    joined.append(change)
+            products.append(
+                _Product(other.pose[None], members[:1], weight, choices, joined, energy, other.row)
+            )
+        for flipped, hung in self._torso_flips(lead.pose, [a.chain for a in alternatives]):
+            rated, energy = self._rate(replace(lead, pose=flipped), hung)
+            products.append(
+                _Product(flipped[None], members[:1], weight, hung, rated, energy, lead.row)
+            )
+        return products, lead.textures
+
+    def _search(self, lead: _Lead, known: Array, rng: np.random.Generator) -> dict[str, Array]:
+        """Configurations of some limbs, chosen by vote, that fit the image."""
+        s, evidence = self.posterior.settings, lead.observation.evidence
+        shape = 'containment' in evidence or 'edges' in evidence
+        names = list(self._searches) if shape else []
+        count = min(s.searched_chains, len(names))
+        if count == 0:
+            return {}
+        votes = chain_votes(
+            self.posterior.body, lead.covariance[None], names, s.vote, lead.pose[None], known
+        )[0]
+        chosen = rng.choice(len(names), size=count, replace=False, p=votes)
+        return {
+            names[i]: self._searches[names[i]].find(
+                lead.pose, lead.covariance, lead.observation, lead.textures, lead.row, rng
+            )
+            for i in sorted(chosen)
+        }
+
+    def _alternatives(self, modes: Array, chain: str, found: Array | None) -> Alternatives:
+        """Configurations of a chain in a group: the modes' own, what was found, and all flips."""
+        s, body = self.posterior.settings, self.posterior.body
+        own = body.skeleton.chain_dofs[chain]
+        jump = -np.log(s.jump_probability)
+        angles, penalties = [modes[:, own]], [np.where(np.eye(len(modes)) > 0, 0.0, jump)]
+        if found is not None:
+            angles.append(found)
+        if chain in self._searches:
+            # Limbs that cross in the image are easily taken for each other.
+            sibling = other_side(chain)
+            swapped, _ = rehang_chain(body, modes[:1], modes[:1], chain, image_of=sibling)
+            angles.append(swapped[:, own])
+        sources = np.concatenate(angles)
+        poses = np.repeat(modes[:1], len(sources), axis=0)
+        poses[:, own] = sources
+        flips, parents = enumerate_flips(body, poses, chain)
+        first = np.concatenate([[True], parents[1:] != parents[:-1]])
+        every = np.concatenate([sources, flips[~first][:, own]])
+        penalties.append(np.full((len(modes), len(every) - len(modes)), jump))
+        return distinct_alternatives(
+            body, modes[0], chain, every, np.concatenate(penalties, axis=1),
+            apart=DISTINCT, most=s.alternatives,
+        )  # fmt: skip
+
+    def _torso_flips(
+        self, pose: Array, chains: list[str]
+    ) -> list[tuple[Array, list[Alternatives]]]:
+        """The pose with its torso flipped, and its limbs in all ways that keep their image."""
+        result = []
+        for flipped in flip_torso(self.posterior.body, pose[None])[0]:
+            base, alternatives = flipped.copy(), []
+            for chain in chains:
+                own = self.posterior.body.skeleton.chain_dofs[chain]
+                hung, _ = rehang_chain(self.posterior.body, pose[None], flipped[None], chain)
+                angles = hung[:, own] if len(hung) else flipped[None, own]
+                base[own] = angles[0]
+                distinct = distinct_alternatives(
+                    self.posterior.body, flipped, chain, angles, np.zeros((1, len(angles))),
+                    apart=DISTINCT, most=self.posterior.settings.alternatives,
+                )  # fmt: skip
+                alternatives.append(distinct)
+            result.append((base, alternatives))
+        return result
+
+    def _swap(self, lead: _Lead, pair: tuple[str, str]) -> tuple[_Lead, list[Alternatives]] | None:
+        """The pose with two limbs each on the other's image, in all ways; None if they reach not.
+
+        Limbs that cross in the image are easily taken for each other, and one alone that changes
+        sides leaves its own place empty.
+        """
+        pose, textures, row = lead.pose, lead.textures, lead.row
+        base, alternatives = pose.copy(), []
+        for chain, sibling in (pair, pair[::-1]):
+            own = self.posterior.body.skeleton.chain_dofs[chain]
+            hung, _ = rehang_chain(
+                self.posterior.body, pose[None], pose[None], chain, image_of=sibling
+            )
+            if len(hung) == 0:
+                return None
+            base[own] = hung[0, own]
+            distinct = distinct_alternatives(
+                self.posterior.body, pose, chain, hung[:, own], np.zeros((1, len(hung))),
+                apart=DISTINCT, most=self.posterior.settings.alternatives,
+            )  # fmt: skip
+            alternatives.append(distinct)
+        if textures is not None:
+            row = len(textures.counts)
+            segments = (self.posterior.body.skeleton.chains[chain] for chain in pair)
+            textures = with_swapped_sides(textures, lead.row, *segments)
+        return replace(lead, pose=base, textures=textures, row=row), alternatives
+
+    def _rate(self, lead: _Lead, alternatives: list[Alternatives]) -> tuple[list[Array], float]:
+        """Energy change that each alternative makes alone, and the energy of the pose itself."""
+        poses = [lead.pose[None]]
+        for chain in alternatives:
+            block = np.repeat(lead.pose[None], len(chain.angles), axis=0)
+            block[:, self.posterior.body.skeleton.chain_dofs[chain.chain]] = chain.angles
+            poses.append(block)
+        value = self._values(lead, np.concatenate(poses))
+        ends = np.cumsum([1] + [len(c.angles) for c in alternatives])
+        return [value[a:b] - value[0] for a, b in pairwise(ends)], float(value[0])
+
+    def _values(self, lead: _Lead, poses: Array) -> Array:
+        """Energies (N,) of poses (N, d) that carry the textures of a lead."""
+        rows = np.full(len(poses), lead.row)
+        return self.posterior.values(poses, lead.observation, lead.textures, rows)

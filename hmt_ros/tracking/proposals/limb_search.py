@@ -1,0 +1,116 @@
+"""Covariance-scaled sampling of one limb at a time (KJS 3).
+
+    E(a) = E_image(a) + E_keypoints(a) + E_prior(a) + E_motion(a)      over the angles a of a limb
+
+Given the trunk, limbs are nearly independent: instead of 37 degrees of freedom at once, samples of
+the four to six of one limb are compared with the image there, and the best are refined. What the
+rest of the body explains of the silhouette's outline costs a limb nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.pose_terms import Posed
+from hmt_ros.image.likelihood import ImageLikelihood
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.texture import Textures
+from hmt_ros.inference.bounded_newton import minimise
+from hmt_ros.inference.energy import Derivatives, Quadratic, Restricted, Student, Sum
+from hmt_ros.tracking.posterior import Posterior
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# Degrees of freedom of the Student prior that keeps a limb near its prediction: heavy tails.
+TAILS = 4.0
+# Factor on the standard deviations of the body's prior, of the samples that are drawn from it.
+WIDE = 1.3
+
+
+@dataclass(frozen=True, eq=False)
+class LimbSearch:
+    """Finds other configurations of a limb in an image.
+
+    Attributes:
+        posterior: of the body before the camera.
+        chain: name of the limb.
+    """
+
+    posterior: Posterior
+    chain: str
+
+    def __post_init__(self) -> None:
+        p = self.posterior
+        segments = set(p.body.skeleton.chains[self.chain])
+        parts = range(len(p.body.flesh.parts))
+        own = tuple(i for i in parts if p.body.flesh.parts[i].segment in segments)
+        rest = tuple(i for i in parts if i not in own)
+        for name, traced, occluders in (('_own', own, None), ('_rest', rest, rest)):
+            likelihood = ImageLikelihood(p.body, p.camera, p.settings.likelihood, traced, occluders)
+            object.__setattr__(self, name, likelihood)
+        object.__setattr__(self, 'dofs', p.body.skeleton.chain_dofs[self.chain])
+
+    _own: ImageLikelihood = None  # type: ignore[assignment]
+    _rest: ImageLikelihood = None  # type: ignore[assignment]
+    dofs: Index = None  # type: ignore[assignment]
+
+    def find(
+        self,
+        pose: Array,
+        covariance: Array,
+        observation: Observation,
+        textures: Textures | None,
+        row: int,
+        rng: np.random.Generator,
+    ) -> Array:
+        """Angles (A, chain dofs) of the limb that fit the image, distinct from each other or not.
+
+        Args:
+            pose: (d,) whose other limbs are kept.
+            covariance: (d, d) how far the limb may have moved.
+            observation: of the image.
+            textures, row: of the last image, and the one that the pose carries.
+            rng: source of randomness.
+        """
+        body, own, s = self.posterior.body, self.dofs, self.posterior.settings
+        block = covariance[np.ix_(own, own)]
+        samples = self._draw(pose[own], block, rng)
+        others = self._rest.energies(
+            forward(body.skeleton, pose[None]), observation, derivatives=False
+        )
+        rows = np.full(len(samples), row)
+        seen = self._own.seen(observation, textures, rows, explained=others.costs)
+        seen = (*seen, *self.posterior.extra)
+        weight = s.likelihood.prior_weight
+        term = Sum(
+            (
+                Restricted(Posed(body.skeleton, seen), pose, own),
+                Quadratic(body.prior_mean[own], weight * body.prior_sigma[own] ** -2.0),
+                Student(pose[own], np.asarray(np.linalg.inv(block)), TAILS),
+            )
+        )
+        value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
+        best = samples[np.argsort(value, kind='stable')[: s.search.refined]]
+        self.posterior.evaluations += s.search.samples + s.search.refined * s.search.iterations
+        return minimise(
+            term, best, body.lower[own], body.upper[own],
+            step_scale=0.4, damping=1.0, max_iterations=s.search.iterations, tolerance=0.05,
+        ).x  # fmt: skip
+
+    def _draw(self, angles: Array, block: Array, rng: np.random.Generator) -> Array:
+        """Samples from the mode, from it stretched, and from the body's prior: a third each."""
+        body, own, search = self.posterior.body, self.dofs, self.posterior.settings.search
+        n = search.samples
+        noise = rng.standard_normal((n, len(own)))
+        near = noise @ np.linalg.cholesky(block).T
+        near[n // 3 :] *= search.stretch
+        result = angles + near
+        wide = body.prior_mean[own] + WIDE * body.prior_sigma[own] * noise
+        result[2 * n // 3 :] = wide[2 * n // 3 :]
+        result[0] = angles
+        return np.clip(result, body.lower[own], body.upper[own])

@@ -1,0 +1,120 @@
+"""Spherical and covariance-scaled sampling (KJS 3 and 5).
+
+SS      x ~ N(m, s^2 r^2 I),  r = |S|^(1/2d)
+CSS     x ~ N(m, s^2 S)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.image.observation import Observation
+from hmt_ros.inference.bounded_newton import Minimum
+from hmt_ros.tracking.hypotheses import Hypotheses, relative_joints
+from hmt_ros.tracking.posterior import Posterior
+from hmt_ros.tracking.selection import choose_hypotheses
+from hmt_ros.tracking.weighting import weigh
+
+Array = NDArray[np.float64]
+
+
+def spherical_samples(
+    body: Body, means: Array, covariances: Array, count: int, scale: float, rng: np.random.Generator
+) -> Array:
+    """Isotropic noise around each mean, of the volume that its covariance has; (K, count, d).
+
+    The radius is the geometric mean of the axes of the ellipsoid, |S|^(1/2d). Samples that leave
+    the limits are projected back.
+
+    Args:
+        body: with the limits.
+        means, covariances: (K, d), (K, d, d).
+        count: samples a mean.
+        scale: factor on the radius; 0: Cauchy tails of scale 1.
+        rng: source of randomness.
+    """
+    d = means.shape[1]
+    radius = np.exp(np.linalg.slogdet(covariances)[1] / (2 * d))
+    noise = _noise((len(means), count, d), scale, rng)
+    samples: Array = np.clip(means[:, None] + radius[:, None, None] * noise, body.lower, body.upper)
+    return samples
+
+
+def covariance_scaled_samples(
+    body: Body, means: Array, covariances: Array, count: int, scale: float, rng: np.random.Generator
+) -> Array:
+    """Noise with the covariance of each mean, stretched; (K, count, d). Arguments as above."""
+    factors = np.linalg.cholesky(covariances)
+    noise = _noise((len(means), count, means.shape[1]), scale, rng)
+    samples: Array = np.clip(
+        means[:, None] + np.einsum('kij,knj->kni', factors, noise), body.lower, body.upper
+    )
+    return samples
+
+
+def _noise(shape: tuple[int, ...], scale: float, rng: np.random.Generator) -> Array:
+    """Gaussian noise times a scale, or multivariate Cauchy noise where the scale is 0."""
+    noise = rng.standard_normal(shape)
+    if scale > 0:
+        return scale * noise
+    heavy = np.sqrt(rng.chisquare(1, size=(*shape[:-1], 1)))
+    return noise / np.maximum(heavy, 1e-3)
+
+
+@dataclass(frozen=True, eq=False)
+class CovarianceScaledSamples:
+    """Proposes covariance-scaled samples around the predictions.
+
+    Attributes:
+        posterior: of the body before the camera.
+    """
+
+    posterior: Posterior
+    iterated: ClassVar[bool] = False
+    draw: ClassVar = staticmethod(covariance_scaled_samples)
+
+    def propose(
+        self,
+        base: Minimum,
+        sources: Hypotheses,
+        covariances: Array,
+        observation: Observation,
+        rng: np.random.Generator,
+    ) -> Hypotheses:
+        """See `Proposal`."""
+        s, body, k = self.posterior.settings, self.posterior.body, len(sources)
+        each = max(s.samples // k, 1)
+        drawn = self.draw(body, sources.expected, covariances, each, s.sample_scale, rng)
+        poses = np.concatenate([base.x, drawn.reshape(-1, body.dimension)])
+        rows = np.concatenate([np.arange(k), np.repeat(np.arange(k), each)])
+        energies = self.posterior.values(
+            poses, observation, sources.textures, sources.texture_rows[rows]
+        )
+        kept = choose_hypotheses(
+            relative_joints(body, poses),
+            weigh(sources.log_weights[rows], energies, s.inverse_temperature),
+            s.candidates,
+            same=s.hypothesis_merge_distance,
+        ).chosen
+        rows = rows[kept]
+        return Hypotheses(
+            poses[kept],
+            sources.log_weights[rows],
+            sources.ancestors[rows],
+            sources.expected[rows],
+            np.zeros((len(rows), body.dimension), dtype=np.bool_),
+            sources.textures,
+            sources.texture_rows[rows],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SphericalSamples(CovarianceScaledSamples):
+    """Proposes spherical samples of the same volume."""
+
+    draw: ClassVar = staticmethod(spherical_samples)

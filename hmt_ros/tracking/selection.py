@@ -1,0 +1,97 @@
+"""Select: which of many hypotheses to keep, few that stand for all (KJS figure 4, step 5).
+
+    min over S, |S| = K:   sum_i w_i min_{s in S} d(i, s)
+
+Keeping the K heaviest modes keeps near copies of the heaviest one. Here the K are chosen that leave
+the least expected distance from a hypothesis to the nearest kept one, greedily, heaviest first; d
+is the mean distance of the joints, each capped, below which two hypotheses count as the same. What
+is not kept gives its weight to the nearest that is.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+
+class Kept(NamedTuple):
+    """Hypotheses that stand for all.
+
+    Attributes:
+        chosen: (K,) indices, in the order in which they were chosen.
+        owner: (N,) position in `chosen` of the hypothesis that stands for each.
+        log_weights: (K,) of the groups.
+    """
+
+    chosen: Index
+    owner: Index
+    log_weights: Array
+
+
+def choose_hypotheses(
+    joints: Array, log_weights: Array, count: int, *, same: float = 0.02, cap: float = 0.3
+) -> Kept:
+    """The hypotheses to keep.
+
+    Args:
+        joints: (N, J, 3) positions that distances are taken of, m.
+        log_weights: (N,).
+        count: how many to keep at most, K.
+        same: mean distance below which two hypotheses are one, m.
+        cap: largest distance that a joint counts with, m.
+    """
+    top = log_weights.max()
+    weights = np.exp(log_weights - top)
+    chosen, owner = _choose(np.ascontiguousarray(joints), weights / weights.sum(), count, same, cap)
+    groups = np.array([np.logaddexp.reduce(log_weights[owner == k]) for k in range(len(chosen))])
+    return Kept(chosen, owner, groups)
+
+
+@njit(cache=True, nogil=True)
+def _choose(joints, weights, count, same, cap):  # type: ignore[no-untyped-def]
+    n, j = joints.shape[0], joints.shape[1]
+    distance = np.zeros((n, n))
+    for a in range(n):
+        for b in range(a):
+            total = 0.0
+            for k in range(j):
+                x = joints[a, k, 0] - joints[b, k, 0]
+                y = joints[a, k, 1] - joints[b, k, 1]
+                z = joints[a, k, 2] - joints[b, k, 2]
+                total += min(np.sqrt(x * x + y * y + z * z), cap)
+            distance[a, b] = max(total / j - same, 0.0)
+            distance[b, a] = distance[a, b]
+    nearest = np.full(n, cap)
+    chosen = np.empty(min(count, n), np.intp)
+    owner = np.zeros(n, np.intp)
+    kept = 0
+    while kept < len(chosen):
+        best, best_gain = -1, 0.0
+        if kept == 0:
+            best = int(np.argmax(weights))
+        else:
+            for c in range(n):
+                if nearest[c] == 0.0:
+                    continue  # the same as one that is kept
+                gain = 0.0
+                for i in range(n):
+                    if distance[i, c] < nearest[i]:
+                        gain += weights[i] * (nearest[i] - distance[i, c])
+                if gain > best_gain:
+                    best, best_gain = c, gain
+        if best < 0:
+            break
+        chosen[kept] = best
+        for i in range(n):
+            if distance[i, best] < nearest[i]:
+                nearest[i] = distance[i, best]
+                owner[i] = kept
+        owner[best] = kept
+        kept += 1
+    return chosen[:kept], owner

@@ -1,0 +1,298 @@
+"""Message types for work without ROS, and one way to make messages of both families of classes.
+
+The types are those of ROS 2 Jazzy and hmt_msgs. The .msg files in `hmt_msgs/` are the one
+definition: colcon generates the classes of the nodes from them, and this module the classes that
+`rosbags` serialises.
+
+Offline work has the classes of `rosbags`, whose arrays are numpy arrays and whose fields all have
+to be given; a node has the classes that ROS generates, whose sequences are `array.array`. The
+functions that turn arrays into messages take a `MessageFactory` and work for both.
+"""
+
+from __future__ import annotations
+
+import array
+import re
+from collections.abc import Callable, Iterable
+from functools import cache
+from importlib import resources
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+if TYPE_CHECKING:
+    from rosbags.interfaces.typing import Typesdict
+
+# Stands before each of the IDL files that a bag strings together.
+_IDL_HEADER = re.compile(r'^={80}\nIDL: .*\n', re.MULTILINE)
+
+# What ROS 2 makes of a message without fields.
+_NO_FIELDS = 'uint8 structure_needs_at_least_one_member'
+
+
+@cache
+def typestore() -> Typestore:
+    """All types that the project reads and writes; the same object every time."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types: Typesdict = {}
+    folder = resources.files('msg_tools') / 'hmt_msgs' / 'msg'
+    for file in sorted(folder.iterdir(), key=lambda file: file.name):
+        if file.name.endswith('.msg'):
+            name = f'hmt_msgs/msg/{file.name.removesuffix(".msg")}'
+            types.update(get_types_from_msg(file.read_text('utf-8'), name))
+    store.register(types)
+    return store
+
+
+def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typestore:
+    """Types for messages that carry their own definition, as those of a bag do.
+
+    A bag may hold types that nobody else knows, or an older version of a known one; its messages
+    have to be read with its own definition.
+
+    Args:
+        msgtype: for example 'sensor_msgs/msg/Image'.
+        encoding: 'ros2msg', 'ros2idl', or '' when there is no definition.
+        definition: text of the definition, with those of the nested types.
+
+    Returns:
+        `typestore()` itself when it agrees with the definition.
+
+    Raises:
+        ValueError: the type is not known and the definition can not be understood.
+    """
+    if not msgtype:
+        raise ValueError('the bag does not name the type')
+    known = typestore()
+    types: Typesdict = {}
+    if encoding == 'ros2msg' and not definition.strip() and msgtype not in known.fielddefs:
+        definition = _NO_FIELDS
+    if definition.strip():
+        try:
+            if encoding == 'ros2msg':
+                types = get_types_from_msg(definition, msgtype)
+            elif encoding == 'ros2idl':
+                for part in _IDL_HEADER.split(definition):
+                    if part.strip():
+                        types.update(get_types_from_idl(part))
+        except Exception as error:
+            # The parser meets any text here, and does not say what it may raise.
+            if msgtype not in known.fielddefs:
+                raise ValueError(f'its {encoding} definition can not be parsed') from error
+    if msgtype not in types and msgtype not in known.fielddefs:
+        raise ValueError('the type is not known, and the bag does not define it')
+    changed = {name for name in types if not _same_fields(name, types, known)}
+    if not changed:
+        return known
+    own = Typestore()
+    own.fielddefs.update(
+        {name: fields for name, fields in known.fielddefs.items() if name not in changed}
+    )
+    own.types.update({name: cls for name, cls in known.types.items() if name not in changed})
+    try:
+        own.register({name: types[name] for name in changed})
+    except Exception as error:
+        raise ValueError(f'its {encoding} definition can not be used') from error
+    return own
+
+
+def _same_fields(name: str, types: Typesdict, known: Typestore) -> bool:
+    """Whether a definition has the fields of the known one; constants do not matter on the wire.
+
+    Names are compared without case: the first ROS 2 releases wrote D, K, R, P in CameraInfo.
+    """
+    if name not in known.fielddefs:
+        return False
+    return [(field.lower(), kind) for field, kind in types[name][1]] == [
+        (field.lower(), kind) for field, kind in known.fielddefs[name][1]
+    ]
+
+
+_POINT = 'geometry_msgs/msg/Point'
+
+
+class MessageFactory(Protocol):
+    """Makes messages by the name of their type, for example 'hmt_msgs/msg/PoseMixture'."""
+
+    def create(self, msgtype: str, **fields: Any) -> Any:
+        """A message with some fields given, the others zero or empty (quaternions: no rotation).
+
+        Numpy arrays are converted to what the field wants.
+        """
+
+    def points(self, positions: NDArray[np.float64]) -> list[Any]:
+        """geometry_msgs/Point of positions (N, 3): as `create`, of which there would be many."""
+
+
+class RosbagsMessages:
+    """Messages of `typestore()`, for bags and everything else without ROS."""
+
+    def create(self, msgtype: str, **fields: Any) -> Any:
+        """See `MessageFactory.create`.
+
+        Raises:
+            TypeError: a field that the type does not have.
+        """
+        plain = _plain_class(msgtype)
+        if plain is not None and len(fields) == plain[1]:
+            try:
+                return plain[0](**fields)
+            except TypeError:
+                pass  # a wrong name: the error is raised below
+        defaults = _defaults(msgtype)
+        unknown = fields.keys() - defaults.keys()
+        if unknown:
+            raise TypeError(f'{msgtype} has no field {sorted(unknown)[0]!r}')
+        values = {}
+        for name, (default, dtype) in defaults.items():
+            if name not in fields:
+                values[name] = default()
+            elif dtype is None:
+                values[name] = fields[name]
+            else:
+                values[name] = np.ascontiguousarray(fields[name], dtype=dtype)
+        return typestore().types[msgtype](**values)
+
+    def adopt(self, value: Any) -> Any:
+        """A message of an older definition of its type as one of `typestore()`.
+
+        Fields that it does not have are zero or empty.
+
+        Args:
+            value: the message, or the value of one of its fields.
+
+        Raises:
+            TypeError: a field that the type of `typestore()` does not have.
+        """
+        if isinstance(value, list):
+            return [self.adopt(item) for item in value]
+        msgtype = getattr(value, '__msgtype__', None)
+        if msgtype is None or isinstance(value, typestore().types[msgtype]):
+            return value
+        # Beside the fields it has constants, in capital letters, and the name of its type.
+        fields = {
+            name: self.adopt(x)
+            for name, x in vars(value).items()
+            if name.islower() and name[0] != '_'
+        }
+        return self.create(msgtype, **fields)
+
+    def points(self, positions: NDArray[np.float64]) -> list[Any]:
+        """See `MessageFactory.points`."""
+        point = typestore().types[_POINT]
+        return [point(x, y, z) for x, y, z in positions.tolist()]
+
+
+class GeneratedMessages:
+    """Messages of the classes that ROS generates; a node hands over those that it uses.
+
+    Args:
+        classes: for example `[hmt_msgs.msg.PoseMixture, std_msgs.msg.Header]`.
+    """
+
+    def __init__(self, classes: Iterable[type]) -> None:
+        self._classes = {
+            f'{cls.__module__.partition(".")[0]}/msg/{cls.__name__}': cls for cls in classes
+        }
+        self._kinds = {
+            name: cls.get_fields_and_field_types()  # type: ignore[attr-defined]
+            for name, cls in self._classes.items()
+        }
+
+    def create(self, msgtype: str, **fields: Any) -> Any:
+        """See `MessageFactory.create`.
+
+        Raises:
+            KeyError: a type whose class was not handed over.
+        """
+        kinds = self._kinds[msgtype]
+        for name, value in fields.items():
+            kind = kinds.get(name, '')
+            if isinstance(value, np.ndarray) and kind.startswith('sequence<'):
+                fields[name] = _sequence(value, kind)
+            elif kind == 'octet' and isinstance(value, int):
+                fields[name] = bytes([value])
+        return self._classes[msgtype](**fields)
+
+    def points(self, positions: NDArray[np.float64]) -> list[Any]:
+        """See `MessageFactory.points`."""
+        point = self._classes[_POINT]
+        return [point(x=x, y=y, z=z) for x, y, z in positions.tolist()]
+
+
+_TYPE_CODES = {
+    'boolean': '?', 'octet': 'B', 'uint8': 'B', 'int8': 'b', 'uint16': 'H', 'int16': 'h',
+    'uint32': 'I', 'int32': 'i', 'uint64': 'Q', 'int64': 'q', 'float': 'f', 'double': 'd',
+}  # fmt: skip
+
+
+def _sequence(value: NDArray[Any], kind: str) -> Any:
+    """The array that a generated class takes without looking at every element."""
+    code = _TYPE_CODES[kind.removeprefix('sequence<').removesuffix('>').partition(',')[0]]
+    result = array.array(code)
+    result.frombytes(np.ascontiguousarray(value, dtype=code).tobytes())
+    return result
+
+
+_ZEROS: dict[str, Callable[[], Any]] = {
+    'bool': bool,
+    'string': str,
+    'float32': float,
+    'float64': float,
+}
+
+
+@cache
+def _defaults(msgtype: str) -> dict[str, tuple[Callable[[], Any], str | None]]:
+    """For each field what makes its default, and the dtype where it is an array of numbers."""
+    result: dict[str, tuple[Callable[[], Any], str | None]] = {}
+    for name, description in typestore().fielddefs[msgtype][1]:
+        kind, detail = description
+        if kind == Nodetype.NAME:
+            result[name] = _message_default(str(detail)), None
+        elif kind == Nodetype.BASE:
+            result[name] = _ZEROS.get(str(detail[0]), int), None
+        else:
+            element_kind, element, length = _element(detail)
+            count = length if kind == Nodetype.ARRAY else 0
+            if element_kind == Nodetype.NAME:
+                result[name] = _list_default(_message_default(str(element)), count), None
+            elif element[0] == 'string':
+                result[name] = _list_default(str, count), None
+            else:
+                dtype = {'char': 'uint8', 'byte': 'uint8'}.get(element[0], element[0])
+                result[name] = _array_default(count, dtype), dtype
+    if msgtype == 'geometry_msgs/msg/Quaternion':
+        result['w'] = (lambda: 1.0), None
+    return result
+
+
+@cache
+def _plain_class(msgtype: str) -> tuple[type, int] | None:
+    """Class and number of fields of a type without arrays of numbers, such as a point."""
+    defaults = _defaults(msgtype)
+    if any(dtype is not None for _, dtype in defaults.values()):
+        return None
+    return typestore().types[msgtype], len(defaults)
+
+
+def _element(detail: Any) -> tuple[Any, Any, int]:
+    """Kind and type of the elements of an array, and its length."""
+    (kind, element), length = detail
+    return kind, element, int(length)
+
+
+def _message_default(msgtype: str) -> Callable[[], Any]:
+    return lambda: RosbagsMessages().create(msgtype)
+
+
+def _list_default(element: Callable[[], Any], count: int) -> Callable[[], list[Any]]:
+    return lambda: [element() for _ in range(count)]
+
+
+def _array_default(count: int, dtype: str) -> Callable[[], NDArray[Any]]:
+    return lambda: np.zeros(count, dtype=dtype)

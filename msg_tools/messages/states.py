@@ -1,0 +1,127 @@
+"""sensor_msgs/JointState and tf2_msgs/TFMessage: a pose for viewers of the URDF."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from msg_tools.messages.headers import header_message
+from msg_tools.messages.message_error import MessageError
+from msg_tools.messages.message_types import MessageFactory
+from msg_tools.messages.pose_mixtures import PoseMixture
+
+
+def joint_state_message(
+    messages: MessageFactory,
+    dof_names: Sequence[str],
+    pose: ArrayLike,
+    stamp_ns: int,
+    frame_id: str = '',
+) -> Any:
+    """sensor_msgs/JointState of a pose (d,): positions only, m or rad.
+
+    Raises:
+        MessageError: not one position for each name.
+    """
+    position = np.asarray(pose, dtype=np.float64)
+    if position.shape != (len(dof_names),):
+        raise MessageError(
+            f'joint state has {len(dof_names)} names, but a pose of shape {position.shape}'
+        )
+    return messages.create(
+        'sensor_msgs/msg/JointState',
+        header=header_message(messages, stamp_ns, frame_id),
+        name=list(dof_names),
+        position=position,
+        velocity=np.empty(0),
+        effort=np.empty(0),
+    )
+
+
+def heaviest_joint_state(messages: MessageFactory, content: PoseMixture) -> Any:
+    """sensor_msgs/JointState of the heaviest component of a mixture."""
+    mixture = content.mixture
+    return joint_state_message(
+        messages,
+        content.dof_names,
+        mixture.means[int(np.argmax(mixture.weights))],
+        content.stamp_ns,
+        content.frame_id,
+    )
+
+
+Array = NDArray[np.float64]
+
+
+def quaternions(rotations: ArrayLike) -> Array:
+    """Unit quaternions (N, 4), x y z w with w >= 0, of rotation matrices (N, 3, 3)."""
+    r = np.asarray(rotations, dtype=np.float64)
+    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
+    # 4 q q^T for q = (x, y, z, w), linear in R; its longest row is the quaternion to full accuracy.
+    outer = np.empty((len(r), 4, 4))
+    outer[:, 0, 0] = 1 + xx - yy - zz
+    outer[:, 1, 1] = 1 - xx + yy - zz
+    outer[:, 2, 2] = 1 - xx - yy + zz
+    outer[:, 3, 3] = 1 + xx + yy + zz
+    outer[:, 0, 1] = outer[:, 1, 0] = r[:, 0, 1] + r[:, 1, 0]
+    outer[:, 0, 2] = outer[:, 2, 0] = r[:, 0, 2] + r[:, 2, 0]
+    outer[:, 1, 2] = outer[:, 2, 1] = r[:, 1, 2] + r[:, 2, 1]
+    outer[:, 0, 3] = outer[:, 3, 0] = r[:, 2, 1] - r[:, 1, 2]
+    outer[:, 1, 3] = outer[:, 3, 1] = r[:, 0, 2] - r[:, 2, 0]
+    outer[:, 2, 3] = outer[:, 3, 2] = r[:, 1, 0] - r[:, 0, 1]
+    longest = np.argmax(np.diagonal(outer, axis1=1, axis2=2), axis=1)
+    q = outer[np.arange(len(r)), longest]
+    q = q / np.linalg.norm(q, axis=1, keepdims=True)
+    result: Array = np.where(q[:, 3:] < 0, -q, q)
+    return result
+
+
+def transforms_message(
+    messages: MessageFactory,
+    parents: Sequence[str],
+    children: Sequence[str],
+    rotations: ArrayLike,
+    translations: ArrayLike,
+    stamp_ns: int,
+) -> Any:
+    """tf2_msgs/TFMessage.
+
+    Args:
+        messages: factory of messages.
+        parents, children: (N,) names of frames.
+        rotations: (N, 3, 3) and
+        translations: (N, 3), m: p_parent = R p_child + t.
+        stamp_ns: of the pose.
+
+    Raises:
+        MessageError: arrays whose lengths contradict each other, values that are not finite.
+    """
+    r = np.asarray(rotations, dtype=np.float64)
+    t = np.asarray(translations, dtype=np.float64)
+    n = len(children)
+    if len(parents) != n or r.shape != (n, 3, 3) or t.shape != (n, 3):
+        raise MessageError(
+            f'transforms: {len(parents)} parents, {n} children, rotations {r.shape} and '
+            f'translations {t.shape} do not fit'
+        )
+    if not (np.isfinite(r).all() and np.isfinite(t).all()):
+        raise MessageError('transforms: a rotation or translation is not finite')
+    transforms = [
+        messages.create(
+            'geometry_msgs/msg/TransformStamped',
+            header=header_message(messages, stamp_ns, parent),
+            child_frame_id=child,
+            transform=messages.create(
+                'geometry_msgs/msg/Transform',
+                translation=messages.create('geometry_msgs/msg/Vector3', x=x, y=y, z=z),
+                rotation=messages.create('geometry_msgs/msg/Quaternion', x=qx, y=qy, z=qz, w=qw),
+            ),
+        )
+        for parent, child, (x, y, z), (qx, qy, qz, qw) in zip(
+            parents, children, t.tolist(), quaternions(r).tolist(), strict=True
+        )
+    ]
+    return messages.create('tf2_msgs/msg/TFMessage', transforms=transforms)

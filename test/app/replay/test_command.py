@@ -1,0 +1,376 @@
+"""replay, offline."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_ros.app.replay.command import main
+from hmt_ros.app.replay.inputs import recorded_input
+from hmt_ros.experts import load_predictor
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.sessions import track_start
+from hmt_ros.sessions.smoothed_messages import TOPICS as SMOOTHED_TOPICS
+from hmt_ros.sessions.track_messages import TOPICS
+from hmt_ros.tracking import Status
+from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
+from msg_tools.messages.headers import header_message, time_ns
+from msg_tools.messages.images import decode_image, image_message
+from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+from test.msg_tools.conftest import limited_file_size
+
+ROOT = Path(__file__).resolve().parents[3]
+REACH = ROOT / 'bags' / 'reach'
+IMAGES = 2
+STARTS = ('body', 'human_description')
+SUBJECT = ['--subject', str(REACH / 'subject.yaml')]
+PERSON = [*SUBJECT, '--background', str(REACH / 'background.png')]
+MESSAGES = RosbagsMessages()
+
+
+def recorded():
+    """(topic, log time, message) of the first images of a bag, with all that goes with them."""
+    found, last = [], None
+    with BagReader(REACH) as bag:
+        for stored in bag.messages():
+            if stored.topic == 'image/compressed':
+                last = stored.log_time_ns
+                if sum(topic == stored.topic for topic, _, _ in found) == IMAGES:
+                    break
+            if stored.topic != 'body':
+                found.append((stored.topic, stored.log_time_ns, stored.message))
+    return [entry for entry in found if last is not None and entry[1] < last]
+
+
+def write(folder, entries):
+    with BagWriter(folder) as bag:
+        for topic, time, message in entries:
+            bag.write(topic, time, message)
+    return folder
+
+
+def read(folder):
+    found = {}
+    with BagReader(folder) as bag:
+        for stored in bag.messages():
+            found.setdefault(stored.topic, []).append(stored)
+    return found
+
+
+def content(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+class StandingStill:
+    """A tracker that costs nothing."""
+
+    made = []  # noqa: RUF012
+
+    def __init__(self, body, camera, settings, background, seed):
+        self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
+        self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
+        self.keypoints, self.predictions = [], []
+        StandingStill.made.append(self)
+
+    def reset(self, start):
+        self.start = start
+
+    @property
+    def modes(self):
+        return self
+
+    log_likelihoods = np.zeros(1)
+
+    def step(self, image, stamp, keypoints=None, prediction=None):
+        self.keypoints.append(None if keypoints is None else keypoints.names)
+        self.predictions.append(prediction)
+        if stamp < self.start.stamp_ns:
+            return None, None
+        mean = self.body.prior_mean[None].copy()
+        mean[:, 2] = 4.0 + image.mean() / 256
+        mixture = GaussianMixture(np.ones(1), mean, np.eye(self.body.dimension)[None])
+        return mixture, mixture
+
+
+@pytest.fixture
+def still(monkeypatch):
+    monkeypatch.setattr(track_start, 'Tracker', StandingStill)
+    monkeypatch.setattr(StandingStill, 'made', [])
+    return StandingStill.made
+
+
+@pytest.fixture(scope='module')
+def entries():
+    return recorded()
+
+
+@pytest.fixture(scope='module')
+def short(tmp_path_factory, entries):
+    return write(tmp_path_factory.mktemp('bags') / 'short', entries)
+
+
+@pytest.fixture(scope='module')
+def replayed(short, tmp_path_factory):
+    """Tracked for good, without ROS."""
+    out = tmp_path_factory.mktemp('out') / 'tracked'
+    with pytest.MonkeyPatch.context() as patch:
+        for missing in ('rclpy', 'hmt_msgs', 'sensor_msgs'):
+            patch.setitem(sys.modules, missing, None)
+        assert main([str(short), '-o', str(out), *PERSON, '--quiet']) == 0
+    return out
+
+
+def test_topics(replayed, entries):
+    found = read(replayed)
+    stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
+    assert {topic: len(messages) for topic, messages in found.items()} == {
+        **dict.fromkeys(STARTS, 1),
+        'ground_truth': IMAGES,
+        **{topic: IMAGES for topic in (*TOPICS, *SMOOTHED_TOPICS) if topic not in STARTS},
+    }
+    for topic, published in {**TOPICS, **SMOOTHED_TOPICS}.items():
+        assert {stored.msgtype for stored in found[topic]} == {published.msgtype}
+        if topic not in STARTS:
+            assert [stored.log_time_ns for stored in found[topic]] == stamps
+    assert sorted(content(replayed)) == ['metadata.yaml', 'tracked.mcap']
+
+
+def test_mixtures_explain_the_images(replayed):
+    found = read(replayed)
+    (body,) = (stored.message for stored in found['body'])
+    for posterior, likelihood, truth, state, overlay in zip(
+        found['pose_mixture'],
+        found['likelihood_mixture'],
+        found['ground_truth'],
+        found['joint_states'],
+        found['overlay/compressed'],
+        strict=True,
+    ):
+        mixture = pose_mixture_of(posterior.message, body.dof_names, body.joint_names)
+        assert mixture.kind == MixtureKind.POSTERIOR
+        assert 2 <= len(mixture.mixture) <= 8
+        assert np.array_equal(state.message.position, mixture.mixture.means[0])
+        assert pose_mixture_of(likelihood.message).kind == MixtureKind.LIKELIHOOD
+        assert posterior.message.header == truth.message.header
+        (known,) = truth.message.components
+        joints = np.array([[p.x, p.y, p.z] for p in known.joint_positions])
+        order = [list(truth.message.joint_names).index(name) for name in mixture.joint_names]
+        errors = mixture.joint_positions - mixture.joint_positions[:, :1]
+        errors = errors - (joints[order] - joints[order][:1])
+        assert np.linalg.norm(errors, axis=2).mean(1).min() < 0.15
+        assert decode_image(overlay.message).shape == (360, 480, 3)
+
+
+def test_without_a_subject_a_prediction_starts_the_track(short, tmp_path, capsys):
+    out = tmp_path / 'out'
+    command = [str(short), '-o', str(out), '--background', str(REACH / 'background.png')]
+    assert main(command) == 0
+    assert 'no --subject: the track starts from a prediction' in capsys.readouterr().err
+    found = read(out)
+    assert {len(found[topic]) for topic in ('pose_prediction', 'pose_mixture')} == {IMAGES}
+    predicted = pose_mixture_of(found['pose_prediction'][0].message)
+    assert predicted.kind == MixtureKind.PREDICTION
+    (body,) = (stored.message for stored in found['body'])
+    # The person is as large as the model says.
+    model = load_predictor().body.segment_lengths
+    assert dict(zip(body.segment_names, body.segment_lengths, strict=True)) == pytest.approx(model)
+    again = tmp_path / 'again' / 'out'
+    assert main([*command[:2], str(again), *command[3:], '--bme', '--quiet']) == 0
+    assert content(again) == content(out)
+
+
+def test_predictions_beside_a_subject(still, short, tmp_path):
+    out = tmp_path / 'out'
+    assert main([str(short), '-o', str(out), *PERSON, '--bme', '--quiet']) == 0
+    assert len(read(out)['pose_prediction']) == IMAGES
+    assert [prediction is None for prediction in still[0].predictions] == [False] * IMAGES
+
+
+def test_ground_truth_is_copied(replayed, entries):
+    copied = [stored.message for stored in read(replayed)['ground_truth']]
+    given = [message for topic, _, message in entries if topic == 'ground_truth']
+    for one, other in zip(copied, given, strict=True):
+        assert one.header == other.header
+        assert np.array_equal(one.components[0].mean, other.components[0].mean)
+
+
+def test_same_command_same_bytes(replayed, short, tmp_path):
+    again = tmp_path / 'tracked'
+    assert main([str(short), '-o', str(again), *PERSON, '--quiet']) == 0
+    assert content(again) == content(replayed)
+
+
+def test_file_instead_of_folder_and_summary(still, short, tmp_path, capsys):
+    out = tmp_path / 'out'
+    assert main([str(short / 'short.mcap'), '-o', str(out), *SUBJECT]) == 0
+    assert capsys.readouterr().out == f'{out}: {IMAGES} of {IMAGES} images tracked\n'
+    assert main([str(short), '-o', str(tmp_path / 'quiet'), *SUBJECT, '--quiet']) == 0
+    streams = capsys.readouterr()
+    assert (streams.out, streams.err) == ('', '')
+
+
+def test_images_are_copied_on_demand(still, short, tmp_path, entries):
+    out = tmp_path / 'out'
+    assert main([str(short), '-o', str(out), *SUBJECT, '--with-images', '--quiet']) == 0
+    found = read(out)
+    for topic in ('image/compressed', 'camera_info'):
+        given = [(time, m.header) for name, time, m in entries if name == topic]
+        assert [(s.log_time_ns, s.message.header) for s in found[topic]] == given
+    # What came out can be tracked again.
+    assert main([str(out), '-o', str(tmp_path / 'again'), *SUBJECT, '--quiet']) == 0
+    assert read(tmp_path / 'again').keys() == read(tmp_path / 'out').keys() - {
+        'image/compressed',
+        'camera_info',
+    }
+
+
+def test_options_reach_the_tracker(still, short, tmp_path):
+    config = tmp_path / 'config.yaml'
+    config.write_text(
+        '/**:\n  ros__parameters:\n    max_hypotheses: 5\n    candidates: 10\n'
+        '    image_transport: raw\n    autostart: false\n    use_sim_time: true\n'
+        '    qos_overrides: {/image: {subscription: {depth: 3}}}\n    random_seed: 3\n'
+    )
+    options = ['--config', str(config), '--set', 'candidates=12', '--set', 'proposals=css']
+    options += ['--set', 'likelihood.edges.weight=3', '--seed', '7', '--body', 'human34', '--quiet']
+    assert main([str(short), '-o', str(tmp_path / 'out'), *SUBJECT, *options]) == 0
+    (tracker,) = still
+    settings = tracker.settings
+    assert (settings.max_hypotheses, settings.candidates, settings.proposals) == (5, 12, 'css')
+    assert settings.likelihood.edges.weight == 3.0
+    assert (tracker.seed, tracker.body.name) == (7, 'human34')
+
+
+def test_config_of_the_node_changes_nothing(still, short, tmp_path):
+    config = str(ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml')
+    plain, given = tmp_path / 'a' / 'out', tmp_path / 'b' / 'out'
+    assert main([str(short), '-o', str(plain), *SUBJECT, '--quiet']) == 0
+    assert main([str(short), '-o', str(given), *SUBJECT, '--quiet', '--config', config]) == 0
+    assert content(plain) == content(given)
+
+
+def keypoints(stamp, names=('head', 'left_hip', 'right_hip')):
+    return MESSAGES.create(
+        'hmt_msgs/msg/Keypoints2D',
+        header=header_message(MESSAGES, stamp, ''),
+        names=list(names),
+        u=np.full(len(names), 100.0),
+        v=np.full(len(names), 100.0),
+    )
+
+
+def test_keypoints_of_the_bag_are_used(still, entries, tmp_path):
+    stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
+    # The detector is late, and finds nobody in the last image.
+    extra = [('/keypoints', stamps[0] + 1000, keypoints(stamps[0]))]
+    bag = write(tmp_path / 'bag', sorted(entries + extra, key=lambda entry: entry[1]))
+    options = [*SUBJECT, '--quiet', '-o']
+    assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
+    assert still[-1].keypoints == [('head', 'left_hip', 'right_hip'), None]
+    assert len(read(tmp_path / 'out')['pose_mixture']) == IMAGES
+    assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_keypoints=false']) == 0
+    assert still[-1].keypoints == [None] * IMAGES
+
+
+def renamed(entries, names):
+    return [(names.get(topic, topic), time, message) for topic, time, message in entries]
+
+
+def test_raw_images(still, entries, tmp_path):
+    def raw(message):
+        stamp = time_ns(message.header.stamp)
+        return image_message(MESSAGES, decode_image(message), stamp, message.header.frame_id)
+
+    changed = [
+        ('/image', time, raw(message)) if topic == 'image/compressed' else (topic, time, message)
+        for topic, time, message in entries
+    ]
+    both = [tmp_path / name / 'out' for name in ('raw', 'compressed')]
+    for out, given in zip(both, (changed, entries), strict=True):
+        bag = write(out.parent / 'bag', given)
+        assert main([str(bag), '-o', str(out), *SUBJECT, '--quiet']) == 0
+    assert content(both[0]) == content(both[1])
+
+
+def test_topics_are_found_by_their_names(entries, tmp_path):
+    names = {'image/compressed': '/cam/image_raw/compressed', 'camera_info': '/cam/camera_info'}
+    others = {'image/compressed': '/other/image/compressed', 'camera_info': '/other/camera_info'}
+    one = write(tmp_path / 'one', renamed(entries, names))
+    with BagReader(one) as bag:
+        found = recorded_input(bag)
+        assert found.image.name == '/cam/image_raw/compressed'
+        assert found.camera_info.name == '/cam/camera_info'
+        assert found.ground_truth.name == 'ground_truth'
+        assert (found.keypoints, found.transport) == (None, 'compressed')
+    several = write(tmp_path / 'several', renamed(entries, names) + renamed(entries, others))
+    with BagReader(several) as bag:
+        with pytest.raises(BagError, match='several topics of CompressedImage or Image') as caught:
+            recorded_input(bag)
+        assert 'name one of /cam/image_raw/compressed, ' in str(caught.value)
+        assert str(caught.value).endswith(' by --image-topic')
+        for name in ('/other/image/compressed', 'other/image/compressed'):
+            found = recorded_input(bag, name)
+            assert found.camera_info.name == '/other/camera_info'
+        found = recorded_input(bag, '/other/image/compressed', '/cam/camera_info')
+        assert found.camera_info.name == '/cam/camera_info'
+    usual = write(tmp_path / 'usual', renamed(entries, others) + entries)
+    with BagReader(usual) as bag:
+        assert recorded_input(bag).image.name == 'image/compressed'
+        assert recorded_input(bag).camera_info.name == 'camera_info'
+
+
+def test_learned_background_needs_images_before_the_track(still, short, tmp_path, entries):
+    subject = tmp_path / 'late.yaml'
+    stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
+    text = (REACH / 'subject.yaml').read_text()
+    subject.write_text(text.replace(str(stamps[0]), str(stamps[1])))
+    out = tmp_path / 'out'
+    assert main([str(short), '-o', str(out), '--subject', str(subject), '--quiet']) == 0
+    assert [stored.log_time_ns for stored in read(out)['pose_mixture']] == stamps[1:]
+
+
+def test_nothing_is_overwritten_unasked(still, short, tmp_path, capsys):
+    out = tmp_path / 'out'
+    command = [str(short), '-o', str(out), *SUBJECT, '--quiet']
+    assert main(command) == 0
+    before = content(out)
+    assert main([*command, '--seed', '1']) == 1
+    assert 'exists; give another name' in capsys.readouterr().err
+    assert content(out) == before
+    assert main([*command, '--overwrite', '--set', 'overlay_modes=0']) == 0
+    assert content(out) != before
+    (out / 'notes.txt').write_text('mine')
+    assert main([*command, '--overwrite']) == 1
+    assert (out / 'notes.txt').read_text() == 'mine'
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['out']
+
+
+def test_the_bag_that_is_read_is_never_replaced(still, entries, tmp_path, capsys):
+    bag = write(tmp_path / 'bag', entries)
+    before = content(bag)
+    for given in (bag, bag / 'bag.mcap'):
+        assert main([str(given), '-o', str(bag), *SUBJECT, '--overwrite']) == 1
+        assert 'is the bag that is read' in capsys.readouterr().err
+    assert content(bag) == before
+
+
+def test_interruption_leaves_nothing(short, tmp_path, monkeypatch, capsys):
+    def interrupted(self, image, stamp, keypoints=None, prediction=None):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(track_start, 'Tracker', StandingStill)
+    monkeypatch.setattr(StandingStill, 'step', interrupted)
+    assert main([str(short), '-o', str(tmp_path / 'out'), *SUBJECT]) == 130
+    assert capsys.readouterr().err == 'replay: interrupted, nothing is written\n'
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize('options', [[], ['--keep-going']])
+def test_full_disk(still, short, tmp_path, capsys, options):
+    """It is no fault of an image that could be passed over."""
+    with limited_file_size(20_000):
+        assert main([str(short), '-o', str(tmp_path / 'out'), *SUBJECT, *options]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f'replay: {tmp_path / "out"} can not be written: File too large'
+    assert list(tmp_path.iterdir()) == []

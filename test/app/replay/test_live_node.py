@@ -1,0 +1,223 @@
+"""replay --live: the real nodes give the bag that the offline run gives, byte for byte."""
+
+import os
+import socket
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_ros.app.replay import live_node
+from hmt_ros.app.replay.command import main
+from hmt_ros.app.replay.options import NodeParameters
+from hmt_ros.app.replay.player import (
+    LiveNodeError,
+    changed_environment,
+    environment,
+    reserved_domain,
+)
+from hmt_ros.app.replay.tracks import LiveTrack
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.filter_session import KEYPOINTS
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from msg_tools import BagReader, BagWriter, RosbagsMessages
+from msg_tools.messages.headers import header_message, time_ns
+from msg_tools.messages.images import decode_image, image_message
+
+pytestmark = pytest.mark.ros
+
+ROOT = Path(__file__).resolve().parents[3]
+REACH = ROOT / 'bags' / 'reach'
+PERSON = ['--subject', str(REACH / 'subject.yaml'), '--background', str(REACH / 'background.png')]
+MESSAGES = RosbagsMessages()
+
+
+def recorded(images):
+    """(topic, log time, message) of the first images of a bag, with all that goes with them."""
+    found = []
+    with BagReader(REACH) as bag:
+        first = bag.start_ns
+        for stored in bag.messages(['image/compressed', 'camera_info', 'ground_truth']):
+            if stored.log_time_ns - first >= images * 10**9 // 15:
+                break
+            found.append((stored.topic, stored.log_time_ns, stored.message))
+    return found
+
+
+def write(folder, entries):
+    with BagWriter(folder) as bag:
+        for topic, time, message in entries:
+            bag.write(topic, time, message)
+    return folder
+
+
+def content(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def messages(folder, topic):
+    with BagReader(folder) as bag:
+        return [(stored.log_time_ns, bytes(stored.data)) for stored in bag.messages([topic])]
+
+
+def both_ways(bag, tmp_path, capsys, *options, person=PERSON):
+    """The folders, and the exit codes and lines, of the same replay offline and live."""
+    folders, ends = [], []
+    for how in ('offline', 'live'):
+        out = tmp_path / how / 'out'
+        command = [str(bag), '-o', str(out), *person, *options]
+        code = main([*command, '--live'] if how == 'live' else command)
+        streams = capsys.readouterr()
+        folders.append(out)
+        ends.append((code, streams.out.replace(how, ''), streams.err))
+    return folders, ends
+
+
+def test_same_mixtures_of_every_image(tmp_path, capsys):
+    bag = write(tmp_path / 'bag', recorded(3))
+    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys)
+    assert one == other
+    assert one[0] == 0
+    mixtures = ('pose_mixture', 'likelihood_mixture', 'smoothed_pose_mixture', 'trajectory_mixture')
+    for topic in mixtures:
+        assert len(messages(offline, topic)) == 3
+        assert messages(offline, topic) == messages(live, topic)
+    # And everything else.
+    assert content(offline) == content(live)
+
+
+def test_same_without_a_subject(tmp_path, capsys):
+    """What the BME predicts reaches the filter beside the image that it is from."""
+    bag = write(tmp_path / 'bag', recorded(3))
+    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, person=PERSON[2:])
+    assert one == other
+    assert one[0] == 0
+    for topic in ('pose_prediction', 'pose_mixture'):
+        assert len(messages(offline, topic)) == 3
+    assert content(offline) == content(live)
+
+
+def test_same_of_raw_images_with_keypoints_and_faults(tmp_path, capsys):
+    """Keypoints that come late, an image of another size, a time that jumps."""
+    entries = []
+    for topic, time, message in recorded(2):
+        if topic == 'image/compressed':
+            stamp = time_ns(message.header.stamp)
+            picture = decode_image(message)
+            seen = MESSAGES.create(
+                'hmt_msgs/msg/Keypoints2D',
+                header=header_message(MESSAGES, stamp, ''),
+                names=['left_wrist', 'nose', 'right_wrist'],
+                u=np.array([272.0, 10.0, np.nan]),
+                v=np.array([213.0, 10.0, np.nan]),
+            )
+            half = image_message(MESSAGES, picture[::2].copy(), stamp + 5000, 'lens')
+            entries.append(('image', time, image_message(MESSAGES, picture, stamp, '')))
+            entries.append(('image', time + 5000, half))
+            entries.append(('keypoints', time + 9000, seen))
+        elif topic == 'camera_info':
+            entries.append((topic, time + 1000, message))
+    again = next(message for topic, _, message in entries if topic == 'image')
+    entries.append(('image', entries[-1][1] + 10_000, again))
+    bag = write(tmp_path / 'bag', sorted(entries, key=lambda entry: entry[1]))
+    options = ['--keep-going', '--set', 'reset_on_time_jump=true', '--set', 'frame_prefix=x']
+    options += ['--set', 'smoother.reset_on_time_jump=true', '--set', 'smoother.fixed_lag=1']
+    options += ['--set', 'max_hypotheses=2', '--set', 'candidates=3', '--set', 'combinations=4']
+    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
+    assert one == other
+    assert one[0] == 0
+    assert "keypoints ['nose'] are no joints" in one[2]
+    assert 'has 480x180 pixels' in one[2]
+    assert 'the track starts anew' in one[2]
+    assert len(messages(offline, 'pose_mixture')) == 3
+    # The smoother goes back in time as the filter does.
+    smoothed = [stamp for stamp, _ in messages(offline, 'smoothed_pose_mixture')]
+    assert smoothed == [stamp for stamp, _ in messages(offline, 'likelihood_mixture')]
+    assert content(offline) == content(live)
+
+
+def test_bad_input_ends_both_in_the_same_way(tmp_path, capsys):
+    entries = recorded(2)
+    entries[3] = (*entries[3][:2], entries[3][2])
+    broken = next(m for topic, _, m in entries if topic == 'image/compressed')
+    broken.data = broken.data[:100]
+    bag = write(tmp_path / 'bag', entries)
+    folders, (one, other) = both_ways(bag, tmp_path, capsys)
+    assert one == other
+    assert one[0] == 1
+    assert 'breaks off or is damaged' in one[2]
+    assert len(one[2].splitlines()) == 1
+    assert [list(folder.parent.iterdir()) for folder in folders] == [[], []]
+
+
+@pytest.fixture
+def parameters():
+    values = {'subject_file': str(REACH / 'subject.yaml'), 'image_transport': 'compressed'}
+    return with_values(FilterParameters(), values)
+
+
+class Nobody:
+    """A publisher that nobody hears."""
+
+    def publish(self, data):
+        pass
+
+
+def test_node_that_is_silent_or_dies_is_told(parameters, monkeypatch):
+    entries = {topic: message for topic, _, message in recorded(1)}
+    with LiveTrack(NodeParameters(parameters), lambda *output: None) as track:
+        running = track._filter
+        handled = track.take(CAMERA_INFO, entries['camera_info'])
+        assert (handled.source, handled.faults, handled.published) == (CAMERA_INFO, (), ())
+        with monkeypatch.context() as patch:
+            patch.setattr(live_node, 'MESSAGE_SECONDS', 1.0)
+            patch.setitem(running._publishers, KEYPOINTS, Nobody())
+            with pytest.raises(LiveNodeError, match='waited 1 s for an answer to a keypoints; '):
+                track.take(KEYPOINTS, entries['camera_info'])
+        running._process.kill()
+        with pytest.raises(LiveNodeError, match='the filter node ended with code -9: '):
+            track.take(IMAGE, entries['image/compressed'])
+        # It can not end well any more.
+        monkeypatch.setattr(running, 'stop', lambda: 0)
+
+
+def test_node_that_does_not_start_is_told(parameters, monkeypatch):
+    monkeypatch.setattr(sys, 'executable', '/bin/false')
+    with (
+        pytest.raises(LiveNodeError, match='ended with code 1: it has written nothing'),
+        LiveTrack(NodeParameters(parameters, SmootherParameters()), lambda *output: None),
+    ):
+        raise AssertionError('it has started')
+
+
+def test_without_ros_it_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, 'rclpy', None)
+    out = tmp_path / 'out'
+    assert main([str(REACH), '-o', str(out), *PERSON, '--live']) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith('replay: --live needs a sourced ROS 2 workspace')
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_replay_has_a_domain_of_its_own():
+    with reserved_domain() as one, reserved_domain() as other:
+        assert one != other
+        assert 1 <= min(one, other) <= max(one, other) <= 100
+        for domain in (one, other):
+            with socket.socket() as taken, pytest.raises(OSError, match='in use'):
+                taken.bind(('', 32768 + domain))
+    with reserved_domain() as again:
+        assert again == one
+
+
+def test_environment_is_left_as_it_was(monkeypatch):
+    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
+    monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE', raising=False)
+    before = dict(os.environ)
+    with changed_environment(environment(3)):
+        assert os.environ['ROS_DOMAIN_ID'] == '3'
+        assert os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+    assert dict(os.environ) == before

@@ -1,0 +1,430 @@
+"""The command report: what stands in its page."""
+
+import base64
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from hmt_ros.app.bag_scores import score_bag
+from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
+from hmt_ros.app.report import command as report
+from hmt_ros.app.report.images import ImageSource, film_strip
+from hmt_ros.app.report.mixtures import ENDS, KEPT_TRAJECTORIES, read_mixtures
+from hmt_ros.app.report.page import data_size
+from hmt_ros.app.report.skeletons import BONES
+from hmt_ros.app.truth import read_truth
+from hmt_ros.inference import GaussianMixture
+from msg_tools import BagReader, BagWriter
+from msg_tools.messages.bodies import message_of_body
+from msg_tools.messages.images import compressed_image_message
+from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
+from test.app.conftest import (
+    CAMERA,
+    FRAMES,
+    MESSAGES,
+    STAMPS,
+    data_of,
+    make,
+    mixture_of,
+    pose_message,
+    write_images,
+    write_out,
+)
+
+PICTURES = ('overview.png', 'overlays.png', 'side_views.png', 'weights.png')
+
+
+def integers(text):
+    return np.frombuffer(base64.b64decode(text), '<i2').astype(float)
+
+
+def positions(data, text, *shape):
+    return np.array(data['origin']) + data['step'] * integers(text).reshape(*shape, 3)
+
+
+# What stands in the page.
+
+
+@pytest.mark.parametrize('topic', ['pose_mixture', 'smoothed_pose_mixture'])
+def test_modes_are_those_of_the_bag(made, data, body, topic):
+    (layer,) = (layer for layer in data['layers'] if layer['topic'] == topic)
+    with BagReader(made.out) as bag:
+        contents = [pose_mixture_of(stored.message) for stored in bag.messages([topic])]
+    assert layer['kind'] == contents[0].kind.name.lower()
+    assert layer['joints'] == list(body.joint_names)
+    assert np.allclose(data['times'], np.arange(FRAMES) / 10)
+    for weights, content in zip(layer['weights'], contents, strict=True):
+        assert np.allclose(weights, content.mixture.weights, atol=1e-5)
+    joints = np.concatenate([content.joint_positions for content in contents])
+    assert np.abs(positions(data, layer['positions'], *joints.shape[:2]) - joints).max() < 3e-4
+    pixels = integers(layer['pixels']).reshape(*joints.shape[:2], 2) * data['pixel'] * CAMERA.width
+    assert np.abs(pixels - CAMERA.project(joints)).max() < CAMERA.width / 8000
+
+
+def test_bones_connect_the_joints_of_the_pictures(data):
+    layer = data['layers'][0]
+    named = {(layer['joints'][a], layer['joints'][b]) for a, b, _ in layer['bones']}
+    assert named == {(a, b) for a, b, _ in BONES}
+    sides = {layer['joints'][b]: side for _, b, side in layer['bones']}
+    assert sides['left_wrist'] == 'left'
+    assert sides['right_wrist'] == 'right'
+    assert sides['neck'] == 'trunk'
+
+
+def test_trajectories_are_those_of_the_bag(made, data, body):
+    (topic,) = data['trajectories']
+    assert topic['ends'] == list(ENDS)
+    with BagReader(made.out) as bag:
+        messages = [stored.message for stored in bag.messages(['trajectory_mixture'])]
+    assert len(topic['windows']) == len(messages) == FRAMES
+    for window, message in zip(topic['windows'], messages, strict=True):
+        assert np.allclose(window['weights'], [c.weight for c in message.components], atol=1e-5)
+        assert np.allclose(window['free_energy'], message.free_energy, atol=1e-4)
+        steps = len(message.stamps)
+        assert len(window['times']) == steps
+        means = [c.means.reshape(steps, -1) for c in message.components[:KEPT_TRAJECTORIES]]
+        joints = body.joint_positions(np.concatenate(means))
+        ways = joints[:, body.skeleton.joint_index(ENDS)]
+        found = positions(data, window['ways'], *ways.shape[:2])
+        assert np.abs(found - ways).max() < 3e-4
+
+
+def test_truth_errors_and_calibration(made, data, body, poses):
+    truth = body.joint_positions(poses)
+    assert data['truth']['known'] == [True] * FRAMES
+    found = positions(data, data['truth']['positions'], *truth.shape[:2])
+    assert np.abs(found - truth).max() < 3e-4
+    scores = score_bag(made.out, read_truth(made.truth))
+    for layer in data['layers']:
+        own = scores[layer['topic']].scores
+        assert np.allclose([e[0] for e in layer['errors_mm']], 1e3 * own.heaviest.mean(1), atol=0.1)
+        best = [min(errors) for errors in layer['errors_mm']]
+        assert np.allclose(best, 1e3 * own.best.mean(1), atol=0.1)
+        told = data['scores']['topics'][layer['topic']]
+        assert told['coverage_90'] == own.summary()['coverage_90']
+        at_half = data['scores']['probabilities'].index(0.5)
+        assert told['calibration']['together'][at_half] == pytest.approx(
+            told['coverage_50'], abs=1e-4
+        )
+    trajectories = data['scores']['topics']['trajectory_mixture']
+    assert trajectories['calibration'] == {'together': None, 'each': None}
+    assert any(note.startswith('trajectory_mixture') for note in data['notes'])
+
+
+def test_truth_without_pelvis_is_aligned_at_the_hips(made, body, poses, tmp_path):
+    names = body.joint_names[1:]
+    joints = body.joint_positions(poses)[:, 1:]
+    np.savez(tmp_path / 'truth.npz', stamps=STAMPS, joint_names=names, joints=joints)
+    found = data_of(make(made.out, tmp_path / 'report', '--truth', tmp_path / 'truth.npz'))
+    scores = score_bag(made.out, read_truth(tmp_path / 'truth.npz'))
+    for layer in found['layers']:
+        assert [layer['joints'][i] for i in layer['roots']] == ['left_hip', 'right_hip']
+        own = scores[layer['topic']].scores
+        assert np.allclose([e[0] for e in layer['errors_mm']], 1e3 * own.heaviest.mean(1), atol=0.1)
+    truth = found['truth']
+    assert [truth['joints'][i] for i in truth['roots']] == ['left_hip', 'right_hip']
+    drawn = {(truth['joints'][a], truth['joints'][b]) for a, b, _ in truth['bones']}
+    assert {('left_hip', 'right_hip'), ('neck', 'left_hip'), ('left_hip', 'left_knee')} <= drawn
+    assert (tmp_path / 'report' / 'side_views.png').stat().st_size > 10_000
+
+
+def test_images_are_those_of_the_bag(data):
+    images = data['images']
+    assert (images['width'], images['height'], images['drawn_on']) == (320, 240, False)
+    assert len(images['jpegs']) == FRAMES
+    for jpeg in images['jpegs']:
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(jpeg), np.uint8), cv2.IMREAD_COLOR)
+        assert picture.shape == (240, 320, 3)
+
+
+def test_pictures_lie_beside_the_page(folder):
+    wanted = {'report.html', 'calibration.png', 'free_energy.png', *PICTURES}
+    assert {path.name for path in folder.iterdir()} == wanted
+    assert [path.name for path in folder.parent.iterdir()] == ['report']
+    for name in wanted - {'report.html'}:
+        assert min(cv2.imread(str(folder / name)).shape[:2]) > 200, name
+
+
+def test_the_page_needs_nothing_else(page):
+    assert not re.findall(r'https?:|//[a-z]+\.', page)
+    assert not re.findall(r'<(?:link|iframe|object|embed|base)\b|\b(?:src|href)\s*=\s*["\']', page)
+    assert not re.findall(r'\burl\(|@import|\bfetch\(|XMLHttpRequest|WebSocket|\bimport\(', page)
+    assert "default-src 'none'" in page
+    assert '<!--' not in page
+    assert page.isascii()
+
+
+def test_the_same_bag_gives_the_same_page(made, page, tmp_path):
+    assert page == make(
+        made.out, tmp_path / 'again', '--images', made.images, '--truth', made.truth
+    )
+
+
+def test_ground_truth_of_the_bag_is_used(body, poses, data, tmp_path):
+    found = data_of(make(write_out(tmp_path / 'out', body, poses), tmp_path / 'report'))
+    assert found['truth']['source'].endswith('(ground_truth)')
+    assert [layer['topic'] for layer in found['layers']] == [
+        'pose_mixture',
+        'smoothed_pose_mixture',
+    ]
+    assert found['truth']['known'] == data['truth']['known']
+    assert found['images'] is None
+
+
+def test_without_images_and_truth(made, tmp_path):
+    found = data_of(make(made.out, tmp_path / 'report'))
+    assert (found['images'], found['truth'], found['scores']) == (None, None, None)
+    assert found['layers'][0]['pixels'] is None
+    names = {path.name for path in (tmp_path / 'report').iterdir()}
+    assert names == {'report.html', 'side_views.png', 'weights.png', 'free_energy.png'}
+
+
+def test_images_that_the_bag_has_itself(body, poses, made, tmp_path):
+    out = tmp_path / 'out'
+    with BagWriter(out) as bag, BagReader(made.images) as images, BagReader(made.out) as mixtures:
+        for reader in (images, mixtures):
+            for stored in reader.messages():
+                bag.write(stored.topic, stored.log_time_ns, stored.message)
+        picture = np.zeros((240, 320, 3), np.uint8)
+        message = compressed_image_message(MESSAGES, picture, STAMPS[0], FRAME_ID)
+        bag.write('overlay/compressed', STAMPS[0], message)
+    found = data_of(make(out, tmp_path / 'report'))
+    assert found['images']['drawn_on'] is False
+    assert len(found['images']['jpegs']) == FRAMES
+    assert found['layers'][0]['pixels'] is not None
+
+
+def test_what_the_tracker_drew_stands_in_for_images(body, poses, tmp_path):
+    out = write_out(tmp_path / 'out', body, poses, overlay=True)
+    found = data_of(make(out, tmp_path / 'report'))
+    assert found['images']['drawn_on'] is True
+    assert len(found['images']['jpegs']) == FRAMES
+    assert found['layers'][0]['pixels'] is None
+    assert not (tmp_path / 'report' / 'overview.png').exists()
+
+
+def test_chosen_topics_and_fewer_times(made, tmp_path):
+    options = ['--topic', 'smoothed_pose_mixture', '--times', '4', '--truth', made.truth]
+    found = data_of(make(made.out, tmp_path / 'report', *options))
+    assert [layer['topic'] for layer in found['layers']] == ['smoothed_pose_mixture']
+    assert found['trajectories'] == []
+    assert np.allclose(found['times'], [0.0, 0.2, 0.4, 0.6])
+    assert found['scores']['topics']['smoothed_pose_mixture']['frames'] == FRAMES
+    assert found['notes'] == [f'4 of {FRAMES} times are shown']
+
+
+def test_one_window_over_the_whole_time(body, poses, tmp_path):
+    """Trajectories that stand alone: their own times are shown."""
+    rng = np.random.default_rng(0)
+    means = poses + 0.1 * rng.normal(size=(2, *poses.shape))
+    content = TrajectoryMixture(
+        np.array([0.25, 0.75]), means, None, np.zeros(2), np.ones(2), tuple(STAMPS), STAMPS[-1],
+        np.array([2.0, 1.0]), body.name, body.dof_names, FRAME_ID,
+    )  # fmt: skip
+    for with_body in (True, False):
+        with BagWriter(tmp_path / f'out{with_body}') as bag:
+            if with_body:
+                bag.write('body', START_NS, message_of_body(MESSAGES, body, START_NS, FRAME_ID))
+            message = trajectory_mixture_message(MESSAGES, content)
+            bag.write('trajectory_mixture', STAMPS[-1], message)
+        data = data_of(make(tmp_path / f'out{with_body}', tmp_path / f'report{with_body}'))
+        assert np.allclose(data['times'], np.arange(FRAMES) / 10)
+        (window,) = data['trajectories'][0]['windows']
+        assert window['weights'] == [0.75, 0.25]
+        assert (window['ways'] is not None) == with_body
+        assert len(data['notes']) == (0 if with_body else 1)
+
+
+def test_mixtures_without_covariances_and_missing_frames(body, poses, tmp_path):
+    def change(message):
+        for component in message.components:
+            component.covariance = np.empty(0)
+        return message
+
+    out = write_out(tmp_path / 'out', body, poses, change=change)
+    found = data_of(make(out, tmp_path / 'report'))
+    assert found['scores']['topics']['pose_mixture']['calibration']['together'] is None
+    assert not (tmp_path / 'report' / 'calibration.png').exists()
+
+    with BagWriter(tmp_path / 'predicted') as bag:
+        for i, stamp in enumerate(STAMPS[:3]):
+            mixture = GaussianMixture(
+                np.ones(1), poses[i : i + 1], 0.01 * np.eye(body.dimension)[None]
+            )
+            message = pose_message(body, mixture, stamp, MixtureKind.PREDICTION)
+            if i == 1:
+                message.components = []
+            bag.write('pose_prediction', stamp, message)
+    found = data_of(make(tmp_path / 'predicted', tmp_path / 'second'))
+    assert np.allclose(found['times'], [0.0, 0.2])
+
+
+def test_text_from_outside_stays_text(body, poses, made, tmp_path):
+    def change(message):
+        message.joint_names = ['</script><b>' if n == 'head' else n for n in message.joint_names]
+        return message
+
+    out = write_out(tmp_path / '<img src=x>', body, poses, change=change, truth=False)
+    page = make(out, tmp_path / 'report')
+    assert page.count('</script>') == 2
+    assert '<img' not in page
+    assert '&lt;img src=x&gt;' in page
+    assert '</script><b>' in data_of(page)['layers'][0]['joints']
+
+
+# How large it gets.
+
+
+def noise(width, height):
+    return np.random.default_rng(0).integers(0, 255, (height, width, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize('each', [60_000, 6_000, 1_500])
+def test_images_get_smaller_until_they_fit(each, tmp_path):
+    path = write_images(tmp_path / 'in', picture=noise(640, 480))
+    source = ImageSource(path, 'image/compressed', 'camera_info')
+    strip = film_strip(source, STAMPS, each * FRAMES, keep={STAMPS[2]})
+    assert sum(len(jpeg) for jpeg in strip.jpegs.values()) <= each * FRAMES
+    assert strip.size == (640, 480)
+    assert strip.kept[STAMPS[2]].shape == (480, 640, 3)
+    # Where even the smallest are too large, some are left out.
+    assert (len(strip.jpegs) == FRAMES) == (each > 1_500)
+
+
+def test_two_hundred_frames_stay_under_20_mb(body, poses, tmp_path):
+    stamps = [START_NS + i * 33_333_333 for i in range(200)]
+    rng = np.random.default_rng(0)
+    with BagWriter(tmp_path / 'out') as bag:
+        mixture = mixture_of(body, poses[0], 16, rng)
+        for stamp in stamps:
+            for topic in ('pose_mixture', 'likelihood_mixture', 'smoothed_pose_mixture'):
+                message = pose_message(body, mixture, stamp, MixtureKind.POSTERIOR)
+                bag.write(topic, stamp, message)
+    # Nothing compresses worse than noise: 0.2 MB an image.
+    images = write_images(tmp_path / 'in', stamps, noise(640, 480))
+    page = make(tmp_path / 'out', tmp_path / 'report', '--images', images)
+    data = data_of(page)
+    assert len(data['times']) == 200
+    assert None not in data['images']['jpegs']
+    assert 10_000_000 < len(page) < 20_000_000
+    mixtures = read_mixtures(tmp_path / 'out')
+    told = sum(len(layer['positions']) + len(layer['pixels']) for layer in data['layers'])
+    assert told < data_size(mixtures) < 1.2 * told
+
+
+def test_times_are_left_out_where_the_data_get_too_large(made, tmp_path, monkeypatch):
+    size = data_size(read_mixtures(made.out))
+    monkeypatch.setattr(report, 'DATA_BYTES', size // 2)
+    data = data_of(make(made.out, tmp_path / 'report'))
+    assert len(data['times']) == 3
+
+
+# What goes wrong.
+
+
+def fails(tmp_path, capsys, out, *options):
+    """The line that the command ends with; nothing may be written."""
+    target = tmp_path / 'new' / 'report'
+    assert report.main([str(out), '-o', str(target), *map(str, options)]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ''
+    (line,) = captured.err.splitlines()
+    assert line.startswith('report: ')
+    assert not target.parent.exists()
+    return line
+
+
+def test_bags_that_can_not_be_shown(made, tmp_path, capsys):
+    assert 'can not be read' in fails(tmp_path, capsys, tmp_path / 'nowhere')
+    assert 'has no pose mixtures' in fails(tmp_path, capsys, made.images)
+    line = fails(tmp_path, capsys, made.out, '--topic', 'body')
+    assert 'has no mixtures' in line
+    content = (made.out / 'out.mcap').read_bytes()
+    cut = tmp_path / 'cut.mcap'
+    cut.write_bytes(content[: len(content) // 2])
+    assert str(cut) in fails(tmp_path, capsys, cut)
+    cut.write_bytes(b'')
+    assert str(cut) in fails(tmp_path, capsys, cut)
+    line = fails(tmp_path, capsys, made.out, '--images', made.out)
+    assert 'no topic of type' in line
+
+
+def test_mixtures_that_can_not_be_understood(body, poses, tmp_path, capsys):
+    def heavy(message):
+        message.components[0].weight = 2.0
+        return message
+
+    out = write_out(tmp_path / 'heavy', body, poses, change=heavy, truth=False)
+    assert 'weights that sum to' in fails(tmp_path, capsys, out)
+
+    def elsewhere(message):
+        message.header.frame_id = f'camera_{int(message.kind)}'
+        return message
+
+    out = write_out(tmp_path / 'elsewhere', body, poses, change=elsewhere, truth=False)
+    assert 'name those of one camera by --topic' in fails(tmp_path, capsys, out)
+
+
+def test_truth_that_does_not_fit(made, body, poses, tmp_path, capsys):
+    joints = body.joint_positions(poses)
+    later = tmp_path / 'later.npz'
+    np.savez(
+        later, stamps=np.array(STAMPS) + 1, joint_names=np.array(body.joint_names), joints=joints
+    )
+    assert 'is among those of' in fails(tmp_path, capsys, made.out, '--truth', later)
+    fewer = tmp_path / 'fewer.npz'
+    np.savez(fewer, stamps=np.array(STAMPS), joint_names=np.array(['pelvis']), joints=joints)
+    assert 'wanted (1, 3)' in fails(tmp_path, capsys, made.out, '--truth', fewer)
+    line = fails(tmp_path, capsys, made.out, '--truth', tmp_path / 'none.npz')
+    assert 'can not be read' in line
+    assert 'has no ground truth' in fails(tmp_path, capsys, made.out, '--truth', made.images)
+
+
+def test_images_that_do_not_fit(made, tmp_path, capsys):
+    other = write_images(tmp_path / 'other', [stamp + 1 for stamp in STAMPS])
+    line = fails(tmp_path, capsys, made.out, '--images', other)
+    assert 'is this the bag that was tracked?' in line
+    cut = tmp_path / 'cut.mcap'
+    cut.write_bytes((made.images / 'in.mcap').read_bytes()[:-200])
+    assert str(cut) in fails(tmp_path, capsys, made.out, '--images', cut)
+
+
+def test_only_reports_are_replaced(made, page, tmp_path, capsys):
+    folder = tmp_path / 'report'
+    folder.mkdir()
+    (folder / 'letter.txt').write_text('dear')
+    for options in ([], ['--overwrite']):
+        assert report.main([str(made.out), '-o', str(folder), *options]) == 1
+        assert str(folder) in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ['report']
+    (folder / 'letter.txt').unlink()
+    (folder / 'report.html').write_text('an older one')
+    assert report.main([str(made.out), '-o', str(folder)]) == 1
+    assert 'exists' in capsys.readouterr().err
+    make(made.out, folder, '--overwrite', '--images', made.images, '--truth', made.truth)
+    assert (folder / 'report.html').read_text('utf-8') == page
+
+
+@pytest.mark.parametrize(('error', 'code'), [(KeyboardInterrupt(), 130), (OSError(28, 'full'), 1)])
+def test_after_an_error_nothing_is_left(made, error, code, tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        raise error
+
+    folder = tmp_path / 'report'
+    folder.mkdir()
+    (folder / 'report.html').write_text('an older one')
+    monkeypatch.setattr(report, 'draw_pictures', fail)
+    assert report.main([str(made.out), '-o', str(folder), '--overwrite']) == code
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ['report']
+    assert [path.read_text() for path in folder.iterdir()] == ['an older one']
+
+
+def test_it_tells_what_came_out(made, tmp_path, capsys):
+    assert report.main([str(made.out), '-o', str(tmp_path / 'report')]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith(f'{tmp_path / "report" / "report.html"}: {FRAMES} times, ')
+    assert any('weights.png' in line for line in lines)

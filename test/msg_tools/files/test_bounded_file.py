@@ -1,0 +1,29 @@
+"""Files up to an agreed size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from msg_tools.files.bounded_file import read_bytes
+
+
+def test_content_up_to_the_limit(tmp_path: Path) -> None:
+    path = tmp_path / 'file'
+    path.write_bytes(bytes(range(256)) * 8192)
+    assert read_bytes(path, 2**21) == path.read_bytes()
+    with pytest.raises(ValueError, match='2097152 bytes, wanted at most 2097151') as caught:
+        read_bytes(path, 2**21 - 1)
+    assert str(path) not in str(caught.value)
+
+
+def test_what_has_no_size_ends_at_the_limit() -> None:
+    with pytest.raises(ValueError, match='more than 1000 bytes'):
+        read_bytes('/dev/zero', 1000)
+
+
+def test_what_can_not_be_read(tmp_path: Path) -> None:
+    for path, error in ((tmp_path / 'none', 'No such file'), (tmp_path, 'Is a directory')):
+        with pytest.raises(ValueError, match=rf'can not be read \({error}'):
+            read_bytes(path, 1000)

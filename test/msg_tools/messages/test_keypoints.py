@@ -1,0 +1,87 @@
+"""Keypoints2D to arrays and back, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import load_body
+from msg_tools import MessageError, RosbagsMessages
+from msg_tools.messages.keypoints import keypoints_message, keypoints_of
+
+
+def message(messages: RosbagsMessages, **changes: Any) -> Any:
+    fields: dict[str, Any] = {
+        'names': ['neck', 'left_elbow', 'head'],
+        'u': [10.0, np.nan, 30.5],
+        'v': [20.0, np.nan, 40.5],
+        'covariance': np.tile([4.0, 1.0, 1.0, 9.0], 3),
+        'confidence': [1.0, 0.0, 0.5],
+    }
+    return messages.create('hmt_msgs/msg/Keypoints2D', **{**fields, **changes})
+
+
+def test_fields_become_arrays(messages: RosbagsMessages) -> None:
+    content = keypoints_of(message(messages), 3.0)
+    assert content.names == ('neck', 'left_elbow', 'head')
+    np.testing.assert_array_equal(content.pixels, [[10, 20], [np.nan, np.nan], [30.5, 40.5]])
+    np.testing.assert_array_equal(content.seen, [True, False, True])
+    np.testing.assert_array_equal(content.covariances[2], [[4, 1], [1, 9]])
+    np.testing.assert_array_equal(content.confidences, [1, 0, 0.5])
+    again = keypoints_of(keypoints_message(messages, content, 7, 'camera'), 1.0)
+    np.testing.assert_array_equal(again.pixels, content.pixels)
+    np.testing.assert_array_equal(again.covariances, content.covariances)
+
+
+def test_what_is_empty_is_filled_in(messages: RosbagsMessages) -> None:
+    content = keypoints_of(message(messages, covariance=[], confidence=[]), 3.0)
+    np.testing.assert_array_equal(content.covariances[0], 9 * np.eye(2))
+    np.testing.assert_array_equal(content.confidences, np.ones(3))
+
+
+def test_covariance_of_a_joint_that_was_not_seen_does_not_matter(messages: RosbagsMessages) -> None:
+    covariance = np.tile([4.0, 1.0, 1.0, 9.0], 3)
+    covariance[4:8] = np.nan
+    content = keypoints_of(message(messages, covariance=covariance), 3.0)
+    np.testing.assert_array_equal(content.covariances[1], np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error'),
+    [
+        ({'names': [], 'u': [], 'v': []}, r'keypoints has no names'),
+        ({'names': ['neck', 'neck', 'head']}, r"keypoints has the name 'neck' twice"),
+        ({'names': ['x'] * 10_001}, r'keypoints has 10001 names, the limit is 10000'),
+        ({'u': [1.0, 2.0]}, r'keypoints: u has 2 values, wanted 3'),
+        ({'v': [1.0] * 4}, r'keypoints: v has 4 values, wanted 3'),
+        ({'covariance': [1.0] * 11}, r'keypoints: covariance has 11 values, wanted 12'),
+        ({'confidence': [1.0]}, r'keypoints: confidence has 1 values, wanted 3'),
+        ({'confidence': [1.0, -0.1, 1.0]}, r'left_elbow has confidence -0.1, wanted 0 to 1'),
+        ({'confidence': [1.0, 1.0, 1.1]}, r'head has confidence 1.1'),
+        ({'confidence': [np.nan, 1.0, 1.0]}, r'neck has confidence nan'),
+        ({'u': [1.0, np.nan, np.nan]}, r'keypoint head lies at \(nan, 40.5\), wanted numbers, or'),
+        ({'u': [1.0, np.nan, np.inf]}, r'keypoint head lies at \(inf, 40.5\)'),
+        ({'covariance': [0.0] * 12}, r'covariance of keypoint neck is not positive definite'),
+        ({'covariance': [1.0, 2.0, 2.0, 1.0] * 3}, r'neck is not positive definite: .* -1$'),
+        ({'covariance': [1.0, 0.5, 0.0, 1.0] * 3}, r'covariance of keypoint neck is not symmetric'),
+        ({'covariance': [np.nan] * 12}, r'covariance of keypoint neck has values that are not'),
+    ],
+)
+def test_messages_that_contradict_themselves(
+    messages: RosbagsMessages, changes: dict[str, Any], error: str
+) -> None:
+    with pytest.raises(MessageError, match=error) as caught:
+        keypoints_of(message(messages, **changes), 3.0)
+    assert '\n' not in str(caught.value)
+
+
+def test_other_names_of_joints_are_those_of_the_body(messages: RosbagsMessages) -> None:
+    body = load_body('human37')
+    changed = message(messages, names=['neck', 'left_foot_index', 'nose'])
+    known, strange = keypoints_of(changed, 3.0).named_for(body)
+    assert (known.names, strange) == (('neck', 'left_toe'), ['nose'])
+    np.testing.assert_array_equal(known.pixels, [[10, 20], [np.nan, np.nan]])
+    twice = message(messages, names=['pelvis', 'mid_hip', 'hip'])
+    assert keypoints_of(twice, 3.0).named_for(body)[0].names == ('pelvis',)

@@ -1,0 +1,227 @@
+"""PoseMixture to arrays and back, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import load_body
+from hmt_ros.inference import GaussianMixture
+from msg_tools import MessageError, RosbagsMessages, typestore
+from msg_tools.messages.bodies import body_of
+from msg_tools.messages.cdr import deserialise, serialise
+from msg_tools.messages.message_error import MessageFault
+from msg_tools.messages.message_types import typestore_of_definition
+from msg_tools.messages.pose_mixtures import (
+    POSE_MIXTURE,
+    MixtureKind,
+    PoseMixture,
+    pose_mixture_message,
+    pose_mixture_of,
+)
+
+
+def test_kinds_are_those_of_the_message() -> None:
+    constants = typestore().fielddefs['hmt_msgs/msg/PoseMixture'][0]
+    assert {name: value for name, _, value in constants} == {
+        kind.name: kind.value for kind in MixtureKind
+    }
+
+
+def test_round_trip_sorts_by_weight(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
+    data = serialise(pose_mixture_message(messages, pose_mixture))
+    back = pose_mixture_of(
+        deserialise(data, 'hmt_msgs/msg/PoseMixture'),
+        pose_mixture.dof_names,
+        pose_mixture.joint_names,
+    )
+    order = [2, 1, 0]
+    np.testing.assert_array_equal(back.mixture.weights, [0.5, 0.3, 0.2])
+    np.testing.assert_array_equal(back.mixture.means, pose_mixture.means[order])
+    np.testing.assert_array_equal(back.mixture.covariances, pose_mixture.covariances[order])
+    np.testing.assert_array_equal(back.joint_positions, pose_mixture.joint_positions[order])
+    np.testing.assert_array_equal(back.log_likelihoods, [-1.0, -2.0, -3.0])
+    np.testing.assert_array_equal(back.degrees_of_freedom, [0.0, 5.0, 0.0])
+    for name in (
+        'body_model', 'dof_names', 'joint_names', 'kind', 'stamp_ns', 'frame_id', 'segment_lengths',
+    ):  # fmt: skip
+        assert getattr(back, name) == getattr(pose_mixture, name)
+    # Sorted it is the same message again.
+    assert serialise(pose_mixture_message(messages, back)) == data
+
+
+def test_what_is_unknown(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
+    content = replace(
+        pose_mixture,
+        covariances=None,
+        segment_lengths={},
+        log_likelihoods=None,
+        degrees_of_freedom=None,
+    )
+    message = pose_mixture_message(messages, content)
+    assert all(len(component.covariance) == 0 for component in message.components)
+    back = pose_mixture_of(message)
+    assert back.covariances is None
+    assert back.segment_lengths == {}
+    assert np.isnan(back.log_likelihoods).all()
+    assert (back.degrees_of_freedom == 0).all()
+    with pytest.raises(MessageError, match='mixture has no covariances'):
+        _ = back.mixture
+
+
+def test_nobody(messages: RosbagsMessages) -> None:
+    body = load_body('human37')
+    content = PoseMixture.of_body(body, None, MixtureKind.PREDICTION, 7, 'camera')
+    back = pose_mixture_of(pose_mixture_message(messages, content), body.dof_names)
+    assert back.joint_positions.shape == (0, len(body.joint_names), 3)
+    with pytest.raises(MessageError, match='mixture has no components') as caught:
+        _ = back.mixture
+    assert caught.value.fault is MessageFault.NO_COMPONENTS
+
+
+def test_messages_older_than_the_lengths(
+    pose_mixture: PoseMixture, messages: RosbagsMessages
+) -> None:
+    """A bag carries its own definition, which has no such fields."""
+    store = typestore()
+    definition, _ = store.generate_msgdef(POSE_MIXTURE, ros_version=2)
+    fields = ('string[] segment_names\n', 'float64[] segment_lengths\n')
+    assert all(field in definition for field in fields)
+    for field in fields:
+        definition = definition.replace(field, '', 1)
+    old = typestore_of_definition(POSE_MIXTURE, 'ros2msg', definition)
+    message = pose_mixture_message(messages, replace(pose_mixture, segment_lengths={}))
+    # The fields are the last of the message: two counts of zero.
+    data = serialise(message)
+    assert data[-8:] == bytes(8)
+    back = pose_mixture_of(deserialise(data[:-8], POSE_MIXTURE, old))
+    assert back.segment_lengths == {}
+    np.testing.assert_array_equal(back.weights, [0.5, 0.3, 0.2])
+    # Written again it is of the present definition.
+    assert serialise(deserialise(data[:-8], POSE_MIXTURE, old)) == data
+
+
+def test_whose_poses_they_are() -> None:
+    model = load_body('human37')
+    person = model.with_stature(1.6)
+    mixture = GaussianMixture([1.0], person.prior_mean[None], np.eye(37)[None])
+    content = PoseMixture.of_body(person, mixture, MixtureKind.POSTERIOR, 7, 'camera')
+    assert body_of(content, model).segment_lengths == person.segment_lengths
+    assert body_of(replace(content, segment_lengths={}), model) is model
+    renamed = replace(content, body_model='anna')
+    assert body_of(renamed, model, any_name=True).segment_lengths == person.segment_lengths
+    for strange, error in (
+        (renamed, 'mixture is of the body anna, wanted one of human37'),
+        (replace(content, segment_lengths={'tail': 1.0}), "body human37: .*'tail'"),
+    ):
+        with pytest.raises(MessageError, match=error) as caught:
+            body_of(strange, model)
+        assert caught.value.fault is MessageFault.BODY
+    with pytest.raises(MessageError, match='wanted 32') as caught:
+        body_of(content, load_body('human32'), any_name=True)
+    assert caught.value.fault is MessageFault.NAMES
+
+
+def test_equal_weights_keep_their_order(
+    pose_mixture: PoseMixture, messages: RosbagsMessages
+) -> None:
+    even = replace(pose_mixture, weights=np.full(3, 1 / 3))
+    back = pose_mixture_of(pose_mixture_message(messages, even))
+    np.testing.assert_array_equal(back.means, pose_mixture.means)
+
+
+def bend(path: str, value: Any) -> Callable[[Any], None]:
+    """Sets a field of a message, or of a component as '0.mean'."""
+
+    def change(message: Any) -> None:
+        index, _, name = path.rpartition('.')
+        setattr(message.components[int(index)] if index else message, name, value)
+
+    return change
+
+
+def asymmetric() -> Any:
+    result = np.eye(4)
+    result[0, 1] = 0.1
+    return result.ravel()
+
+
+@pytest.mark.parametrize(
+    ('change', 'error'),
+    [
+        (bend('1.mean', np.zeros(3)), r'mixture: component 1: mean has 3 values, wanted 4'),
+        (bend('1.mean', np.array([0, 0, np.nan, 0])), r'mean has values that are not finite'),
+        (bend('1.covariance', np.zeros(0)), r'component 1 has no covariance, others have one'),
+        (bend('2.covariance', np.zeros(15)), r'component 2: covariance has 15 values, wanted 16'),
+        (bend('2.covariance', np.zeros(16)), r'covariance of mixture is not positive definite: sm'),
+        (
+            bend('2.covariance', -np.eye(4).ravel()),
+            r'not positive definite: smallest eigenvalue -1',
+        ),
+        (bend('2.covariance', asymmetric()), r'covariance of mixture is not symmetric'),
+        (bend('2.covariance', np.full(16, np.inf)), r'covariance of mixture has values that are n'),
+        (bend('segment_names', ['a', 'a']), r"segment_names has the name 'a' twice"),
+        (bend('segment_names', ['a']), r'segment_lengths has 2 values, wanted 1'),
+        (bend('segment_lengths', np.array([1, np.inf])), r'segment_lengths has values that are n'),
+        (bend('0.weight', -0.5), r'mixture has the weight -0.5, wanted numbers from 0 to 1'),
+        (bend('0.weight', np.nan), r'mixture has the weight nan'),
+        (bend('0.weight', 0.51), r'mixture has weights that sum to 1.01, wanted 1'),
+        (bend('0.joint_positions', []), r'component 0 has 0 joint_positions, wanted 2'),
+        (bend('joint_names', ['pelvis']), r'component 0 has 2 joint_positions, wanted 1'),
+        (bend('joint_names', ['a', 'a']), r"joint_names has the name 'a' twice"),
+        (bend('dof_names', ['a', 'b', 'c', 'a']), r"dof_names has the name 'a' twice"),
+        (bend('dof_names', ['a', 'b', 'c']), r'component 0: mean has 4 values, wanted 3'),
+        (bend('kind', 9), r'mixture has the kind 9'),
+    ],
+)
+def test_messages_that_contradict_themselves(
+    pose_mixture: PoseMixture,
+    messages: RosbagsMessages,
+    change: Callable[[Any], None],
+    error: str,
+) -> None:
+    message = pose_mixture_message(messages, pose_mixture)
+    change(message)
+    with pytest.raises(MessageError, match=error) as caught:
+        pose_mixture_of(message)
+    assert '\n' not in str(caught.value)
+
+
+def test_another_body(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
+    message = pose_mixture_message(messages, pose_mixture)
+    with pytest.raises(MessageError, match=r'dof_names has 4 names, wanted 2'):
+        pose_mixture_of(message, ['root_x', 'bend'])
+    with pytest.raises(MessageError, match=r"dof_names has 'root_yy' at 1, wanted 'root_y'"):
+        pose_mixture_of(message, ['root_x', 'root_y', 'root_zzz', 'bend'])
+    with pytest.raises(MessageError, match=r"joint_names has 'pelvis' at 0, wanted 'head'"):
+        pose_mixture_of(message, None, ['head', 'pelvis'])
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error'),
+    [
+        ({'dof_names': ('a', 'b')}, r'means has shape \(3, 4\), wanted \(3, 2\)'),
+        ({'joint_names': ('a',)}, r'joint_positions has shape \(3, 2, 3\), wanted \(3, 1, 3\)'),
+        ({'joint_positions': np.full((3, 2, 3), np.nan)}, r'joint_positions has values'),
+        ({'log_likelihoods': np.zeros(2)}, r'log_likelihoods has shape \(2,\), wanted \(3,\)'),
+        ({'weights': np.ones(3)}, r'weights that sum to 3, wanted 1'),
+    ],
+)
+def test_content_that_no_message_may_have(
+    pose_mixture: PoseMixture, changes: dict[str, Any], error: str
+) -> None:
+    with pytest.raises(MessageError, match=error):
+        replace(pose_mixture, **changes)
+
+
+def test_more_components_than_anybody_publishes(
+    pose_mixture: PoseMixture, messages: RosbagsMessages
+) -> None:
+    message = pose_mixture_message(messages, pose_mixture)
+    message.components = [message.components[0]] * 1025
+    with pytest.raises(MessageError, match='mixture has 1025 components, the limit is 1024'):
+        pose_mixture_of(message)

@@ -1,0 +1,259 @@
+"""The rules of the session, with a predictor that costs nothing."""
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import Camera
+from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, BmeSession
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.handled import Handled
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.images import compressed_image_message, image_message
+from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+
+FRAME_NS = 100_000_000
+
+
+@pytest.fixture
+def session(stub_predictor, background_file, outputs):
+    def make(wanted=lambda topic: True, **values):
+        values = {'background_file': str(background_file), 'least_height': 10, **values}
+        return BmeSession(with_values(BmeParameters(), values), outputs.append, wanted)
+
+    return make
+
+
+def predictions(outputs):
+    return [deserialise(output.data, 'hmt_msgs/msg/PoseMixture') for output in outputs]
+
+
+def test_every_image_has_a_prediction(session, outputs, somebody, stub_predictor):
+    one = session()
+    one.take(CAMERA_INFO, somebody.info())
+    handled = one.take(IMAGE, somebody.image(0))
+    assert handled == Handled(
+        IMAGE, somebody.stamp(0), (), (), (('pose_prediction', somebody.stamp(0)),)
+    )
+    (message,) = predictions(outputs)
+    content = pose_mixture_of(message)
+    assert content.kind == MixtureKind.PREDICTION
+    assert (content.stamp_ns, content.frame_id) == (somebody.stamp(0), 'lens')
+    assert content.body_model == 'human37'
+    assert np.allclose(content.mixture.weights, [0.7, 0.3])
+    body = stub_predictor.body
+    assert np.allclose(content.joint_positions, body.joint_positions(content.mixture.means))
+    state = one.state
+    assert (state.status, state.modes, state.wants) == ('predicting', 2, '')
+    assert state.support == 0.5
+    assert state.height == 24
+    assert np.isclose(state.entropy, -(0.7 * np.log(0.7) + 0.3 * np.log(0.3)))
+    assert state.counts == {'received': 1, 'predicted': 1}
+    ((mask, *_),) = stub_predictor.asked
+    assert mask.shape == (48, 64)
+    assert mask.sum() == pytest.approx(24 * 10, rel=0.1)
+
+
+def test_same_messages_same_bytes(session, outputs, somebody):
+    for _ in range(2):
+        one = session()
+        one.take(CAMERA_INFO, somebody.info())
+        for index in range(3):
+            one.take(IMAGE, somebody.image(index))
+    assert outputs[:3] == outputs[3:]
+
+
+def test_nobody_is_a_prediction_without_components(session, outputs, somebody, stub_predictor):
+    one = session()
+    one.take(CAMERA_INFO, somebody.info())
+    one.take(IMAGE, somebody.empty(0))
+    assert session(least_height=25) is not None
+    (message,) = predictions(outputs)
+    assert len(message.components) == 0
+    assert (message.kind, message.body_model) == (MixtureKind.PREDICTION, 'human37')
+    assert one.state.status == 'nobody'
+    assert one.state.counts == {'received': 1, 'predicted': 1, 'empty': 1}
+    assert stub_predictor.asked == []
+
+
+def test_low_silhouettes_are_nobody(session, outputs, somebody):
+    one = session(least_height=25)
+    one.take(CAMERA_INFO, somebody.info())
+    one.take(IMAGE, somebody.image(0))
+    assert len(predictions(outputs)[0].components) == 0
+    assert one.state.height == 24
+
+
+def test_background_is_learned_from_the_first_images(session, outputs, somebody):
+    one = session(background_file='', background_images=2)
+    one.take(CAMERA_INFO, somebody.info())
+    assert one.state.wants == '2 more images of the empty scene'
+    for index in range(2):
+        one.take(IMAGE, somebody.empty(index))
+    assert one.state.status == 'nobody'
+    one.take(IMAGE, somebody.image(2))
+    assert [len(message.components) for message in predictions(outputs)] == [0, 0, 2]
+
+
+def test_predictions_take_those_before_into_account(session, somebody, stub_predictor):
+    one = session(propagate=True, longest_interval=0.25)
+    one.take(CAMERA_INFO, somebody.info())
+    for index in (0, 1, 4):
+        one.take(IMAGE, somebody.image(index))
+    (_, first, _), (_, second, _), (_, third, _) = stub_predictor.asked
+    assert first is None
+    assert len(second) == 2
+    # The dynamics were learned for a step of 1/30 s; of the rest little is known.
+    gained = second.covariances[0] - 1e-2 * np.eye(37)
+    assert np.allclose(gained, np.diag(stub_predictor.body.rates * 2 / 30))
+    assert third is None
+    alone = session()
+    alone.take(CAMERA_INFO, somebody.info())
+    for index in (0, 1):
+        alone.take(IMAGE, somebody.image(index))
+    assert [previous for _, previous, _ in stub_predictor.asked[3:]] == [None, None]
+
+
+def test_at_most_so_many_components(session, outputs, somebody):
+    one = session(max_hypotheses=1)
+    one.take(CAMERA_INFO, somebody.info())
+    one.take(IMAGE, somebody.image(0))
+    assert len(predictions(outputs)[0].components) == 1
+
+
+def test_known_stature_narrows_the_depth(session, somebody, stub_predictor):
+    for values in ({}, {'stature': 1.9}):
+        one = session(**values)
+        one.take(CAMERA_INFO, somebody.info())
+        one.take(IMAGE, somebody.image(0))
+    (_, _, unknown), (_, _, known) = stub_predictor.asked
+    assert known < unknown / 2
+
+
+def test_what_is_strange_about_a_silhouette_is_told_once(session, somebody):
+    one = session()
+    one.take(CAMERA_INFO, somebody.info())
+    warnings = [one.take(IMAGE, somebody.at_the_border(index)).warnings for index in range(2)]
+    assert warnings == [(f'image of {somebody.stamp(0)} ns: cut at the left',), ()]
+    assert one.state.faults['silhouette'] == 2
+
+
+def test_images_wait_for_the_camera(session, outputs, somebody):
+    one = session(queue_size=2)
+    handled = [one.take(IMAGE, somebody.image(index)) for index in range(3)]
+    assert [len(each.faults) for each in handled] == [0, 0, 1]
+    assert 'waited for a calibrated camera_info' in handled[2].faults[0]
+    assert one.state.wants == 'a calibrated camera_info'
+    assert len(one.take(CAMERA_INFO, somebody.info()).published) == 2
+    assert one.state.counts == {'received': 3, 'predicted': 2, 'dropped': 1}
+
+
+def test_time(session, outputs, somebody, stub_predictor):
+    one = session()
+    one.take(CAMERA_INFO, somebody.info())
+    one.take(IMAGE, somebody.image(3))
+    assert 'wanted stamps that increase' in one.take(IMAGE, somebody.image(3)).faults[0]
+    assert 'with reset_on_time_jump' in one.take(IMAGE, somebody.image(2)).faults[0]
+    assert len(outputs) == 1
+    again = session(reset_on_time_jump=True)
+    again.take(CAMERA_INFO, somebody.info())
+    again.take(IMAGE, somebody.image(3))
+    handled = again.take(IMAGE, somebody.image(2))
+    assert (handled.faults, len(handled.warnings)) == ((), 1)
+    assert stub_predictor.asked[-1][1] is None
+
+
+def test_another_calibration_begins_a_new_sequence(session, somebody, stub_predictor):
+    one = session()
+    one.take(CAMERA_INFO, somebody.info())
+    one.take(IMAGE, somebody.image(0))
+    other = Camera(70.0, 70.0, 31.5, 23.5, 64, 48)
+    (text,) = one.take(CAMERA_INFO, somebody.info(camera=other)).warnings
+    assert text == 'camera_info changes: the sequence starts anew'
+    one.take(IMAGE, somebody.image(1))
+    assert stub_predictor.asked[1][1] is None
+
+
+def test_bad_input_is_told_once_and_skipped(session, outputs, somebody):
+    one = session()
+    uncalibrated = one.take(CAMERA_INFO, somebody.uncalibrated())
+    assert len(uncalibrated.warnings) == 1
+    assert one.take(CAMERA_INFO, somebody.uncalibrated()).warnings == ()
+    one.take(CAMERA_INFO, somebody.info())
+    broken = somebody.messages.create(
+        'sensor_msgs/msg/CompressedImage', header=somebody.image(0).header, format='jpeg',
+        data=np.arange(9, dtype=np.uint8),
+    )  # fmt: skip
+    small = somebody.image(1, size=(32, 24))
+    for message in (broken, small):
+        assert len(one.take(IMAGE, message).faults) == 1
+    assert one.refuse(IMAGE, 'garbage').warnings == ('message of image can not be read: garbage',)
+    assert outputs == []
+    one.take(IMAGE, somebody.image(2))
+    assert len(outputs) == 1
+    assert one.state.counts == {'received': 3, 'skipped': 2, 'predicted': 1}
+
+
+def test_failed_prediction_skips_the_image(session, outputs, somebody, stub_predictor):
+    one = session()
+    one.take(CAMERA_INFO, somebody.info())
+    stub_predictor.fault = ValueError('the person is\nbehind the camera')
+    (text,) = one.take(IMAGE, somebody.image(0)).warnings
+    assert text.endswith('the person is behind the camera')
+    stub_predictor.fault = None
+    one.take(IMAGE, somebody.image(1))
+    assert len(outputs) == 1
+
+
+def test_what_nobody_wants_is_not_made(session, outputs, somebody):
+    one = session(wanted=lambda topic: False)
+    one.take(CAMERA_INFO, somebody.info())
+    assert one.take(IMAGE, somebody.image(0)).published == ()
+    assert one.state.counts['predicted'] == 1
+
+
+@pytest.mark.parametrize('made', [image_message, compressed_image_message])
+def test_one_image_is_predicted_on_demand(session, somebody, stub_predictor, made):
+    one = session()
+    message = made(somebody.messages, somebody.picture(7), somebody.stamp(7), 'lens')
+    with pytest.raises(ValueError, match='no calibrated camera_info has come yet'):
+        one.predict_once(message)
+    one.take(CAMERA_INFO, somebody.info())
+    one.take(IMAGE, somebody.image(0))
+    content = pose_mixture_of(one.predict_once(message))
+    assert (content.kind, content.stamp_ns) == (MixtureKind.PREDICTION, somebody.stamp(7))
+    # It is not part of the sequence.
+    assert stub_predictor.asked[-1][1] is None
+    assert one.state.counts == {'received': 1, 'predicted': 1}
+    with pytest.raises(ValueError, match='nobody is seen: the silhouette is 0 px high'):
+        one.predict_once(somebody.empty(8))
+    with pytest.raises(ValueError, match='image has 32x24 pixels, wanted the 64x48'):
+        one.predict_once(somebody.image(8, size=(32, 24)))
+    learning = session(background_file='')
+    learning.take(CAMERA_INFO, somebody.info())
+    with pytest.raises(ValueError, match='from 0 of 30 images so far'):
+        learning.predict_once(message)
+
+
+@pytest.mark.parametrize(
+    ('values', 'message'),
+    [
+        ({'background_file': 'nowhere.png'}, r'nowhere\.png: can not be read'),
+        ({'image_transport': 'pigeon'}, 'image_transport must be one of'),
+        ({'background.method': 'magic'}, 'background method must be'),
+        ({'max_hypotheses': 0}, 'must lie between 1 and 64'),
+    ],
+)
+def test_parameters_that_can_not_be(session, values, message):
+    with pytest.raises(ValueError, match=message):
+        session(**values)
+
+
+def test_model_file_that_can_not_be(background_file, tmp_path):
+    for name, content in (('nowhere.npz', None), ('garbage.npz', b'PK not a model')):
+        path = tmp_path / name
+        if content is not None:
+            path.write_bytes(content)
+        parameters = with_values(BmeParameters(), {'model_file': str(path)})
+        with pytest.raises(ValueError, match=name):
+            BmeSession(parameters, lambda output: None)

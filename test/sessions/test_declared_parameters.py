@@ -1,0 +1,224 @@
+import math
+from dataclasses import dataclass, field, replace
+
+import pytest
+
+from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.declared_parameters import (
+    AT_LAUNCH,
+    AT_ONCE,
+    EFFECTS,
+    NEXT_TRACK,
+    NOT_NEGATIVE,
+    ParameterError,
+    declared_parameters,
+    described_fields,
+    nested_parameters,
+    parameter_field,
+    values_of,
+    with_values,
+)
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
+
+ALL = (FilterParameters(), SmootherParameters(), BmeParameters())
+
+
+@dataclass(frozen=True)
+class Term:
+    """A term.
+
+    Attributes:
+        weight: Weight of the term.
+        low, high: Thresholds, of which
+            the first is the lower.
+    """
+
+    weight: float = 2.0
+    low: float = -1.0
+    high: int = 3
+
+    def __post_init__(self):
+        if self.low >= self.high:
+            raise ValueError(f'low {self.low} must be below high {self.high}')
+
+
+@dataclass(frozen=True)
+class Inner:
+    """Settings.
+
+    Attributes:
+        method: Method, 'a' or 'b'.
+        edges: Contours on edges.
+        flow: Flow of the texture.
+    """
+
+    method: str = 'a'
+    edges: Term = field(default_factory=Term)
+    flow: Term = field(default_factory=Term)
+
+
+@dataclass(frozen=True)
+class Base:
+    """What all have.
+
+    Attributes:
+        shared: Shared by all.
+    """
+
+    shared: bool = parameter_field(True, AT_LAUNCH)
+
+
+@dataclass(frozen=True)
+class Outer(Base):
+    """All.
+
+    Attributes:
+        on: More: with a colon.
+        inner: settings of the part.
+        own: Another term.
+
+    Raises:
+        ValueError: never.
+    """
+
+    on: bool = parameter_field(True, AT_ONCE)
+    inner: Inner = field(
+        default_factory=Inner,
+        metadata=nested_parameters(
+            NEXT_TRACK,
+            {'method': None, 'edges.weight': (0.5, 9.0), 'edges.low': (-math.inf, math.inf)},
+        ),
+    )
+    own: Term = field(
+        default_factory=Term,
+        metadata=nested_parameters(AT_ONCE, {'high': (0, 9), 'weight': NOT_NEGATIVE}, 'own.'),
+    )
+    apart: Term = field(default_factory=Term)
+
+
+def test_fields_that_are_listed_are_parameters():
+    found = {p.name: p for p in declared_parameters(Outer())}
+    assert list(found) == [
+        'on', 'method', 'edges.weight', 'edges.low', 'own.high', 'own.weight', 'shared',
+    ]  # fmt: skip
+    assert {name: p.default for name, p in found.items()} == values_of(Outer())
+    assert found['on'].description == 'More: with a colon.'
+    assert found['method'].description == "Method, 'a' or 'b'."
+    assert found['edges.weight'].description == 'Contours on edges: weight of the term.'
+    assert found['own.high'].description == (
+        'Another term: thresholds, of which the first is the lower.'
+    )
+    assert found['shared'].description == 'Shared by all.'
+    assert found['on'].effect == found['own.high'].effect == AT_ONCE
+    assert found['edges.low'].effect == NEXT_TRACK
+    assert found['on'].limits is None
+    assert found['edges.weight'].limits == (0.5, 9.0)
+    assert found['edges.low'].path == ('inner', 'edges', 'low')
+
+
+def test_values_replace_defaults():
+    settings = with_values(Outer(), {'edges.low': 1, 'own.high': 5, 'method': 'b', 'on': False})
+    assert settings == Outer(
+        on=False, inner=Inner('b', replace(Term(), low=1.0)), own=replace(Term(), high=5)
+    )
+    assert isinstance(settings.inner.edges.low, float)
+    assert with_values(Outer(), {}) == Outer()
+
+
+def test_settings_that_are_no_parameters_stay():
+    settings = Outer(apart=replace(Term(), high=7), inner=Inner(flow=replace(Term(), high=8)))
+    changed = with_values(settings, {'method': 'b'})
+    assert changed.apart.high == 7
+    assert changed.inner == Inner('b', flow=replace(Term(), high=8))
+
+
+@pytest.mark.parametrize(
+    ('values', 'message'),
+    [
+        ({'metod': 'b'}, 'no parameter metod; is method meant?'),
+        ({'zzz': 1}, 'no parameter zzz$'),
+        ({'on': 1}, 'on must be a truth value, saw 1'),
+        ({'own.high': 2.5}, 'own.high must be a whole number, saw 2.5'),
+        ({'own.high': True}, 'own.high must be a whole number, saw True'),
+        ({'edges.low': 'x'}, "edges.low must be a number, saw 'x'"),
+        ({'own.low': 1.0}, 'no parameter own.low$'),
+        ({'method': None}, 'method must be a text, saw None'),
+        ({'edges.weight': 9.5}, 'edges.weight must lie between 0.5 and 9, saw 9.5'),
+        ({'own.weight': math.nan}, 'own.weight must lie between 0 and inf, saw nan'),
+    ],
+)
+def test_wrong_values_are_refused(values, message):
+    with pytest.raises(ParameterError, match=message):
+        with_values(Outer(), values)
+
+
+def test_values_that_do_not_go_together_are_refused():
+    with pytest.raises(ValueError, match=r'low 4.0 must be below high 3'):
+        with_values(Outer(), {'edges.low': 4.0})
+    both = with_values(Outer(own=Term(low=2.0)), {'own.high': 5, 'own.weight': 1.0})
+    assert both.own == Term(1.0, 2.0, 5)
+
+
+def test_docstrings_without_attributes_describe_nothing():
+    class Bare:
+        """Nothing."""
+
+    assert described_fields(Bare) == {}
+    assert described_fields(Outer) == {
+        'shared': 'Shared by all.',
+        'on': 'More: with a colon.',
+        'inner': 'settings of the part.',
+        'own': 'Another term.',
+    }
+
+
+def test_nodes_have_few_parameters():
+    counts = [len(declared_parameters(settings)) for settings in ALL]
+    assert counts[0] <= 55
+    assert sum(counts) <= 90
+    names = {p.name for p in declared_parameters(FilterParameters())}
+    assert {'max_hypotheses', 'hypothesis_merge_distance', 'random_seed', 'proposals'} < names
+    parameters = with_values(FilterParameters(), {'likelihood.edges.weight': 7, 'candidates': 20})
+    assert parameters.tracker.likelihood.edges.weight == 7.0
+    assert parameters.tracker.candidates == 20
+
+
+@pytest.mark.parametrize('settings', ALL, ids=lambda settings: type(settings).__name__)
+def test_descriptions_are_sentences_that_stand_alone(settings):
+    parameters = declared_parameters(settings)
+    names = [p.name for p in parameters]
+    assert len(set(names)) == len(names)
+    for parameter in parameters:
+        text = parameter.description
+        assert text[0].isupper(), parameter
+        assert text.endswith('.'), parameter
+        assert not text.lower().startswith(('of ', 'whether ', 'so many ', 'their ')), parameter
+
+
+@pytest.mark.parametrize('settings', ALL, ids=lambda settings: type(settings).__name__)
+def test_defaults_lie_between_limits(settings):
+    for parameter in declared_parameters(settings):
+        assert parameter.effect in EFFECTS
+        assert (parameter.limits is None) == (type(parameter.default) in (bool, str)), parameter
+        assert parameter.checked(parameter.default) == parameter.default
+
+
+@pytest.mark.parametrize(
+    ('values', 'message'),
+    [
+        ({'max_hypotheses': 0}, 'max_hypotheses must lie between 1 and 64, saw 0'),
+        ({'max_hypotheses': 50}, 'max_hypotheses <= candidates'),
+        ({'proposals': 'guess'}, "proposals must be one of .* saw 'guess'"),
+        ({'likelihood.edges.wieght': 2.0}, 'is likelihood.edges.weight meant'),
+        ({'surprise': 2.0}, 'there is no parameter surprise'),
+        ({'background.method': 'guess'}, "saw 'guess'"),
+        ({'image_transport': 'theora'}, "image_transport must be one of .* saw 'theora'"),
+        ({'body_model': ''}, 'body_model must be a name or a file'),
+        ({'sample_scale': -1.0}, 'sample_scale must lie between 0 and inf'),
+        ({'jump_probability': 0.0}, 'jump_probability must lie in'),
+    ],
+)
+def test_wrong_parameters_of_the_node(values, message):
+    with pytest.raises(ValueError, match=message):
+        with_values(FilterParameters(), values)

@@ -1,0 +1,617 @@
+"""The rules of the session, with a tracker that costs nothing."""
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import Camera, load_body
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
+from hmt_ros.sessions.track_messages import TOPICS
+from hmt_ros.sessions.track_start import prepare_start
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+from test.sessions.conftest import Likelihoods
+
+MIXTURES = ['pose_mixture', 'likelihood_mixture']
+STARTS = ['body', 'human_description']
+ONE_IMAGE = [*MIXTURES, 'joint_states', '/tf', 'markers', 'overlay/compressed']
+
+
+@pytest.fixture
+def session(stub_tracker, subject_file, outputs):
+    def make(wanted=lambda topic: True, **values):
+        values.setdefault('subject_file', str(subject_file))
+        parameters = with_values(FilterParameters(), values)
+        return FilterSession(parameters, outputs.append, wanted)
+
+    return make
+
+
+def tracked(outputs):
+    """Stamps of the images that were tracked."""
+    return [output.stamp_ns for output in outputs if output.topic == 'pose_mixture']
+
+
+def test_images_become_messages_in_their_order(session, outputs, small_camera):
+    one = session()
+    assert one.take(CAMERA_INFO, small_camera.info()).published == ()
+    first = one.take(IMAGE, small_camera.image(0))
+    second = one.take(IMAGE, small_camera.image(1))
+    assert [output.topic for output in outputs] == [*STARTS, *ONE_IMAGE, *ONE_IMAGE]
+    assert first.published == tuple(
+        (topic, small_camera.stamp(0)) for topic in [*STARTS, *ONE_IMAGE]
+    )
+    assert second.published == tuple((topic, small_camera.stamp(1)) for topic in ONE_IMAGE)
+    assert (first.source, first.stamp_ns) == (IMAGE, small_camera.stamp(0))
+    assert first.faults == first.warnings == ()
+    assert one.state.counts == {'received': 2, 'tracked': 2}
+    assert (one.state.status, one.state.modes, one.state.wants) == ('tracking', 2, '')
+    assert np.isclose(one.state.entropy, -(0.75 * np.log(0.75) + 0.25 * np.log(0.25)))
+    assert (one.state.misfit, one.state.evaluations) == (0.125, 7)
+
+
+def test_same_messages_same_bytes(session, outputs, small_camera):
+    for _ in range(2):
+        one = session()
+        one.take(CAMERA_INFO, small_camera.info())
+        for index in range(3):
+            one.take(IMAGE, small_camera.image(index))
+    half = len(outputs) // 2
+    assert outputs[:half] == outputs[half:]
+
+
+def test_raw_and_compressed_images_are_the_same_to_it(session, outputs, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    assert one.take(IMAGE, small_camera.compressed(0)).faults == ()
+    assert tracked(outputs) == [small_camera.stamp(0)]
+
+
+def test_what_nobody_wants_is_not_made(session, outputs, small_camera):
+    one = session(wanted=lambda topic: topic == 'markers')
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    assert [output.topic for output in outputs] == [*STARTS, 'markers']
+    assert one.state.counts['tracked'] == 1
+
+
+def test_images_wait_for_the_camera(session, outputs, small_camera):
+    one = session()
+    assert one.state.status == 'no camera'
+    for index in range(3):
+        handled = one.take(IMAGE, small_camera.image(index))
+        assert (handled.faults, handled.published) == ((), ())
+    handled = one.take(CAMERA_INFO, small_camera.info(3))
+    assert tracked(outputs) == [small_camera.stamp(i) for i in range(3)]
+    assert [stamp for topic, stamp in handled.published if topic == 'markers'] == tracked(outputs)
+
+
+def test_oldest_images_that_wait_are_dropped(session, outputs, small_camera):
+    one = session(queue_size=2)
+    handled = [one.take(IMAGE, small_camera.image(index)) for index in range(5)]
+    assert [len(h.faults) for h in handled] == [0, 0, 1, 1, 1]
+    assert [len(h.warnings) for h in handled] == [0, 0, 1, 0, 0]
+    assert 'waited for a calibrated camera_info' in handled[2].warnings[0]
+    one.take(CAMERA_INFO, small_camera.info())
+    assert tracked(outputs) == [small_camera.stamp(3), small_camera.stamp(4)]
+    assert one.state.counts == {'received': 5, 'tracked': 2, 'dropped': 3}
+    assert one.state.faults['camera_info'] == 3
+
+
+def test_uncalibrated_camera_is_told_once(session, outputs, small_camera):
+    one = session(queue_size=1)
+    handled = []
+    for index in range(3):
+        handled.append(one.take(CAMERA_INFO, small_camera.uncalibrated(index)))
+        handled.append(one.take(IMAGE, small_camera.image(index)))
+    warnings = [text for h in handled for text in h.warnings]
+    assert warnings == ['camera info: the camera is not calibrated (K is zero)']
+    # Three messages that are no calibration, and two images that waited in vain.
+    assert one.state.faults == {'camera_info': 5}
+    assert one.state.wants == 'a calibrated camera_info'
+    one.take(CAMERA_INFO, small_camera.info(3))
+    one.take(CAMERA_INFO, small_camera.uncalibrated(3))
+    one.take(IMAGE, small_camera.image(3))
+    assert tracked(outputs) == [small_camera.stamp(2), small_camera.stamp(3)]
+
+
+def test_time_that_stands_still_is_skipped(session, outputs, small_camera):
+    one = session(reset_on_time_jump=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    handled = [one.take(IMAGE, small_camera.image(index)) for index in (0, 0, 0, 1)]
+    assert [len(h.faults) for h in handled] == [0, 1, 1, 0]
+    assert [len(h.warnings) for h in handled] == [0, 1, 0, 0]
+    assert 'wanted stamps that increase' in handled[1].warnings[0]
+    assert tracked(outputs) == [small_camera.stamp(0), small_camera.stamp(1)]
+    assert one.state.faults == {'time stands still': 2}
+
+
+def test_time_that_jumps_back_is_skipped(session, outputs, small_camera, stub_tracker):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    handled = [one.take(IMAGE, small_camera.image(index)) for index in (2, 1, 0, 3)]
+    assert [len(h.faults) for h in handled] == [0, 1, 1, 0]
+    assert [len(h.warnings) for h in handled] == [0, 1, 0, 0]
+    assert 'reset_on_time_jump' in handled[1].warnings[0]
+    assert tracked(outputs) == [small_camera.stamp(2), small_camera.stamp(3)]
+    assert len(stub_tracker.made) == 1
+
+
+def test_time_that_jumps_back_starts_the_track_anew(session, outputs, small_camera, stub_tracker):
+    one = session(reset_on_time_jump=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    for _ in range(2):
+        for index in range(3):
+            handled = one.take(IMAGE, small_camera.image(index))
+            assert handled.faults == ()
+    assert len(stub_tracker.made) == 2
+    # A bag that is played twice gives the same twice.
+    half = len(outputs) // 2
+    assert outputs[:half] == outputs[half:]
+    assert [output.topic for output in outputs].count('body') == 2
+    assert one.state.faults == {'time jumps back': 1}
+    assert 'the track starts anew' in one.state.last_fault
+
+
+def test_images_that_wait_are_tracked_before_time_jumps(session, outputs, small_camera):
+    one = session(reset_on_time_jump=True, use_keypoints=True)
+    one.take(IMAGE, small_camera.image(5))
+    one.take(IMAGE, small_camera.image(4))
+    assert one.state.counts == {'received': 2, 'dropped': 1}
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(3))
+    assert tracked(outputs) == [small_camera.stamp(4)]
+    one.take(KEYPOINTS, small_camera.keypoints(3))
+    assert tracked(outputs) == [small_camera.stamp(4), small_camera.stamp(3)]
+
+
+def test_new_calibration_starts_the_track_anew(session, outputs, small_camera, stub_tracker):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info(0))
+    one.take(IMAGE, small_camera.image(0))
+    assert one.take(CAMERA_INFO, small_camera.info(1)).warnings == ()
+    other = replace(small_camera.camera, fx=70.0)
+    handled = one.take(CAMERA_INFO, small_camera.info(1, other))
+    assert handled.warnings == ('camera_info changes: the track starts anew',)
+    one.take(IMAGE, small_camera.image(1))
+    assert [tracker.camera for tracker in stub_tracker.made] == [small_camera.camera, other]
+    assert len(tracked(outputs)) == 2
+
+
+@pytest.mark.parametrize(
+    ('spoil', 'message'),
+    [
+        (lambda m: setattr(m, 'encoding', 'yuv9'), "encoding 'yuv9' is not known, wanted one of"),
+        (lambda m: setattr(m, 'width', 0), 'image has size 0x48, wanted at least one pixel'),
+        (lambda m: setattr(m, 'data', m.data[:-1]), 'image has 9215 bytes, wanted 9216'),
+        (lambda m: setattr(m, 'step', 10), 'image step is 10'),
+    ],
+)
+def test_bad_images_are_skipped(session, outputs, small_camera, spoil, message):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    handled = []
+    for index in range(3):
+        image = small_camera.image(index)
+        if index < 2:
+            spoil(image)
+        handled.append(one.take(IMAGE, image))
+    assert [len(h.faults) for h in handled] == [1, 1, 0]
+    assert [len(h.warnings) for h in handled] == [1, 0, 0]
+    assert message in handled[0].warnings[0]
+    assert tracked(outputs) == [small_camera.stamp(2)]
+    assert one.state.counts == {'received': 3, 'tracked': 1, 'skipped': 2}
+
+
+def test_damaged_pictures_are_skipped(session, outputs, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    for data in (b'', b'\xff\xd8\xff\xe0', b'GIF89a'):
+        image = small_camera.compressed(0)
+        image.data = np.frombuffer(data, np.uint8)
+        assert len(one.take(IMAGE, image).faults) == 1
+    assert one.take(IMAGE, small_camera.compressed(0)).faults == ()
+    assert tracked(outputs) == [small_camera.stamp(0)]
+
+
+def test_images_of_another_size_are_skipped(session, outputs, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    handled = one.take(IMAGE, small_camera.image(0, size=(32, 24)))
+    assert handled.faults == ('image has 32x24 pixels, wanted the 64x48 of camera_info',)
+    assert one.take(IMAGE, small_camera.image(1)).faults == ()
+    assert tracked(outputs) == [small_camera.stamp(1)]
+
+
+def test_messages_that_can_not_be_read_are_counted(session):
+    one = session()
+    first, second = (one.refuse(IMAGE, 'it breaks off') for _ in range(2))
+    assert first.warnings == first.faults == ('message of image can not be read: it breaks off',)
+    assert second.warnings == ()
+    assert one.state.faults == {'message': 2}
+
+
+# Keypoints.
+
+
+def seen(stub_tracker):
+    """Names of the keypoints that came with each image, None where there were none."""
+    return [
+        None if keypoints is None else keypoints.names
+        for tracker in stub_tracker.made
+        for _, keypoints in tracker.seen
+    ]
+
+
+def test_keypoints_are_not_used_unless_asked_for(session, small_camera, stub_tracker):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(KEYPOINTS, small_camera.keypoints(0))
+    one.take(IMAGE, small_camera.image(0))
+    assert seen(stub_tracker) == [None]
+
+
+@pytest.mark.parametrize('order', [(0, 1, 2, 3), (1, 0, 3, 2), (0, 2, 1, 3), (1, 3, 0, 2)])
+def test_keypoints_go_with_the_image_of_their_stamp(
+    session, small_camera, stub_tracker, order, outputs
+):
+    """In whatever order they come."""
+    inputs = [
+        (IMAGE, small_camera.image(0)),
+        (KEYPOINTS, small_camera.keypoints(0, names=('head',))),
+        (IMAGE, small_camera.image(1)),
+        (KEYPOINTS, small_camera.keypoints(1, names=('left_hip', 'right_hip'))),
+    ]
+    one = session(use_keypoints=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in order:
+        one.take(*inputs[index])
+    assert seen(stub_tracker) == [('head',), ('left_hip', 'right_hip')]
+    assert tracked(outputs) == [small_camera.stamp(0), small_camera.stamp(1)]
+
+
+def test_images_wait_for_keypoints(session, small_camera, stub_tracker, outputs):
+    one = session(use_keypoints=True, keypoints_timeout=0.25)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.take(IMAGE, small_camera.image(1))
+    assert tracked(outputs) == []
+    # None for 0: later ones have come. Nobody seen in 1: that is an answer, too.
+    one.take(KEYPOINTS, small_camera.keypoints(1, names=()))
+    assert tracked(outputs) == [small_camera.stamp(0), small_camera.stamp(1)]
+    # The detector is silent: an image waits until one comes that is over 0.25 s younger.
+    for index in (2, 3, 4):
+        one.take(IMAGE, small_camera.image(index))
+    assert len(tracked(outputs)) == 2
+    one.take(IMAGE, small_camera.image(5))
+    assert tracked(outputs)[2:] == [small_camera.stamp(2)]
+    # Too late for 2, and all that have waited since.
+    one.take(KEYPOINTS, small_camera.keypoints(2))
+    assert tracked(outputs)[3:] == []
+    one.take(KEYPOINTS, small_camera.keypoints(5))
+    assert tracked(outputs)[3:] == [small_camera.stamp(i) for i in (3, 4, 5)]
+    assert [names is None for names in seen(stub_tracker)] == [True] * 5 + [False]
+
+
+def test_last_keypoints_of_a_stamp_count(session, small_camera, stub_tracker):
+    one = session(use_keypoints=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(KEYPOINTS, small_camera.keypoints(0, names=('head',)))
+    one.take(KEYPOINTS, small_camera.keypoints(0, names=('left_hip',)))
+    one.take(IMAGE, small_camera.image(0))
+    assert seen(stub_tracker) == [('left_hip',)]
+
+
+def test_nan_is_not_seen(session, small_camera, stub_tracker):
+    one = session(use_keypoints=True, keypoint_sigma_px=2.0)
+    one.take(CAMERA_INFO, small_camera.info())
+    place = np.array([np.nan, 3.0])
+    handled = one.take(
+        KEYPOINTS, small_camera.keypoints(0, names=('head', 'left_hip'), u=place, v=place)
+    )
+    assert handled.faults == ()
+    one.take(IMAGE, small_camera.image(0))
+    ((_, keypoints),) = stub_tracker.made[0].seen
+    assert keypoints.names == ('left_hip',)
+    assert np.array_equal(keypoints.pixels, [[3.0, 3.0]])
+    assert np.array_equal(keypoints.covariances, [4.0 * np.eye(2)])
+    assert np.array_equal(keypoints.confidences, [1.0])
+
+
+@pytest.mark.parametrize(
+    ('fields', 'message'),
+    [
+        ({'u': [np.nan, 1.0], 'v': [1.0, 1.0]}, 'keypoint head lies at (nan, 1.0)'),
+        ({'u': [np.inf, 1.0], 'v': [1.0, 1.0]}, 'keypoint head lies at (inf, 1.0)'),
+        ({'u': [1.0], 'v': [1.0, 2.0]}, 'keypoints: u has 1 values, wanted 2'),
+        ({'covariance': [-1.0, 0, 0, -1, 1, 0, 0, 1]}, 'not positive definite'),
+        ({'confidence': [0.5, 1.5]}, 'confidence 1.5, wanted 0 to 1'),
+    ],
+)
+def test_bad_keypoints_are_told_and_not_used(
+    session, small_camera, stub_tracker, fields, message, outputs
+):
+    fields = {name: np.array(value) for name, value in fields.items()}
+    one = session(use_keypoints=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    warnings = []
+    for index in range(2):
+        keypoints = small_camera.keypoints(index, names=('head', 'left_hip'), **fields)
+        warnings += one.take(KEYPOINTS, keypoints).warnings
+        one.take(IMAGE, small_camera.image(index))
+    assert len(warnings) == 1
+    assert message in warnings[0]
+    assert seen(stub_tracker) == [None, None]
+    assert one.state.faults == {'keypoints': 2}
+
+
+def test_keypoints_that_the_body_does_not_have_are_left_out(session, small_camera, stub_tracker):
+    one = session(use_keypoints=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    handled = one.take(KEYPOINTS, small_camera.keypoints(0, names=('nose', 'head')))
+    assert handled.warnings == ("keypoints ['nose'] are no joints of the body",)
+    assert handled.faults == ()
+    one.take(IMAGE, small_camera.image(0))
+    assert seen(stub_tracker) == [('head',)]
+
+
+def test_keypoints_are_forgotten(session, small_camera):
+    one = session(use_keypoints=True)
+    for index in range(1000):
+        one.take(KEYPOINTS, small_camera.keypoints(index))
+    assert len(one._keypoints._content) <= 256
+
+
+# Starts.
+
+
+def test_predictions_start_a_track(session, small_camera, likelihoods, stub_tracker, outputs):
+    one = session(subject_file='', use_predictions=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    assert one.state.wants == 'a pose_prediction with components'
+    one.take(IMAGE, small_camera.image(0))
+    one.take(PREDICTION, likelihoods.nobody(0))
+    assert tracked(outputs) == []
+    one.take(PREDICTION, likelihoods.message(1, kind=MixtureKind.PREDICTION))
+    one.take(IMAGE, small_camera.image(1))
+    one.take(IMAGE, small_camera.image(2))
+    one.take(PREDICTION, likelihoods.nobody(2))
+    assert tracked(outputs) == [small_camera.stamp(1), small_camera.stamp(2)]
+    first, second = stub_tracker.made[0].predictions
+    assert np.array_equal(first.mixture.means, likelihoods.mixture(1).means)
+    assert np.allclose(
+        list(first.body.segment_lengths.values()), list(likelihoods.body.segment_lengths.values())
+    )
+    assert second is None
+
+
+def test_images_wait_for_predictions(session, small_camera, likelihoods, outputs):
+    one = session(use_predictions=True, prediction_timeout=0.15, queue_size=2)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.take(IMAGE, small_camera.image(1))
+    assert tracked(outputs) == []
+    one.take(IMAGE, small_camera.image(2))
+    assert tracked(outputs) == [small_camera.stamp(0)]
+    one.parameters = replace(one.parameters, prediction_timeout=60.0)
+    handled = one.take(IMAGE, small_camera.image(3))
+    (fault,) = handled.faults
+    assert 'no pose_prediction of its stamp has come, and queue_size is 2' in fault
+    one.take(PREDICTION, likelihoods.message(3))
+    assert tracked(outputs)[1:] == [small_camera.stamp(i) for i in (2, 3)]
+
+
+def test_predictions_are_not_used_unless_asked_for(session, small_camera, likelihoods, outputs):
+    one = session(subject_file='')
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(PREDICTION, likelihoods.message(0))
+    one.take(IMAGE, small_camera.image(0))
+    assert tracked(outputs) == []
+
+
+def test_bad_predictions_are_told_and_not_used(session, small_camera, likelihoods, outputs):
+    one = session(subject_file='', use_predictions=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    of_another = Likelihoods(load_body('human32')).message(0)
+    crooked = likelihoods.message(1)
+    crooked.components[0].mean = np.full(likelihoods.body.dimension, np.nan)
+    strange = likelihoods.message(2)
+    strange.segment_names[3] = 'tail'
+    for index, message, text in (
+        (0, of_another, 'human32'),
+        (1, crooked, 'finite'),
+        (2, strange, 'tail'),
+    ):
+        (fault,) = one.take(PREDICTION, message).faults
+        assert text in fault
+        one.take(IMAGE, small_camera.image(index))
+    assert tracked(outputs) == []
+    one.take(PREDICTION, likelihoods.message(4))
+    one.take(IMAGE, small_camera.image(4))
+    assert tracked(outputs) == [small_camera.stamp(4)]
+
+
+def test_waits_for_the_image_of_the_subject(session, outputs, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    assert one.take(IMAGE, small_camera.image(-1)).published == ()
+    assert one.state.status == 'waiting'
+    assert f'image of {small_camera.stamp(0)} ns or later' in one.state.wants
+    one.take(IMAGE, small_camera.image(0))
+    assert tracked(outputs) == [small_camera.stamp(0)]
+
+
+def test_joints_that_were_seen_long_before_are_told(session, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    (text,) = one.take(IMAGE, small_camera.image(30)).warnings
+    assert text == 'the joints that start the track were seen 3.0 s before its first image'
+
+
+def test_nothing_starts_without_a_subject(session, small_camera, outputs):
+    one = session(subject_file='')
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    assert tracked(outputs) == []
+    assert one.state.wants == 'subject_file, use_predictions, or ~/reset with a mixture'
+
+
+def test_settings_reach_the_tracker(session, small_camera, stub_tracker, background_file):
+    one = session(
+        max_hypotheses=3,
+        random_seed=5,
+        background_file=str(background_file),
+        **{'background.threshold': 9.0, 'likelihood.edges.weight': 2.0},
+    )
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    (tracker,) = stub_tracker.made
+    assert tracker.settings.max_hypotheses == 3
+    assert tracker.settings.likelihood.edges.weight == 2.0
+    assert tracker.seed == 5
+    assert tracker.background.settings.threshold == 9.0
+    assert tracker.background.frames == 1
+
+
+def test_background_is_learned_with_the_settings(session, small_camera, stub_tracker):
+    one = session(**{'background.threshold': 9.0})
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    (tracker,) = stub_tracker.made
+    assert tracker.background.settings.threshold == 9.0
+    assert tracker.background.frames == 0
+
+
+def test_changed_parameters_take_effect_with_the_next_track(session, small_camera, stub_tracker):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.parameters = with_values(one.parameters, {'max_hypotheses': 3})
+    one.take(IMAGE, small_camera.image(1))
+    one.restart()
+    one.take(IMAGE, small_camera.image(2))
+    assert [t.settings.max_hypotheses for t in stub_tracker.made] == [8, 3]
+
+
+def test_restarts_from_a_mixture(session, small_camera, stub_tracker, outputs, body):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    data = next(o.data for o in outputs if o.topic == 'pose_mixture')
+    mixture = deserialise(data, 'hmt_msgs/msg/PoseMixture')
+    one.restart(prepare_start(one.parameters, mixture, one.state.body))
+    one.take(IMAGE, small_camera.image(1))
+    start = stub_tracker.made[1]._start
+    assert np.array_equal(start.weights, [0.75, 0.25])
+    assert np.array_equal(start.means, pose_mixture_of(mixture).mixture.means)
+    assert stub_tracker.made[1].body is one.state.body
+
+
+def test_failed_start_is_told_and_not_tried_again(session, small_camera, stub_tracker, outputs):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    stub_tracker.fault = ValueError('no pose of the body\nexplains the keypoints')
+    (text,) = one.take(IMAGE, small_camera.image(0)).warnings
+    assert text.endswith('no pose of the body explains the keypoints')
+    stub_tracker.fault = None
+    one.take(IMAGE, small_camera.image(1))
+    assert tracked(outputs) == []
+    assert one.state.wants == 'subject_file, use_predictions, or ~/reset with a mixture'
+    one.restart()
+    one.take(IMAGE, small_camera.image(2))
+    assert tracked(outputs) == [small_camera.stamp(2)]
+
+
+def test_failed_estimate_skips_the_image(session, small_camera, stub_tracker, outputs):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    for index in (1, 2):
+        stub_tracker.fault = np.linalg.LinAlgError('Singular matrix')
+        assert (
+            'can not be tracked: Singular matrix'
+            in one.take(IMAGE, small_camera.image(index)).faults[0]
+        )
+    stub_tracker.fault = None
+    one.take(IMAGE, small_camera.image(3))
+    assert tracked(outputs) == [small_camera.stamp(0), small_camera.stamp(3)]
+    assert one.state.faults == {'estimate': 2}
+
+
+def test_background_of_another_camera(session, small_camera, background_file):
+    one = session(background_file=str(background_file))
+    wide = Camera(60.0, 60.0, 63.5, 23.5, 128, 48)
+    one.take(CAMERA_INFO, small_camera.info(0, wide))
+    (fault,) = one.take(IMAGE, small_camera.image(0, size=(128, 48))).faults
+    assert 'background.png has 64x48 pixels, but the camera gives 128x48' in fault
+
+
+def test_files_that_vanish_do_not_end_it(session, small_camera, subject_file, outputs):
+    one = session(reset_on_time_jump=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(1))
+    subject_file.unlink()
+    handled = one.take(IMAGE, small_camera.image(0))
+    assert 'can not be read' in handled.faults[0]
+    assert tracked(outputs) == [small_camera.stamp(1), small_camera.stamp(0)]
+
+
+def test_frames_are_named_by_the_image_or_the_camera(session, small_camera, outputs):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info(frame_id='sensor'))
+    one.take(IMAGE, small_camera.image(0, frame_id='lens'))
+    one.take(IMAGE, small_camera.image(1, frame_id=''))
+    one.take(CAMERA_INFO, small_camera.info(frame_id=''))
+    one.take(IMAGE, small_camera.image(2, frame_id=''))
+    frames = [
+        deserialise(o.data, 'hmt_msgs/msg/PoseMixture').header.frame_id
+        for o in outputs
+        if o.topic == 'pose_mixture'
+    ]
+    assert frames == ['lens', 'sensor', 'camera_optical_frame']
+
+
+def test_switches_of_the_outputs(session, small_camera, outputs):
+    one = session(overlay_modes=0, publish_tf=False)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    assert [o.topic for o in outputs] == [*STARTS, *MIXTURES, 'joint_states', 'markers']
+
+
+def test_urdf_comes_again_with_other_frames(session, small_camera, outputs):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.take(IMAGE, small_camera.image(1))
+    one.parameters = replace(one.parameters, frame_prefix='anna/')
+    one.take(IMAGE, small_camera.image(2))
+    one.take(IMAGE, small_camera.image(3, frame_id='other'))
+    texts = [
+        deserialise(o.data, 'std_msgs/msg/String').data
+        for o in outputs
+        if o.topic == 'human_description'
+    ]
+    links = [ET.fromstring(text).findall('link')[:2] for text in texts]
+    assert [[link.attrib['name'] for link in pair] for pair in links] == [
+        ['lens', 'pelvis.root_tx'],
+        ['lens', 'anna/pelvis.root_tx'],
+        ['other', 'anna/pelvis.root_tx'],
+    ]
+    assert [o.topic for o in outputs].count('body') == 1
+
+
+def test_dropped_images_are_counted(session, small_camera):
+    one = session()
+    one.count_dropped(3)
+    one.take(CAMERA_INFO, small_camera.info())
+    assert one.state.counts == {'received': 3, 'dropped': 3}
+
+
+def test_topics_are_those_of_the_architecture():
+    assert set(TOPICS) == {*STARTS, *ONE_IMAGE}
+    assert [topic for topic, published in TOPICS.items() if published.latched] == STARTS

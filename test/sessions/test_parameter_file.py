@@ -1,0 +1,89 @@
+from pathlib import Path
+
+import pytest
+import yaml
+
+from hmt_ros.sessions.declared_parameters import ParameterError, values_of, with_values
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.parameter_file import parameter_file_text, read_parameter_file, yaml_scalar
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml'
+
+
+def test_file_of_the_node_is_what_it_declares():
+    wanted = parameter_file_text('filter_node', FilterParameters())
+    assert CONFIG.read_text('utf-8') == wanted, (
+        'write it: python -m hmt_ros.sessions.filter_parameters > hmt_ros/config/filter_node.yaml'
+    )
+    assert max(len(line) for line in wanted.splitlines()) <= 100
+    assert read_parameter_file(CONFIG, 'filter_node') == values_of(FilterParameters())
+
+
+def test_other_values_survive(tmp_path):
+    changed = with_values(
+        FilterParameters(),
+        {'subject_file': "it's: #1", 'jump_probability': 1e-5, 'publish_tf': False,
+         'likelihood.self_intersection_sigma': float('inf')},
+    )  # fmt: skip
+    path = tmp_path / 'changed.yaml'
+    path.write_text(parameter_file_text('filter_node', changed))
+    assert with_values(FilterParameters(), read_parameter_file(path, 'filter_node')) == changed
+
+
+@pytest.mark.parametrize('value', [True, 3, 1e-7, 0.25, float('inf'), '', 'yes', "a'b", '1.5'])
+def test_scalars_keep_their_type(value):
+    read = yaml.safe_load(yaml_scalar(value))
+    assert read == value
+    assert type(read) is type(value)
+
+
+def test_sections_are_chosen_by_the_name_of_the_node(tmp_path):
+    path = tmp_path / 'launch.yaml'
+    path.write_text(
+        '/camera:\n  ros__parameters: {rate: 30}\n'
+        'filter_node:\n  ros__parameters:\n    max_hypotheses: 4\n'
+        '    background: {threshold: 0.5}\n'
+        '/**:\n  ros__parameters: {max_hypotheses: 6, likelihood.edges.weight: 3.0}\n'
+    )
+    assert read_parameter_file(path, 'filter_node') == {
+        'max_hypotheses': 4,
+        'likelihood.edges.weight': 3.0,
+        'background.threshold': 0.5,
+    }
+    assert read_parameter_file(path, 'other') == {
+        'max_hypotheses': 6,
+        'likelihood.edges.weight': 3.0,
+    }
+
+
+def test_files_without_sections(tmp_path):
+    path = tmp_path / 'plain.yaml'
+    path.write_text('max_hypotheses: 4\nbackground:\n  threshold: 0.5\n')
+    assert read_parameter_file(path, 'filter_node') == {
+        'max_hypotheses': 4,
+        'background.threshold': 0.5,
+    }
+    path.write_text('')
+    assert read_parameter_file(path, 'filter_node') == {}
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        (None, r'can not be read \(No such file'),
+        ('a: [', 'not YAML'),
+        ('- 1\n- 2\n', 'wanted parameters by name, saw list'),
+        ('/**:\n  ros__parameters: 3\n', 'wanted parameters by name, saw 3'),
+        ('/**:\n  ros__parameters: {}\nother: 3\n', "section 'other' has no ros__parameters"),
+        ('#' * 1_000_001, '1000001 bytes, wanted at most 1000000'),
+    ],
+)
+def test_files_that_are_none(tmp_path, text, message):
+    path = tmp_path / 'wrong.yaml'
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ParameterError, match=message) as caught:
+        read_parameter_file(path, 'filter_node')
+    assert str(path) in str(caught.value)
+    assert '\n' not in str(caught.value)

@@ -1,0 +1,379 @@
+"""The rules of the session that smooths."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.smoothed_messages import TOPICS
+from hmt_ros.sessions.smoother_parameters import SmootherDynamics, SmootherParameters
+from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
+from hmt_ros.smoothing import MixtureSmoother
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.headers import EARLIEST_NS, header_message, time_ns
+from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
+
+LAG = 2
+WINDOW = ['trajectory_mixture', 'trajectory_markers']
+FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
+
+RANDOM_WALK = SmootherDynamics()
+
+
+@pytest.fixture
+def session(outputs):
+    def make(wanted=lambda topic: True, dynamics=RANDOM_WALK, **values):
+        values.setdefault('fixed_lag', LAG)
+        parameters = with_values(SmootherParameters(dynamics=dynamics), values)
+        return SmootherSession(parameters, outputs.append, wanted)
+
+    return make
+
+
+def smoothed(outputs):
+    """Stamps of the poses that have become final."""
+    return [output.stamp_ns for output in outputs if output.topic == 'smoothed_pose_mixture']
+
+
+def read(outputs, topic):
+    kind = TOPICS[topic].msgtype
+    return [deserialise(output.data, kind) for output in outputs if output.topic == topic]
+
+
+def test_poses_become_final_after_the_lag(session, outputs, likelihoods):
+    one = session()
+    stamps = [likelihoods.stamp(index) for index in range(5)]
+    for index in range(5):
+        handled = one.take(MIXTURE, likelihoods.message(index))
+        assert (handled.source, handled.stamp_ns) == (MIXTURE, stamps[index])
+        assert handled.faults == handled.warnings == ()
+        wanted = [(topic, stamps[index]) for topic in WINDOW]
+        if index >= LAG:
+            wanted += [(topic, stamps[index - LAG]) for topic in FINAL]
+        assert list(handled.published) == wanted
+    assert smoothed(outputs) == stamps[:3]
+    assert one.state.counts == {'received': 5, 'smoothed': 5}
+    assert (one.state.status, one.state.wants, one.state.window) == ('smoothing', '', LAG + 1)
+    finished = one.finish()
+    assert (finished.source, finished.stamp_ns) == (FINISH, stamps[-1])
+    assert [topic for topic, _ in finished.published] == FINAL * LAG
+    assert smoothed(outputs) == stamps
+    assert one.state.status == 'waiting'
+    assert one.finish().published == ()
+
+
+def test_final_poses_are_mixtures_that_need_no_kinematics(session, outputs, likelihoods):
+    one = session(error_correlation=0.0)
+    for index in range(6):
+        one.take(MIXTURE, likelihoods.message(index))
+    one.finish()
+    body = likelihoods.body
+    states = read(outputs, 'smoothed_joint_states')
+    for index, message in enumerate(read(outputs, 'smoothed_pose_mixture')):
+        content = pose_mixture_of(message, body.dof_names, body.joint_names)
+        assert content.kind == MixtureKind.SMOOTHED
+        assert (content.stamp_ns, content.frame_id) == (likelihoods.stamp(index), 'lens')
+        mixture, seen = content.mixture, likelihoods.mixture(index)
+        np.testing.assert_allclose(
+            content.joint_positions, body.joint_positions(mixture.means), atol=1e-9
+        )
+        assert np.array_equal(states[index].position, mixture.means[0])
+        # Each image has a variance of 0.001, neighbours tell a little about it.
+        elbow = body.dof_names.index('left_elbow')
+        for mean, covariance in zip(mixture.means, mixture.covariances, strict=True):
+            assert np.abs(seen.means[:, elbow] - mean[elbow]).min() < 0.02
+            assert (np.diagonal(covariance) < 1e-3).all()
+        # The elbow that is the more probable all along gets more so with every image.
+        straight = mixture.means[:, elbow] < seen.means[:, elbow].mean()
+        assert 0.6 < mixture.weights[straight].sum() < 0.95
+
+
+def test_errors_that_last_make_mixtures_wider(session, outputs, likelihoods):
+    for time in (0.0, 0.1):
+        one = session(error_correlation=time, max_trajectories=1)
+        for index in range(3):
+            one.take(MIXTURE, likelihoods.message(index))
+    narrow, wide = (pose_mixture_of(m).mixture for m in read(outputs, 'smoothed_pose_mixture'))
+    np.testing.assert_allclose(wide.covariances * np.tanh(0.5), narrow.covariances, rtol=1e-9)
+    assert np.array_equal(wide.means, narrow.means)
+
+
+def test_trajectories(session, outputs, likelihoods):
+    one = session(max_trajectories=3)
+    for index in range(4):
+        one.take(MIXTURE, likelihoods.message(index))
+    *_, last = read(outputs, 'trajectory_mixture')
+    content = trajectory_mixture_of(last, likelihoods.body.dof_names)
+    assert content.stamps_ns == tuple(likelihoods.stamp(index) for index in (1, 2, 3))
+    assert content.final_until_ns == likelihoods.stamp(1)
+    assert content.means.shape == (3, 3, likelihoods.body.dimension)
+    assert content.marginal_covariances is None
+    one.parameters = with_values(one.parameters, {'publish_covariances': True})
+    one.take(MIXTURE, likelihoods.message(4))
+    *_, last = read(outputs, 'trajectory_mixture')
+    assert trajectory_mixture_of(last).marginal_covariances.shape == (3, 3, 37, 37)
+    (final,) = read(outputs, 'smoothed_pose_mixture')[-1:]
+    found = pose_mixture_of(final).mixture
+    covariances = trajectory_mixture_of(last).marginal_covariances[:, 0]
+    np.testing.assert_allclose(found.covariances, covariances, atol=1e-12)
+
+
+def test_same_messages_same_bytes(session, outputs, likelihoods):
+    for _ in range(2):
+        one = session()
+        for index in range(4):
+            one.take(MIXTURE, likelihoods.message(index))
+        one.finish()
+    half = len(outputs) // 2
+    assert half > 0
+    assert outputs[:half] == outputs[half:]
+
+
+def test_what_nobody_wants_is_not_made(session, outputs, likelihoods):
+    one = session(wanted=lambda topic: topic == 'smoothed_joint_states')
+    for index in range(4):
+        one.take(MIXTURE, likelihoods.message(index))
+    assert {output.topic for output in outputs} == {'smoothed_joint_states'}
+    assert one.state.counts['smoothed'] == 4
+
+
+def test_variational_smoothing_is_chosen_by_a_parameter(session, likelihoods):
+    one = session(method='variational', max_trajectories=2, fixed_lag=1)
+    one.take(MIXTURE, likelihoods.message(0))
+    assert type(one._window.smoother) is MixtureSmoother
+    assert one.state.counts['smoothed'] == 1
+
+
+def test_constant_velocity(session, outputs, likelihoods):
+    one = session(dynamics=SmootherDynamics(model='constant_velocity'))
+    for index in range(4):
+        assert one.take(MIXTURE, likelihoods.message(index)).faults == ()
+    assert len(smoothed(outputs)) == 2
+
+
+def test_mixtures_without_lengths_are_about_the_model(session, outputs, likelihoods):
+    one = session()
+    assert (one.state.status, one.state.wants) == ('waiting', 'likelihood_mixture')
+    tall = likelihoods.body.with_stature(1.9)
+    message = likelihoods.message(0, tall)
+    message.segment_names, message.segment_lengths = [], np.empty(0)
+    assert one.take(MIXTURE, message).faults == ()
+    one.finish()
+    (final,) = read(outputs, 'smoothed_pose_mixture')
+    content = pose_mixture_of(final)
+    assert content.segment_lengths == likelihoods.body.segment_lengths
+
+
+def test_a_new_body_begins_a_new_window(session, outputs, likelihoods):
+    one = session()
+    other = likelihoods.body.with_stature(1.6)
+    one.take(MIXTURE, likelihoods.message(0))
+    handled = one.take(MIXTURE, likelihoods.message(1, other))
+    assert handled.warnings == ('mixtures are about another body: a new window begins',)
+    assert smoothed(outputs) == [likelihoods.stamp(0)]
+    # The same body once more changes nothing.
+    assert one.take(MIXTURE, likelihoods.message(2, other)).warnings == ()
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(index) for index in range(3)]
+    for message, body in zip(
+        read(outputs, 'smoothed_pose_mixture'), (likelihoods.body, other, other), strict=True
+    ):
+        content = pose_mixture_of(message)
+        assert content.segment_lengths == body.segment_lengths
+        np.testing.assert_allclose(
+            content.joint_positions, body.joint_positions(content.mixture.means), atol=1e-9
+        )
+    windows = [trajectory_mixture_of(m) for m in read(outputs, 'trajectory_mixture')]
+    assert [len(window.stamps_ns) for window in windows] == [1, 1, 2]
+    assert windows[2].segment_lengths == other.segment_lengths
+
+
+def change(message, **fields):
+    for name, value in fields.items():
+        setattr(message, name, value)
+    return message
+
+
+def covariance_of(message, value):
+    d = len(message.dof_names)
+    message.components[0].covariance = np.full((d, d), value).reshape(-1)
+    return message
+
+
+def nan_in_mean(message):
+    mean = np.array(message.components[0].mean)
+    mean[3] = np.nan
+    message.components[0].mean = mean
+    return message
+
+
+BAD = {
+    'no components': (lambda m: change(m, components=[]), 'mixture has no components'),
+    'dof_names': (
+        lambda m: change(m, dof_names=[*m.dof_names[:-1], 'tail']),
+        "has 'tail' at 36, wanted ",
+    ),
+    'fewer dof_names': (
+        lambda m: change(m, dof_names=m.dof_names[:-1]),
+        'mean has 37 values, wanted 36',
+    ),
+    'not finite': (nan_in_mean, 'mixture: mean has values that are not finite'),
+    'not positive definite': (lambda m: covariance_of(m, 1.0), 'is not positive definite'),
+    'weight': (lambda m: change(m.components[0], weight=3.0) and m, 'weights that sum to 3.4'),
+    'body': (
+        lambda m: change(m, body_model='horse'),
+        "no body 'horse': wanted one of",
+    ),
+}
+
+
+@pytest.mark.parametrize('name', BAD)
+def test_bad_mixtures_are_skipped(session, outputs, likelihoods, name):
+    spoil, text = BAD[name]
+    one = session(longest_interval=1.0)
+    handled = []
+    for index in range(4):
+        message = likelihoods.message(index)
+        handled.append(one.take(MIXTURE, spoil(message) if index in (1, 2) else message))
+    assert [len(h.faults) for h in handled] == [0, 1, 1, 0]
+    assert [len(h.warnings) for h in handled] == [0, 1, 0, 0]
+    assert text in handled[1].warnings[0]
+    assert '\n' not in handled[1].warnings[0]
+    assert one.state.counts == {'received': 4, 'smoothed': 2, 'skipped': 2}
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(0), likelihoods.stamp(3)]
+
+
+def test_every_kind_of_fault_is_told_once(session, likelihoods):
+    one = session()
+    one.take(MIXTURE, likelihoods.message(0))
+    warnings = []
+    for _ in range(2):
+        for spoil, _ in BAD.values():
+            warnings += one.take(MIXTURE, spoil(likelihoods.message(1))).warnings
+        warnings += one.take(MIXTURE, likelihoods.message(0)).warnings
+    assert len(warnings) == len(BAD) + 1
+    assert one.state.faults['names'] == one.state.faults['covariances'] == 2
+    assert one.state.faults['time stands still'] == 2
+
+
+def test_time_that_stands_still_or_jumps_back_is_skipped(session, outputs, likelihoods):
+    one = session()
+    handled = [one.take(MIXTURE, likelihoods.message(index)) for index in (1, 1, 0, 2)]
+    assert [len(h.faults) for h in handled] == [0, 1, 1, 0]
+    assert 'wanted stamps that increase' in handled[1].warnings[0]
+    assert 'with reset_on_time_jump the window would start anew' in handled[2].warnings[0]
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(1), likelihoods.stamp(2)]
+
+
+def test_the_earliest_of_all_times(session, outputs, likelihoods):
+    """Nothing is before it, not even the end of what was final before."""
+    message = likelihoods.message(0)
+    header = header_message(likelihoods.messages, EARLIEST_NS, 'lens')
+    assert session().take(MIXTURE, replace(message, header=header)).faults == ()
+    (window,) = read(outputs, 'trajectory_mixture')
+    assert time_ns(window.final_until) == time_ns(window.stamps[0]) == EARLIEST_NS
+
+
+def test_time_that_jumps_back_begins_a_new_window(session, outputs, likelihoods):
+    one = session(reset_on_time_jump=True)
+    for _ in range(2):
+        for index in range(4):
+            assert one.take(MIXTURE, likelihoods.message(index)).faults == ()
+    one.finish()
+    # A bag that is played twice gives the same twice.
+    wanted = [likelihoods.stamp(index) for index in range(4)]
+    assert smoothed(outputs) == [*wanted, *wanted]
+    half = len(outputs) // 2
+    assert outputs[:half] == outputs[half:]
+    assert one.state.faults == {'time jumps back': 1}
+
+
+def test_gaps_are_bridged_and_told(session, outputs, likelihoods):
+    one = session(longest_interval=0.15)
+    handled = [one.take(MIXTURE, likelihoods.message(index)) for index in (0, 1, 6, 7, 14)]
+    assert [len(h.faults) for h in handled] == [0] * 5
+    assert [len(h.warnings) for h in handled] == [0, 0, 1, 0, 0]
+    assert 'no mixture for 0.50 s' in handled[2].warnings[0]
+    assert (one.state.gaps, one.state.longest_gap) == (2, pytest.approx(0.7))
+    one.finish()
+    assert len(smoothed(outputs)) == 5
+    # Neighbours that are far away tell less.
+    variances = [
+        pose_mixture_of(message).mixture.covariances[0].trace()
+        for message in read(outputs, 'smoothed_pose_mixture')
+    ]
+    assert variances[4] > variances[0]
+
+
+def test_posteriors_are_told_but_smoothed(session, likelihoods):
+    one = session()
+    message = likelihoods.message(0, kind=MixtureKind.POSTERIOR)
+    handled = one.take(MIXTURE, message)
+    assert handled.faults == ()
+    assert 'kind POSTERIOR, wanted LIKELIHOOD' in handled.warnings[0]
+    assert one.state.counts['smoothed'] == 1
+
+
+def test_bodies_that_are_not_known(session, likelihoods, tmp_path):
+    one = session()
+    handled = one.take(MIXTURE, change(likelihoods.message(0), body_model='horse'))
+    assert 'horse' in handled.faults[0]
+    assert 'body_model names it' in handled.faults[0]
+    one.parameters = with_values(one.parameters, {'body_model': 'human37'})
+    assert one.take(MIXTURE, change(likelihoods.message(0), body_model='horse')).faults == ()
+    strange = change(likelihoods.message(1), segment_names=['tail'], segment_lengths=np.ones(1))
+    assert 'tail' in one.take(MIXTURE, strange).faults[0]
+    assert one.state.faults == {'body': 2}
+    with pytest.raises(ValueError, match='body_model names it'):
+        session(body_model=str(tmp_path / 'none.yaml'))
+
+
+def test_a_span_is_smoothed_on_demand(session, likelihoods):
+    one = session(window_length=4, max_trajectories=4)
+    with pytest.raises(ValueError, match='none is'):
+        one.smooth_span()
+    for index in range(6):
+        one.take(MIXTURE, likelihoods.message(index))
+    content = trajectory_mixture_of(one.smooth_span(0, likelihoods.stamp(4)))
+    assert content.stamps_ns == tuple(likelihoods.stamp(index) for index in (2, 3, 4))
+    assert content.marginal_covariances.shape == (len(content.weights), 3, 37, 37)
+    assert content.body_model == 'human37'
+    newest = likelihoods.stamp(5)
+    assert trajectory_mixture_of(one.smooth_span(newest, 0)).stamps_ns == (newest,)
+    with pytest.raises(ValueError, match='are kept'):
+        one.smooth_span(likelihoods.stamp(7), likelihoods.stamp(9))
+    one.restart()
+    with pytest.raises(ValueError, match='none is'):
+        one.smooth_span()
+
+
+@pytest.mark.parametrize(
+    ('values', 'message'),
+    [
+        ({'method': 'guess'}, "method must be one of .* saw 'guess'"),
+        ({'dynamics.model': 'jump'}, 'there is no parameter dynamics.model'),
+        ({'max_trajectories': 0}, 'between 1 and 1024'),
+        ({'fixed_lag': 1.5}, 'whole number'),
+    ],
+)
+def test_parameters_that_can_not_be(values, message):
+    with pytest.raises(ValueError, match=message):
+        with_values(SmootherParameters(), values)
+
+
+def test_body_in_a_message_leads_to_no_file(session, likelihoods, tmp_path):
+    """Files are read where a parameter names them, not where somebody on the network does."""
+    path = tmp_path / 'own.yaml'
+    path.write_text('extends: human37\n')
+    message = change(likelihoods.message(0), body_model=str(path))
+    one = session()
+    (fault,) = one.take(MIXTURE, message).faults
+    assert 'own.yaml' in fault
+    assert 'wanted one of' in fault
+    assert one.state.status == 'waiting'
+    trusting = session(body_model=str(path))
+    assert trusting.take(MIXTURE, message).faults == ()

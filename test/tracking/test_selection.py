@@ -1,0 +1,194 @@
+"""Choice of hypotheses and inheritance of weights against plain loops and full enumeration."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.tracking.selection import choose_hypotheses
+from hmt_ros.tracking.weighting import inherited_log_weights
+
+SAME, CAP = 0.02, 0.3
+
+
+def distance(a, b, same=SAME, cap=CAP):
+    """Mean of the capped distances of the joints, less what counts as nothing."""
+    gaps = [min(float(np.sqrt(((p - q) ** 2).sum())), cap) for p, q in zip(a, b)]
+    return max(sum(gaps) / len(gaps) - same, 0.0)
+
+
+def objective(joints, weights, chosen):
+    """Expected distance from a hypothesis to the nearest of the chosen; CAP where there is none."""
+    nearest = [min([CAP] + [distance(x, joints[c]) for c in chosen]) for x in joints]
+    return float(np.dot(weights, nearest))
+
+
+def greedy(joints, weights, count):
+    """Heaviest first, then what lessens the objective most, while anything does."""
+    chosen = [int(np.argmax(weights))]
+    while len(chosen) < count:
+        now = objective(joints, weights, chosen)
+        values = [objective(joints, weights, [*chosen, c]) for c in range(len(joints))]
+        if now - min(values) <= 1e-13:
+            break
+        chosen.append(int(np.argmin(values)))
+    return chosen
+
+
+def hypotheses(n, seed, spread=0.15, joints=4):
+    rng = np.random.default_rng(seed)
+    return spread * rng.normal(size=(n, joints, 3)), rng.normal(0, 1.5, n)
+
+
+def shares(log_weights):
+    return np.exp(log_weights - logsumexp(log_weights))
+
+
+@pytest.mark.parametrize('seed', range(6))
+@pytest.mark.parametrize('count', [1, 3, 6])
+def test_choice_is_greedy_on_the_expected_distance(seed, count):
+    joints, log_weights = hypotheses(14, seed)
+    kept = choose_hypotheses(joints, log_weights, count)
+    assert list(kept.chosen) == greedy(joints, shares(log_weights), count)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_choice_is_near_the_best_of_all_subsets(seed):
+    """Given the first, three more gain at least 1 - 1/e of what the best three would."""
+    joints, log_weights = hypotheses(10, seed)
+    weights = shares(log_weights)
+    kept = choose_hypotheses(joints, log_weights, 4)
+    first = int(np.argmax(weights))
+    base = objective(joints, weights, [first])
+    best = min(
+        objective(joints, weights, [first, *more]) for more in itertools.combinations(range(10), 3)
+    )
+    found = objective(joints, weights, list(kept.chosen))
+    assert best <= found + 1e-15
+    assert base - found >= (1 - np.exp(-1)) * (base - best)
+
+
+def test_well_separated_groups_are_each_kept_once():
+    """Three heaps a metre apart: one of each, and their weights summed."""
+    rng = np.random.default_rng(0)
+    heap = np.repeat(np.arange(3), 7)
+    joints = np.zeros((21, 5, 3))
+    joints[..., 0] = heap[:, None]
+    joints += 0.002 * rng.normal(size=joints.shape)
+    log_weights = rng.normal(0, 2.0, 21)
+    kept = choose_hypotheses(joints, log_weights, 8)
+    assert sorted(heap[kept.chosen]) == [0, 1, 2]
+    assert np.array_equal(heap[kept.chosen][kept.owner], heap)
+    for k, chosen in enumerate(kept.chosen):
+        assert kept.log_weights[k] == pytest.approx(logsumexp(log_weights[heap == heap[chosen]]))
+
+
+def test_copies_are_not_kept():
+    joints, log_weights = hypotheses(5, 1)
+    assert len(choose_hypotheses(joints, log_weights, 5).chosen) == 5
+    copies = np.concatenate([joints] * 4)
+    rng = np.random.default_rng(2)
+    copies += 0.004 * rng.normal(size=copies.shape)
+    kept = choose_hypotheses(copies, np.tile(log_weights, 4), 20)
+    assert sorted(kept.chosen % 5) == [0, 1, 2, 3, 4]
+    wanted = log_weights[kept.chosen % 5] + np.log(4)
+    assert np.allclose(kept.log_weights, wanted, atol=1e-12)
+
+
+def test_a_wider_tolerance_merges_more():
+    joints, log_weights = hypotheses(30, 3, spread=0.05)
+    counts = [len(choose_hypotheses(joints, log_weights, 30, same=s).chosen) for s in (0, 0.1, 0.5)]
+    assert counts[0] == 30
+    assert counts[0] > counts[1] > counts[2] == 1
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_weights_go_to_the_nearest_that_is_kept(seed):
+    joints, log_weights = hypotheses(25, seed, spread=0.1)
+    kept = choose_hypotheses(joints, log_weights, 5)
+    for i, owner in enumerate(kept.owner):
+        gaps = [distance(joints[i], joints[c]) for c in kept.chosen]
+        assert gaps[owner] == pytest.approx(min(min(gaps), CAP), abs=1e-12)
+    assert np.array_equal(kept.owner[kept.chosen], np.arange(5))
+    for k in range(5):
+        assert kept.log_weights[k] == pytest.approx(logsumexp(log_weights[kept.owner == k]))
+    assert logsumexp(kept.log_weights) == pytest.approx(logsumexp(log_weights))
+
+
+def test_scale_of_weights_does_not_matter():
+    joints, log_weights = hypotheses(20, 4)
+    first = choose_hypotheses(joints, log_weights, 6)
+    second = choose_hypotheses(joints, log_weights - 5000.0, 6)
+    assert np.array_equal(first.chosen, second.chosen)
+    assert np.allclose(first.log_weights, second.log_weights + 5000.0, atol=1e-9)
+
+
+def test_an_unlikely_hypothesis_far_away_beats_a_likely_one_nearby():
+    """Three in a row: two thirds of the weight are 3 cm from the heaviest, the rest 30 cm."""
+    joints = np.zeros((3, 2, 3))
+    joints[1, :, 0], joints[2, :, 0] = 0.03, 0.30
+    weights = np.array([0.5, 0.4, 0.1])
+    kept = choose_hypotheses(joints, np.log(weights), 2)
+    assert list(kept.chosen) == [0, 2]
+    assert np.allclose(np.exp(kept.log_weights), [0.9, 0.1])
+
+
+def gaussians(n, d, seed):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(n, d, d))
+    return rng.normal(0, 2.0, (n, d)), root @ root.transpose(0, 2, 1) + 0.3 * np.eye(d)
+
+
+def bhattacharyya(m1, s1, m2, s2):
+    middle = (s1 + s2) / 2
+    gap = m1 - m2
+    dets = [np.linalg.det(s) for s in (middle, s1, s2)]
+    value = gap @ np.linalg.inv(middle) @ gap / 8
+    return value + 0.5 * np.log(dets[0] / np.sqrt(dets[1] * dets[2]))
+
+
+@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize(('modes', 'before'), [(5, 5), (3, 6), (7, 3), (1, 1)])
+def test_inherited_weights(seed, modes, before):
+    means, covariances = gaussians(modes, 3, seed)
+    rng = np.random.default_rng(seed)
+    components = gaussians(before, 3, 50 + seed)
+    mixture = GaussianMixture(3.0 * rng.dirichlet(np.ones(before)), *components)
+    order = rng.permutation(modes)
+    found = inherited_log_weights(means, covariances, order, mixture)
+    weights = mixture.weights / mixture.weights.sum()
+    free = set(range(before))
+    wanted = np.full(modes, weights.min())
+    for k in order:
+        if free:
+            nearest = min(
+                free,
+                key=lambda j, k=k: bhattacharyya(
+                    means[k], covariances[k], mixture.means[j], mixture.covariances[j]
+                ),
+            )
+            free.remove(nearest)
+            wanted[k] = weights[nearest]
+    assert np.allclose(np.exp(found), wanted, rtol=1e-12)
+
+
+def test_modes_that_did_not_move_keep_their_weights():
+    means, covariances = gaussians(6, 4, 9)
+    weights = np.array([0.3, 0.25, 0.2, 0.15, 0.07, 0.03])
+    mixture = GaussianMixture(weights, means, covariances)
+    shuffled = np.array([4, 2, 0, 5, 1, 3])
+    found = inherited_log_weights(means[shuffled], covariances[shuffled], np.arange(6), mixture)
+    assert np.allclose(np.exp(found), weights[shuffled], rtol=1e-12)
+
+
+def test_components_without_weight_stay_finite():
+    means, covariances = gaussians(2, 2, 10)
+    mixture = GaussianMixture(np.array([1.0, 0.0]), means, covariances)
+    found = inherited_log_weights(means, covariances, np.arange(2), mixture)
+    assert found[0] == 0.0
+    assert np.isfinite(found[1])
+    assert found[1] < -600
