@@ -99,49 +99,11 @@ def rehang_chain(
     ends = links if image_of is None else chain_links(skeleton, image_of)
     if len(ends.lengths) != len(links.lengths):
         raise ValueError(f'chains {chain} and {image_of} differ in their number of segments')
-    return _hung(body, new, links, _ends(seen, ends), slack)
-
-
-def chain_points(body: Body, poses: ArrayLike, chain: str) -> Array:
-    """The start of a chain of K links and the ends of its links, (N, K + 1, 3) m.
-
-    Raises:
-        KeyError, ValueError: as `enumerate_flips`.
-    """
-    links = chain_links(body.skeleton, chain)
-    frames = forward(body.skeleton, np.array(poses, dtype=np.float64, ndmin=2))
-    root = frames.origins[links.segments[:1]]
-    points: Array = np.concatenate([root, _ends(frames, links)]).transpose(2, 0, 1)
-    return points
-
-
-def place_chain(
-    body: Body, poses: ArrayLike, chain: str, points: ArrayLike, *, slack: float = 0.1
-) -> tuple[Array, Index]:
-    """Poses whose chain has a given image, in all ways that lengths and limits allow.
-
-    Args:
-        body: the body.
-        poses: (N, d) whose trunk the chain hangs on.
-        chain: name of a chain with K links.
-        points: (N, K, 3) on the rays of the ends of the links. In the first solution the ends lie
-            before or behind their parents as these points do.
-        slack: a ray that misses its sphere by less than this touches it, m.
-
-    Returns:
-        poses (M, d), equal to the given ones outside the chain, and the index (M,) of each.
-
-    Raises:
-        KeyError, ValueError: as `enumerate_flips`, and points of another shape.
-    """
-    links = chain_links(body.skeleton, chain)
-    q = np.array(poses, dtype=np.float64, ndmin=2, order='C')
-    wanted = np.asarray(points, dtype=np.float64)
-    shape = (len(q), len(links.lengths), 3)
-    if wanted.shape != shape:
-        raise ValueError(f'chain {chain} wants points of shape {shape}, saw {wanted.shape}')
-    targets = np.ascontiguousarray(wanted.transpose(1, 2, 0))
-    return _hung(body, q, links, targets, slack)
+    angles, valid = _grown(forward(skeleton, new), new, links, _ends(seen, ends), slack)
+    parents, choice = np.nonzero(valid)
+    result = new[parents]
+    result[:, links.dofs] = angles[parents, choice]
+    return result, parents
 
 
 def flip_counts(body: Body, poses: ArrayLike, chain: str) -> Index:
@@ -165,17 +127,6 @@ def _ends(frames: Frames, chain: ChainLinks) -> Array:
     lengths = chain.lengths[:, None, None]
     ends: Array = frames.origins[chain.segments] - lengths * frames.columns[chain.segments, 2]
     return ends
-
-
-def _hung(
-    body: Body, poses: Array, links: ChainLinks, targets: Array, slack: float
-) -> tuple[Array, Index]:
-    """Poses (M, d) whose chain is seen at targets (K, 3, N), and the index (M,) of each."""
-    angles, valid = _grown(forward(body.skeleton, poses), poses, links, targets, slack)
-    parents, choice = np.nonzero(valid)
-    result = poses[parents]
-    result[:, links.dofs] = angles[parents, choice]
-    return result, parents
 
 
 def _grown(

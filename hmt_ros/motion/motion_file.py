@@ -84,12 +84,6 @@ class Motion:
     def __len__(self) -> int:
         return len(self.poses)
 
-    @property
-    def stamps(self) -> Array:
-        """Seconds since the first frame, (T,)."""
-        result: Array = np.arange(len(self.poses)) / self.fps
-        return result
-
     def joint_positions(self, names: Sequence[str] | None = None) -> Array:
         """Positions (T, J, 3) of some or of all joints in the world frame (z up), m.
 
