@@ -374,7 +374,7 @@ def test_a_span_is_smoothed_on_demand(running, likelihoods):
     [
         ({'method': 'guess'}, "method must be one of .* saw 'guess'"),
         ({'dynamics.model': 'jump'}, "dynamics.model must be one of .* saw 'jump'"),
-        ({'dynamics.hip': 0.0}, 'dynamics.hip must be positive'),
+        ({'dynamics.velocity_time': 0.0}, 'dynamics.velocity_time'),
         ({'max_trajectories': 0}, 'between 1 and 1024'),
         ({'fixed_lag': 1.5}, 'whole number'),
     ],
