@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 
 DOFS = 32
 STEP = 0.05
+# Greatest deviation of a mode over its least: the ratio of eigenvalues of one image is its square.
+SPREAD = 70.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +81,7 @@ def waving(
             if alike:
                 rng.bit_generator.state = shared
             turned = np.linalg.qr(basis + 0.1 * rng.normal(size=(DOFS, DOFS)))[0]
-            sigma = 0.01 * np.exp(np.linspace(0.0, np.log(70.0) / 1.0, DOFS)) ** 1.0
+            sigma = 0.01 * np.exp(np.linspace(0.0, np.log(SPREAD), DOFS))
             covariances.append((turned * sigma**2) @ turned.T)
             means.append(centre + turned @ (0.25 * sigma * rng.normal(size=DOFS)))
         weights = rng.dirichlet(np.full(len(signs), 8.0))

@@ -272,7 +272,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         found = result['relations']
         ratios = ', '.join(f'{k}: {v:.0f}' for k, v in found['eigenvalue_ratio'].items())
         rows += [
-            ['eigenvalue ratio, by frames', ratios, 'falls'],
+            ['eigenvalue ratio by frames (generated: 4900)', ratios, 'falls'],
             ['difference of paths and optima', f'{found["difference_deg"]:.1f} deg', ''],
             ['roughness of optima over paths', f'{found["roughness_ratio"]:.2f}', 'below 1'],
             ['change of -log likelihood', f'{100 * found["log_likelihood_change"]:+.1f} %', '10'],

@@ -132,7 +132,7 @@ def eigenvalues(sequence: Waving, states: Array, frames: int) -> Array:
 
 
 def eigenvalue_ratio(values: Array) -> float:
-    """Largest over smallest."""
+    """Largest over smallest; of one image it is the constant that its modes are generated with."""
     return float(values[0] / values[-1])
 
 

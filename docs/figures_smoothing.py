@@ -80,7 +80,8 @@ def draw_eigenvalues(axes: Axes, found: Analysis) -> None:
         ratio = values[0] / values[-1]
         axes.semilogy(share, values, color=colour, label=f'{frames} ({ratio:.0f})')
     axes.legend(title='images (ratio)', frameon=False)
-    axes.set(xlabel='rank / size', ylabel='1 / rad²', title='Eigenvalues of the Hessian')
+    # The ratio of one image is the generator's constant, that of `arm_waving.SPREAD` squared.
+    axes.set(xlabel='rank / size', ylabel='1 / rad²', title='Eigenvalues (1 image: as generated)')
 
 
 def draw_angles(axes: np.ndarray, found: Analysis) -> None:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from fnmatch import fnmatch
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -251,3 +252,27 @@ def test_data_files_are_installed() -> None:
             for path in (ROOT / package).rglob(f'*.{suffix}')
         }
         assert {path for path in sources if not (site / path).is_file()} == set()
+
+
+HEADS = {
+    'smoothing/variational_mixture.py': '    F(q) = KL(q || p(X | R)) - log p(R) =',
+    'smoothing/mode_sequence.py': '    w_k N(X; M_k, P_k^-1),',
+    'smoothing/sliding_window.py': "    w_i w_k N(x; A m_i, A S_i A' + Q) N(C x; mu_k, S_k)",
+    'smoothing/trajectory_refinement.py': '    E(X) = -log p(x_1) - sum_t log p(x_t | x_{t-1})',
+    'inference/trust_region.py': '    rho = (E(x) - E(x + s)) / (m(0) - m(s))',
+    'inference/reduction.py': '    w = sum_i w_i,   m = sum_i w_i m_i / w,',
+}
+
+
+def test_module_heads_keep_their_equations_on_lines_of_their_own() -> None:
+    for name, equation in HEADS.items():
+        head = ast.get_docstring(ast.parse((ROOT / 'hmt_ros' / name).read_text('utf-8')))
+        assert head is not None
+        assert [line for line in head.splitlines() if line.startswith(equation)], name
+        for block in head.split('\n\n'):
+            lines = block.splitlines()
+            if any(line.startswith((' ', '- ')) for line in lines):
+                continue
+            # Text that is filled: a formatter that wraps again leaves words on lines of their own.
+            for line, following in pairwise(lines):
+                assert len(line) + len(following.split()[0]) >= 100, f'{name}: {line}'

@@ -22,28 +22,6 @@ from hmt_ros.inference.mixture import GaussianMixture
 Array = NDArray[np.float64]
 
 
-def highest_density_levels(
-    mixture: GaussianMixture, points: ArrayLike, samples: ArrayLike
-) -> tuple[Array, Array]:
-    """Levels (N,) and log densities (N,) of points (N, d).
-
-    Args:
-        mixture: the density.
-        points: known values.
-        samples: (S, d) drawn from the density, `stratified_samples` for example; a level has the
-            standard error sqrt(level (1 - level) / S), and coverages that are averaged over many
-            densities are free of bias for any S.
-
-    Raises:
-        ValueError: points or samples of another dimension, covariances that are not positive
-            definite.
-    """
-    points = np.asarray(points, dtype=np.float64)
-    at_points = mixture.log_density(points)
-    at_samples = mixture.log_density(samples)
-    return levels_of(at_points, at_samples), at_points
-
-
 def levels_of(at_points: Array, at_samples: Array) -> Array:
     """Share of samples whose density is above that of each point.
 

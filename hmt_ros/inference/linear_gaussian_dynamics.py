@@ -225,15 +225,6 @@ class LinearGaussianDynamics:
             return means, covariances + q
         return means @ a.T, a @ covariances @ a.T + q
 
-    def transitions(self, intervals: Array) -> tuple[Array, Array]:
-        """A and Q, both (T-1, n, n), over intervals (T-1,) in seconds."""
-        different, which = np.unique(intervals, return_inverse=True)
-        n = self.state_dimension
-        a, q = np.empty((2, len(different), n, n))
-        for i, interval in enumerate(different):
-            a[i], q[i] = self.transition(float(interval))
-        return a[which], q[which]
-
     def prior(self, intervals: Array, *, initial: bool = True) -> TrajectoryPrior:
         """The density of trajectories with these intervals (T-1,) between their states, s.
 

@@ -35,7 +35,7 @@ from hmt_ros.sessions.smoothed_messages import (
 )
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow
-from hmt_ros.smoothing.path_smoother import PathSmoother
+from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of

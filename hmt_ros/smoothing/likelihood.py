@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numba import njit
@@ -18,6 +18,10 @@ from scipy.linalg.lapack import dtrtri
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy, EnergyTerm
 from hmt_ros.inference.exact_sums import dot
+
+if TYPE_CHECKING:
+    from hmt_ros.image.likelihood import ImageLikelihood
+    from hmt_ros.image.observation import Observation
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -168,6 +172,36 @@ class WindowLikelihood:
             value[at], gradient[at, :d] = found.value, found.gradient
             if hessian is not None:
                 hessian[at, :d, :d] = found.hessian
+        return Energy(value, gradient, hessian)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSequence:
+    """p(r_t | x_t) of the images themselves, the likelihood that the tracker minimises.
+
+    Attributes:
+        likelihood: the terms and the soft prior.
+        observations: of the T images.
+    """
+
+    likelihood: ImageLikelihood
+    observations: Sequence[Observation]
+
+    @property
+    def times(self) -> int:
+        """T."""
+        return len(self.observations)
+
+    def energy(
+        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `EnergyTerm`; the rows are times, the Hessian is that of Gauss-Newton."""
+        n, d = x.shape
+        value, gradient, hessian = np.empty(n), np.empty((n, d)), np.empty((n, d, d))
+        for t in np.unique(rows):
+            at = rows == t
+            found = self.likelihood.given(self.observations[t]).energy(x[at])
+            value[at], gradient[at], hessian[at] = found.value, *found.derivatives()
         return Energy(value, gradient, hessian)
 
 

@@ -15,8 +15,7 @@ from hmt_ros.inference.block_tridiagonal import BlockCholesky
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.smoothing.likelihood import LikelihoodPart, SequenceLikelihood, check_mixtures
-from hmt_ros.smoothing.mode_sequence import ModeSequence
-from hmt_ros.smoothing.path_gaussians import path_gaussians
+from hmt_ros.smoothing.mode_sequence import ModeSequence, path_gaussians
 from hmt_ros.smoothing.paths import Paths
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states, refine
@@ -58,6 +57,11 @@ class Candidates:
     weights: Array
     states: Array
     factors: tuple[BlockCholesky, ...]
+
+    @property
+    def inflation(self) -> Array:
+        """(M,) ones."""
+        return np.ones(len(self.weights))
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,26 +285,36 @@ class MixtureSmoother:
         """The mixture that is closest to the posterior, from the candidates on."""
         iterations = self.max_iterations if self.adapt else 0
         found = self._descended(candidates, prior, likelihood, seed, iterations)
+        result = self._mixture(found, prior, likelihood, stamps_ns)
+        return replace(result, free_energy=found.free_energy, free_energy_fresh=found.fresh)
+
+    def _mixture(
+        self,
+        found: VariationalMixture | Candidates,
+        prior: TrajectoryPrior,
+        likelihood: SequenceLikelihood,
+        stamps_ns: Sequence[int] | None,
+    ) -> TrajectoryMixture:
+        """The components, heaviest first, with their log joint densities."""
         low, high = self._limits()
-        count, times, _ = candidates.states.shape
         order = np.argsort(-found.weights, kind='stable')
-        energies, _ = prior.energy(found.states)
+        states = found.states[order]
+        count, times, _ = states.shape
+        energies, _ = prior.energy(states)
         at = np.tile(np.arange(times), count)
-        poses = found.states[:, :, : prior.dimension].reshape(-1, prior.dimension)
-        energy = likelihood.energy(poses, at, derivatives=Derivatives.NONE)
-        observed = energy.value.reshape(count, times).sum(1)
+        poses = states[:, :, : prior.dimension].reshape(-1, prior.dimension)
+        seen = likelihood.energy(poses, at, derivatives=Derivatives.NONE).value
         d = self.dynamics.dimension
         return TrajectoryMixture(
             weights=found.weights[order],
-            states=found.states[order],
+            states=states,
             factors=tuple(found.factors[i] for i in order),
             inflation=found.inflation[order],
-            log_joint=-(energies + observed)[order],
-            free_energy=found.free_energy,
+            log_joint=-(energies + seen.reshape(count, times).sum(1)),
+            free_energy=np.empty(0),
             dimension=d,
             stamps_ns=None if stamps_ns is None else tuple(int(stamp) for stamp in stamps_ns),
             identities=tuple(range(count)),
-            free_energy_fresh=found.fresh,
             lower=low[:d],
             upper=high[:d],
         )
@@ -312,6 +326,39 @@ class MixtureSmoother:
             self.dynamics.dimension,
             self.dynamics.state_dimension,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class PathSmoother(MixtureSmoother):
+    """A smoother in closed form, for windows that have to keep up with a camera.
+
+    The posterior of a sequence of Gaussian mixtures is a Gaussian mixture with a component for
+    every path through their modes. The components of the most probable paths that differ, with the
+    weights that they have in the posterior, are the result; neither optima nor the free energy are
+    descended to, which costs fifty times as much. Modes that overlap share their mass among many
+    paths and should be merged before (`reduction.merged_if_close`).
+
+    `adapt`, `start` and `max_iterations` have no meaning here, nor has `seed`; the result has no
+    free energy. Means beyond the limits are moved onto them.
+    """
+
+    def smooth_sequence(
+        self,
+        sequence: ModeSequence,
+        seed: int = 0,
+        stamps_ns: Sequence[int] | None = None,
+        observation: SequenceLikelihood | None = None,
+    ) -> TrajectoryMixture:
+        """As `MixtureSmoother.smooth_sequence`.
+
+        Raises:
+            ValueError: another observation than the mixtures.
+        """
+        if observation is not None:
+            raise ValueError('paths are smoothed by the mixtures alone, without an observation')
+        found = self._on_paths(sequence, self.paths(sequence))
+        result = self._mixture(found, sequence.prior, sequence.likelihood, stamps_ns)
+        return self.as_evidence(result, sequence.intervals)
 
 
 def with_refined_parts(

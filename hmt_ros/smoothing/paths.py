@@ -133,21 +133,6 @@ def _ranks_at(network: EmbeddedNetwork, t: int, k: int) -> int:
     return ranks
 
 
-def node_probabilities(network: EmbeddedNetwork) -> tuple[Array, ...]:
-    """Probability (K_t,) of each node at each time under all paths, by sum-product."""
-    forward = [network.nodes[0]]
-    for links, nodes in zip(network.links, network.nodes[1:]):
-        forward.append(logsumexp(forward[-1][:, None] + links, axis=0) + nodes)
-    backward = [np.zeros(len(network.nodes[-1]))]
-    for links, nodes in zip(network.links[::-1], network.nodes[:0:-1]):
-        backward.append(logsumexp(links + nodes + backward[-1], axis=1))
-    result = []
-    for ahead, behind in zip(forward, backward[::-1]):
-        log = ahead + behind
-        result.append(np.exp(log - logsumexp(log)))
-    return tuple(result)
-
-
 def visiting_probabilities(network: EmbeddedNetwork, paths: Paths) -> tuple[Array, ...]:
     """How probably the paths from each source visit each node (VMS fig. 2), T arrays (K_1, K_t).
 

@@ -1,11 +1,14 @@
 """Smoothing while observations arrive: a window of fixed lag.
 
 The window holds the newest poses. What came before it is a density of its first state, a mixture
-that
-is filtered in closed form: every component is predicted by the dynamics and multiplied with every
-mode of the likelihood. The window is smoothed with that density in the place of the first
-likelihood, so that a new image costs the same however long the sequence is. A pose is final once so
-many later ones have been seen as the lag says.
+that is filtered in closed form. Of all pairs of its components i and modes k of the likelihood the
+next one has the component
+
+    w_i w_k N(x; A m_i, A S_i A' + Q) N(C x; mu_k, S_k)
+
+where C takes the pose out of the state. The window is smoothed with that density in the place of
+the first likelihood, so that a new image costs the same however long the sequence is. A pose is
+final once as many later ones have been seen as the lag says.
 """
 
 from __future__ import annotations

@@ -111,13 +111,6 @@ class TrajectoryMixture:
             result[i] = scale**2 * factor.inverse_blocks()[0][:, :d, :d]
         return result
 
-    def neighbour_covariances(self, component: int) -> Array:
-        """Cov(x_{t+1}, x_t) in a component, inflation included, (T-1, d, d)."""
-        d = self.dimension
-        both = self.factors[component].inverse_blocks()[1][:, :d, :d]
-        result: Array = self.inflation[component] ** 2 * both
-        return result
-
     def marginal(self, t: int) -> GaussianMixture:
         """The density of the pose at index t, a component for each trajectory."""
         return GaussianMixture(self.weights, self.means[:, t], self.marginal_covariances[:, t])

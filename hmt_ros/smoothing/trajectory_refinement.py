@@ -1,13 +1,16 @@
-"""Trajectories of locally greatest posterior probability (VMS 5).
+"""Trajectories of locally greatest posterior probability (VMS 5, with its numbers).
 
-    E(X) = -log p(x_1) - sum log p(x_t | x_{t-1}) - sum log p(r_t | x_t),   lower <= x_t <= upper
+    E(X) = -log p(x_1) - sum_t log p(x_t | x_{t-1}) - sum_t log p(r_t | x_t)       -log of (1)
 
-is minimised from many starts by damped Newton steps on the block-tridiagonal system. The Hessian of
-an
-observation is indefinite between modes: where the matrix can not be factorised, the step is made
-with the positive part of the curvature, and where that does not descend either, the damping grows.
-Variables that rest on a limit with a gradient pushing outwards are held there; a step that crosses
-limits is projected onto the box.
+is minimised from many starts by damped Newton steps D on the block-tridiagonal system,
+
+    minimise    g.D + 1/2 D.(H + lambda W) D    subject to    lower <= x_t <= upper       (5)
+
+where `TrustRegion` moves lambda. The Hessian of an observation is indefinite between modes: where
+the matrix can not be factorised, the step is made with a share of the positive part of the
+curvature, and where that does not descend either, the damping grows. Variables that rest on a limit
+with a gradient that pushes them outwards are held there; a step that crosses limits is projected
+onto the box.
 """
 
 from __future__ import annotations

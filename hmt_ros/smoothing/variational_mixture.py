@@ -1,15 +1,20 @@
-"""The mixture over trajectories that is closest to the posterior (VMS 6).
+"""The mixture over trajectories that is closest to the posterior (VMS 6, with its numbers).
 
-    q = sum_i a_i N(M_i, s_i^2 S_i),    F(q) = E_q[log q(X) - log p(X, R)] = KL(q || p(X | R)) - log
-    p(R)
+    q(X) = sum_i a_i N(X; M_i, s_i^2 S_i)
+
+    F(q) = KL(q || p(X | R)) - log p(R) = E_q[log q(X) - log p(X, R)]             (2), (4)
+
+         = sum_i a_i E_i[log q(X) - log p(X, R)]                                  (7)
 
 F is minimised over proportions a (softmax), means M, inflations s (log), or whole covariances
-through their block Cholesky factors. The expectation is over X = M_i + s_i L_i'^-1 z with the same
-antithetic noise z throughout, so that the sampled F is a smooth function with exact gradients and
-its descent is repeatable; what is reported besides comes from fresh samples, with a standard error.
-Variables are
-scaled by the curvature that F would have, were the posterior q: means by L_i sqrt(a_i), log s_i by
-sqrt(2 D a_i).
+through their block Cholesky factors, S_i^-1 = L_i L_i'. The expectation is over samples
+
+    X = M_i + s_i L_i'^-1 z
+
+with the same antithetic noise z throughout, so that the sampled F is a smooth function with exact
+gradients and its descent is repeatable; what is reported besides comes from fresh samples, with a
+standard error. Variables are scaled by the curvature that F would have if the posterior were q:
+means by L_i sqrt(a_i), log s_i by sqrt(2 D a_i).
 """
 
 from __future__ import annotations

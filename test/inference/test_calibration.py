@@ -2,17 +2,20 @@
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, multivariate_normal
+from scipy.stats import chi2
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.calibration import (
     calibration_error,
     coverage,
-    highest_density_levels,
     levels_of,
     marginal_log_densities,
     stratified_samples,
 )
+
+
+def levels_under(mixture, points, samples):
+    return levels_of(mixture.log_density(points), mixture.log_density(samples))
 
 
 def random_mixture(rng, k, d, spread=2.0):
@@ -29,14 +32,10 @@ def test_level_of_a_gaussian_is_the_chi_square_of_its_distance(d):
     rng = np.random.default_rng(d)
     mixture = random_mixture(rng, 1, d)
     points = mixture.sample(20, rng)
-    levels, log_densities = highest_density_levels(
-        mixture, points, stratified_samples(mixture, 20_000, rng)
-    )
+    levels = levels_under(mixture, points, stratified_samples(mixture, 20_000, rng))
     offset = points - mixture.means[0]
     distance = (offset * np.linalg.solve(mixture.covariances[0], offset.T).T).sum(1)
     assert np.allclose(levels, chi2(d).cdf(distance), atol=0.015)
-    expected = multivariate_normal(mixture.means[0], mixture.covariances[0]).logpdf(points)
-    assert np.allclose(log_densities, expected, rtol=1e-10)
 
 
 def test_level_of_a_mixture_agrees_with_quadrature():
@@ -49,7 +48,7 @@ def test_level_of_a_mixture_agrees_with_quadrature():
     at_points = np.exp(mixture.log_density(points))
     wanted = [density[density > p].sum() * (grid[1] - grid[0]) for p in at_points]
     samples = stratified_samples(mixture, 40_000, np.random.default_rng(0))
-    levels, _ = highest_density_levels(mixture, points, samples)
+    levels = levels_under(mixture, points, samples)
     # The narrow mode is the densest: its level is low although it has the smaller weight.
     assert wanted[3] < 0.3
     assert np.allclose(levels, wanted, atol=0.01)
@@ -60,9 +59,7 @@ def test_values_drawn_from_their_densities_have_uniform_levels():
     levels = []
     for _ in range(1500):
         mixture = random_mixture(rng, int(rng.integers(1, 5)), 3)
-        level, _ = highest_density_levels(
-            mixture, mixture.sample(1, rng), stratified_samples(mixture, 100, rng)
-        )
+        level = levels_under(mixture, mixture.sample(1, rng), stratified_samples(mixture, 100, rng))
         levels.append(level[0])
     error = np.sqrt(0.25 / len(levels))
     assert abs(coverage(levels, 0.5) - 0.5) < 3 * error

@@ -14,7 +14,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
-from hmt_ros.smoothing.image_sequence import ImageSequence
+from hmt_ros.smoothing.likelihood import ImageSequence
 
 NAMES = ('pelvis', 'neck', 'left_knee', 'right_knee', 'left_ankle', 'right_ankle', 'left_elbow',
          'right_elbow', 'left_wrist', 'right_wrist')  # fmt: skip

@@ -18,7 +18,6 @@ from hmt_ros.smoothing.paths import (
     diverse_subset,
     k_best_paths,
     most_probable_paths,
-    node_probabilities,
     paths_through_nodes,
     visiting_probabilities,
 )
@@ -129,14 +128,6 @@ def test_visiting_probabilities(network, every_path):
             through = [v for p, v in zip(paths, values) if p[0] == source and p[t] == k]
             expected = np.exp(logsumexp(through) - logsumexp(of)) if through else 0.0
             assert table[source, k] == pytest.approx(expected)
-
-
-def test_node_probabilities_are_sums_over_all_paths(network, every_path):
-    paths, values = every_path
-    weights = np.exp(values - logsumexp(values))
-    for t, found in enumerate(node_probabilities(network)):
-        expected = [sum(w for p, w in zip(paths, weights) if p[t] == k) for k in range(3)]
-        np.testing.assert_allclose(found, expected)
 
 
 def test_a_diverse_subset_differs_more_than_the_best_paths(network):

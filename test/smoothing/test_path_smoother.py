@@ -7,7 +7,7 @@ import pytest
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.smoothing import LinearGaussianDynamics, SlidingWindow
-from hmt_ros.smoothing.path_smoother import PathSmoother
+from hmt_ros.smoothing.mixture_smoother import PathSmoother
 
 
 def test_it_is_exact_where_all_paths_are_kept(modes, walk, exact):

@@ -12,8 +12,7 @@ from hmt_ros.inference import GaussianMixture, Status
 from hmt_ros.inference.energy import Derivatives, Energy
 from hmt_ros.smoothing import LinearGaussianDynamics
 from hmt_ros.smoothing.likelihood import MixtureLikelihood
-from hmt_ros.smoothing.mode_sequence import ModeSequence
-from hmt_ros.smoothing.path_gaussians import path_gaussians
+from hmt_ros.smoothing.mode_sequence import ModeSequence, path_gaussians
 from hmt_ros.smoothing.trajectory_refinement import refine
 
 FAST = LinearGaussianDynamics.constant_velocity([4.0, 4.0], 1.0)
