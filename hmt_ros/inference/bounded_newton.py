@@ -12,14 +12,13 @@ problem has its own lambda and its own active set, and leaves the batch when it 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from hmt_ros.inference.energy import EnergyFunction, EnergyTerm
+from hmt_ros.inference.energy import EnergyTerm
 from hmt_ros.inference.trust_region import Status, TrustRegion
 
 Array = NDArray[np.float64]

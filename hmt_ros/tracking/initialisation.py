@@ -24,7 +24,7 @@ from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.silhouette import Outline
 from hmt_ros.inference.bounded_newton import Minimum, minimise
-from hmt_ros.inference.energy import Derivatives, EnergyTerm
+from hmt_ros.inference.energy import Derivatives, EnergyFunction, EnergyTerm, Quadratic
 from hmt_ros.tracking.subject import Subject
 
 Array = NDArray[np.float64]
@@ -144,7 +144,10 @@ def _fit_with_lengths(
     prior_precision = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, np.inf) ** -2.0
     default = skeleton.lengths
 
-    def energy(x: Array, _: Index) -> tuple[Array, Array, Array]:
+    of_angles = Quadratic(body.prior_mean, prior_precision)
+    of_lengths = Quadratic(default, length_precision)
+
+    def energy(x: Array, rows: Index) -> tuple[Array, Array, Array]:
         poses, lengths = x[:, :d], x[:, d:]
         value = np.empty(len(x))
         gradient = np.empty_like(x)
@@ -171,14 +174,11 @@ def _fit_with_lengths(
             value[i] = 0.5 * np.einsum('ja,jab,jb->', error, precision, error)
             gradient[i] = np.einsum('jad,ja->d', weighted, error)
             hessian[i] = np.einsum('jad,jae->de', weighted, jacobian)
-        offset = poses - body.prior_mean
-        change = lengths - default
-        value += 0.5 * (offset * offset) @ prior_precision
-        value += 0.5 * np.einsum('nl,lm,nm->n', change, length_precision, change)
-        gradient[:, :d] += offset * prior_precision
-        gradient[:, d:] += change @ length_precision
-        hessian[:, :d, :d] += np.diag(prior_precision)
-        hessian[:, d:, d:] += length_precision
+        for own, prior in ((slice(0, d), of_angles), (slice(d, None), of_lengths)):
+            known = prior.energy(x[:, own], rows)
+            value += known.value
+            gradient[:, own] += known.gradient
+            hessian[:, own, own] += known.hessian
         return value, gradient, hessian
 
     starts = np.concatenate(
@@ -196,7 +196,7 @@ def _fit_with_lengths(
     )
     scale = np.concatenate([np.where(skeleton.dof_is_rotation, 0.4, 0.3), np.full(count, 0.05)])
     return minimise(
-        energy, starts, lower, upper, step_scale=scale, damping=10.0, max_iterations=80,
+        EnergyFunction(energy), starts, lower, upper, step_scale=scale, damping=10.0, max_iterations=80,
         tolerance=1e-3,
     )  # fmt: skip
 
