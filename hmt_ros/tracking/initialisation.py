@@ -174,11 +174,12 @@ def _fit_with_lengths(
             value[i] = 0.5 * np.einsum('ja,jab,jb->', error, precision, error)
             gradient[i] = np.einsum('jad,ja->d', weighted, error)
             hessian[i] = np.einsum('jad,jae->de', weighted, jacobian)
-        for own, prior in ((slice(0, d), of_angles), (slice(d, None), of_lengths)):
-            known = prior.energy(x[:, own], rows)
+        for part, prior in ((slice(0, d), of_angles), (slice(d, None), of_lengths)):
+            known = prior.energy(x[:, part], rows)
+            slope, curvature = known.derivatives()
             value += known.value
-            gradient[:, own] += known.gradient
-            hessian[:, own, own] += known.hessian
+            gradient[:, part] += slope
+            hessian[:, part, part] += curvature
         return value, gradient, hessian
 
     starts = np.concatenate(
@@ -196,8 +197,8 @@ def _fit_with_lengths(
     )
     scale = np.concatenate([np.where(skeleton.dof_is_rotation, 0.4, 0.3), np.full(count, 0.05)])
     return minimise(
-        EnergyFunction(energy), starts, lower, upper, step_scale=scale, damping=10.0, max_iterations=80,
-        tolerance=1e-3,
+        EnergyFunction(energy), starts, lower, upper, step_scale=scale, damping=10.0,
+        max_iterations=80, tolerance=1e-3,
     )  # fmt: skip
 
 
