@@ -65,13 +65,13 @@ class Setting:
 
     Attributes:
         body: of the person.
-        energy: value, gradient and Hessian at poses.
+        energy: energy term of the joints and the priors.
         start: the minimum next to the true pose.
         covariance: (d, d) inverse Hessian there.
     """
 
     body: Body
-    energy: Callable[[Array, Any], tuple[Array, Array, Array]]
+    energy: Any
     start: Minimum
     covariance: Array
 
@@ -214,7 +214,7 @@ def sampled(setting: Setting, sampler: str, scale: str, draw: Callable[[], Array
         optimised = optimise(setting.body, setting.energy, raw)
         times.append((drawn - start, time.process_time() - drawn))
     drawing, optimising = min(times, key=sum)
-    costs = setting.energy(raw, None)[0] - setting.start.value[0]
+    costs = setting.energy.energy(raw, derivatives=False).value - setting.start.value[0]
     return Samples(
         sampler, scale, raw, costs, optimised, minima_of(setting.body, optimised), drawing,
         optimising,
