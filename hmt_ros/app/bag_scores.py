@@ -9,9 +9,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
 from hmt_ros.app.truth import is_truth, mixture_topics
 from hmt_ros.body import Body
@@ -26,7 +23,6 @@ from msg_tools.messages.trajectory_mixtures import (
     trajectory_mixture_of,
 )
 
-Array = NDArray[np.float64]
 _Content = TypeVar('_Content')
 
 

@@ -12,19 +12,17 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.rendered_bag import MEASURED, Take, new_bag_folder, write_bag
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.camera import Viewpoint
+from hmt_ros.inference.arrays import Array
 from hmt_ros.motion.limb_motions import sole
 from hmt_ros.motion.motion_file import Motion, read_motion
 from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS, procedural_motion
 from hmt_ros.motion.retarget import body_from_motion, retarget
 from hmt_ros.rendering.scene import Scene
-
-Array = NDArray[np.float64]
 
 DURATION, HEADING = 4.0, 30.0  # s; degrees, of recorded motions
 LARGEST = 10_000  # largest side of an image, px

@@ -15,10 +15,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from hmt_ros.body import Body, Camera
+from hmt_ros.inference.arrays import Array
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from msg_tools import BagWriter, RosbagsMessages
@@ -28,8 +28,6 @@ from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
-
-Array = NDArray[np.float64]
 
 FRAME_ID = 'camera_optical_frame'
 START_NS = 1_700_000_000 * SECOND_NS  # stamp of the first image

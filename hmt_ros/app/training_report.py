@@ -9,7 +9,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from hmt_ros.app.report.skeletons import STYLE
 from hmt_ros.body import Body
@@ -17,8 +16,7 @@ from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
 from hmt_ros.experts.pose_encoding import AXES
 from hmt_ros.experts.predictor_learning import Described, affinities, multimodality
 from hmt_ros.experts.training_set import PoseSequence, TrainingSet, seen_from
-
-Array = NDArray[np.float64]
+from hmt_ros.inference.arrays import Array
 
 ACTIVITIES = 3  # maximum number of activities whose affinities are drawn
 FRAMES = 120  # maximum number of frames of each

@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.evaluation.track_scores import Truth
+from hmt_ros.inference.arrays import Array
 from msg_tools import BagReader, MessageError
 from msg_tools.files.array_file import read_archive
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mixture_of
-
-Array = NDArray[np.float64]
 
 FIELDS = ('stamps', 'joint_names', 'joints')
 

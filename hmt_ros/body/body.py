@@ -7,13 +7,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hmt_ros.body import kinematics
 from hmt_ros.body.flesh import Flesh, Superquadric
 from hmt_ros.body.skeleton import Skeleton, sided_pairs
-
-Array = NDArray[np.float64]
+from hmt_ros.inference.arrays import Array
 
 
 @dataclass(frozen=True)

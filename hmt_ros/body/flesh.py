@@ -26,10 +26,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from hmt_ros.inference.arrays import Array, Index
 
 
 @dataclass(frozen=True)

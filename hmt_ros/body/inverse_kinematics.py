@@ -10,15 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward, point_energy
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import EnergyFunction, Quadratic, Sum
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 
 def solve_joint_positions(

@@ -9,13 +9,12 @@ lie within the limits, too.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton, other_side
-
-Array = NDArray[np.float64]
+from hmt_ros.inference.arrays import Array
 
 # Axes of the root's rotations, in the order in which they act.
 ROOT_AXES = 'zyx'

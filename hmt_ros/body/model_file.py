@@ -9,13 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body, PartShape
 from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.inference.arrays import Array
 from msg_tools.files.plain_yaml import load_plain_yaml, read_plain_yaml
-
-Array = NDArray[np.float64]
 
 AXES = {
     'x': (0, True), 'y': (1, True), 'z': (2, True),

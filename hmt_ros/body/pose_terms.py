@@ -7,16 +7,13 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, add_energies
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 
 class FrameTerm(Protocol):

@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import Frames, forward
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from hmt_ros.inference.arrays import Array, Index
 
 TOLERANCE = 0.02  # m of overlap without cost: flesh is soft, and ellipsoids fit roughly
 SMALL = 1e-9

@@ -19,8 +19,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from hmt_ros.inference.arrays import Array, Index
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,9 +18,9 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.calibration import (
     calibration_error,
     coverage,
@@ -29,8 +29,6 @@ from hmt_ros.inference.calibration import (
     stratified_samples,
 )
 from hmt_ros.inference.mixture import GaussianMixture
-
-Array = NDArray[np.float64]
 
 EVALUATED_JOINTS = (
     'neck', 'left_shoulder', 'right_shoulder', 'left_elbow', 'right_elbow', 'left_wrist',

@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.evaluation.pose_scores import (
@@ -24,9 +23,8 @@ from hmt_ros.evaluation.pose_scores import (
     relative_positions,
     score,
 )
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
-
-Array = NDArray[np.float64]
 
 # Fewer joints than this are no pose.
 _FEWEST_JOINTS = 4

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from hmt_ros.experts.model_file import Arrays
 from hmt_ros.experts.training_pairs import Standardisation
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.clustering import squared_distances
-
-Array = NDArray[np.float64]
 
 BASES = ('linear', 'rbf')
 

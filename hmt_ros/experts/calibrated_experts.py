@@ -22,12 +22,11 @@ from hmt_ros.experts.conditional_density import Components, ConditionalDensity, 
 from hmt_ros.experts.gates import log_softmax
 from hmt_ros.experts.model_file import Arrays, nested, parameters_of, part
 from hmt_ros.experts.training_pairs import checked_pairs
+from hmt_ros.inference.arrays import Array, Index
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 FOLDS = 3
 LEFT_OUT = 500  # maximum number of samples of a fold that are left out

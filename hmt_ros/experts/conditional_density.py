@@ -34,11 +34,10 @@ from hmt_ros.experts.model_file import (
 )
 from hmt_ros.experts.training_pairs import finite_matrix
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,15 +19,13 @@ The M^2 components are reduced to M (`hmt_ros.inference.reduction`).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
 from hmt_ros.experts.conditional_density import ConditionalDensity
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.reduction import reduced
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # Below it no kernel fires: the experts have seen nothing like the input.
 LEAST_SUPPORT = 1e-3

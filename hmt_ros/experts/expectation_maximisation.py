@@ -19,15 +19,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from hmt_ros.experts.gates import Gates, log_softmax
 from hmt_ros.experts.sparse_bayes import SparseRegression, WeightedSums
 from hmt_ros.experts.training_pairs import TrainingPairs
+from hmt_ros.inference.arrays import Array, Index
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 # An expert from its weighted sums and its previous state.
 Learner = Callable[[WeightedSums, SparseRegression | None], SparseRegression]
 

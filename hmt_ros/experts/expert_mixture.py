@@ -38,13 +38,12 @@ from hmt_ros.experts.sparse_bayes import (
     maximum_likelihood,
 )
 from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs, checked_pairs
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.clustering import k_means, spread_points, squared_distances
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 LEARNING = ('bayesian', 'maximum_likelihood')
 # Candidate kernel widths, in typical distances between inputs.

@@ -29,9 +29,7 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from hmt_ros.experts.basis import Basis, LinearBasis, RadialBasis, basis_of
 from hmt_ros.experts.model_file import Arrays, nested, part
 from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from hmt_ros.inference.arrays import Array, Index
 
 # Gamma hyperprior of precisions: shape and rate (BME 2.2.2).
 SHAPE, RATE = 1e-2, 1e-4

@@ -27,12 +27,11 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from hmt_ros.experts.conditional_density import Components, ConditionalDensity
 from hmt_ros.experts.model_file import Arrays
 from hmt_ros.experts.training_pairs import Standardisation, TrainingPairs, checked_pairs
+from hmt_ros.inference.arrays import Array, Index
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 BATCH = 256  # inputs whose neighbours are searched together
 RIDGE = 1e-6  # share of the targets' variance that is added to the covariance

@@ -13,13 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hmt_ros.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_angles, root_rotations
-
-Array = NDArray[np.float64]
+from hmt_ros.inference.arrays import Array
 
 AXES = 6
 ROOT = ('root_tx', 'root_ty', 'root_tz')

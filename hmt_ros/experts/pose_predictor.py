@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.experts.conditional_density import ConditionalDensity, stored_model
@@ -42,9 +42,8 @@ from hmt_ros.experts.root_placement import (
     placed_gaussians,
 )
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.reduction import reduced
-
-Array = NDArray[np.float64]
 
 FOLDER = Path(__file__).resolve().parent / 'models'
 # Trained from procedural motions: `train --motions procedural`.

@@ -33,10 +33,9 @@ from hmt_ros.experts.pose_encoding import PoseEncoding
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.experts.training_pairs import finite_matrix
 from hmt_ros.experts.training_set import TrainingSet
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.clustering import k_means, squared_distances
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 Bytes = NDArray[np.uint8]
 Progress = Callable[[Iterable[Bytes], int], Iterable[Bytes]]
 

@@ -27,9 +27,7 @@ from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.experts.descriptor.contour import PersonBlob
 from hmt_ros.experts.pose_encoding import PoseEncoding
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from hmt_ros.inference.arrays import Array, Index
 
 STACKS, SLICES = 9, 12  # of the mesh; its box is exact to 1 % of the radius of a part
 SIZE_SPREAD = 0.06  # relative standard deviation of the size of persons

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from hmt_ros.inference.arrays import Array
 
 SCALINGS = ('each', 'common')
 

@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.mirror import mirror, root_angles, root_rotations
 from hmt_ros.experts.pose_encoding import AXES, PoseEncoding
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.motion.motion_file import read_motion
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.motion.retarget import body_from_motion, retarget
 from hmt_ros.rendering.renderer import render_silhouettes
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 Bytes = NDArray[np.uint8]
 Item = TypeVar('Item')
 Progress = Callable[[Iterable[Item], int], Iterable[Item]]

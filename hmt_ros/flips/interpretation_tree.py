@@ -20,9 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.flips.tree_growth import ChainLinks, chain_links, grow_leaves
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from hmt_ros.inference.arrays import Array, Index
 
 
 def enumerate_flips(

@@ -17,9 +17,7 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import ROOT_AXES, rotations_of
 from hmt_ros.body.skeleton import Skeleton
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from hmt_ros.inference.arrays import Array, Index
 
 JOINTS = ('pelvis', 'neck', 'left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
 SIGNIFICANT = 0.04  # m; a flip changes the depth of some joint of the torso by more

@@ -18,8 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hmt_ros.body.skeleton import Skeleton
-
-Array = NDArray[np.float64]
+from hmt_ros.inference.arrays import Array
 
 TURN = 2.0 * np.pi
 # Two solutions nearer than this are one: the ray touches the sphere, m.

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
@@ -29,10 +29,7 @@ from hmt_ros.body.self_intersection import deepest_overlaps
 from hmt_ros.flips.best_combinations import distinct_poses, least_sums
 from hmt_ros.flips.interpretation_tree import enumerate_flips, rehang_chain
 from hmt_ros.flips.torso_flips import JOINTS, flip_torso
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
+from hmt_ros.inference.arrays import Array, Index, Mask
 
 SAME_TRUNK = 0.03  # m; torsos of which no joint differs by more are the same
 ITERATIONS = 20  # of inverse kinematics, which starts near its solution

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
+from hmt_ros.inference.arrays import Image, Mask
+
 Box = tuple[int, int, int, int]
 
 # Learning rate at which nothing is learned; at 0 the KNN model would replace its samples at once.

@@ -29,10 +29,8 @@ from hmt_ros.image.terms.keypoints import KEYPOINTS, KeypointTerm
 from hmt_ros.image.terms.registry import TERMS, Model, Placement, add_energies
 from hmt_ros.image.terms.residuals import tree_of
 from hmt_ros.image.texture import Textures, no_textures
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 OFF = TermSettings(0.0, 1.0, 1.0)
 

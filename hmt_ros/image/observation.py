@@ -8,17 +8,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.image_term import ImageWindow
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.image.terms.silhouette import Outline
+from hmt_ros.inference.arrays import Image, Mask
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Box = tuple[int, int, int, int]
 
 # Pixels around the silhouette that evidence is taken from.

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import NEAR, Camera
+from hmt_ros.inference.arrays import Array, Mask
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # Parts are grown by this factor when they hide others: superquadrics are fatter than ellipsoids.
 COVER = 1.04

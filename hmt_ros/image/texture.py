@@ -15,8 +15,8 @@ from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import Frames
 from hmt_ros.image.sampling import ImageMap, sample
 from hmt_ros.image.surface import flesh_table_of, lens_of, mark_visibility, project
+from hmt_ros.inference.arrays import Array
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 # A surface that faces the camera less than this (cosine) is seen too flat to carry a texture.

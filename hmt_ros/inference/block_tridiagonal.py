@@ -20,12 +20,10 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 from numpy.lib.stride_tricks import as_strided
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs, dtrtri
 
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.exact_sums import dot
-
-Array = NDArray[np.float64]
 
 
 class NotPositiveDefiniteError(ValueError):

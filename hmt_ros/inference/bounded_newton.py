@@ -18,11 +18,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import EnergyTerm
 from hmt_ros.inference.trust_region import Status, TrustRegion
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 DAMPING_LIMIT = 1e12
 

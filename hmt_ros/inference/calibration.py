@@ -15,11 +15,10 @@ pose estimation metrics favor miscalibrated distributions" (2022).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
-
-Array = NDArray[np.float64]
 
 
 def levels_of(at_points: Array, at_samples: Array) -> Array:

@@ -12,15 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, cast
 
-import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.errors import TypingError
 from numba.extending import intrinsic
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 _LANES = 4
 _VECTOR = ir.VectorType(ir.DoubleType(), _LANES)

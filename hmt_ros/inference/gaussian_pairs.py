@@ -12,7 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hmt_ros.inference.arrays import Array
+
 Index = NDArray[np.int64]
 
 # Pairs whose covariances are factorised side by side.

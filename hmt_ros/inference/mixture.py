@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
-Array = NDArray[np.float64]
+from hmt_ros.inference.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

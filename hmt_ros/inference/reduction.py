@@ -22,13 +22,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.gaussian_pairs import pair_distances
 from hmt_ros.inference.mixture import GaussianMixture
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # Components with a smaller share than this of the weight are dropped by `reduced`.
 NEGLIGIBLE = 1e-8

@@ -16,8 +16,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+from hmt_ros.inference.arrays import Array, Index
 
 # Least share of the predicted decrease for which a step is taken.
 LEAST_RATIO = 1e-3

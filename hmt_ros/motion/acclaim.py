@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_ros.inference.arrays import Array
 from hmt_ros.motion.rig import (
     LARGEST_MOTION,
     MOST_SEGMENTS,
@@ -27,8 +27,6 @@ from hmt_ros.motion.rig import (
     RigSegment,
     numbers,
 )
-
-Array = NDArray[np.float64]
 
 INCH = 0.0254  # m; CMU's `length 0.45` means inches times 0.45
 CHANNELS = {

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_ros.inference.arrays import Array
 from hmt_ros.motion.rig import (
     LARGEST_MOTION,
     MOST_SEGMENTS,
@@ -25,8 +25,6 @@ from hmt_ros.motion.rig import (
     RigSegment,
     numbers,
 )
-
-Array = NDArray[np.float64]
 
 CHANNELS = {
     f'{letter}{kind}': (axis, kind == 'rotation')

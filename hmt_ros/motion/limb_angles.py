@@ -15,15 +15,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_rotation_dofs, rotations_of
 from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.inference.arrays import Array
 from hmt_ros.motion.rig import ARM, LEG, SIDES
-
-Array = NDArray[np.float64]
 
 # Weights of what shows the twist of a limb; a hinge bent by a right angle has weight 1.
 FOOT = 0.3  # a foot, for its leg

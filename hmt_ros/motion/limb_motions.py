@@ -10,15 +10,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
+from hmt_ros.inference.arrays import Array
 from hmt_ros.motion.rig import SIDES
 
-Array = NDArray[np.float64]
 Posture = dict[str, float]  # degree of freedom -> rad
 
 SIGNS = np.array([-1.0, 1.0])  # of x, outwards

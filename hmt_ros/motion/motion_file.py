@@ -13,16 +13,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
+from hmt_ros.inference.arrays import Array
 from hmt_ros.motion.acclaim import Acclaim, read_amc, read_asf
 from hmt_ros.motion.bvh import read_bvh
 from hmt_ros.motion.rig import MotionFileError, Rig, read_text, rig_body
 
 __all__ = ['Motion', 'MotionFileError', 'read_motion', 'read_skeleton']
-
-Array = NDArray[np.float64]
 
 
 # Rows are the world axes x, y, z in the file's axes; each is a rotation.

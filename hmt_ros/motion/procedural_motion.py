@@ -11,13 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.inverse_kinematics import solve_joint_positions
 from hmt_ros.body.mirror import root_angles, root_rotations
+from hmt_ros.inference.arrays import Array
 from hmt_ros.motion.limb_motions import (
     SIGNS,
     Posture,
@@ -30,8 +31,6 @@ from hmt_ros.motion.limb_motions import (
     walking_foot,
 )
 from hmt_ros.motion.rig import SIDES
-
-Array = NDArray[np.float64]
 
 PLANNING_RATE = 120.0  # Hz at least, at which a motion is planned
 MARGIN = 0.5  # s that are planned before and after, so that smoothing has no ends

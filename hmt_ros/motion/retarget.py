@@ -11,19 +11,18 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference import minimise
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import EnergyFunction
 from hmt_ros.motion.limb_angles import limb_angles
 from hmt_ros.motion.motion_file import Motion
 from hmt_ros.motion.rig import SIDES
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 # Poses of some frames (n, d), and the frames (n,) -> value, gradient, Hessian.
 Misfit = Callable[[Array, Index], tuple[Array, Array, Array]]
 

@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.model_file import read_body
 from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.inference.arrays import Array
 from msg_tools.files.bounded_file import read_bytes
-
-Array = NDArray[np.float64]
 
 LARGEST_FILE = 500_000_000  # bytes
 LARGEST_MOTION = 100_000_000  # numbers, frames times channels

@@ -19,12 +19,10 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.rendering.scene import Clothes, Scene
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 Picture = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 STACKS, SLICES = 13, 18  # of the mesh of a part: its outline is right to 2 % of its radius
 SUPERSAMPLING = 2

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera, Viewpoint
 from hmt_ros.body.kinematics import forward
+from hmt_ros.inference.arrays import Array, Index
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 Picture = NDArray[np.float32]
 Real = TypeVar('Real', np.float32, np.float64)
 

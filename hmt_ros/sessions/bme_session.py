@@ -30,6 +30,7 @@ from hmt_ros.experts.root_placement import SIZE_SPREAD
 from hmt_ros.experts.training_set import RATE
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Mask
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.camera_session import (
@@ -52,7 +53,6 @@ __all__ = ['CAMERA_INFO', 'IMAGE', 'PREDICTION', 'TOPICS', 'BmeSession', 'BmeSta
 PREDICTION = 'pose_prediction'
 TOPICS = {PREDICTION: PublishedTopic('hmt_msgs/msg/PoseMixture')}
 
-Mask = NDArray[np.bool_]
 
 # Relative standard deviation of the size of a person whose stature is known.
 _MEASURED_SPREAD = 0.02

@@ -11,10 +11,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Generic, NamedTuple, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from hmt_ros.body import Camera
+from hmt_ros.inference.arrays import Image
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.session import Order, Parameters, Session, State, everything
 from msg_tools.files.bounded_file import read_bytes
@@ -24,7 +22,6 @@ from msg_tools.messages.images import ImageError, decode_image, decode_picture
 CAMERA_INFO, IMAGE = 'camera_info', 'image'
 FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a frame
 
-Image = NDArray[np.uint8]
 T = TypeVar('T')
 
 # Stamps that `StampedInputs` remembers.

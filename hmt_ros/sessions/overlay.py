@@ -10,12 +10,9 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body import Camera
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
+from hmt_ros.inference.arrays import Array, Image
 
 _FIRST, _OTHERS = (13, 115, 230), (204, 115, 26)  # BGR
 _FAINTEST = 0.2

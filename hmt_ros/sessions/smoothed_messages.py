@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body import Body
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
 from msg_tools import MessageFactory
@@ -19,8 +19,6 @@ from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixt
 from msg_tools.messages.states import heaviest_joint_state
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture as TrajectoryContent
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
-
-Array = NDArray[np.float64]
 
 # In the order in which they are published.
 TOPICS = {

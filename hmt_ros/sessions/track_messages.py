@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.session import PublishedTopic
 from msg_tools import MessageFactory
@@ -25,9 +26,6 @@ from msg_tools.messages.markers import skeleton_markers
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 from msg_tools.messages.states import heaviest_joint_state, transforms_message
 from msg_tools.messages.urdf import link_frames
-
-Array = NDArray[np.float64]
-
 
 # In the order in which they are published.
 TOPICS = {

@@ -19,9 +19,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.exact_sums import dot
-
-Array = NDArray[np.float64]
 
 # Logarithms of overlaps and of densities that make no difference.
 NEGLIGIBLE = 30.0

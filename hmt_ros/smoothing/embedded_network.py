@@ -22,11 +22,11 @@ from scipy.linalg import solve_triangular
 from scipy.special import gammaln, logsumexp
 
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.gaussian_pairs import pair_log_densities
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.smoothing.likelihood import check_mixtures
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
 
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy, EnergyTerm
 from hmt_ros.inference.exact_sums import dot
 
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     from hmt_ros.image.likelihood import ImageLikelihood
     from hmt_ros.image.observation import Observation
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # Modes whose density is below exp(-60) of the greatest are left out: less than rounding.
 NEGLIGIBLE = 60.0

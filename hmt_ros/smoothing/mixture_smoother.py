@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockCholesky
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
@@ -27,8 +28,6 @@ from hmt_ros.smoothing.variational_mixture import (
     minimise_free_energy,
     peak_weights,
 )
-
-Array = NDArray[np.float64]
 
 # Noise values that the descent of the free energy holds: few samples where the state is large.
 SAMPLE_BUDGET = 400_000

@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, add_diagonal, factorise_band
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.inference.reduction import merged_if_close
@@ -36,9 +36,6 @@ from hmt_ros.smoothing.paths import (
     k_best_paths,
     paths_through_nodes,
 )
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # Candidates for each path that is chosen.
 CANDIDATES = 4

@@ -16,11 +16,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.gaussian_pairs import pair_log_densities
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.reduction import merged_if_alike
@@ -28,8 +28,6 @@ from hmt_ros.smoothing.likelihood import check_mixtures
 from hmt_ros.smoothing.mixture_smoother import MixtureSmoother, intervals_of
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
-
-Array = NDArray[np.float64]
 
 # Components with a share below exp(-25) are given up, and those are merged whose means lie within
 # this many standard deviations, and whose sizes are alike.

@@ -15,13 +15,12 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, BlockTridiagonal
-
-Array = NDArray[np.float64]
 
 
 class TrajectoryContent(Protocol):

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.blas import dsbmv
 from scipy.linalg.lapack import dpbtrs
 
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.block_tridiagonal import (
     BlockCholesky,
     NotPositiveDefiniteError,
@@ -33,9 +34,6 @@ from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 from hmt_ros.inference.trust_region import Status, TrustRegion
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 FIRST_DAMPING = 1e-4
 DAMPING_LIMIT = 1e10

@@ -27,14 +27,13 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, add_band_product
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.gaussian_pairs import pair_distances, threads
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
 from hmt_ros.smoothing.component_overlaps import NEGLIGIBLE, add_overlaps
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
-
-Array = NDArray[np.float64]
 
 ADAPTABLE = ('weights', 'means', 'inflation', 'covariances')
 # Components are split into so many parts, whatever the machine: sums keep their order.

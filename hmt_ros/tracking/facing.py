@@ -20,6 +20,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.filter import MixtureFilter
@@ -27,8 +28,6 @@ from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.weighting import log_shares, normalised, weigh
-
-Array = NDArray[np.float64]
 
 # One of two ways to face is given up when it is less probable by this, nats.
 DECIDED = 25.0

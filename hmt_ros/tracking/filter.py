@@ -13,12 +13,12 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, resting
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.flesh_fitting import FleshFit
@@ -31,9 +31,6 @@ from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples
 from hmt_ros.tracking.selection import choose_hypotheses
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.weighting import at_least, inherited_log_weights, normalised, weigh
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # How far the usual energy follows that of the last image.
 USUAL_GAIN = 0.1

@@ -10,14 +10,12 @@ and less.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
-
-Array = NDArray[np.float64]
+from hmt_ros.inference.arrays import Array
 
 # Standard deviation of the logarithm of a width over people and clothes.
 SPREAD = 0.25

@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.image.texture import Textures
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.mixture import GaussianMixture
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,12 +23,10 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.silhouette import Outline
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import Derivatives, EnergyFunction, EnergyTerm, Quadratic
 from hmt_ros.tracking.subject import Subject
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # Standard deviation of a length that was measured on the person, m.
 MEASURED = 0.01

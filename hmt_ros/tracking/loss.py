@@ -8,7 +8,6 @@ A sample or keypoint is unexplained when it is further than 4 sigmas from where 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
@@ -16,8 +15,7 @@ from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import Keypoints
-
-Array = NDArray[np.float64]
+from hmt_ros.inference.arrays import Array
 
 # A sample of the outline or a keypoint further away than this from where it should be is
 # unexplained, in sigmas.

@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
@@ -22,6 +21,7 @@ from hmt_ros.body.pose_terms import FrameTerm, Posed
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures, capture_textures
+from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import (
     Derivatives,
@@ -37,9 +37,6 @@ from hmt_ros.tracking.hypotheses import Hypotheses
 if TYPE_CHECKING:
     from hmt_ros.tracking.settings import TrackerSettings
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-Mask = NDArray[np.bool_]
 
 # Largest standard deviation of a mode: where an image shows nothing, rad or m.
 WIDEST = 2.0

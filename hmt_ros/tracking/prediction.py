@@ -11,18 +11,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.pose_terms import AnglePrior, Posed
 from hmt_ros.image.likelihood import ObservedImage
 from hmt_ros.image.observation import Observation
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.energy import Quadratic, Sum
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses
 from hmt_ros.tracking.posterior import Posterior
-
-Array = NDArray[np.float64]
 
 # Newton steps that follow the optical flow.
 FLOW_ITERATIONS = 5

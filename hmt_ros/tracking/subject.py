@@ -7,13 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools.files.plain_yaml import read_plain_yaml
-
-Array = NDArray[np.float64]
 
 LARGEST_FILE = 1_000_000  # bytes
 LARGEST_PIXEL = 1e5

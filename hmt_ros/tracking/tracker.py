@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
@@ -21,6 +20,7 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.observation import Box, Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
+from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.facing import Track
 from hmt_ros.tracking.hypotheses import Modes
@@ -32,9 +32,6 @@ from hmt_ros.tracking.initialisation import (
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.subject import Subject
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 # Fewest keypoints from which a lost track starts anew.
 FEWEST_KEYPOINTS = 6

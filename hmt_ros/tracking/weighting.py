@@ -21,12 +21,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.mixture import GaussianMixture, bhattacharyya_distances
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 REWEIGHTINGS = ('ancestry', 'bhattacharyya')
 

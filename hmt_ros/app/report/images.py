@@ -8,16 +8,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.app.replay.inputs import CAMERA_INFO_TYPE, COMPRESSED, RAW, recorded_input
 from hmt_ros.body import Camera
+from hmt_ros.inference.arrays import Image
 from msg_tools import BagReader
 from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image, encode_jpeg
-
-Image = NDArray[np.uint8]
 
 # The end of the name of the topic on which the tracker publishes its drawings.
 OVERLAY = 'overlay/compressed'

@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.app.bag_scores import chosen_topics
 from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
+from hmt_ros.inference.arrays import Array
 from msg_tools import BagMessage, BagReader
 from msg_tools.messages.message_error import MessageError
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
-
-Array = NDArray[np.float64]
 
 # Joints whose paths are drawn of trajectories, and how many trajectories are kept.
 ENDS = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')

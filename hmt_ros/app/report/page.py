@@ -14,7 +14,6 @@ from importlib import resources
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.app.evaluate import as_json
 from hmt_ros.app.report.images import FilmStrip
@@ -23,9 +22,8 @@ from hmt_ros.app.report.pictures import PROBABILITIES
 from hmt_ros.app.report.skeletons import LEFT, RIGHT, bones_of
 from hmt_ros.evaluation.pose_scores import LOST, ORIGIN, origin_joints
 from hmt_ros.evaluation.track_scores import TrackScores, Truth, mode_errors
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.calibration import coverage
-
-Array = NDArray[np.float64]
 
 # Least step of positions, m, and step of pixels as a fraction of the width of the image.
 FINEST = 5e-4

@@ -9,7 +9,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from hmt_ros.app.report.images import FilmStrip
 from hmt_ros.app.report.mixtures import Layer, Moment, RecordedMixtures, Window
@@ -22,9 +21,8 @@ from hmt_ros.app.report.skeletons import (
 )
 from hmt_ros.evaluation.pose_scores import LOST
 from hmt_ros.evaluation.track_scores import TrackScores, Truth, mode_errors
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.calibration import coverage
-
-Array = NDArray[np.float64]
 
 # Number of times in the overview and on the sheets.
 IN_OVERVIEW, ON_SHEETS = 4, 8

@@ -18,16 +18,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 from PIL import Image as Picture
 
 from hmt_ros.app.report.mixtures import Layer, Moment
 from hmt_ros.body import Camera
 from hmt_ros.evaluation.pose_scores import HIPS, ORIGIN, origin_joints, relative_positions
 from hmt_ros.evaluation.track_scores import Truth
+from hmt_ros.inference.arrays import Array, Image
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Track = Layer[Moment]
 
 # Okabe and Ito's palette.

@@ -15,7 +15,6 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.experts.descriptor.contour import PersonBlob
 from hmt_ros.experts.pose_encoding import ray_rotations
 
-Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 SIDE = 192  # px, of the view

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from hmt_ros.inference.arrays import Array, Mask
+
 Bytes = NDArray[np.uint8]
 
 SMALLEST = 60  # minimum area of a person, px

@@ -18,10 +18,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.clustering import k_means, squared_distances
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 Bytes = NDArray[np.uint8]
 
 RADIAL, ANGULAR = 5, 12

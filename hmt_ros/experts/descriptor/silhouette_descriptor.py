@@ -30,11 +30,11 @@ from hmt_ros.experts.descriptor.contour_histograms import (
     edge_pairs,
     shape_contexts,
 )
+from hmt_ros.inference.arrays import Array
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 SIZE = 128  # longer side of the person before anything is measured, px

@@ -18,10 +18,7 @@ from numpy.typing import NDArray
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface import Contour, Lens
 from hmt_ros.image.texture import Textures
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
+from hmt_ros.inference.arrays import Array, Image, Mask
 
 NO_MAP = ImageMap(np.zeros((2, 2, 2), np.float32))
 

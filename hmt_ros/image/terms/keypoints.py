@@ -23,10 +23,8 @@ from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.image.surface import lens_of, project
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.residuals import add_residual, assemble_pose, geman_mcclure, tree_of
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 KEYPOINTS = TermSettings(1.0, 1.0, 5.0)
 # A joint behind the camera errs by this much, in standard deviations.

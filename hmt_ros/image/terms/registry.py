@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from hmt_ros.image.surface import (
     FleshTable,
@@ -25,9 +24,7 @@ from hmt_ros.image.terms.image_term import ImageTerm, PoseView
 from hmt_ros.image.terms.residuals import Tree, assemble_pose
 from hmt_ros.image.terms.silhouette import CONTAINMENT, COVERAGE
 from hmt_ros.image.terms.texture import INTENSITY, MOTION
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from hmt_ros.inference.arrays import Array, Mask
 
 TERMS: tuple[ImageTerm, ...] = (CONTAINMENT, COVERAGE, EDGES, INTENSITY, MOTION)
 

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.skeleton import Skeleton
 
-Array = NDArray[np.float64]
-
 
 class Tree(NamedTuple):
     """The skeleton as the compiled code reads it.

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from hmt_ros.image.sampling import ImageMap, sample_distance
 from hmt_ros.image.terms.image_term import (
@@ -29,8 +28,7 @@ from hmt_ros.image.terms.image_term import (
     Weighting,
 )
 from hmt_ros.image.terms.residuals import add_residual, geman_mcclure
-
-Array = NDArray[np.float64]
+from hmt_ros.inference.arrays import Array
 
 # Samples on the outline.
 OUTLINE_POINTS = 120

@@ -8,8 +8,9 @@ from typing import Protocol
 import numpy as np
 
 from hmt_ros.image.observation import Observation
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
-from hmt_ros.tracking.hypotheses import Array, Hypotheses
+from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals.kinematic_jumps import KinematicJumps
 from hmt_ros.tracking.proposals.predicted_poses import PosePrediction, PredictedPoses

@@ -10,14 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.flips.interpretation_tree import enumerate_flips
+from hmt_ros.inference.arrays import Array
 from hmt_ros.tracking.hypotheses import relative_joints
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 VOTES = ('trace', 'uniform', 'minima')
 

@@ -14,7 +14,6 @@ from itertools import pairwise
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.skeleton import other_side
 from hmt_ros.flips.best_combinations import Alternatives, best_combinations, distinct_alternatives
@@ -22,6 +21,7 @@ from hmt_ros.flips.interpretation_tree import enumerate_flips, rehang_chain
 from hmt_ros.flips.torso_flips import flip_torso
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures, with_swapped_sides
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.tracking.hypotheses import Hypotheses, relative_joints
 from hmt_ros.tracking.posterior import Posterior
@@ -29,9 +29,6 @@ from hmt_ros.tracking.proposals.chain_votes import chain_votes
 from hmt_ros.tracking.proposals.limb_search import LimbSearch
 from hmt_ros.tracking.selection import choose_hypotheses
 from hmt_ros.tracking.weighting import weigh
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # Groups of modes with a trunk of their own whose products are rated.
 MOST_GROUPS = 3

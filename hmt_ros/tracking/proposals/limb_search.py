@@ -12,19 +12,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.pose_terms import Posed
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import minimise
 from hmt_ros.inference.energy import Derivatives, Quadratic, Restricted, Student, Sum
 from hmt_ros.tracking.posterior import Posterior
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 # Degrees of freedom of the Student prior that keeps a limb near its prediction: heavy tails.
 TAILS = 4.0

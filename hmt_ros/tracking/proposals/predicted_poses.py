@@ -15,9 +15,10 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import reverse_depth
 from hmt_ros.image.observation import Observation
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.hypotheses import Array, Hypotheses, relative_joints
+from hmt_ros.tracking.hypotheses import Hypotheses, relative_joints
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,17 +10,15 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.image.observation import Observation
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.tracking.hypotheses import Hypotheses, relative_joints
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.selection import choose_hypotheses
 from hmt_ros.tracking.weighting import weigh
-
-Array = NDArray[np.float64]
 
 
 def spherical_samples(
