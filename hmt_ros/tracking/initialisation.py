@@ -143,7 +143,6 @@ def _fit_with_lengths(
     default = skeleton.lengths
 
     of_angles = Quadratic(body.prior_mean, prior_precision)
-    of_lengths = Quadratic(default, length_precision)
 
     def energy(x: Array, rows: Index) -> tuple[Array, Array, Array]:
         poses, lengths = x[:, :d], x[:, d:]
@@ -172,12 +171,15 @@ def _fit_with_lengths(
             value[i] = 0.5 * np.einsum('ja,jab,jb->', error, precision, error)
             gradient[i] = np.einsum('jad,ja->d', weighted, error)
             hessian[i] = np.einsum('jad,jae->de', weighted, jacobian)
-        for part, prior in ((slice(0, d), of_angles), (slice(d, None), of_lengths)):
-            known = prior.energy(x[:, part], rows)
-            slope, curvature = known.derivatives()
-            value += known.value
-            gradient[:, part] += slope
-            hessian[:, part, part] += curvature
+        angles = of_angles.energy(poses, rows)
+        slope, curvature = angles.derivatives()
+        change = lengths - default
+        value += angles.value
+        value += 0.5 * np.einsum('nl,lm,nm->n', change, length_precision, change)
+        gradient[:, :d] += slope
+        gradient[:, d:] += change @ length_precision
+        hessian[:, :d, :d] += curvature
+        hessian[:, d:, d:] += length_precision
         return value, gradient, hessian
 
     starts = np.concatenate(
