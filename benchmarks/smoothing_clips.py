@@ -98,9 +98,8 @@ def smoothed_marginals(
     body: Body, stamps: Sequence[int], mixtures: Sequence[GaussianMixture]
 ) -> list[GaussianMixture]:
     """Marginals at all times, from overlapping windows; the motion as the tracker expects it."""
-    rates = TrackerSettings().dynamics.rates(body.skeleton)
     smoother = MixtureSmoother(
-        LinearGaussianDynamics.random_walk(rates), body.lower, body.upper,
+        LinearGaussianDynamics.random_walk(body.rates), body.lower, body.upper,
         max_trajectories=TRAJECTORIES, adapt=(), through_modes=True,
         error_correlation=ERROR_CORRELATION,
     )  # fmt: skip

@@ -43,7 +43,7 @@ def test_energies_are_those_of_the_likelihood(walk):
     times = np.array([3, 0, 3])
     value, gradient, hessian = sequence.energy(poses[times], times, derivatives=Derivatives.EXACT)
     for i, t in enumerate(times):
-        v, g, h = sequence.likelihood.energy(poses[[t]], sequence.observations[t])
+        v, g, h = sequence.likelihood.given(sequence.observations[t]).energy(poses[[t]])
         assert value[i] == pytest.approx(v[0])
         np.testing.assert_allclose(gradient[i], g[0], atol=1e-9)
         np.testing.assert_allclose(hessian[i], h[0], atol=1e-9)

@@ -102,7 +102,7 @@ module my_msgs {
 @pytest.mark.parametrize(
     ('msgtype', 'encoding', 'definition', 'error'),
     [
-        ('', 'ros2msg', 'int32 x', 'does not tell the type'),
+        ('', 'ros2msg', 'int32 x', 'does not name the type'),
         ('my_msgs/msg/X', '', '', 'the bag does not define it'),
         ('my_msgs/msg/X', 'ros2msg', '?', 'can not be parsed'),
         ('my_msgs/msg/X', 'ros2idl', 'struct', 'can not be parsed'),
