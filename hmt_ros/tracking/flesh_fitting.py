@@ -1,10 +1,11 @@
 """Widths of the flesh from the first images of a track (KJS 2: shape estimated at initialisation).
 
-How thick limbs and clothes are is unknown at the start, and a wrong width pushes poses: a model
-that is too thin hugs one side of a limb, one that is too thick turns it away. The widths of the
-parts, left and right alike, are moved by damped Newton steps on the energy of the silhouette and
-the edges at the present modes; every image adds its curvature, so that later ones move them less
-and less.
+    P_g <- P_g + max(d2E/du_g^2, 0),    u_g <- u_g - (dE/du_g + u_g / (s^2 n)) / P_g
+
+u_g is the log width of a group of parts, left and right alike, E the energy of the image terms at
+the present modes, weighted, n the number of images so far, and s the spread of widths over people.
+A wrong width pushes poses: a model that is too thin hugs one side of a limb, one that is too thick
+turns it away. Every image adds its curvature, so that later images move the widths less.
 """
 
 from __future__ import annotations

@@ -1,9 +1,12 @@
-"""The start of a track: poses, depth, lengths and widths from joints in one image (KJS 2, 5.2).
+"""The start of a track: poses, depth and lengths from joints in one image (KJS 2 and 5.2).
 
-From several headings the pose is fitted to the joints together with the lengths, each length held
-by what was measured or by its spread over people. The lengths are then fixed, the flips of all
-limbs that the image and the limits allow are enumerated and fitted again, and the best stand as the
-first mixture.
+    E(x, l) = 1/2 sum_j |u_j(x, l) - p_j|^2_j + E_prior(x) + 1/2 (l - l_0)' S_l^-1 (l - l_0)
+
+u_j projects joint j of the pose x with the lengths l, which was seen at p_j; the norm is that of
+the keypoint's covariance. From several headings the pose is fitted together with the lengths, each
+length held by what was measured or by its spread over people. The lengths are then fixed, the flips
+of all limbs that the image and the limits allow are enumerated and fitted again, and the best are
+the first mixture.
 """
 
 from __future__ import annotations
