@@ -75,8 +75,8 @@ class NodeParameters:
     """Parameters that all nodes have.
 
     Attributes:
-        reset_on_time_jump: If true, a message that is older than the one before starts the estimate
-            anew; if false, it is skipped.
+        reset_on_time_jump: If true, a message that is older than the one before restarts the
+            estimate; if false, it is skipped.
         queue_size: Maximum number of messages that wait to be estimated from; when the node is late
             the oldest are dropped.
         status_interval: Interval between two status lines on the console while messages arrive, s;

@@ -44,7 +44,7 @@ class Order(Enum):
 
 
 @dataclass(frozen=True)
-class SessionState:
+class SessionState(ABC):
     """State of a session, for diagnostics.
 
     Attributes:
@@ -64,17 +64,17 @@ class SessionState:
     faults: Counter[str] = field(default_factory=Counter)
     last_fault: str = ''
 
+    @abstractmethod
     def summary(self) -> str:
         """The present estimate in a few words."""
-        raise NotImplementedError
 
     def trouble(self) -> str:
         """Why the estimate is not to be trusted, '' where it is."""
         return ''
 
+    @abstractmethod
     def values(self) -> list[tuple[str, str]]:
         """Keys and values that only this kind of session has in the diagnostics."""
-        raise NotImplementedError
 
 
 def everything(_topic: str) -> bool:
@@ -159,7 +159,7 @@ class Session(ABC, Generic[Parameters, State]):
         return self._handled(source, 0)
 
     def break_off(self, source: str, text: str) -> Handled:
-        """Counts an error of the session itself, and starts the estimate anew."""
+        """Counts an error of the session itself, and restarts the estimate."""
         self._log.fault(Fault.NODE, text)
         self._start_again()
         # The traceback is in the log of the node already.

@@ -73,7 +73,7 @@ class TrackerSettings:
             keeps those of the model.
         lost_misfit: Fraction of the outline, or of the keypoints, left unexplained by every mode
             above which an image counts as lost.
-        lost_images: Number of consecutive lost images after which the track starts anew.
+        lost_images: Number of consecutive lost images after which the track restarts.
         likelihood: settings of the likelihood.
         search: settings of the search of limbs.
     """
