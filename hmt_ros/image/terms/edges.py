@@ -23,7 +23,7 @@ from hmt_ros.image.terms.image_term import (
     TermSettings,
     Weighting,
 )
-from hmt_ros.image.terms.residuals import add_residual, geman_mcclure
+from hmt_ros.image.terms.residuals import add_contour_residual, geman_mcclure
 
 ORIENTATIONS = 4
 # Canny's thresholds.
@@ -96,12 +96,9 @@ def add_edges(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
         value, gu, gv = sample_distance(edges, channel, contour.pixels[i, 0], contour.pixels[i, 1])
         rho, pull, curvature = geman_mcclure(value / term.sigma, term.scale, each)
         energy += rho
-        j, p = contour.projections, contour.points
-        gu, gv = gu / term.sigma, gv / term.sigma
-        add_residual(
-            wrenches, stiffnesses, view.owners[contour.parts[i]], p[i, 0], p[i, 1], p[i, 2],
-            gu * j[i, 0, 0] + gv * j[i, 1, 0], gu * j[i, 0, 1] + gv * j[i, 1, 1],
-            gu * j[i, 0, 2] + gv * j[i, 1, 2], pull, curvature,
+        add_contour_residual(
+            wrenches, stiffnesses, view.owners[contour.parts[i]], contour, i,
+            gu / term.sigma, gv / term.sigma, pull, curvature,
         )  # fmt: skip
     return energy
 

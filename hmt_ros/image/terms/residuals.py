@@ -119,6 +119,20 @@ def add_residual(wrenches, stiffnesses, s, p0, p1, p2, a0, a1, a2, pull, curvatu
     stiffnesses[s, 5, 5] += curvature * a5 * a5
 
 
+@njit(cache=True, nogil=True, inline='always')
+def add_contour_residual(wrenches, stiffnesses, s, contour, i, gu, gv, pull, curvature):  # type: ignore[no-untyped-def]
+    """Adds a residual of the pixel of contour point i to segment s.
+
+    Its derivatives by column and row are gu and gv.
+    """
+    p, j = contour.points, contour.projections
+    add_residual(
+        wrenches, stiffnesses, s, p[i, 0], p[i, 1], p[i, 2],
+        gu * j[i, 0, 0] + gv * j[i, 1, 0], gu * j[i, 0, 1] + gv * j[i, 1, 1],
+        gu * j[i, 0, 2] + gv * j[i, 1, 2], pull, curvature,
+    )  # fmt: skip
+
+
 @njit(cache=True, nogil=True)
 def assemble_pose(tree, axes, dof_origins, wrenches, stiffnesses, gradient, hessian):  # type: ignore[no-untyped-def]
     """Gradient (d,) and Hessian (d, d) of one pose; overwrites the sums of the segments.
