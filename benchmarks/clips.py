@@ -16,11 +16,20 @@ from numpy.typing import NDArray
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import Camera
 from hmt_ros.evaluation.track_scores import Truth
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.sessions.filter_parameters import FilterParameters
 from msg_tools import BagReader
+from msg_tools.files.array_file import read_archive
 from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image
 
+# Joints that the detector and our bodies share.
+JOINTS_OF_DETECTOR = tuple(
+    f'{side}_{name}'
+    for name in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle', 'toe')
+    for side in ('left', 'right')
+)
 ROOT = Path(__file__).resolve().parents[1]
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 IMAGES = (COMPRESSED, 'sensor_msgs/msg/Image')
@@ -37,7 +46,7 @@ class Clip:
         images: (T,) BGR.
         truth: where the joints were.
         pixels: stamp -> (J, 2) true image positions of the joints of `truth`.
-        background: the empty scene.
+        background: the empty scene; None: the camera moves.
     """
 
     folder: Path
@@ -46,7 +55,7 @@ class Clip:
     images: list[NDArray[np.uint8]]
     truth: Truth
     pixels: dict[int, NDArray[np.float64]]
-    background: NDArray[np.uint8]
+    background: NDArray[np.uint8] | None
 
     @property
     def name(self) -> str:
@@ -71,26 +80,27 @@ def index_back_and_forth(number: int, count: int) -> int:
     return min(number % turn, turn - number % turn)
 
 
-def find_clips(folder: Path | None) -> tuple[list[Path], str]:
+def find_clips(folder: Path | None, *, moving: bool = False) -> tuple[list[Path], str]:
     """Folders of clips with truth, and where they come from.
 
     Args:
         folder: that holds the clips; None: the development data, and where that is absent the
             bags of this repository.
+        moving: whether those are wanted too that have no image of the empty scene.
 
     Raises:
         ValueError: there are none.
     """
     if folder is not None:
-        return _clips_in(folder), str(folder)
+        return _clips_in(folder, moving), str(folder)
     shared = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video'
     if shared.is_dir():
-        return _clips_in(shared), 'development clips'
-    return _clips_in(ROOT / 'bags'), f'bags/ of the repository, as {shared.resolve()} is absent'
+        return _clips_in(shared, moving), 'development clips'
+    return _clips_in(ROOT / 'bags', moving), f'bags/ of the repository, as {shared.resolve()} is absent'
 
 
-def _clips_in(folder: Path) -> list[Path]:
-    wanted = ('metadata.yaml', 'truth.npz', 'subject.yaml', 'background.png')
+def _clips_in(folder: Path, moving: bool) -> list[Path]:
+    wanted = ['metadata.yaml', 'truth.npz', 'subject.yaml', 'background.png'][: 3 if moving else 4]
     found = [
         path
         for path in (sorted(folder.iterdir()) if folder.is_dir() else [])
@@ -124,9 +134,9 @@ def read_clip(folder: Path, frames: int | None = None) -> Clip:
     info, messages = read_messages(folder, frames=frames)
     stamps = [time_ns(message.header.stamp) for message in messages]
     images = [decode_image(message) for message in messages]
-    background = cv2.imread(str(folder / 'background.png'))
-    if background is None:
-        raise ValueError(f'{folder / "background.png"} is no image')
+    background, empty = None, folder / 'background.png'
+    if empty.is_file() and (background := cv2.imread(str(empty))) is None:
+        raise ValueError(f'{empty} is no image')
     height, width = images[0].shape[:2]
     with np.load(folder / 'truth.npz') as content:
         pixels = dict(zip(map(int, content['stamps']), np.array(content['pixels']), strict=True))
@@ -137,8 +147,55 @@ def read_clip(folder: Path, frames: int | None = None) -> Clip:
         images,
         read_truth(folder / 'truth.npz'),
         pixels,
-        background,
+        None if background is None else np.asarray(background, dtype=np.uint8),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """What a detector says of a clip, from `keypoints_mediapipe.npz`.
+
+    Attributes:
+        keypoints: by stamp, of the joints that our bodies have.
+        names: (J,) joints of its own 3D poses.
+        joints: by stamp, (J, 3) m, its own 3D pose relative to the middle of the hips; the axes are
+            those of the camera.
+    """
+
+    keypoints: dict[int, Keypoints]
+    names: tuple[str, ...]
+    joints: dict[int, NDArray[np.float64]]
+
+
+# Landmarks of the detector that have other names than our joints.
+LANDMARKS = {'left_foot_index': 'left_toe', 'right_foot_index': 'right_toe'}
+# Standard deviation of a keypoint of confidence 1, px: the default of the filter node.
+KEYPOINT_SIGMA = FilterParameters().keypoint_sigma_px
+
+
+def read_detections(folder: Path) -> Detections:
+    """Reads the detector's keypoints of a clip.
+
+    Raises:
+        ValueError: there are none, or they can not be read.
+    """
+    try:
+        content = read_archive(folder / 'keypoints_mediapipe.npz')
+    except OSError as error:
+        raise ValueError(f'{folder} has no keypoints_mediapipe.npz ({error.strerror})') from error
+    names = [LANDMARKS.get(str(name), str(name)) for name in content['landmark_names']]
+    known = [i for i, name in enumerate(names) if name in JOINTS_OF_DETECTOR]
+    own = tuple(names[i] for i in known)
+    stamps, found = [int(x) for x in content['stamps']], content['detected'].astype(bool)
+    covariances = np.tile(KEYPOINT_SIGMA**2 * np.eye(2), (len(known), 1, 1))
+    keypoints, joints = {}, {}
+    for t, stamp in enumerate(stamps):
+        confidences = np.nan_to_num(content['visibility'][t, known].astype(float))
+        pixels = content['pixels'][t, known].astype(float)
+        keypoints[stamp] = Keypoints(own, pixels, covariances, confidences)
+        if found[t]:
+            joints[stamp] = content['world'][t, known].astype(float)
+    return Detections(keypoints, own, joints)
 
 
 def table(rows: list[list[str]], *, left: int = 1, markdown: bool = False) -> str:

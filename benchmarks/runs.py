@@ -1,0 +1,379 @@
+"""Runs of the tracker over clips: each in a process of its own, remembered until the code changes.
+
+A run is a clip, what the tracker is given of it, a seed and changed settings. What it found is kept
+as arrays in `build/benchmarks/tracking`, under a name that depends on the run, the code and the
+clip: a benchmark that was broken off goes on where it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import os
+import sys
+import time
+import zipfile
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from benchmarks.clips import ROOT, Clip, read_clip, read_detections
+from hmt_ros.body import Body, load_body
+from hmt_ros.evaluation.pose_scores import (
+    EVALUATED_JOINTS,
+    ORIGIN,
+    joint_mixtures,
+    origin_joints,
+    score,
+)
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.likelihood import OFF
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.image.terms.registry import TERMS
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.tracking import Tracker, TrackerSettings, read_subject
+
+IMAGES, BOTH, KEYPOINTS = 'images', 'images + keypoints', 'keypoints'
+INPUTS = (IMAGES, BOTH, KEYPOINTS)
+KEPT = ROOT / 'build' / 'benchmarks' / 'tracking'
+# Joints of a record: the origin, then those that are scored.
+JOINTS = (ORIGIN, *EVALUATED_JOINTS)
+# Streams of random numbers of a seed.
+OF_BLIND_CONTROL = 5
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run.
+
+    Attributes:
+        folder: of the clip.
+        inputs: what the tracker is given, one of `INPUTS`.
+        seed: of the tracker.
+        changes: settings of the tracker, by their path, that differ from the defaults.
+        limit: number of images; None: all.
+    """
+
+    folder: Path
+    inputs: str
+    seed: int
+    changes: tuple[tuple[str, Any], ...] = ()
+    limit: int | None = None
+
+    @property
+    def clip(self) -> str:
+        """Name of the clip."""
+        return self.folder.name
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What a run found, and the truth: T images that had a posterior, K modes, J joints.
+
+    Attributes:
+        stamps: (T,) ns.
+        joints: (T, K, J, 3) of the modes, m, camera frame; NaN where there are fewer.
+        weights: (T, K); 0 where there are fewer.
+        point: (T, J, 3) of the point estimate, m.
+        blind: (T,) least error of the heaviest mode and draws around it, as many as modes, m.
+        levels: (T,) of the true positions of all joints together.
+        joint_levels: (T, J) of each scored joint alone.
+        log_densities: (T,) of the true positions.
+        evaluations: (T,) of the likelihood.
+        seconds: (T,) a step took.
+        images: (1,) number of images of the run.
+        true: (T, J, 3) m, camera frame; NaN where a joint has no truth.
+        contact: (T, 2) whether the left and the right foot stand; empty: unknown.
+    """
+
+    stamps: NDArray[np.int64]
+    joints: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    point: NDArray[np.float64]
+    blind: NDArray[np.float64]
+    levels: NDArray[np.float64]
+    joint_levels: NDArray[np.float64]
+    log_densities: NDArray[np.float64]
+    evaluations: NDArray[np.float64]
+    seconds: NDArray[np.float64]
+    images: NDArray[np.int64]
+    true: NDArray[np.float64]
+    contact: NDArray[np.bool_]
+
+
+def changed(changes: Sequence[tuple[str, Any]]) -> TrackerSettings:
+    """Settings with those that are named by their path, such as `likelihood.edges.weight`.
+
+    Raises:
+        ValueError: there is no such setting, or it does not take the value.
+    """
+    settings: Any = TrackerSettings()
+    for path, value in changes:
+        settings = _with_value(settings, path.split('.'), value, path)
+    result: TrackerSettings = settings
+    return result
+
+
+def _with_value(settings: Any, names: list[str], value: Any, path: str) -> Any:
+    known = [field.name for field in fields(settings)] if is_dataclass(settings) else []
+    if names[0] not in known:
+        raise ValueError(f'no setting {path!r}: {names[0]!r} is none of {", ".join(known)}')
+    own = getattr(settings, names[0])
+    if names[1:]:
+        return replace(settings, **{names[0]: _with_value(own, names[1:], value, path)})
+    if isinstance(own, float) and isinstance(value, int):
+        value = float(value)
+    if not isinstance(value, type(own)):
+        raise ValueError(f'{path} is a {type(own).__name__}, saw {value!r}')
+    return replace(settings, **{names[0]: value})
+
+
+def parsed_changes(words: Sequence[str]) -> tuple[tuple[str, Any], ...]:
+    """Changes from words such as `max_hypotheses=4`.
+
+    Raises:
+        ValueError: a word of another form, or no such setting.
+    """
+    result = []
+    for word in words:
+        name, equals, value = word.partition('=')
+        if not equals:
+            raise ValueError(f'wanted SETTING=VALUE, saw {word!r}')
+        result.append((name, yaml.safe_load(value)))
+    changed(result)
+    return tuple(result)
+
+
+def keypoints_only(settings: TrackerSettings) -> TrackerSettings:
+    """The same tracker with the terms of the image off."""
+    likelihood = replace(settings.likelihood, **{term.name: OFF for term in TERMS})
+    return replace(settings, likelihood=likelihood)
+
+
+def new_tracker(clip: Clip, body: Body, settings: TrackerSettings, seed: int) -> Tracker:
+    """A tracker that starts with the subject of a clip."""
+    background = None if clip.background is None else BackgroundModel.from_image(clip.background)
+    tracker = Tracker(body, clip.camera, settings, background, seed)
+    tracker.reset(read_subject(clip.subject, body))
+    return tracker
+
+
+def run(one: Run) -> Record:
+    """Runs the tracker.
+
+    Raises:
+        ValueError: the clip can not be read, or lacks what the run needs.
+    """
+    clip, body = read_clip(one.folder, one.limit), load_body('human37')
+    settings = changed(one.changes)
+    keypoints = None if one.inputs == IMAGES else read_detections(one.folder).keypoints
+    if one.inputs == KEYPOINTS:
+        settings = keypoints_only(settings)
+    return follow(clip, new_tracker(clip, body, settings, one.seed), one.seed, keypoints)
+
+
+def follow(
+    clip: Clip, tracker: Tracker, seed: int, keypoints: dict[int, Keypoints] | None = None
+) -> Record:
+    """What a tracker says of the images of a clip.
+
+    Args:
+        clip: images and truth.
+        tracker: before the first image.
+        seed: of the draws of the blind control and of the regions.
+        keypoints: by stamp; None: none are used.
+    """
+    bodies: list[Body] = []
+    mixtures: list[GaussianMixture] = []
+    points: list[NDArray[np.float64]] = []
+    stamps: list[int] = []
+    evaluations, seconds = [], []
+    for stamp, image in zip(clip.stamps, clip.images, strict=True):
+        start = time.perf_counter()
+        seen = None if keypoints is None else keypoints.get(stamp)
+        posterior, _ = tracker.step(image, stamp, seen)
+        spent = time.perf_counter() - start
+        if posterior is not None and stamp in clip.truth.joints:
+            bodies.append(tracker.body)
+            mixtures.append(posterior)
+            points.append(posterior.means[int(np.argmax(posterior.weights))])
+            stamps.append(stamp)
+            evaluations.append(float(tracker.evaluations))
+            seconds.append(spent)
+    return recorded(clip, bodies, mixtures, points, stamps, evaluations, seconds, seed)
+
+
+def recorded(
+    clip: Clip,
+    bodies: list[Body],
+    mixtures: list[GaussianMixture],
+    points: list[NDArray[np.float64]],
+    stamps: list[int],
+    evaluations: list[float],
+    seconds: list[float],
+    seed: int,
+) -> Record:
+    """Mixtures and point estimates (T,) with their scores against the truth of a clip."""
+    names = clip.truth.joint_names
+    origin = origin_joints(names)
+    scored = clip.truth.evaluated_joints()
+    true = np.full((len(stamps), len(JOINTS), 3), np.nan)
+    for j, name in enumerate(JOINTS):
+        if name in names:
+            true[:, j] = [clip.truth.joints[stamp][names.index(name)] for stamp in stamps]
+    centre = [names.index(name) for name in origin]
+    middle = np.array([clip.truth.joints[stamp][centre].mean(0) for stamp in stamps])
+    which = [JOINTS.index(name) for name in scored]
+    if ORIGIN not in origin:
+        true[:, 0] = middle
+    k = max(map(len, mixtures))
+    joints = np.full((len(stamps), k, len(JOINTS), 3), np.nan)
+    weights = np.zeros((len(stamps), k))
+    point = np.empty((len(stamps), len(JOINTS), 3))
+    blind = np.empty(len(stamps))
+    rng = np.random.default_rng([seed, OF_BLIND_CONTROL])
+    found = []
+    # The body changes only while its flesh is fitted: its kinematics is computed in batches.
+    first = 0
+    for i in range(1, len(bodies) + 1):
+        if i == len(bodies) or bodies[i] is not bodies[first]:
+            body = bodies[first]
+            found += joint_mixtures(body, mixtures[first:i], scored, origin=origin)
+            for t in range(first, i):
+                mixture, n = mixtures[t], len(mixtures[t])
+                heaviest = mixture[np.argsort(-mixture.weights, kind='stable')[:1]]
+                drawn = np.concatenate([heaviest.means, heaviest.sample(n - 1, rng)])
+                poses = np.concatenate([mixture.means, drawn, points[t][None]])
+                placed = _record_joints(body, poses, ORIGIN not in origin)
+                joints[t, :n], weights[t, :n] = placed[:n], mixture.normalised().weights
+                point[t] = placed[-1]
+                relative = placed[n:-1, which] - placed[n:-1, :1]
+                wanted = true[t, which] - true[t, :1]
+                blind[t] = np.linalg.norm(relative - wanted, axis=2).mean(1).min()
+            first = i
+    scores = score(found, true[:, which] - middle[:, None], scored, seed=seed)
+    contact = _contact(clip, stamps)
+    assert scores.levels is not None and scores.joint_levels is not None
+    assert scores.log_densities is not None
+    return Record(
+        np.array(stamps), joints, weights, point, blind, scores.levels, scores.joint_levels,
+        scores.log_densities, np.array(evaluations), np.array(seconds),
+        np.array([len(clip.images)]), true, contact,
+    )  # fmt: skip
+
+
+def _record_joints(body: Body, poses: NDArray[np.float64], at_hips: bool) -> NDArray[np.float64]:
+    """Joints (N, J, 3) of `JOINTS`; the first is the middle of the hips where that is wanted."""
+    every = body.joint_positions(poses)
+    result: NDArray[np.float64] = every[:, body.skeleton.joint_index([*JOINTS])]
+    if at_hips:
+        hips = body.skeleton.joint_index(['left_hip', 'right_hip'])
+        result[:, 0] = every[:, hips].mean(1)
+    return result
+
+
+def _contact(clip: Clip, stamps: list[int]) -> NDArray[np.bool_]:
+    with np.load(clip.folder / 'truth.npz') as content:
+        if 'contact' not in content:
+            return np.zeros((0, 2), dtype=np.bool_)
+        known = dict(zip(map(int, content['stamps']), content['contact'], strict=True))
+    return np.array([known[stamp] for stamp in stamps], dtype=np.bool_)
+
+
+# Many runs.
+
+
+def run_all(runs: Sequence[Run], processes: int = 0, kept: Path = KEPT) -> list[Record]:
+    """Records of many runs, in parallel; those that are kept are read.
+
+    Args:
+        runs: to do.
+        processes: number of processes, one thread each; 0: one a core.
+        kept: folder of the records.
+    """
+    kept.mkdir(parents=True, exist_ok=True)
+    cores = sorted(os.sched_getaffinity(0))
+    paths = {one: kept / f'{name_of(one)}.npz' for one in runs}
+    missing = [one for one in dict.fromkeys(runs) if read_record(paths[one]) is None]
+    if len(missing) < len(runs) and missing:
+        tqdm.write(f'tracking: {len(runs) - len(missing)} runs are kept', file=sys.stderr)
+    # The longest first, so that no core waits long at the end.
+    missing.sort(key=lambda one: -_length(one))
+    context = multiprocessing.get_context('spawn')
+    turn = context.Value('i', 0)
+    with (
+        tqdm(total=len(missing), unit='run', desc='tracking', disable=None) as bar,
+        ProcessPoolExecutor(
+            processes or len(cores), context, _own_a_core, (turn, cores)
+        ) as pool,
+    ):  # fmt: skip
+        jobs = {pool.submit(_run_and_keep, one, paths[one]): one for one in missing}
+        for job in as_completed(jobs):
+            job.result()
+            bar.update()
+    records = [read_record(paths[one]) for one in runs]
+    return [record for record in records if record is not None]
+
+
+def _own_a_core(turn: Any, cores: list[int]) -> None:
+    with turn.get_lock():
+        mine = cores[turn.value % len(cores)]
+        turn.value += 1
+    os.sched_setaffinity(0, {mine})
+    cv2.setNumThreads(1)
+
+
+def _run_and_keep(one: Run, path: Path) -> None:
+    record = run(one)
+    partial = path.with_suffix(f'.{os.getpid()}.tmp.npz')
+    np.savez_compressed(
+        partial, **{field.name: getattr(record, field.name) for field in fields(record)}
+    )
+    partial.replace(path)
+
+
+def read_record(path: Path) -> Record | None:
+    """A record that was kept; None: there is none, or it is damaged."""
+    try:
+        with np.load(path) as content:
+            return Record(**{field.name: content[field.name] for field in fields(Record)})
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile):
+        return None
+
+
+def name_of(one: Run) -> str:
+    """Name of the record of a run: another for other code, another clip or other settings."""
+    files = [path for path in sorted(one.folder.iterdir()) if path.is_file()]
+    seen = [(path.name, path.stat().st_size) for path in files]
+    text = repr((code_digest(), seen, {**asdict(one), 'folder': one.clip}))
+    words = (one.clip, one.inputs.replace(' + ', '_'), str(one.seed))
+    return '-'.join((*words, hashlib.sha256(text.encode()).hexdigest()[:16]))
+
+
+@lru_cache(maxsize=1)
+def code_digest() -> str:
+    """Of the code and data that a record depends on."""
+    digest = hashlib.sha256()
+    layers = ('body', 'evaluation', 'flips', 'image', 'inference', 'tracking')
+    for path in sorted(
+        path
+        for layer in layers
+        for path in (ROOT / 'hmt_ros' / layer).rglob('*')
+        if path.suffix in ('.py', '.yaml')
+    ):
+        digest.update(path.read_bytes())
+    digest.update(Path(__file__).read_bytes())
+    return digest.hexdigest()
+
+
+def _length(one: Run) -> int:
+    return sum(path.stat().st_size for path in one.folder.glob('*.mcap'))
