@@ -91,3 +91,18 @@ def root_angles(body: Body, rotations: Array) -> Array:
     y = np.clip(y, body.lower[limits], body.upper[limits])
     z, x = np.arctan2(r[:, 1, 0], r[:, 0, 0]), np.arctan2(r[:, 2, 1], r[:, 2, 2])
     return np.stack([z, y, x], axis=1)
+
+
+def left_directions(body: Body, poses: Array) -> Array:
+    """Unit vectors (N, 3) to the left of the persons in poses (N, d), in the camera frame.
+
+    Raises:
+        ValueError: a body without shoulders and hips.
+    """
+    if not body.trunk_pairs:
+        raise ValueError(f'body {body.name} has neither shoulders nor hips: it faces nowhere')
+    joints = body.joint_positions(poses)
+    ends = [body.skeleton.joint_index(side) for side in zip(*body.trunk_pairs, strict=True)]
+    left = joints[:, ends[0]].sum(1) - joints[:, ends[1]].sum(1)
+    result: Array = left / np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-12)
+    return result

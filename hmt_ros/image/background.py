@@ -8,6 +8,7 @@ work.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,6 +17,12 @@ from hmt_ros.inference.arrays import Image, Mask
 
 Box = tuple[int, int, int, int]
 
+# What OpenCV's models call a pixel that differs from the background, and one that is darker in the
+# same colour.
+FOREGROUND, SHADOW = 255, 127
+# Grey levels by which a pixel may differ from the colours of the background around it: compression
+# and aliasing move its edges.
+BESIDE = 8
 # Learning rate at which nothing is learned; at 0 the KNN model would replace its samples at once.
 FROZEN = 1e-7
 
@@ -47,6 +54,19 @@ class BackgroundSettings:
             raise ValueError(f'background method must be mog2 or knn, saw {self.method!r}')
 
 
+class Silhouette(NamedTuple):
+    """What differs from the background.
+
+    Attributes:
+        foreground: (H, W) the person.
+        unsure: (H, W) darker than the background in the same colour: a shadow, or clothes in the
+            colours of the scene.
+    """
+
+    foreground: Mask
+    unsure: Mask
+
+
 class BackgroundModel:
     """Learns an empty scene and finds what does not belong to it."""
 
@@ -62,6 +82,7 @@ class BackgroundModel:
         self._model.setShadowThreshold(s.shadow_threshold)
         self.frames = 0
         self._shape: tuple[int, ...] = ()
+        self._nearby: tuple[Image, Image] | None = None
 
     @classmethod
     def from_image(
@@ -84,6 +105,7 @@ class BackgroundModel:
         self._check(image)
         self.frames += 1
         self._model.apply(image, learningRate=1.0 / self.frames)
+        self._nearby = None
 
     def silhouette(self, image: Image, region: Box | None = None) -> Mask:
         """Foreground (H, W) of an image: the largest piece and what is near it, without shadow.
@@ -98,11 +120,16 @@ class BackgroundModel:
         Raises:
             ValueError: no background was learned, or the image has another size.
         """
+        return self.split(image, region).foreground
+
+    def split(self, image: Image, region: Box | None = None) -> Silhouette:
+        """Foreground of an image, as for `silhouette`, and what may be person or shadow."""
         if self.frames == 0:
             raise ValueError('no background has been learned: give an image or some frames first')
         self._check(image)
         raw = self._model.apply(image, learningRate=FROZEN)
-        mask = (raw == 255).astype(np.uint8)
+        mask = (raw == FOREGROUND).astype(np.uint8)
+        mask[self._is_beside(image)] = 0
         result = np.zeros(mask.shape, dtype=np.bool_)
         left, top, right, bottom = region or (0, 0, mask.shape[1], mask.shape[0])
         part = np.ascontiguousarray(mask[top:bottom, left:right])
@@ -112,7 +139,26 @@ class BackgroundModel:
             result[top:bottom, left:right] = _pieces_of_one_person(
                 np.asarray(closed, dtype=np.uint8), self.settings
             )
-        return result
+        unsure = raw == SHADOW
+        shadow = np.zeros(mask.shape, dtype=np.bool_)
+        shadow[top:bottom, left:right] = (
+            cv2.morphologyEx(
+                np.ascontiguousarray(unsure[top:bottom, left:right]).view(np.uint8),
+                cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8),
+            )
+            > 0
+        )  # fmt: skip
+        return Silhouette(result, shadow & ~result)
+
+    def _is_beside(self, image: Image) -> Mask:
+        """Pixels (H, W) whose colour the background has beside them: its edges, slightly moved."""
+        if self._nearby is None:
+            empty = np.asarray(self._model.getBackgroundImage(), dtype=np.uint8)
+            square = np.ones((3, 3), np.uint8)
+            darkest, brightest = cv2.erode(empty, square), cv2.dilate(empty, square)
+            margin = np.full_like(empty, BESIDE)
+            self._nearby = cv2.subtract(darkest, margin), cv2.add(brightest, margin)
+        return np.asarray(cv2.inRange(image, *self._nearby) > 0)
 
     def _check(self, image: Image) -> None:
         # OpenCV would silently begin a new model.

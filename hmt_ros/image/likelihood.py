@@ -172,7 +172,10 @@ class ImageLikelihood:
             derivatives: whether gradient and Hessian are wanted.
         """
         n, d = frames.count, self.body.dimension
-        request = Request(n, explained)
+        beliefs = observation.beliefs
+        if beliefs is None:
+            beliefs = np.ones(len(self.body.skeleton.parents))
+        request = Request(n, explained, beliefs)
         textured = textures is not None and len(textures.counts) > 0
         inputs, running = [], []
         for term in TERMS:

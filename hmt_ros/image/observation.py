@@ -14,7 +14,7 @@ from hmt_ros.image.terms.image_term import ImageWindow
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.image.terms.silhouette import Outline
-from hmt_ros.inference.arrays import Image, Mask
+from hmt_ros.inference.arrays import Array, Image, Mask
 
 Box = tuple[int, int, int, int]
 
@@ -27,14 +27,18 @@ class Observation:
     """An image and what was taken from it.
 
     Attributes:
-        silhouette: (H, W) foreground, or None: unknown.
+        silhouette: (H, W) foreground, or None: unknown, or not believed.
         keypoints: joints seen in the image, or None.
         evidence: by the name of the term; what the image lacks is left out.
+        foreground: (H, W) what differs from the background, believed or not; None: unknown.
+        beliefs: (S,) how far the silhouette is believed on each segment, 0 to 1; None: wholly.
     """
 
     silhouette: Mask | None = None
     keypoints: Keypoints | None = None
     evidence: Mapping[str, Any] = field(default_factory=dict)
+    foreground: Mask | None = None
+    beliefs: Array | None = None
 
     @property
     def outline(self) -> Outline | None:
@@ -54,6 +58,7 @@ def observe(
     window: Box | None = None,
     last_image: Image | None = None,
     wanted: Collection[str] | None = None,
+    unsure: Mask | None = None,
 ) -> Observation:
     """The evidence that an image gives to the terms of the likelihood.
 
@@ -65,6 +70,7 @@ def observe(
             silhouette; the whole image when None.
         last_image: the image before, of the same size, for the optical flow.
         wanted: names of terms; None: all.
+        unsure: (H, W) pixels that may belong to the silhouette; None: none.
 
     Raises:
         ValueError: shapes that contradict each other.
@@ -80,8 +86,11 @@ def observe(
     mask = None
     if known is not None:
         mask = np.ascontiguousarray(known[rows, columns]).view(np.uint8)
+    doubtful = None
+    if known is not None and unsure is not None:
+        doubtful = np.ascontiguousarray(unsure[rows, columns]).view(np.uint8)
     before = None if last_image is None else np.ascontiguousarray(last_image[rows, columns])
-    part = ImageWindow(np.ascontiguousarray(image[rows, columns]), left, top, mask, before)
+    part = ImageWindow(np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful)
     evidence = {
         term.name: found
         for term in TERMS

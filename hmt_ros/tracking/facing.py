@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.mirror import left_directions
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -70,6 +71,11 @@ class Track:
     def lost(self) -> bool:
         """Whether the last images were explained too badly."""
         return self._first.lost
+
+    @property
+    def believes_silhouettes(self) -> bool:
+        """Whether silhouettes have shown the person so far."""
+        return self._first.recall.believed
 
     @property
     def misfit(self) -> float:
@@ -224,21 +230,6 @@ def _joined(a: MixtureFilter, b: MixtureFilter) -> Modes:
     both = first.joined(second)
     heaviest = both[np.argsort(-both.log_weights, kind='stable')[: a.settings.max_hypotheses]]
     return replace(heaviest, log_weights=normalised(heaviest.log_weights))
-
-
-def left_directions(body: Body, poses: Array) -> Array:
-    """Unit vectors (N, 3) to the left of the persons in poses (N, d), in the camera frame.
-
-    Raises:
-        ValueError: a body without shoulders and hips.
-    """
-    if not body.trunk_pairs:
-        raise ValueError(f'body {body.name} has neither shoulders nor hips: it faces nowhere')
-    joints = body.joint_positions(poses)
-    ends = [body.skeleton.joint_index(side) for side in zip(*body.trunk_pairs, strict=True)]
-    left = joints[:, ends[0]].sum(1) - joints[:, ends[1]].sum(1)
-    result: Array = left / np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-12)
-    return result
 
 
 def faces_like(body: Body, poses: Array, pose: Array) -> NDArray[np.bool_]:

@@ -21,14 +21,18 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, resting
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.ambiguities import ambiguity_classes
 from hmt_ros.tracking.flesh_fitting import FleshFit
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses, relative_joints
 from hmt_ros.tracking.loss import unexplained_share
 from hmt_ros.tracking.posterior import Posterior, free_covariances
 from hmt_ros.tracking.prediction import follow_flow, predict, updated_velocities
 from hmt_ros.tracking.proposals import PROPOSALS, PredictedPoses, Proposal
+from hmt_ros.tracking.proposals.headings import Headings
+from hmt_ros.tracking.proposals.reversals import Reversals
 from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples
-from hmt_ros.tracking.selection import choose_hypotheses
+from hmt_ros.tracking.reliability import SilhouetteRecall
+from hmt_ros.tracking.selection import choose_hypotheses, heads_of_classes
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.weighting import at_least, inherited_log_weights, normalised, weigh
 
@@ -69,6 +73,7 @@ class MixtureFilter:
     Attributes:
         body: with the widths that have been estimated.
         misfit: share of the last image that no mode explains.
+        recall: how far silhouettes are believed.
         log_evidence: sum over images of -beta times the least energy, for comparison with another
             filter of the same images.
     """
@@ -90,6 +95,8 @@ class MixtureFilter:
         self._rng = np.random.default_rng(seed)
         self._modes: Modes | None = None
         self._flesh = FleshFit(body)
+        self.recall = SilhouetteRecall(len(body.skeleton.parents))
+        self._observed: tuple[Observation, Observation] | None = None
         self._usual_energy = np.inf
         self._outline_costs = np.empty((0, 0))
         self._bad_images = 0
@@ -159,6 +166,7 @@ class MixtureFilter:
             if not self._fit_flesh(observation):
                 break
             solved = settle(solved.x, self.settings.iterations)
+        self._learn_recall(observation)
         return solved
 
     def begin_anew(self, poses: Array, observation: Observation) -> Minimum:
@@ -200,18 +208,30 @@ class MixtureFilter:
             expected: pose hypotheses from an external predictor, if any.
         """
         s, modes, posterior = self.settings, self.modes, self._posterior
+        observation = self._believed(observation)
         predicted, covariances = predict(modes, self.body, dt, s.velocity_kept)
         precisions = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
+        lasting = s.error_correlation * (modes.energies - modes.energies.min())
+        predicted = replace(
+            predicted, log_weights=predicted.log_weights + s.inverse_temperature * lasting
+        )
         predicted = follow_flow(predicted, precisions, observation, posterior)
         base = posterior.minimise(
             posterior.given(observation, predicted, precisions), predicted.poses, s.base_iterations
         )
         proposals: list[Proposal] = [self._proposal]
+        if s.reversal_probability > 0:
+            proposals.insert(0, Reversals(posterior, s.reversal_probability))
+            if base.value.min() > self._usual_energy + 2.0 * s.energy_rise:
+                proposals.insert(0, Headings(posterior, 1e-3))
         if expected is not None:
             elsewhere = PredictedPoses(self.body, expected, s.prediction_probability)
-            proposals = [elsewhere, *proposals]
-        found = [x.propose(base, predicted, covariances, observation, self._rng) for x in proposals]
-        candidates = found[0] if len(found) == 1 else found[0].joined(found[1])
+            proposals.insert(0, elsewhere)
+        candidates, *others = (
+            x.propose(base, predicted, covariances, observation, self._rng) for x in proposals
+        )
+        for more in others:
+            candidates = candidates.joined(more)
         optimised = self._optimise(candidates, precisions, observation)
         if self._proposal.iterated:
             optimised = self._search_again(optimised, covariances, precisions, observation)
@@ -230,8 +250,12 @@ class MixtureFilter:
         least = self._weigh_and_select(
             Optimised(hypotheses, solved), velocities, observation, before
         )
-        self.log_evidence -= s.inverse_temperature * least
+        # Of the error of an energy only what is new counts.
+        self.log_evidence -= s.inverse_temperature * (
+            least - s.error_correlation * float(modes.energies.min())
+        )
         self._fit_flesh(observation)
+        self._learn_recall(observation)
 
     def assess(self, observation: Observation) -> None:
         """Takes in how much of an image no mode explains, and whether the track is lost."""
@@ -248,6 +272,7 @@ class MixtureFilter:
         parabola; its minimum and curvature make a component, its depth the weight.
         """
         body, poses = self.body, modes.poses
+        observation = self._believed(observation)
         fit = self._posterior.fit(poses, observation)
         gradient, hessian = fit.energy.derivatives()
         free = ~resting(poses, gradient, body.lower, body.upper)
@@ -348,11 +373,14 @@ class MixtureFilter:
         log_weights = weigh(
             optimised.hypotheses.log_weights[usable], solved.value[usable], s.inverse_temperature
         )
+        reference = solved.x[usable[np.argmax(log_weights)]]
+        classes = ambiguity_classes(self.body, solved.x[usable], reference)
         kept = choose_hypotheses(
             relative_joints(self.body, solved.x[usable]),
             log_weights,
             s.max_hypotheses,
             same=s.hypothesis_merge_distance,
+            first=heads_of_classes(classes, log_weights, s.reach, s.max_hypotheses // 2),
         )
         rows = usable[kept.chosen]
         weights = normalised(kept.log_weights)
@@ -383,6 +411,7 @@ class MixtureFilter:
             covariances=covariances,
             filtered=filtered,
             log_likelihoods=-fit.image_energy,
+            energies=solved.value[rows],
         )
         self._outline_costs = fit.outline_costs
         return float(solved.value[usable].min())
@@ -397,6 +426,19 @@ class MixtureFilter:
             # What is unusual is not learned at once.
             change = min(energy - usual, self.settings.energy_rise)
             self._usual_energy = usual + USUAL_GAIN * change
+
+    def _believed(self, observation: Observation) -> Observation:
+        """An observation with what this track has learned of its cues."""
+        if self._observed is None or self._observed[0] is not observation:
+            believed = replace(observation, beliefs=self.recall.beliefs)
+            self._observed = observation, believed
+        return self._observed[1]
+
+    def _learn_recall(self, observation: Observation) -> None:
+        textures = self.modes.textures
+        if textures is not None and observation.foreground is not None:
+            row = int(self.modes.texture_rows[0])
+            self.recall.update(textures, row, observation.foreground)
 
     def _fit_flesh(self, observation: Observation) -> bool:
         """Moves the widths of the flesh by what an image says; False where it says nothing more."""

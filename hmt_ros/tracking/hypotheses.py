@@ -76,12 +76,14 @@ class Modes(Hypotheses):
         filtered: (N, d, d) covariances that are propagated, as if errors were independent from
             image to image.
         log_likelihoods: (N,) of the image.
+        energies: (N,) of the posterior at the optimum, nats.
     """
 
     velocities: Array
     covariances: Array
     filtered: Array
     log_likelihoods: Array
+    energies: Array
 
     @property
     def mixture(self) -> GaussianMixture:

@@ -10,6 +10,7 @@ is not kept gives its weight to the nearest that is.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +34,13 @@ class Kept(NamedTuple):
 
 
 def choose_hypotheses(
-    joints: Array, log_weights: Array, count: int, *, same: float = 0.02, cap: float = 0.3
+    joints: Array,
+    log_weights: Array,
+    count: int,
+    *,
+    same: float = 0.02,
+    cap: float = 0.3,
+    first: Sequence[int] = (),
 ) -> Kept:
     """The hypotheses to keep.
 
@@ -43,16 +50,40 @@ def choose_hypotheses(
         count: how many to keep at most, K.
         same: mean distance below which two hypotheses are one, m.
         cap: largest distance that a joint counts with, m.
+        first: hypotheses that are kept in any case, after the heaviest.
     """
     top = log_weights.max()
     weights = np.exp(log_weights - top)
-    chosen, owner = _choose(np.ascontiguousarray(joints), weights / weights.sum(), count, same, cap)
+    chosen, owner = _choose(
+        np.ascontiguousarray(joints), weights / weights.sum(), count, same, cap,
+        np.array(first, dtype=np.intp),
+    )  # fmt: skip
     groups = np.array([np.logaddexp.reduce(log_weights[owner == k]) for k in range(len(chosen))])
     return Kept(chosen, owner, groups)
 
 
+def heads_of_classes(classes: Index, log_weights: Array, reach: float, most: int) -> list[int]:
+    """The heaviest hypothesis of each class but that of the heaviest of all, heaviest first.
+
+    Args:
+        classes: (N,).
+        log_weights: (N,).
+        reach: how much lighter than the heaviest of all they may be, nats.
+        most: how many.
+    """
+    order = np.argsort(-log_weights, kind='stable')
+    seen, result = {int(classes[order[0]])}, []
+    for i in order[1:]:
+        if log_weights[i] < log_weights[order[0]] - reach or len(result) == most:
+            break
+        if int(classes[i]) not in seen:
+            seen.add(int(classes[i]))
+            result.append(int(i))
+    return result
+
+
 @njit(cache=True, nogil=True)
-def _choose(joints, weights, count, same, cap):  # type: ignore[no-untyped-def]
+def _choose(joints, weights, count, same, cap, first):  # type: ignore[no-untyped-def]
     n, j = joints.shape[0], joints.shape[1]
     distance = np.zeros((n, n))
     for a in range(n):
@@ -73,6 +104,8 @@ def _choose(joints, weights, count, same, cap):  # type: ignore[no-untyped-def]
         best, best_gain = -1, 0.0
         if kept == 0:
             best = int(np.argmax(weights))
+        elif kept <= len(first):
+            best = first[kept - 1]
         else:
             for c in range(n):
                 if nearest[c] == 0.0:

@@ -9,6 +9,7 @@ mixture.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
@@ -144,6 +145,10 @@ class Tracker:
                 return None, None
             observation = self._observe(image, keypoints)
             self._begin(observation, start, stamp)
+            if not self._track.believes_silhouettes:
+                # The start is where the person is; the silhouette is not.
+                observation = self._observe(image, keypoints)
+                self._begin(observation, start, stamp)
         self._last_image, self._last_stamp = image, stamp
         self.evaluations = self._track.evaluations
         return self.posterior, self._track.likelihood_mixture(observation)
@@ -250,10 +255,15 @@ class Tracker:
         wanted = {'containment', 'coverage'}
         wanted |= {term.name for term in TERMS if getattr(t, term.name).weight > 0}
         wanted |= {'intensity'} if textured else set()  # the textures hold it
-        silhouette = None
+        foreground, unsure = None, None
         if shape and self.background.frames:
-            silhouette = self.background.silhouette(image, self._region())
-        return observe(image, silhouette, keypoints, last_image=self._last_image, wanted=wanted)
+            foreground, unsure = self.background.split(image, self._region())
+        believed = foreground if self._track.believes_silhouettes else None
+        found = observe(
+            image, believed, keypoints,
+            last_image=self._last_image, wanted=wanted, unsure=unsure,
+        )  # fmt: skip
+        return replace(found, foreground=foreground)
 
     def _region(self) -> Box | None:
         """Where the person can be in the next image; None: anywhere."""

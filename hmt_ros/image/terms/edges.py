@@ -48,8 +48,8 @@ def edge_distances(window: ImageWindow) -> ImageMap:
     dx = cv2.Sobel(grey, cv2.CV_16S, 1, 0)
     dy = cv2.Sobel(grey, cv2.CV_16S, 0, 1)
     edges = cv2.Canny(dx, dy, EDGE_LOW, EDGE_HIGH) > 0
-    if window.signed_distance is not None:
-        edges &= window.signed_distance <= MARGIN
+    if window.widest_distance is not None:
+        edges &= window.widest_distance <= MARGIN
     rows, columns = np.nonzero(edges)
     angle = np.arctan2(dy[rows, columns], dx[rows, columns])
     result = np.empty((ORIENTATIONS, *grey.shape), dtype=np.float32)

@@ -52,6 +52,7 @@ class ImageWindow:
         image: (h, w, 3) BGR.
         left, top: column and row of its first pixel in the whole image.
         mask: (h, w) silhouette, 0 or 1; None: unknown.
+        unsure: (h, w) pixels that may belong to it, 0 or 1; None: there are none.
         last_image: (h, w, 3) the same part of the image before; None: there is none.
     """
 
@@ -60,21 +61,31 @@ class ImageWindow:
     top: int
     mask: Image | None
     last_image: Image | None
+    unsure: Image | None = None
 
     @cached_property
     def signed_distance(self) -> NDArray[np.float32] | None:
         """Distance (h, w) to the outline of the silhouette, px, positive outside."""
-        if self.mask is None:
-            return None
-        outside = cv2.distanceTransform(1 - self.mask, cv2.DIST_L2, 5)
-        inside = cv2.distanceTransform(self.mask, cv2.DIST_L2, 5)
-        # The outline lies between the pixels: half a pixel from either side.
-        result: NDArray[np.float32] = np.where(self.mask > 0, 0.5 - inside, outside - 0.5)
-        return result
+        return None if self.mask is None else _signed_distance(self.mask)
+
+    @cached_property
+    def widest_distance(self) -> NDArray[np.float32] | None:
+        """Distance (h, w) to the outline of the silhouette with all that may belong to it, px."""
+        if self.mask is None or self.unsure is None:
+            return self.signed_distance
+        return _signed_distance(self.mask | self.unsure)
 
     def as_map(self, channels: NDArray[np.float32]) -> ImageMap:
         """Values (C, h, w) of the window as a map of the whole image."""
         return ImageMap(channels, self.left, self.top)
+
+
+def _signed_distance(mask: Image) -> NDArray[np.float32]:
+    outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5)
+    inside = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
+    # The outline lies between the pixels: half a pixel from either side.
+    result: NDArray[np.float32] = np.where(mask > 0, 0.5 - inside, outside - 0.5)
+    return result
 
 
 class Weighting(NamedTuple):
@@ -124,6 +135,7 @@ class Request:
 
     poses: int
     explained: Array | None = None
+    beliefs: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,6 +37,9 @@ TURN = 12.0
 # Along the outline distances up to this, px, cost nothing: the contour's points stand that far
 # apart.
 SPACING = 8.0
+# How far a sample of the outline is believed whose outside, so many px away, may be the person.
+UNSURE = 0.3
+BESIDE = 4.0
 
 
 class Outline(NamedTuple):
@@ -45,17 +48,26 @@ class Outline(NamedTuple):
     Attributes:
         pixels: (M, 2).
         normals: (M, 2) unit vectors out of the silhouette.
+        beliefs: (M,) how far each is believed, 0 to 1.
     """
 
     pixels: Array
     normals: Array
+    beliefs: Array
 
 
 class ContainmentInputs(NamedTuple):
-    """Weighting, and the signed distance to the outline, px, positive outside."""
+    """What the kernel of the containment reads.
+
+    Attributes:
+        term: weighting.
+        distance: signed distance to the outline, px, positive outside.
+        beliefs: (S,) factor on the weight of the points of each segment.
+    """
 
     term: Weighting
     distance: ImageMap
+    beliefs: Array
 
 
 class CoverageInputs(NamedTuple):
@@ -76,8 +88,13 @@ class CoverageInputs(NamedTuple):
 
 def distance_map(window: ImageWindow) -> ImageMap | None:
     """Signed distance to the outline of the silhouette, px, positive outside."""
-    signed = window.signed_distance
-    return None if signed is None else window.as_map(signed[None])
+    signed, widest = window.signed_distance, window.widest_distance
+    if signed is None or widest is None:
+        return None
+    # What may be a shadow or the person forbids nothing.
+    if widest is not signed:
+        signed = np.minimum(signed, np.maximum(widest, 0.0))
+    return window.as_map(signed[None])
 
 
 def outline(window: ImageWindow, count: int = OUTLINE_POINTS) -> Outline | None:
@@ -113,14 +130,23 @@ def outline(window: ImageWindow, count: int = OUTLINE_POINTS) -> Outline | None:
     good = length > 1e-3
     normals = normals[good] / length[good, None]
     # The outline lies half a pixel outside the last pixels of the silhouette.
-    return Outline(pixels[good] + 0.5 * normals + np.array([window.left, window.top]), normals)
+    pixels = pixels[good]
+    beliefs = np.ones(len(pixels))
+    if window.unsure is not None:
+        column, row = np.round(pixels + BESIDE * normals).astype(int).T
+        column = np.clip(column, 0, mask.shape[1] - 1)
+        row = np.clip(row, 0, mask.shape[0] - 1)
+        beliefs[window.unsure[row, column] > 0] = UNSURE
+    pixels = pixels + 0.5 * normals + np.array([window.left, window.top])
+    return Outline(pixels, normals, beliefs)
 
 
-NO_OUTLINE = Outline(np.zeros((0, 2)), np.zeros((0, 2)))
+NO_OUTLINE = Outline(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
 
 
-def _containment_inputs(term: Weighting, evidence: Any, _request: Request) -> ContainmentInputs:
-    return ContainmentInputs(term, evidence or NO_MAP)
+def _containment_inputs(term: Weighting, evidence: Any, request: Request) -> ContainmentInputs:
+    beliefs = np.zeros(0) if request.beliefs is None else request.beliefs
+    return ContainmentInputs(term, evidence or NO_MAP, beliefs)
 
 
 def _coverage_inputs(term: Weighting, evidence: Any, request: Request) -> CoverageInputs:
@@ -149,10 +175,12 @@ def add_containment(view, inputs, wrenches, stiffnesses):  # type: ignore[no-unt
         value, gu, gv = sample_distance(distance, 0, contour.pixels[i, 0], contour.pixels[i, 1])
         if value <= 0.0:
             continue
-        rho, pull, curvature = geman_mcclure(value / term.sigma, term.scale, each)
+        segment = view.owners[contour.parts[i]]
+        believed = each * inputs.beliefs[segment]
+        rho, pull, curvature = geman_mcclure(value / term.sigma, term.scale, believed)
         energy += rho
         add_contour_residual(
-            wrenches, stiffnesses, view.owners[contour.parts[i]], contour, i,
+            wrenches, stiffnesses, segment, contour, i,
             gu / term.sigma, gv / term.sigma, pull, curvature,
         )  # fmt: skip
     return energy
@@ -166,7 +194,8 @@ def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untype
     """
     pixels, normals = inputs.outline.pixels, inputs.outline.normals
     term, contour, part_segments = inputs.term, view.contour, view.owners
-    each = term.weight / len(pixels)
+    beliefs = inputs.outline.beliefs
+    share = term.weight / len(pixels)
     explained = inputs.explained[view.number if len(inputs.explained) > 1 else 0]
     costs = inputs.costs[view.number]
     count = len(contour.parts)
@@ -191,6 +220,7 @@ def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untype
     energy = 0.0
     gaps = np.empty(used, np.float32)
     for m in range(len(pixels)):
+        each = share * beliefs[m]
         if used == 0:
             costs[m] = min(explained[m], 0.5 * each * term.scale * term.scale)
             energy += costs[m]

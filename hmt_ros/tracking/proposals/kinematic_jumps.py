@@ -299,7 +299,7 @@ class KinematicJumps:
                 apart=DISTINCT, most=self.posterior.settings.alternatives,
             )  # fmt: skip
             alternatives.append(distinct)
-        if textures is not None:
+        if textures is not None and lead.row >= 0:
             row = len(textures.counts)
             segments = (self.posterior.body.skeleton.chains[chain] for chain in pair)
             textures = with_swapped_sides(textures, lead.row, *segments)
