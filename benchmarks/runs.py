@@ -265,7 +265,8 @@ def recorded(
                 blind[t] = np.linalg.norm(relative - relative_truth[t], axis=2).mean(1).min()
             first = i
     scores = score(found, relative_truth, scored, seed=seed)
-    assert scores.levels is not None and scores.joint_levels is not None
+    assert scores.levels is not None
+    assert scores.joint_levels is not None
     assert scores.log_densities is not None
     return Record(
         np.array(stamps), joints, weights, point, blind, scores.levels, scores.joint_levels,
@@ -295,9 +296,7 @@ def joints_of(body: Body, poses: NDArray[np.float64], clip: Clip) -> NDArray[np.
     return result
 
 
-def _feet_and_views(
-    clip: Clip, stamps: list[int]
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def _feet_and_views(clip: Clip, stamps: list[int]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Contact and views of a record."""
     contact, views = np.zeros((0, 2), dtype=np.bool_), np.tile(np.eye(3, 4), (len(stamps), 1, 1))
     with np.load(clip.folder / 'truth.npz') as content:

@@ -410,7 +410,5 @@ def _table_of_ablations(rows: list[dict[str, Any]], markdown: bool) -> str:
     for row in rows:
         cells = [f'{x.cell(row[x.key][0])} ({_ends(x, row[x.key])})' for x in OF_ABLATIONS[:-1]]
         last = OF_ABLATIONS[-1]
-        result.append(
-            [row['setting'], str(row['value']), *cells, last.cell(row[last.key][0])]
-        )
+        result.append([row['setting'], str(row['value']), *cells, last.cell(row[last.key][0])])
     return table(result, left=2, markdown=markdown)

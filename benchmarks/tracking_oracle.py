@@ -78,7 +78,9 @@ def oracle(
     """
     work = partial(of_clip, limit=limit, every=every)
     clips = dict(
-        zip([x.name for x in folders], in_processes(work, folders, processes, 'oracle'), strict=True)
+        zip(
+            [x.name for x in folders], in_processes(work, folders, processes, 'oracle'), strict=True
+        )
     )
     longest = max(map(len, clips.values()))
     whole = {name: cases for name, cases in clips.items() if len(cases) == longest}
@@ -113,7 +115,9 @@ def of_clip(folder: Path, limit: int | None = None, every: int = EVERY) -> list[
         ]
         for name, masks in silhouettes.items():
             seen = [observe(*pair, wanted=SHAPE_TERMS) for pair in zip(images, masks, strict=True)]
-            found += [(name, terms, optima(body, clip, x, seen, best)) for terms, x in shape.items()]
+            found += [
+                (name, terms, optima(body, clip, x, seen, best)) for terms, x in shape.items()
+            ]
         result += [
             {'lengths': lengths, 'silhouette': silhouette, 'terms': terms}
             | errors_of(body, clip, stamps, poses)
