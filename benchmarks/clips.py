@@ -96,9 +96,8 @@ def find_clips(folder: Path | None, *, moving: bool = False) -> tuple[list[Path]
     shared = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video'
     if shared.is_dir():
         return _clips_in(shared, moving), 'development clips'
-    return _clips_in(
-        ROOT / 'bags', moving
-    ), f'bags/ of the repository, as {shared.resolve()} is absent'
+    source = f'bags/ of the repository, as {shared.resolve()} is absent'
+    return _clips_in(ROOT / 'bags', moving), source
 
 
 def _clips_in(folder: Path, moving: bool) -> list[Path]:
@@ -195,10 +194,8 @@ def read_detections(folder: Path) -> Detections:
         content = read_archive(folder / 'keypoints_mediapipe.npz')
     except OSError as error:
         raise ValueError(f'{folder} has no keypoints_mediapipe.npz ({error.strerror})') from error
-    names = [
-        LANDMARKS.get(str(name), str(name))
-        for name in content.get('landmark_names', LANDMARK_NAMES)
-    ]
+    given = content.get('landmark_names', LANDMARK_NAMES)
+    names = [LANDMARKS.get(str(name), str(name)) for name in given]
     known = [i for i, name in enumerate(names) if name in JOINTS_OF_DETECTOR]
     own = tuple(names[i] for i in known)
     stamps, found = [int(x) for x in content['stamps']], content['detected'].astype(bool)

@@ -13,6 +13,7 @@ import os
 import sys
 import time
 import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
@@ -395,7 +396,7 @@ def read_record(path: Path) -> Record | None:
     try:
         with np.load(path) as content:
             return Record(**{field.name: content[field.name] for field in fields(Record)})
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile):
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error):
         return None
 
 

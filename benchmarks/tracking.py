@@ -62,7 +62,11 @@ class Column(NamedTuple):
 
     def cell(self, value: float | None, sign: str = '') -> str:
         """A number, or `-` for None."""
-        return '-' if value is None else format(self.factor * value, sign + self.form)
+        if value is None:
+            return '-'
+        text = format(self.factor * value, sign + self.form)
+        # Without the sign of a zero that was rounded from below.
+        return format(0.0, sign + self.form) if float(text) == 0.0 else text
 
 
 HEAVIEST, POINT = Column('heaviest', 'heaviest_mm'), Column('point', 'point_mm')
@@ -82,7 +86,11 @@ CALIBRATION = (
     Column('acceleration', 'acceleration', '.1f'), Column('feet, m/s', 'feet', '.2f'),
     EVALUATIONS,
 )  # fmt: skip
-COMPARED = (HEAVIEST, POINT, BEST, KEPT, WEIGHTS, JOINT_90)
+# Of two kinds of settings.
+COMPARED = tuple(
+    column._replace(form=column.form.replace('.0f', '.1f'))
+    for column in (HEAVIEST, POINT, BEST, KEPT, WEIGHTS, JOINT_90)
+)
 OF_ABLATIONS = (HEAVIEST, POINT, BEST, BLIND, KEPT, WEIGHTS, JOINT_90, EVALUATIONS)
 WORST_JOINT = 'worst joint 90 %'
 
@@ -262,7 +270,7 @@ def means_of(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
         means: dict[str, Any] = {'inputs': given}
         for key in mine[0]['by_seed']:
             values = np.array([entry['by_seed'][key] for entry in mine], dtype=float)
-            means[key] = list(map(_known, interval(values)))
+            means[key] = interval(values)
         if 'by_joint_90' in mine[0]:
             shares = np.array([[*entry['by_joint_90'].values()] for entry in mine], dtype=float)
             known = np.isfinite(shares)
@@ -316,7 +324,7 @@ def ablations(folders: Sequence[Path], limit: int | None, processes: int = 0) ->
     for (name, value), own in zip(ABLATIONS, variants, strict=True):
         scores = [found[Run(folder, IMAGES, 0, own, limit)] for folder in folders]
         means = {
-            column.key: list(map(_known, interval(np.array([[x[column.key]] for x in scores]))))
+            column.key: interval(np.array([[x[column.key]] for x in scores]))
             for column in OF_ABLATIONS
         }
         rows.append({'setting': name, 'value': value, **means})
@@ -343,10 +351,10 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         found = result['against']
         what = ', '.join(found['changes'])
         for group in found['groups']:
-            parts.append(f'{group["group"]}: {what} minus the usual settings.')
+            parts.append(f'{group["group"]}: {what} minus the usual settings, mm.')
             parts.append(_table(group, COMPARED, markdown, sign='+'))
         if len(found['groups']) > 1:
-            parts.append(f'All clips: {what} minus the usual settings.')
+            parts.append(f'All clips: {what} minus the usual settings, mm.')
             parts.append(_table({**found, 'clips': []}, COMPARED, markdown, sign='+'))
     if 'ablations' in result:
         found = result['ablations']

@@ -82,15 +82,28 @@ def oracle(
             [x.name for x in folders], in_processes(work, folders, processes, 'oracle'), strict=True
         )
     )
+    return {
+        'every': every,
+        'clips': clips,
+        'mean_of': list(_complete(clips)),
+        'means': means_of(clips),
+    }
+
+
+def means_of(clips: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """Means of each case over the clips that have all cases, with intervals."""
+    found = list(_complete(clips).values())
+    return [
+        {key: case[key] for key in ('lengths', 'silhouette', 'terms')}
+        | {key: interval(np.array([[cases[i][key]] for cases in found])) for key in SHOWN}
+        for i, case in enumerate(found[0])
+    ]
+
+
+def _complete(clips: dict[str, list[dict[str, Any]]]) -> dict[str, list[dict[str, Any]]]:
+    """Clips in which as many silhouettes are known as in any."""
     longest = max(map(len, clips.values()))
-    whole = {name: cases for name, cases in clips.items() if len(cases) == longest}
-    means = []
-    for i, case in enumerate(next(iter(whole.values()))):
-        found = {
-            key: interval(np.array([[cases[i][key]] for cases in whole.values()])) for key in SHOWN
-        }
-        means.append({**{key: case[key] for key in ('lengths', 'silhouette', 'terms')}, **found})
-    return {'every': every, 'clips': clips, 'means': means, 'mean_of': list(whole)}
+    return {name: cases for name, cases in clips.items() if len(cases) == longest}
 
 
 def of_clip(folder: Path, limit: int | None = None, every: int = EVERY) -> list[dict[str, Any]]:
@@ -241,13 +254,13 @@ def as_text(found: dict[str, Any], *, markdown: bool = False) -> str:
     rows = [head]
     for case in found['means']:
         (error, low, high), depth, absolute = (case[key] for key in SHOWN)
+        ends = '-' if low is None else f'{low:.0f} to {high:.0f}'
         rows.append(
             [
                 case['lengths'], case['silhouette'], case['terms'], f'{error:.0f}',
-                f'{low:.0f} to {high:.0f}', f'{depth[0]:+.1f}', f'{absolute[0]:.1f}',
+                ends, f'{depth[0]:+.1f}', f'{absolute[0]:.1f}',
             ]
         )  # fmt: skip
-    by_clip = _by_clip(found['clips'])
     residuals = [
         f'{name} {cases[0]["coordinate_mm"]:.0f} mm' for name, cases in found['clips'].items()
     ]
@@ -256,25 +269,28 @@ def as_text(found: dict[str, Any], *, markdown: bool = False) -> str:
             f'From the truth to the optimum, every {found["every"]}th image; mean over '
             f'{", ".join(found["mean_of"])}.',
             table(rows, left=3, markdown=markdown),
-            'The three terms together, by clip: error in mm and depth in %.',
-            table(by_clip, markdown=markdown),
+            'The same by clip, error in mm and depth in %: the best pose, the three terms together, '
+            'then with the true silhouette, with true lengths, and with both.',
+            table(_by_clip(found['clips']), markdown=markdown),
             f'Best pose of the body, a coordinate of a joint: {", ".join(residuals)}.',
         ]
     )
 
 
 def _by_clip(clips: dict[str, list[dict[str, Any]]]) -> list[list[str]]:
-    shown = [
-        (lengths, silhouette) for lengths in (OF_SUBJECT, TRUE) for silhouette in (SUBTRACTED, TRUE)
-    ]
-    heads = [f'lengths {lengths}, silhouette {silhouette}' for lengths, silhouette in shown]
-    rows = [['clip', f'{BEST_POSE}, lengths {OF_SUBJECT}', *heads]]
+    columns = {
+        'best pose': (OF_SUBJECT, '-', BEST_POSE),
+        'optimum': (OF_SUBJECT, SUBTRACTED, TOGETHER),
+        'true silhouette': (OF_SUBJECT, TRUE, TOGETHER),
+        'true lengths': (TRUE, SUBTRACTED, TOGETHER),
+        'both true': (TRUE, TRUE, TOGETHER),
+    }
+    rows = [['clip', *columns]]
     for name, cases in clips.items():
         of = {(case['lengths'], case['silhouette'], case['terms']): case for case in cases}
-        wanted = [(OF_SUBJECT, '-', BEST_POSE), *((*pair, TOGETHER) for pair in shown)]
-        rows.append([name, *(_cell(of.get(key)) for key in wanted)])
+        rows.append([name, *(_cell(of.get(key)) for key in columns.values())])
     return rows
 
 
 def _cell(case: dict[str, Any] | None) -> str:
-    return '-' if case is None else f'{case["error_mm"]:.0f}, {case["depth_percent"]:+.1f}'
+    return '-' if case is None else f'{case["error_mm"]:.0f}, {case["depth_percent"]:+.1f} %'

@@ -156,7 +156,9 @@ def standing_speed(record: Record) -> float:
     return float(speeds[standing].mean()) if standing.any() else float('nan')
 
 
-def interval(values: Array, *, draws: int = DRAWS, seed: int = 0) -> tuple[float, float, float]:
+def interval(
+    values: Array, *, draws: int = DRAWS, seed: int = 0
+) -> tuple[float | None, float | None, float | None]:
     """Mean over clips with the interval that holds it with a probability of 95 %, by bootstrap.
 
     Clips are drawn with replacement, and of each drawn clip its seeds. Clips without values are
@@ -168,17 +170,20 @@ def interval(values: Array, *, draws: int = DRAWS, seed: int = 0) -> tuple[float
         seed: of the draws.
 
     Returns:
-        Mean, lower and upper end; NaN without values.
+        Mean, lower and upper end; None without values. One clip has no interval.
     """
     values = values[np.isfinite(values).all(1)]
     clips, seeds = values.shape
     if clips == 0 or seeds == 0:
-        return float('nan'), float('nan'), float('nan')
+        return None, None, None
+    mean = float(values.mean())
+    if clips == 1:
+        return mean, None, None
     rng = np.random.default_rng(seed)
     drawn = rng.integers(clips, size=(draws, clips, 1))
     means = values[drawn, rng.integers(seeds, size=(draws, clips, seeds))].mean((1, 2))
     low, high = np.quantile(means, [0.025, 0.975])
-    return float(values.mean()), float(low), float(high)
+    return mean, float(low), float(high)
 
 
 def _distances(joints: Array, true: Array) -> Array:
