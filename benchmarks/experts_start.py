@@ -39,6 +39,7 @@ def starts(
     result: dict[str, Any] = {'clips': {}}
     for folder in folders[:1] if quick else folders:
         clip = read_clip(folder, 6 if quick else None)
+        assert clip.background is not None
         background = BackgroundModel.from_image(clip.background)
         unstarted = Tracker(body, clip.camera, settings, background, 0)
         predict = Predicting(predictor, clip)
@@ -76,6 +77,7 @@ class Predicting:
     """
 
     def __init__(self, predictor: PosePredictor, clip: Clip) -> None:
+        assert clip.background is not None
         self._predictor, self._camera = predictor, clip.camera
         self._background = BackgroundModel.from_image(clip.background)
 

@@ -162,7 +162,8 @@ def parsed_changes(words: Sequence[str]) -> tuple[tuple[str, Any], ...]:
 
 def keypoints_only(settings: TrackerSettings) -> TrackerSettings:
     """The same tracker with the terms of the image off."""
-    likelihood = replace(settings.likelihood, **{term.name: OFF for term in TERMS})
+    off: dict[str, Any] = {term.name: OFF for term in TERMS}
+    likelihood = replace(settings.likelihood, **off)
     return replace(settings, likelihood=likelihood)
 
 

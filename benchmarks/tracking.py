@@ -236,7 +236,8 @@ def _entry(clip: str, given: str, scores: list[dict[str, Any]]) -> dict[str, Any
     }
     result: dict[str, Any] = {'clip': clip, 'inputs': given, 'by_seed': numbers}
     for key, values in numbers.items():
-        result[key] = None if None in values else float(np.mean(values))
+        known = [value for value in values if value is not None]
+        result[key] = float(np.mean(known)) if len(known) == len(values) else None
     if 'by_joint_90' in scores[0]:
         shares = np.mean([one['by_joint_90'] for one in scores], axis=0)
         result['by_joint_90'] = dict(zip(EVALUATED_JOINTS, map(_known, shares), strict=True))

@@ -269,8 +269,8 @@ def as_text(found: dict[str, Any], *, markdown: bool = False) -> str:
             f'From the truth to the optimum, every {found["every"]}th image; mean over '
             f'{", ".join(found["mean_of"])}.',
             table(rows, left=3, markdown=markdown),
-            'The same by clip, error in mm and depth in %: the best pose, the three terms together, '
-            'then with the true silhouette, with true lengths, and with both.',
+            'By clip, error in mm and depth in %: the best pose, the three terms together, then '
+            'with the true silhouette, with true lengths, and with both.',
             table(_by_clip(found['clips']), markdown=markdown),
             f'Best pose of the body, a coordinate of a joint: {", ".join(residuals)}.',
         ]

@@ -42,7 +42,7 @@ def scores_of(record: Record) -> dict[str, Any]:
         K modes: 0 if weights are uniform. `evaluations` and `ms` count an image. What is unknown
         is NaN.
     """
-    known = np.isfinite(record.true).all((0, 2))
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(record.true).all((0, 2)))
     known[0] = False
     true = record.true[:, known] - record.true[:, :1]
     modes = record.joints[:, :, known] - record.joints[:, :, :1]

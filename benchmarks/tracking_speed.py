@@ -22,7 +22,11 @@ OPENCV = 'MOG2 + Canny + distance transform'
 
 
 def speed(clip: Clip) -> dict[str, Any]:
-    """Time of a step and of its stages, and of OpenCV's work on the same images, in turn."""
+    """Time of a step and of its stages, and of OpenCV's work on the same images, in turn.
+
+    The camera of the clip does not move.
+    """
+    assert clip.background is not None
     forget_peak()
     tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
     subtractor = cv2.createBackgroundSubtractorMOG2()
