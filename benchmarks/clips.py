@@ -96,7 +96,8 @@ def find_clips(folder: Path | None, *, moving: bool = False) -> tuple[list[Path]
     shared = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video'
     if shared.is_dir():
         return _clips_in(shared, moving), 'development clips'
-    return _clips_in(ROOT / 'bags', moving), f'bags/ of the repository, as {shared.resolve()} is absent'
+    source = f'bags/ of the repository, as {shared.resolve()} is absent'
+    return _clips_in(ROOT / 'bags', moving), source
 
 
 def _clips_in(folder: Path, moving: bool) -> list[Path]:
@@ -167,6 +168,16 @@ class Detections:
     joints: dict[int, NDArray[np.float64]]
 
 
+# Landmarks of the detector in its order, for files without their names.
+_FACE = (
+    'nose', 'left_eye_inner', 'left_eye', 'left_eye_outer', 'right_eye_inner', 'right_eye',
+    'right_eye_outer', 'left_ear', 'right_ear', 'mouth_left', 'mouth_right',
+)  # fmt: skip
+_OF_SIDES = (
+    'shoulder', 'elbow', 'wrist', 'pinky', 'index', 'thumb', 'hip', 'knee', 'ankle', 'heel',
+    'foot_index',
+)  # fmt: skip
+LANDMARK_NAMES = (*_FACE, *(f'{side}_{x}' for x in _OF_SIDES for side in ('left', 'right')))
 # Landmarks of the detector that have other names than our joints.
 LANDMARKS = {'left_foot_index': 'left_toe', 'right_foot_index': 'right_toe'}
 # Standard deviation of a keypoint of confidence 1, px: the default of the filter node.
@@ -183,7 +194,8 @@ def read_detections(folder: Path) -> Detections:
         content = read_archive(folder / 'keypoints_mediapipe.npz')
     except OSError as error:
         raise ValueError(f'{folder} has no keypoints_mediapipe.npz ({error.strerror})') from error
-    names = [LANDMARKS.get(str(name), str(name)) for name in content['landmark_names']]
+    given = content.get('landmark_names', LANDMARK_NAMES)
+    names = [LANDMARKS.get(str(name), str(name)) for name in given]
     known = [i for i, name in enumerate(names) if name in JOINTS_OF_DETECTOR]
     own = tuple(names[i] for i in known)
     stamps, found = [int(x) for x in content['stamps']], content['detected'].astype(bool)

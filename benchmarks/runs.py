@@ -13,17 +13,19 @@ import os
 import sys
 import time
 import zipfile
-from collections.abc import Sequence
+import zlib
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from benchmarks.clips import ROOT, Clip, read_clip, read_detections
@@ -40,8 +42,10 @@ from hmt_ros.image.likelihood import OFF
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking import Tracker, TrackerSettings, read_subject
+from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings, read_subject
 
+Item = TypeVar('Item')
+Result = TypeVar('Result')
 IMAGES, BOTH, KEYPOINTS = 'images', 'images + keypoints', 'keypoints'
 INPUTS = (IMAGES, BOTH, KEYPOINTS)
 KEPT = ROOT / 'build' / 'benchmarks' / 'tracking'
@@ -93,6 +97,8 @@ class Record:
         images: (1,) number of images of the run.
         true: (T, J, 3) m, camera frame; NaN where a joint has no truth.
         contact: (T, 2) whether the left and the right foot stand; empty: unknown.
+        views: (T, 3, 4) rotation and position of the camera in the world; the world is the camera's
+            frame where the clip does not tell.
     """
 
     stamps: NDArray[np.int64]
@@ -108,6 +114,7 @@ class Record:
     images: NDArray[np.int64]
     true: NDArray[np.float64]
     contact: NDArray[np.bool_]
+    views: NDArray[np.float64]
 
 
 def changed(changes: Sequence[tuple[str, Any]]) -> TrackerSettings:
@@ -155,7 +162,8 @@ def parsed_changes(words: Sequence[str]) -> tuple[tuple[str, Any], ...]:
 
 def keypoints_only(settings: TrackerSettings) -> TrackerSettings:
     """The same tracker with the terms of the image off."""
-    likelihood = replace(settings.likelihood, **{term.name: OFF for term in TERMS})
+    off: dict[str, Any] = {term.name: OFF for term in TERMS}
+    likelihood = replace(settings.likelihood, **off)
     return replace(settings, likelihood=likelihood)
 
 
@@ -182,7 +190,11 @@ def run(one: Run) -> Record:
 
 
 def follow(
-    clip: Clip, tracker: Tracker, seed: int, keypoints: dict[int, Keypoints] | None = None
+    clip: Clip,
+    tracker: Tracker,
+    seed: int,
+    keypoints: dict[int, Keypoints] | None = None,
+    predict: Callable[[NDArray[np.uint8]], PosePrediction] | None = None,
 ) -> Record:
     """What a tracker says of the images of a clip.
 
@@ -191,6 +203,7 @@ def follow(
         tracker: before the first image.
         seed: of the draws of the blind control and of the regions.
         keypoints: by stamp; None: none are used.
+        predict: poses that a regression expects by an image; None: there is none.
     """
     bodies: list[Body] = []
     mixtures: list[GaussianMixture] = []
@@ -200,7 +213,8 @@ def follow(
     for stamp, image in zip(clip.stamps, clip.images, strict=True):
         start = time.perf_counter()
         seen = None if keypoints is None else keypoints.get(stamp)
-        posterior, _ = tracker.step(image, stamp, seen)
+        prediction = None if predict is None else predict(image)
+        posterior, _ = tracker.step(image, stamp, seen, prediction)
         spent = time.perf_counter() - start
         if posterior is not None and stamp in clip.truth.joints:
             bodies.append(tracker.body)
@@ -223,18 +237,11 @@ def recorded(
     seed: int,
 ) -> Record:
     """Mixtures and point estimates (T,) with their scores against the truth of a clip."""
-    names = clip.truth.joint_names
-    origin = origin_joints(names)
+    origin = origin_joints(clip.truth.joint_names)
     scored = clip.truth.evaluated_joints()
-    true = np.full((len(stamps), len(JOINTS), 3), np.nan)
-    for j, name in enumerate(JOINTS):
-        if name in names:
-            true[:, j] = [clip.truth.joints[stamp][names.index(name)] for stamp in stamps]
-    centre = [names.index(name) for name in origin]
-    middle = np.array([clip.truth.joints[stamp][centre].mean(0) for stamp in stamps])
     which = [JOINTS.index(name) for name in scored]
-    if ORIGIN not in origin:
-        true[:, 0] = middle
+    true = true_joints(clip, stamps)
+    relative_truth = true[:, which] - true[:, :1]
     k = max(map(len, mixtures))
     joints = np.full((len(stamps), k, len(JOINTS), 3), np.nan)
     weights = np.zeros((len(stamps), k))
@@ -253,40 +260,56 @@ def recorded(
                 heaviest = mixture[np.argsort(-mixture.weights, kind='stable')[:1]]
                 drawn = np.concatenate([heaviest.means, heaviest.sample(n - 1, rng)])
                 poses = np.concatenate([mixture.means, drawn, points[t][None]])
-                placed = _record_joints(body, poses, ORIGIN not in origin)
+                placed = joints_of(body, poses, clip)
                 joints[t, :n], weights[t, :n] = placed[:n], mixture.normalised().weights
                 point[t] = placed[-1]
                 relative = placed[n:-1, which] - placed[n:-1, :1]
-                wanted = true[t, which] - true[t, :1]
-                blind[t] = np.linalg.norm(relative - wanted, axis=2).mean(1).min()
+                blind[t] = np.linalg.norm(relative - relative_truth[t], axis=2).mean(1).min()
             first = i
-    scores = score(found, true[:, which] - middle[:, None], scored, seed=seed)
-    contact = _contact(clip, stamps)
-    assert scores.levels is not None and scores.joint_levels is not None
+    scores = score(found, relative_truth, scored, seed=seed)
+    assert scores.levels is not None
+    assert scores.joint_levels is not None
     assert scores.log_densities is not None
     return Record(
         np.array(stamps), joints, weights, point, blind, scores.levels, scores.joint_levels,
         scores.log_densities, np.array(evaluations), np.array(seconds),
-        np.array([len(clip.images)]), true, contact,
+        np.array([len(clip.images)]), true, *_feet_and_views(clip, stamps),
     )  # fmt: skip
 
 
-def _record_joints(body: Body, poses: NDArray[np.float64], at_hips: bool) -> NDArray[np.float64]:
-    """Joints (N, J, 3) of `JOINTS`; the first is the middle of the hips where that is wanted."""
-    every = body.joint_positions(poses)
-    result: NDArray[np.float64] = every[:, body.skeleton.joint_index([*JOINTS])]
-    if at_hips:
-        hips = body.skeleton.joint_index(['left_hip', 'right_hip'])
-        result[:, 0] = every[:, hips].mean(1)
+def true_joints(clip: Clip, stamps: Sequence[int]) -> NDArray[np.float64]:
+    """True positions (T, J, 3) of `JOINTS`; NaN where a joint has no truth."""
+    names = clip.truth.joint_names
+    every = np.array([clip.truth.joints[stamp] for stamp in stamps])
+    result = np.full((len(stamps), len(JOINTS), 3), np.nan)
+    for j, name in enumerate(JOINTS):
+        if name in names:
+            result[:, j] = every[:, names.index(name)]
+    result[:, 0] = every[:, [names.index(name) for name in origin_joints(names)]].mean(1)
     return result
 
 
-def _contact(clip: Clip, stamps: list[int]) -> NDArray[np.bool_]:
+def joints_of(body: Body, poses: NDArray[np.float64], clip: Clip) -> NDArray[np.float64]:
+    """Positions (N, J, 3) of `JOINTS`; the first is the origin that the truth of a clip has."""
+    every = body.joint_positions(poses)
+    result: NDArray[np.float64] = every[:, body.skeleton.joint_index([*JOINTS])]
+    centre = body.skeleton.joint_index([*origin_joints(clip.truth.joint_names)])
+    result[:, 0] = every[:, centre].mean(1)
+    return result
+
+
+def _feet_and_views(clip: Clip, stamps: list[int]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Contact and views of a record."""
+    contact, views = np.zeros((0, 2), dtype=np.bool_), np.tile(np.eye(3, 4), (len(stamps), 1, 1))
     with np.load(clip.folder / 'truth.npz') as content:
-        if 'contact' not in content:
-            return np.zeros((0, 2), dtype=np.bool_)
-        known = dict(zip(map(int, content['stamps']), content['contact'], strict=True))
-    return np.array([known[stamp] for stamp in stamps], dtype=np.bool_)
+        row = {int(stamp): t for t, stamp in enumerate(content['stamps'])}
+        rows = [row[stamp] for stamp in stamps]
+        if 'contact' in content:
+            contact = content['contact'][rows].astype(np.bool_)
+        if 'camera_quaternion' in content:
+            views[:, :, :3] = Rotation.from_quat(content['camera_quaternion'][rows]).as_matrix()
+            views[:, :, 3] = content['camera_position'][rows]
+    return contact, views
 
 
 # Many runs.
@@ -301,27 +324,54 @@ def run_all(runs: Sequence[Run], processes: int = 0, kept: Path = KEPT) -> list[
         kept: folder of the records.
     """
     kept.mkdir(parents=True, exist_ok=True)
-    cores = sorted(os.sched_getaffinity(0))
     paths = {one: kept / f'{name_of(one)}.npz' for one in runs}
     missing = [one for one in dict.fromkeys(runs) if read_record(paths[one]) is None]
     if len(missing) < len(runs) and missing:
         tqdm.write(f'tracking: {len(runs) - len(missing)} runs are kept', file=sys.stderr)
     # The longest first, so that no core waits long at the end.
     missing.sort(key=lambda one: -_length(one))
+    in_processes(_run_and_keep, [(one, paths[one]) for one in missing], processes, 'tracking')
+    records = []
+    for one in runs:
+        record = read_record(paths[one])
+        if record is None:
+            raise ValueError(f'{paths[one]} was written and can not be read')
+        records.append(record)
+    return records
+
+
+def in_processes(
+    work: Callable[[Item], Result], items: Sequence[Item], processes: int, what: str
+) -> list[Result]:
+    """What work makes of items, each in a process of one thread; a bar shows progress.
+
+    The first error ends it: items whose work has not begun are left.
+
+    Args:
+        work: function of a module.
+        items: that can be pickled.
+        processes: number of processes; 0: one a core.
+        what: is done, for the bar.
+    """
+    if not items:
+        return []
+    cores = sorted(os.sched_getaffinity(0))
     context = multiprocessing.get_context('spawn')
     turn = context.Value('i', 0)
+    count = min(processes or len(cores), len(items))
     with (
-        tqdm(total=len(missing), unit='run', desc='tracking', disable=None) as bar,
-        ProcessPoolExecutor(
-            processes or len(cores), context, _own_a_core, (turn, cores)
-        ) as pool,
-    ):  # fmt: skip
-        jobs = {pool.submit(_run_and_keep, one, paths[one]): one for one in missing}
-        for job in as_completed(jobs):
-            job.result()
-            bar.update()
-    records = [read_record(paths[one]) for one in runs]
-    return [record for record in records if record is not None]
+        tqdm(total=len(items), unit='run', desc=what, disable=None) as bar,
+        ProcessPoolExecutor(count, context, _own_a_core, (turn, cores)) as pool,
+    ):
+        jobs = [pool.submit(work, item) for item in items]
+        try:
+            for job in as_completed(jobs):
+                job.result()
+                bar.update()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        return [job.result() for job in jobs]
 
 
 def _own_a_core(turn: Any, cores: list[int]) -> None:
@@ -332,7 +382,8 @@ def _own_a_core(turn: Any, cores: list[int]) -> None:
     cv2.setNumThreads(1)
 
 
-def _run_and_keep(one: Run, path: Path) -> None:
+def _run_and_keep(item: tuple[Run, Path]) -> None:
+    one, path = item
     record = run(one)
     partial = path.with_suffix(f'.{os.getpid()}.tmp.npz')
     np.savez_compressed(
@@ -346,7 +397,7 @@ def read_record(path: Path) -> Record | None:
     try:
         with np.load(path) as content:
             return Record(**{field.name: content[field.name] for field in fields(Record)})
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile):
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error):
         return None
 
 
@@ -371,7 +422,8 @@ def code_digest() -> str:
         if path.suffix in ('.py', '.yaml')
     ):
         digest.update(path.read_bytes())
-    digest.update(Path(__file__).read_bytes())
+    for name in ('clips.py', 'runs.py'):
+        digest.update((ROOT / 'benchmarks' / name).read_bytes())
     return digest.hexdigest()
 
 

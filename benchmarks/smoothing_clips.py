@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from benchmarks.clips import Clip, find_clips, read_clip
-from benchmarks.tracking import new_tracker
+from benchmarks.runs import new_tracker
 from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import (
     EVALUATED_JOINTS,

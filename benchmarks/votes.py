@@ -24,7 +24,7 @@ from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
 from benchmarks.flips import random_poses
 from benchmarks.machine import description
-from benchmarks.tracking import keypoints_only
+from benchmarks.runs import keypoints_only
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score

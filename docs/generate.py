@@ -3,8 +3,8 @@
     python docs/generate.py NAME [NAME ...]
 
 The name of a node, such as filter_node, writes the table of its parameters. The name of a benchmark
-runs it and writes its results (minutes; soak ten, experts fifteen). Such a part stands between
-`<!-- begin NAME -->` and `<!-- end -->`.
+runs it and writes its results (minutes; soak ten, experts fifteen, tracking thirty or more). Such a
+part stands between `<!-- begin NAME -->` and `<!-- end -->`.
 """
 
 from __future__ import annotations

@@ -3,24 +3,21 @@
 import json
 import multiprocessing
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import bags, flips, kernels, kjs, nodes, tracking, votes
+from benchmarks import bags, flips, kernels, kjs, nodes, votes
 from benchmarks.__main__ import main
-from benchmarks.clips import find_clips, read_clip, rounded, table
+from benchmarks.clips import find_clips, read_clip, table
 from benchmarks.command import run_stages
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
-from benchmarks.stages import STAGES, StageClock
+from benchmarks.stages import StageClock
 from hmt_ros.body import load_body
 from hmt_ros.flips.interpretation_tree import enumerate_flips
-from hmt_ros.tracking import TrackerSettings
 
 ROOT = Path(__file__).resolve().parents[1]
-SMALL = TrackerSettings(max_hypotheses=4, candidates=6, combinations=24)
 
 
 @pytest.fixture(scope='module')
@@ -31,26 +28,6 @@ def clip():
 @pytest.fixture(scope='module')
 def body():
     return load_body('human37')
-
-
-@pytest.fixture(scope='module')
-def run(clip, body):
-    """Scores of a short run."""
-    return tracking.accuracy(clip, body, SMALL, seed=0)
-
-
-@pytest.fixture(scope='module')
-def timed(clip):
-    """Times of a short run, and the parts of the tracker before and after."""
-    before = [getattr(owner, name) for owner, name, _ in STAGES]
-    found = tracking.speed(clip)
-    return found, before, [getattr(owner, name) for owner, name, _ in STAGES]
-
-
-@pytest.fixture(scope='module')
-def remembered(clip):
-    """Memory in a short run."""
-    return tracking.memory(clip, 6)
 
 
 def test_the_tree_that_is_timed_has_1024_leaves(body):
@@ -160,63 +137,6 @@ def test_back_and_forth(clip):
     assert order == [0, 1, 2, 3, 2, 1, 0, 1, 2]
 
 
-def test_accuracy_of_a_short_run(run):
-    found = run
-    assert found['frames'] == 4
-    assert 0 < found['best_mm'] <= found['heaviest_mm']
-    assert 0 <= found['coverage_90'] <= 1
-    assert found['evaluations'] > 10
-    assert 'by_joint' not in found
-    both = tracking._over_seeds([found, {**found, 'best_max_mm': 1e3, 'best_mm': 0.0}])
-    assert both['frames'] == 8
-    assert both['best_max_mm'] == 1e3
-    assert both['best_mm'] == pytest.approx(found['best_mm'] / 2)
-    assert len(both['by_seed']) == 2
-
-
-def test_spherical_sampling_gets_as_many_evaluations(clip, body):
-    wanted = 900.0
-    settings = tracking._with_evaluations(clip, body, wanted, 0)
-    assert settings.proposals == 'ss'
-    found = tracking.accuracy(clip, body, settings, 0)
-    assert found['evaluations'] == pytest.approx(wanted, rel=0.1)
-
-
-def test_keypoints_alone(clip, body):
-    keypoints = tracking.keypoints_of(clip, body, seed=0)
-    again = tracking.keypoints_of(clip, body, seed=0)
-    offsets = []
-    for stamp in clip.stamps:
-        assert np.array_equal(keypoints[stamp].pixels, again[stamp].pixels)
-        where = [clip.truth.joint_names.index(name) for name in keypoints[stamp].names]
-        offsets.append(keypoints[stamp].pixels - clip.pixels[stamp][where])
-    assert np.std(offsets) == pytest.approx(3.0, rel=0.15)
-    settings = tracking.keypoints_only(SMALL)
-    short = replace(clip, images=clip.images[:2], stamps=clip.stamps[:2])
-    found = tracking.accuracy(short, body, settings, 0, keypoints)
-    assert found['frames'] == 2
-    # Without the image terms another image changes nothing.
-    grey = replace(short, images=[np.full_like(image, 128) for image in short.images])
-    blind = tracking.accuracy(grey, body, settings, 0, keypoints)
-    assert blind['best_mm'] == pytest.approx(found['best_mm'])
-
-
-def test_what_no_pose_of_the_body_meets(clip, body):
-    # The truth of this clip is of the same body, with lengths that were measured to 5 mm.
-    assert 0 < tracking.model_residual(clip, body, every=2) < 0.005
-
-
-def test_stages_add_up_to_the_step(timed):
-    found, before, after = timed
-    assert before == after
-    stages = found['stages_ms']
-    assert sum(stages.values()) == pytest.approx(found['step_ms'])
-    assert {'background', 'observation', 'predictions', 'candidates', 'keeping'} <= set(stages)
-    assert stages['other'] < 0.2 * found['step_ms']
-    assert found['ratio'] == pytest.approx(found['step_ms'] / found['opencv_ms'])
-    assert found['images'] == 3
-
-
 def test_time_in_a_stage_is_not_charged_to_the_one_around_it():
     clock = StageClock()
     clock._enter('chain search')
@@ -227,35 +147,6 @@ def test_time_in_a_stage_is_not_charged_to_the_one_around_it():
     assert set(clock.seconds) == {'chain search', 'rating'}
     assert clock.seconds['chain search'] >= outer
     assert clock._stack == []
-
-
-def test_memory_is_followed(remembered):
-    assert remembered['images'] == 6
-    assert len(remembered['resident_mb']) == 6
-    assert all(size > 10 for _, size in remembered['resident_mb'])
-
-
-def test_reports(run, timed, remembered):
-    entry = tracking._over_seeds([run])
-    result = {
-        'machine': {'cores': 2},
-        'clips': 'here',
-        'seeds': [0],
-        'model_residual_mm': {'reach': 1.4},
-        'accuracy': [
-            {'clip': 'reach', 'what': tracking.TRACKER, **entry},
-            {'clip': 'reach', 'what': 'MediaPipe', 'heaviest_mm': 147.0},
-        ],
-        'speed': timed[0],
-        'memory': remembered,
-    }
-    text = tracking.as_text(result)
-    assert f'{entry["best_mm"]:.0f}' in text
-    markdown = tracking.as_text(result, markdown=True).splitlines()
-    rows = [line for line in markdown if line.startswith('| reach')]
-    assert len(rows) == 2
-    assert {line.count('|') for line in rows} == {13}
-    assert json.loads(json.dumps(rounded(result)))['speed']['clip'] == 'reach'
 
 
 def test_where_clips_come_from(tmp_path, monkeypatch):

@@ -1,0 +1,127 @@
+"""How long a step of the tracker takes, where the time goes, and how memory grows."""
+
+from __future__ import annotations
+
+import sys
+import time
+from itertools import islice
+from typing import Any
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks.clips import Clip, table
+from benchmarks.machine import forget_peak, peak_memory, resident_memory
+from benchmarks.runs import new_tracker
+from benchmarks.stages import StageClock
+from hmt_ros.body import load_body
+from hmt_ros.tracking import TrackerSettings
+
+OPENCV = 'MOG2 + Canny + distance transform'
+
+
+def speed(clip: Clip) -> dict[str, Any]:
+    """Time of a step and of its stages, and of OpenCV's work on the same images, in turn.
+
+    The camera of the clip does not move.
+    """
+    assert clip.background is not None
+    forget_peak()
+    tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
+    subtractor = cv2.createBackgroundSubtractorMOG2()
+    for _ in range(10):
+        subtractor.apply(clip.background)
+    # Compile, or load what was compiled, before anything is timed.
+    for stamp, image in islice(zip(clip.stamps, clip.images, strict=True), 3):
+        tracker.step(image, stamp)
+    tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
+    clock = StageClock()
+    steps, reference = [], []
+    with clock.running():
+        for i, (stamp, image) in enumerate(zip(clip.stamps, clip.images, strict=True)):
+            clock.begin_step()
+            start = time.perf_counter()
+            tracker.step(image, stamp)
+            middle = time.perf_counter()
+            opencv_work(subtractor, image)
+            reference.append(time.perf_counter() - middle)
+            steps.append(middle - start)
+            if i == 0:  # the start of a track is told apart
+                begin = clock.seconds.copy()
+                clock.seconds.clear()
+    count = len(steps) - 1
+    mean = float(np.mean(steps[1:]))
+    stages = {name: 1e3 * spent / count for name, spent in clock.seconds.items()}
+    stages['other'] = 1e3 * mean - sum(stages.values())
+    height, width = clip.images[0].shape[:2]
+    return {
+        'clip': clip.name,
+        'size': f'{width}x{height}',
+        'images': count,
+        'steps_per_second': 1.0 / mean,
+        'step_ms': 1e3 * mean,
+        'step_median_ms': 1e3 * float(np.median(steps[1:])),
+        'start_ms': 1e3 * sum(begin.values()),
+        'opencv_ms': 1e3 * float(np.mean(reference[1:])),
+        'ratio': mean / float(np.mean(reference[1:])),
+        'ratio_of_medians': float(np.median(steps[1:]) / np.median(reference[1:])),
+        'stages_ms': dict(sorted(stages.items(), key=lambda item: -item[1])),
+        'peak_memory_mb': peak_memory() / 1e6,
+    }
+
+
+def opencv_work(subtractor: Any, image: Any) -> Any:
+    """What OpenCV does for a silhouette, edges and distances to them."""
+    mask = subtractor.apply(image)
+    edges = cv2.Canny(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), 40, 100)
+    return mask, cv2.distanceTransform(255 - edges, cv2.DIST_L2, 5)
+
+
+def memory(clip: Clip, frames: int) -> dict[str, Any]:
+    """Resident memory while a clip is played back and forth."""
+    forget_peak()
+    tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
+    every = max(frames // 50, 1)
+    seen: list[tuple[int, float]] = []
+    images = clip.back_and_forth(frames)
+    for i, (stamp, image) in enumerate(
+        tqdm(images, total=frames, unit='image', desc='memory', disable=not sys.stderr.isatty())
+    ):
+        tracker.step(image, stamp)
+        if i % every == every - 1:
+            seen.append((i + 1, resident_memory()))
+    # What grows at the beginning are caches and arenas that fill once.
+    late = np.array(seen[len(seen) // 5 :])
+    slope = float(np.polyfit(late[:, 0], late[:, 1], 1)[0]) if len(late) > 1 else 0.0
+    return {
+        'clip': clip.name,
+        'images': frames,
+        'resident_mb': [[count, size / 1e6] for count, size in seen],
+        'growth_kb_per_1000_images': slope,
+        'peak_memory_mb': peak_memory() / 1e6,
+    }
+
+
+def speed_as_text(found: dict[str, Any], cores: int, *, markdown: bool = False) -> str:
+    """A line and a table of the stages."""
+    line = (
+        f'{found["clip"]} {found["size"]}, {found["images"]} images, {cores} cores: '
+        f'{found["steps_per_second"]:.1f} steps/s; a step {found["step_ms"]:.1f} ms, {OPENCV} '
+        f'{found["opencv_ms"]:.1f} ms, ratio {found["ratio"]:.1f} (of medians '
+        f'{found["ratio_of_medians"]:.1f}); start of the track {found["start_ms"]:.0f} ms; peak '
+        f'memory {found["peak_memory_mb"]:.0f} MB'
+    )
+    rows = [['stage', 'ms']]
+    rows += [[name, f'{value:.1f}'] for name, value in found['stages_ms'].items()]
+    return f'{line}\n\n{table(rows, markdown=markdown)}'
+
+
+def memory_as_text(found: dict[str, Any]) -> str:
+    """A line."""
+    resident = found['resident_mb']
+    first, last = resident[len(resident) // 5], resident[-1]
+    return (
+        f'memory: {first[1]:.1f} MB after {first[0]} images, {last[1]:.1f} MB after {last[0]}; '
+        f'{found["growth_kb_per_1000_images"]:+.0f} kB per 1000 images'
+    )
