@@ -219,7 +219,7 @@ def follow(
         if posterior is not None and stamp in clip.truth.joints:
             bodies.append(tracker.body)
             mixtures.append(posterior)
-            points.append(posterior.means[int(np.argmax(posterior.weights))])
+            points.append(tracker.point_estimate)
             stamps.append(stamp)
             evaluations.append(float(tracker.evaluations))
             seconds.append(spent)

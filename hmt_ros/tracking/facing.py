@@ -192,7 +192,7 @@ class Track:
         if s.facing_trial == 0:
             return
         usable = np.flatnonzero(np.isfinite(solved.value))
-        weights = weigh(log_weights[usable], solved.value[usable], s.inverse_temperature)
+        weights = weigh(log_weights[usable], solved.value[usable], first.beta)
         best = usable[np.argmax(weights)]
         alike = faces_like(first.body, solved.x, solved.x[best])[usable]
         if alike.all():

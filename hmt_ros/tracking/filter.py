@@ -38,6 +38,8 @@ from hmt_ros.tracking.weighting import at_least, inherited_log_weights, normalis
 
 # How far the usual energy follows that of the last image.
 USUAL_GAIN = 0.1
+# Number of images from one reversal that is proposed to the next.
+REVERSED_EVERY = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +102,7 @@ class MixtureFilter:
         self._usual_energy = np.inf
         self._outline_costs = np.empty((0, 0))
         self._bad_images = 0
+        self._images = 0
         self._posterior = Posterior(body, camera, settings, extra)
         self._proposal = PROPOSALS[settings.proposals](self._posterior)
 
@@ -122,6 +125,11 @@ class MixtureFilter:
         if self._modes is None:
             raise ValueError('there is no track yet')
         return self._modes
+
+    @property
+    def beta(self) -> float:
+        """Factor on the energies in the weights; see `trust`."""
+        return self._posterior.trust.inverse_temperature
 
     @property
     def begun(self) -> bool:
@@ -181,7 +189,7 @@ class MixtureFilter:
         """Makes modes at rest from minima and their log prior weights (N,)."""
         optimised = Optimised(new_hypotheses(solved.x, log_weights), solved)
         least = self._weigh_and_select(optimised, np.zeros_like(solved.x), observation)
-        self.log_evidence = -self.settings.inverse_temperature * least
+        self.log_evidence = -self.beta * least
 
     def twin(self) -> MixtureFilter:
         """Another filter of the same person, without modes, with random numbers of its own."""
@@ -211,17 +219,20 @@ class MixtureFilter:
         observation = self._believed(observation)
         predicted, covariances = predict(modes, self.body, dt, s.velocity_kept)
         precisions = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
+        beta = self.beta
         lasting = s.error_correlation * (modes.energies - modes.energies.min())
         predicted = replace(
-            predicted, log_weights=predicted.log_weights + s.inverse_temperature * lasting
+            predicted, log_weights=predicted.log_weights + beta * lasting
         )
         predicted = follow_flow(predicted, precisions, observation, posterior)
         base = posterior.minimise(
             posterior.given(observation, predicted, precisions), predicted.poses, s.base_iterations
         )
         proposals: list[Proposal] = [self._proposal]
+        self._images += 1
         if s.reversal_probability > 0:
-            proposals.insert(0, Reversals(posterior, s.reversal_probability))
+            if self._images % REVERSED_EVERY == 0:
+                proposals.insert(0, Reversals(posterior, s.reversal_probability))
             if base.value.min() > self._usual_energy + 2.0 * s.energy_rise:
                 proposals.insert(0, Headings(posterior, 1e-3))
         if expected is not None:
@@ -251,9 +262,10 @@ class MixtureFilter:
             Optimised(hypotheses, solved), velocities, observation, before
         )
         # Of the error of an energy only what is new counts.
-        self.log_evidence -= s.inverse_temperature * (
+        self.log_evidence -= beta * (
             least - s.error_correlation * float(modes.energies.min())
         )
+        posterior.trust.update(least)
         self._fit_flesh(observation)
         self._learn_recall(observation)
 
@@ -285,7 +297,7 @@ class MixtureFilter:
             covariances = self._posterior.covariances(fit, free)
         nothing = np.zeros(len(poses))
         weights = np.exp(
-            normalised(weigh(nothing, fit.energy.value, self.settings.inverse_temperature))
+            normalised(weigh(nothing, fit.energy.value, self.beta))
         )
         return GaussianMixture(weights, means, covariances).sorted()
 
@@ -371,7 +383,7 @@ class MixtureFilter:
         if len(usable) == 0:
             raise ValueError('no hypothesis has a finite energy')
         log_weights = weigh(
-            optimised.hypotheses.log_weights[usable], solved.value[usable], s.inverse_temperature
+            optimised.hypotheses.log_weights[usable], solved.value[usable], self.beta
         )
         reference = solved.x[usable[np.argmax(log_weights)]]
         classes = ambiguity_classes(self.body, solved.x[usable], reference)
@@ -456,7 +468,8 @@ class MixtureFilter:
     def _use_body(self, body: Body) -> None:
         """Goes on with a body of the same degrees of freedom."""
         self.body = body
-        evaluations = self._posterior.evaluations
+        evaluations, trust = self._posterior.evaluations, self._posterior.trust
         self._posterior = Posterior(body, self.camera, self.settings, self._posterior.extra)
         self._posterior.evaluations = evaluations
+        self._posterior.trust = trust
         self._proposal = PROPOSALS[self.settings.proposals](self._posterior)

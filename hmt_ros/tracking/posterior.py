@@ -33,6 +33,7 @@ from hmt_ros.inference.energy import (
     add_energies,
 )
 from hmt_ros.tracking.hypotheses import Hypotheses
+from hmt_ros.tracking.trust import Trust
 
 if TYPE_CHECKING:
     from hmt_ros.tracking.settings import TrackerSettings
@@ -71,6 +72,7 @@ class Posterior:
 
     Attributes:
         evaluations: of the likelihood, so far.
+        trust: how far images are believed.
     """
 
     def __init__(
@@ -81,6 +83,7 @@ class Posterior:
         extra: tuple[FrameTerm, ...] = (),
     ) -> None:
         self.body, self.camera, self.settings, self.extra = body, camera, settings, extra
+        self.trust = Trust(settings.trust, settings.error_correlation)
         self.evaluations = 0
         self._step_scale = np.where(body.skeleton.dof_is_rotation, 0.3, 0.2)
         self._last_fit: tuple[Array, Observation, ImageFit] | None = None
@@ -175,7 +178,7 @@ class Posterior:
         or over time.
         """
         _, hessian = fit.energy.derivatives()
-        disbelief = 1.0 - self.settings.image_information
+        disbelief = 1.0 - self.trust.information
         return free_covariances(hessian - disbelief * fit.image_hessian, free)
 
     def textures(self, poses: Array, observation: Observation) -> Textures | None:

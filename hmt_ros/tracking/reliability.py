@@ -56,12 +56,12 @@ class SilhouetteRecall:
             foreground: (H, W).
         """
         n = int(textures.counts[row])
-        if n == 0:
-            return
         segments = textures.segments[row, :n]
         column, line = textures.pixels[row, :n].T.round().astype(np.intp)
         height, width = foreground.shape
         inside = (column >= 0) & (line >= 0) & (column < width) & (line < height)
+        if not inside.any():
+            return
         hit = foreground[line[inside], column[inside]]
         count = np.bincount(segments[inside], minlength=len(self._recall))
         found = np.bincount(segments[inside], weights=hit, minlength=len(self._recall))
@@ -69,6 +69,6 @@ class SilhouetteRecall:
         gain = np.minimum(count / FEWEST, 1.0) * (GAIN if self._begun else 1.0)
         share = np.where(seen, found / np.maximum(count, 1), self._recall)
         self._recall += gain * (share - self._recall)
-        total = float(found.sum()) / max(int(count.sum()), 1)
+        total = float(found.sum() / count.sum())
         self._total += (GAIN if self._begun else 1.0) * (total - self._total)
         self._begun = True

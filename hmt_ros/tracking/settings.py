@@ -55,16 +55,19 @@ class TrackerSettings:
         jump_probability: Prior probability that a limb flips between two images.
         prediction_probability: Prior probability that a pose comes from a single-image prediction
             and not from the image before.
+        reversal_probability: Prior probability that the track has taken the pose for its reversal in
+            depth, for a reversal that turns the person by little; 0 proposes none.
+        reach: Log weight below the heaviest mode, nats, to which the best mode of another heading,
+            lean or order of the legs is kept.
         facing_trial: Maximum time for which both facing directions are followed after a start from
             silhouettes or predictions alone, s; 0 keeps the better one at once. The trial doubles
             the cost of an image.
         base_iterations: Number of Newton steps on the predictions.
         iterations: Number of Newton steps on the candidates.
-        inverse_temperature: Factor beta on the energy in the weight of a mode; values below 1 allow
-            for correlated errors of neighbouring measurements.
-        image_information: Factor on the curvature of the image energy, without keypoints, in the
-            covariance of a mode; values below 1 allow for shapes, shadows and clothes that the
-            model lacks.
+        trust: Share of the energy of an image that is believed when hypotheses are weighed, at most;
+            values below 1 allow for correlated errors of neighbouring measurements.
+        error_correlation: Correlation of the errors of an image, such as a shape that the model
+            lacks, with those of the image before.
         tails: Degrees of freedom of the Student motion prior; small numbers give heavy tails.
         least_log_weight: Smallest log weight of a mode that is kept, nats.
         velocity_kept: Share of a mode's velocity that lasts to the next image; 0 is a random walk.
@@ -95,13 +98,12 @@ class TrackerSettings:
     jump_probability: float = 0.1
     prediction_probability: float = 0.01
     reversal_probability: float = 0.05
-    error_correlation: float = 0.8
     reach: float = 20.0
     facing_trial: float = 2.0
     base_iterations: int = 6
     iterations: int = 6
-    inverse_temperature: float = 0.5
-    image_information: float = 0.05
+    trust: float = 0.7
+    error_correlation: float = 0.8
     tails: float = 8.0
     least_log_weight: float = -14.0
     velocity_kept: float = 0.7
@@ -125,7 +127,7 @@ class TrackerSettings:
                 f'{self.candidates}'
             )
         least = {'samples': 1, 'rounds': 1, 'iterations': 1, 'base_iterations': 1, 'lost_images': 1}
-        least |= {'combinations': 1, 'alternatives': 1, 'inverse_temperature': 0, 'exploration': 0}
+        least |= {'combinations': 1, 'alternatives': 1, 'trust': 0, 'exploration': 0}
         least |= {'facing_trial': 0}
         for name, bound in least.items():
             if not getattr(self, name) >= bound:

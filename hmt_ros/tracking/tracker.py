@@ -30,6 +30,7 @@ from hmt_ros.tracking.initialisation import (
     poses_from_outline,
     start_from_keypoints,
 )
+from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.subject import Subject
@@ -80,6 +81,7 @@ class Tracker:
         self._start: Subject | GaussianMixture | None = None
         self._extra = tuple(extra)
         self._track = self._new_track(body)
+        self._point = PointEstimate()
         self._last_image: Image | None = None
         self._last_stamp: int | None = None
 
@@ -98,6 +100,7 @@ class Tracker:
         if start is not None:
             self._start = start
         self._track = self._new_track(self.body)
+        self._point = PointEstimate()
         self._last_image, self._last_stamp = None, None
 
     def step(
@@ -149,6 +152,9 @@ class Tracker:
                 # The start is where the person is; the silhouette is not.
                 observation = self._observe(image, keypoints)
                 self._begin(observation, start, stamp)
+        dt = 0.0 if self._last_stamp is None else (stamp - self._last_stamp) * 1e-9
+        modes = self._track.modes
+        self._point.update(self.body, modes.poses, np.exp(modes.log_weights), dt)
         self._last_image, self._last_stamp = image, stamp
         self.evaluations = self._track.evaluations
         return self.posterior, self._track.likelihood_mixture(observation)
@@ -178,6 +184,17 @@ class Tracker:
             ValueError: there is no track.
         """
         return self._track.modes
+
+    @property
+    def point_estimate(self) -> Array:
+        """One pose (d,) for those who want one, steady over time; see `PointEstimate`.
+
+        Raises:
+            ValueError: there is no track.
+        """
+        if self._point.pose is None:
+            raise ValueError('there is no track yet')
+        return self._point.pose
 
     @property
     def posterior(self) -> GaussianMixture:

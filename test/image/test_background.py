@@ -136,3 +136,29 @@ def test_rendered_person_with_shadow_and_noise(shot, method):
         found = background.silhouette(image)
         overlap = (found & mask).sum() / (found | mask).sum()
         assert overlap > 0.8
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_what_may_be_a_shadow_is_told_apart(scene, method):
+    background = model(scene, method)
+    image = scene.copy()
+    image[20:100, 10:50] = (0.6 * image[20:100, 10:50]).astype(np.uint8)
+    image[30:90, 60:90] = (10, 240, 30)
+    found = background.split(image)
+    assert np.array_equal(found.foreground, background.silhouette(image))
+    assert found.unsure[22:98, 12:48].mean() > 0.95
+    assert not (found.unsure & found.foreground).any()
+    assert found.unsure[:, 100:].mean() < 0.01
+
+
+def test_edges_of_the_background_that_move_by_a_pixel_are_no_foreground():
+    empty = np.full((80, 120, 3), 90, np.uint8)
+    empty[:, 60:] = (200, 60, 30)
+    background = BackgroundModel.from_image(empty)
+    moved = np.roll(empty, 1, axis=1)
+    moved[:, 0] = 90
+    # A person stands beside the edge.
+    moved[20:60, 20:40] = (20, 220, 20)
+    found = background.silhouette(moved)
+    assert found[20:60, 20:40].all()
+    assert not found[:, 50:].any()

@@ -34,6 +34,8 @@ from hmt_ros.tracking.weighting import weigh
 MOST_GROUPS = 3
 # Modes have the same trunk when its joints are nowhere further apart, m.
 SAME_TRUNK = 0.06
+# Limbs are searched on trunks whose best mode is at most so much less probable than the best, nats.
+LIKELY = 4.0
 # Configurations of a limb are distinct when some joint is further apart, m.
 DISTINCT = 0.08
 
@@ -99,13 +101,16 @@ class KinematicJumps:
     ) -> Hypotheses:
         """See `Proposal`."""
         s, textures = self.posterior.settings, sources.textures
+        beta = self.posterior.trust.inverse_temperature
         everything: list[tuple[Array, Index, Array, Array, Index]] = []
+        prior = weigh(sources.log_weights, base.value, beta)
         for group in self._groups(base)[:MOST_GROUPS]:
+            likely = prior[group].max() > prior.max() - LIKELY
             lead = _Lead(
                 base.x[group[0]], covariances[sources.ancestors[group[0]]], observation, textures,
                 int(sources.texture_rows[group[0]]),
             )  # fmt: skip
-            found = self._search(lead, base.x, rng)
+            found = self._search(lead, base.x, rng) if likely else {}
             alternatives = [
                 self._alternatives(base.x[group], chain, found.get(chain))
                 for chain in self.posterior.body.chains
@@ -116,7 +121,7 @@ class KinematicJumps:
             for product in products:
                 combined = best_combinations(
                     self.posterior.body, product.modes, product.log_weights, product.energy,
-                    product.alternatives, product.changes, s.inverse_temperature, s.combinations,
+                    product.alternatives, product.changes, beta, s.combinations,
                 )  # fmt: skip
                 members = product.members[combined.parents]
                 rows = np.full(len(members), product.row)
@@ -130,7 +135,7 @@ class KinematicJumps:
         )
         kept = choose_hypotheses(
             relative_joints(self.posterior.body, poses),
-            s.exploration * weigh(log_priors, energies, s.inverse_temperature),
+            s.exploration * weigh(log_priors, energies, beta),
             s.candidates,
             same=s.hypothesis_merge_distance,
         ).chosen

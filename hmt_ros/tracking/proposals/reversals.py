@@ -50,7 +50,7 @@ class Reversals:
         _rng: np.random.Generator,
     ) -> Hypotheses:
         """See `Proposal`."""
-        beta = self.posterior.settings.inverse_temperature
+        beta = self.posterior.trust.inverse_temperature
         best = np.argsort(beta * base.value - sources.log_weights, kind='stable')[: self.count]
         poses, rows = base.x[best], sources.texture_rows[best]
         nothing = np.full(len(best), -1)
