@@ -22,6 +22,7 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, resting
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.ambiguities import ambiguity_classes
+from hmt_ros.tracking.facing_odds import FacingOdds
 from hmt_ros.tracking.flesh_fitting import FleshFit
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses, relative_joints
 from hmt_ros.tracking.loss import unexplained_share
@@ -103,6 +104,7 @@ class MixtureFilter:
         self._outline_costs = np.empty((0, 0))
         self._bad_images = 0
         self._images = 0
+        self._facing = FacingOdds()
         self._posterior = Posterior(body, camera, settings, extra)
         self._proposal = PROPOSALS[settings.proposals](self._posterior)
 
@@ -385,6 +387,8 @@ class MixtureFilter:
         log_weights = weigh(
             optimised.hypotheses.log_weights[usable], solved.value[usable], self.beta
         )
+        if before is None and self.body.trunk_pairs:
+            log_weights = self._with_facing(optimised, usable, log_weights)
         reference = solved.x[usable[np.argmax(log_weights)]]
         classes = ambiguity_classes(self.body, solved.x[usable], reference)
         kept = choose_hypotheses(
@@ -427,6 +431,18 @@ class MixtureFilter:
         )
         self._outline_costs = fit.outline_costs
         return float(solved.value[usable].min())
+
+    def _with_facing(self, optimised: Optimised, usable: Index, log_weights: Array) -> Array:
+        """Log weights (N,) of usable hypotheses with the odds of the two ways to face."""
+        odds, solved = self._facing, optimised.minima
+        poses = solved.x[usable]
+        back = odds.back(self.body, poses)
+        known = ~optimised.hypotheses.jumped[usable].all(1)
+        gamma = self.settings.facing_gain * self._posterior.trust.inverse_temperature
+        odds.update(back, solved.value[usable], known, poses[0, :3], gamma)
+        log_weights = odds.shared(back, log_weights)
+        odds.follow(self.body, poses, log_weights, back)
+        return log_weights
 
     # What is learned.
 

@@ -99,10 +99,11 @@ class TrackerSettings:
     prediction_probability: float = 0.01
     reversal_probability: float = 0.05
     reach: float = 20.0
+    facing_gain: float = 0.4
     facing_trial: float = 2.0
     base_iterations: int = 6
     iterations: int = 6
-    trust: float = 0.7
+    trust: float = 0.35
     error_correlation: float = 0.8
     tails: float = 8.0
     least_log_weight: float = -14.0

@@ -40,6 +40,11 @@ class Trust:
         return self._trust * USUAL_CHANGE / float(np.sqrt(USUAL_CHANGE**2 + self._variance))
 
     @property
+    def lasting(self) -> float:
+        """Factor on a difference of energies that lasts."""
+        return self.inverse_temperature * (1.0 - self.correlation)
+
+    @property
     def information(self) -> float:
         """Share of the curvature of an image's energy in the covariance of a mode."""
         rho = self.correlation
