@@ -60,11 +60,11 @@ class Silhouette(NamedTuple):
     Attributes:
         foreground: (H, W) the person.
         unsure: (H, W) darker than the background in the same colour: a shadow, or clothes in the
-            colours of the scene.
+            colours of the scene; None: there is nothing unsure.
     """
 
     foreground: Mask
-    unsure: Mask
+    unsure: Mask | None = None
 
 
 class BackgroundModel:
@@ -128,27 +128,18 @@ class BackgroundModel:
             raise ValueError('no background has been learned: give an image or some frames first')
         self._check(image)
         raw = self._model.apply(image, learningRate=FROZEN)
-        mask = (raw == FOREGROUND).astype(np.uint8)
-        mask[self._is_beside(image)] = 0
-        result = np.zeros(mask.shape, dtype=np.bool_)
-        left, top, right, bottom = region or (0, 0, mask.shape[1], mask.shape[0])
-        part = np.ascontiguousarray(mask[top:bottom, left:right])
+        mask = raw == FOREGROUND
+        mask[self._is_beside(image)] = False
+        part, unsure = mask[_part(region)], np.zeros(mask.shape, dtype=np.bool_)
         if part.size:
-            opened = cv2.morphologyEx(part, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-            closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-            result[top:bottom, left:right] = _pieces_of_one_person(
-                np.asarray(closed, dtype=np.uint8), self.settings
-            )
-        unsure = raw == SHADOW
-        shadow = np.zeros(mask.shape, dtype=np.bool_)
-        shadow[top:bottom, left:right] = (
-            cv2.morphologyEx(
-                np.ascontiguousarray(unsure[top:bottom, left:right]).view(np.uint8),
-                cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8),
-            )
-            > 0
-        )  # fmt: skip
-        return Silhouette(result, shadow & ~result)
+            small, large = np.ones((3, 3), np.uint8), np.ones((5, 5), np.uint8)
+            pixels = np.ascontiguousarray(part).view(np.uint8)
+            opened = cv2.morphologyEx(pixels, cv2.MORPH_OPEN, small)
+            part[:] = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, large) > 0
+            pixels = np.ascontiguousarray(raw[_part(region)] == SHADOW).view(np.uint8)
+            unsure[_part(region)] = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, large) > 0
+        found = one_person(mask, self.settings, region)
+        return Silhouette(found, unsure & ~found)
 
     def _is_beside(self, image: Image) -> Mask:
         """Pixels (H, W) whose colour the background has beside them: its edges, slightly moved."""
@@ -166,15 +157,25 @@ class BackgroundModel:
             raise ValueError(f'the background has shape {self._shape}, saw an image {image.shape}')
 
 
-def _pieces_of_one_person(mask: Image, settings: BackgroundSettings) -> Mask:
-    """The largest piece of a mask and the pieces that are large enough and near enough to it."""
-    result = np.zeros(mask.shape, dtype=bool)
-    x, y, width, height = cv2.boundingRect(mask)
+def one_person(mask: Mask, settings: BackgroundSettings, region: Box | None = None) -> Mask:
+    """The largest piece of a mask (H, W) and what is large and near enough to belong to it.
+
+    Args:
+        mask: of all that is no background.
+        settings: what is large and near.
+        region: where the person can be, as for `BackgroundModel.silhouette`.
+    """
+    result = np.zeros(mask.shape, dtype=np.bool_)
+    part, found = mask[_part(region)], result[_part(region)]
+    if part.size == 0:
+        return result
+    pixels = np.ascontiguousarray(part).view(np.uint8)
+    x, y, width, height = cv2.boundingRect(pixels)
     if width == 0:
         return result
     # Most of an image is empty.
     inside = slice(y, y + height), slice(x, x + width)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask[inside], connectivity=8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(pixels[inside], connectivity=8)
     area = stats[1:, cv2.CC_STAT_AREA]
     main = 1 + int(np.argmax(area))
     keep = np.zeros(count, dtype=bool)
@@ -189,5 +190,11 @@ def _pieces_of_one_person(mask: Image, settings: BackgroundSettings) -> Mask:
     large = stats[:, cv2.CC_STAT_AREA] >= settings.smallest_part * area.max()
     keep |= near & large
     keep[0] = False
-    result[inside] = keep[labels]
+    found[inside] = keep[labels]
     return result
+
+
+def _part(region: Box | None) -> tuple[slice, slice]:
+    """Rows and columns of a region; None: all."""
+    left, top, right, bottom = region or (0, 0, None, None)
+    return slice(top, bottom), slice(left, right)

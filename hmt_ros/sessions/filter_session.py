@@ -27,7 +27,9 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
+    COMPRESSED_MASK,
     IMAGE,
+    MASK,
     CameraSession,
     StampedInputs,
     WaitingImage,
@@ -45,7 +47,16 @@ from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.keypoints import keypoints_of
 from msg_tools.messages.pose_mixtures import pose_mixture_of
 
-__all__ = ['CAMERA_INFO', 'IMAGE', 'KEYPOINTS', 'PREDICTION', 'FilterSession', 'FilterState']
+__all__ = [
+    'CAMERA_INFO',
+    'COMPRESSED_MASK',
+    'IMAGE',
+    'KEYPOINTS',
+    'MASK',
+    'PREDICTION',
+    'FilterSession',
+    'FilterState',
+]
 
 KEYPOINTS, PREDICTION = 'keypoints', 'pose_prediction'
 
@@ -143,6 +154,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._shown_body = None
 
     def _forget_inputs(self) -> None:
+        super()._forget_inputs()
         self._keypoints.clear()
         self._predictions.clear()
 
@@ -184,7 +196,9 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             return None
 
     def _is_ready(self, stamp: int) -> bool:
-        return self._has_keypoints(stamp) and self._has_prediction(stamp)
+        return (
+            super()._is_ready(stamp) and self._has_keypoints(stamp) and self._has_prediction(stamp)
+        )
 
     def _has_keypoints(self, stamp: int) -> bool:
         p = self.parameters
@@ -194,17 +208,10 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         p = self.parameters
         return not p.use_predictions or self._has(self._predictions, stamp, p.prediction_timeout)
 
-    def _has(self, inputs: StampedInputs[Any], stamp: int, timeout: float) -> bool:
-        assert self._newest is not None
-        return inputs.is_settled(stamp) or self._newest - stamp > timeout * SECOND_NS
-
-    def _report_dropped(self, stamp: int) -> None:
-        kind = Fault.NO_PREDICTION if self._has_keypoints(stamp) else Fault.NO_KEYPOINTS
-        self._log.fault(
-            kind,
-            f'image of {stamp} ns is dropped: {kind.value} of its stamp has come, and '
-            f'queue_size is {self.parameters.queue_size}',
-        )
+    def _missing_input(self, stamp: int) -> Fault:
+        if not self._has_keypoints(stamp):
+            return Fault.NO_KEYPOINTS
+        return Fault.NO_MASK if not self._has_mask(stamp) else Fault.NO_PREDICTION
 
     # Outputs.
 
@@ -216,7 +223,9 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         try:
             if self._tracker is None:
                 self._tracker = self.start.tracker(camera)
-            posterior, likelihood = self._tracker.step(waiting.image, stamp, keypoints, prediction)
+            posterior, likelihood = self._tracker.step(
+                waiting.image, stamp, keypoints, prediction, waiting.mask
+            )
             if starts and posterior is not None:
                 self._report_old_start(stamp)
             if posterior is not None and likelihood is not None:

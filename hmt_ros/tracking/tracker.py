@@ -17,11 +17,11 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.pose_terms import FrameTerm
-from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.background import BackgroundModel, one_person
 from hmt_ros.image.observation import Box, Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
-from hmt_ros.inference.arrays import Array, Image
+from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.facing import Track
 from hmt_ros.tracking.hypotheses import Modes
@@ -109,6 +109,7 @@ class Tracker:
         stamp: int,
         keypoints: Keypoints | None = None,
         prediction: PosePrediction | None = None,
+        mask: Mask | None = None,
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """Takes the next image.
 
@@ -120,37 +121,41 @@ class Tracker:
                 that has no other start, with the lengths that they assume, are among the hypotheses
                 of every image, and of a lost track; they are no evidence, which would count the
                 image twice.
+            mask: (H, W) where a segmenter sees the person, which replaces background subtraction;
+                all false: it sees nobody; None: unknown.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses,
             heaviest first with weights that sum to 1; (None, None) while there is no track.
 
         Raises:
-            ValueError: an image of another size, a stamp that does not increase, or a prediction
-                of a body with other degrees of freedom.
+            ValueError: an image or a mask of another size, a stamp that does not increase, or a
+                prediction of a body with other degrees of freedom.
         """
         if prediction is not None:
             prediction.seen_as(self.body)
         size = (self.camera.height, self.camera.width)
         if image.shape[:2] != size:
             raise ValueError(f'the camera gives images of {size}, saw {image.shape[:2]}')
+        if mask is not None and mask.shape != size:
+            raise ValueError(f'the camera gives images of {size}, saw a mask of {mask.shape}')
         if self._last_stamp is not None and stamp <= self._last_stamp:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
         if self._track.begun:
-            observation = self._observe(image, keypoints)
+            observation = self._observe(image, keypoints, mask)
             self._follow(observation, stamp, prediction)
         else:
             start = self._start_at(stamp, prediction)
             if start is None:
                 self.evaluations = 0
-                if self._learning:
+                if self._learning and (mask is None or not mask.any()):
                     self.background.learn(image)
                 return None, None
-            observation = self._observe(image, keypoints)
+            observation = self._observe(image, keypoints, mask)
             self._begin(observation, start, stamp)
             if not self._track.believes_silhouettes:
                 # The start is where the person is; the silhouette is not.
-                observation = self._observe(image, keypoints)
+                observation = self._observe(image, keypoints, mask)
                 self._begin(observation, start, stamp)
         dt = 0.0 if self._last_stamp is None else (stamp - self._last_stamp) * 1e-9
         modes = self._track.modes
@@ -265,7 +270,7 @@ class Tracker:
             found.append(prediction.both_ways(self.body).means)
         return np.concatenate(found) if found else None
 
-    def _observe(self, image: Image, keypoints: Keypoints | None) -> Observation:
+    def _observe(self, image: Image, keypoints: Keypoints | None, mask: Mask | None) -> Observation:
         t = self.settings.likelihood
         shape = t.containment.weight > 0 or t.coverage.weight > 0
         textured = any(getattr(t, term.name).weight > 0 for term in TERMS if term.needs_texture)
@@ -273,7 +278,9 @@ class Tracker:
         wanted |= {term.name for term in TERMS if getattr(t, term.name).weight > 0}
         wanted |= {'intensity'} if textured else set()  # the textures hold it
         foreground, unsure = None, None
-        if shape and self.background.frames:
+        if shape and mask is not None:
+            foreground = one_person(mask, self.background.settings, self._region())
+        elif shape and self.background.frames:
             foreground, unsure = self.background.split(image, self._region())
         believed = foreground if self._track.believes_silhouettes else None
         found = observe(
