@@ -35,6 +35,7 @@ class Fault(Enum):
     PREDICTION = 'pose_prediction'
     NO_PREDICTION = 'no pose_prediction'
     SILHOUETTE = 'silhouette'
+    BACKGROUND = 'background'
     START = 'start'
     OLD_START = 'old start'
     ESTIMATE = 'estimate'

@@ -11,13 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.pose_terms import FrameTerm
-from hmt_ros.image.background import BackgroundModel, one_person
+from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.observation import Box, Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
@@ -33,6 +34,7 @@ from hmt_ros.tracking.initialisation import (
 from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
+from hmt_ros.tracking.silhouettes import Silhouettes
 from hmt_ros.tracking.subject import Subject
 
 # Fewest keypoints from which a lost track starts anew.
@@ -49,6 +51,22 @@ class Status(Enum):
     LOST = 'lost'
 
 
+class _Beginning(NamedTuple):
+    """What `Track.begin` is given of a start; see there."""
+
+    body: Body
+    start: GaussianMixture | Array
+    both_ways: bool
+    clicked: Keypoints | None = None
+
+    @property
+    def best(self) -> Array:
+        """The most probable pose (1, d)."""
+        if isinstance(self.start, GaussianMixture):
+            return self.start.means[[int(np.argmax(self.start.weights))]]
+        return self.start[:1]
+
+
 class Tracker:
     """Follows one person through images; the posterior over poses is a mixture.
 
@@ -56,10 +74,13 @@ class Tracker:
         body: model of the person; a subject's lengths replace the model's when a track starts.
         camera: calibrated.
         settings: how.
-        background: the empty scene; None: learned from images before the track starts, and if there
-            are none the silhouette is not used.
+        background: the empty scene; None, or a model that has learned nothing: learned from images
+            before the track starts, and if there are none the silhouette is not used.
         seed: of all randomness. The same images, settings and seed give the same numbers.
         extra: further energy terms of the posterior, such as what is known of the floor.
+
+    Attributes:
+        silhouettes: where those of the images come from.
     """
 
     def __init__(
@@ -74,9 +95,8 @@ class Tracker:
         self.settings = settings or TrackerSettings()
         self.model = body
         self.camera = camera
-        self.background = background or BackgroundModel()
+        self.silhouettes = Silhouettes(background or BackgroundModel())
         self.evaluations = 0
-        self._learning = background is None
         self._seed = seed
         self._start: Subject | GaussianMixture | None = None
         self._extra = tuple(extra)
@@ -148,21 +168,30 @@ class Tracker:
             start = self._start_at(stamp, prediction)
             if start is None:
                 self.evaluations = 0
-                if self._learning and (mask is None or not mask.any()):
-                    self.background.learn(image)
+                self.silhouettes.learn(image, mask)
                 return None, None
+            beginning = self._beginning(start, keypoints)
+            if mask is None:
+                self.silhouettes.check(image, beginning.body, self.camera, beginning.best)
             observation = self._observe(image, keypoints, mask)
-            self._begin(observation, start, stamp)
+            self._begin(observation, beginning, stamp)
             if not self._track.believes_silhouettes:
                 # The start is where the person is; the silhouette is not.
                 observation = self._observe(image, keypoints, mask)
-                self._begin(observation, start, stamp)
+                self._begin(observation, beginning, stamp)
+        if mask is None:
+            self.silhouettes.complete(image, self.body, self.camera, self.modes.poses)
         dt = 0.0 if self._last_stamp is None else (stamp - self._last_stamp) * 1e-9
         modes = self._track.modes
         self._point.update(self.body, modes.poses, np.exp(modes.log_weights), dt)
         self._last_image, self._last_stamp = image, stamp
         self.evaluations = self._track.evaluations
         return self.posterior, self._track.likelihood_mixture(observation)
+
+    @property
+    def background(self) -> BackgroundModel:
+        """The empty scene, as far as it is known."""
+        return self.silhouettes.background
 
     @property
     def status(self) -> Status:
@@ -218,26 +247,22 @@ class Tracker:
             return prediction
         return None if isinstance(start, Subject) and stamp < start.stamp_ns else start
 
-    def _begin(
-        self,
-        observation: Observation,
-        start: Subject | GaussianMixture | PosePrediction,
-        stamp: int,
-    ) -> None:
-        """Starts the track."""
+    def _beginning(
+        self, start: Subject | GaussianMixture | PosePrediction, keypoints: Keypoints | None
+    ) -> _Beginning:
+        """The body and the poses that a track begins with."""
         if isinstance(start, Subject):
             begun = start_from_keypoints(self.model, self.camera, start)
-            self._track.begin(
-                begun.body, begun.poses, observation, stamp,
-                both_ways=False, clicked=start.keypoints,
-            )  # fmt: skip
-        elif isinstance(start, PosePrediction):
-            self._track.begin(
-                start.body, start.both_ways(start.body), observation, stamp,
-                both_ways=observation.keypoints is None,
-            )  # fmt: skip
-        else:
-            self._track.begin(self.body, start, observation, stamp, both_ways=False)
+            return _Beginning(begun.body, begun.poses, both_ways=False, clicked=start.keypoints)
+        if isinstance(start, PosePrediction):
+            poses = start.both_ways(start.body)
+            return _Beginning(start.body, poses, both_ways=keypoints is None)
+        return _Beginning(self.body, start, both_ways=False)
+
+    def _begin(self, observation: Observation, beginning: _Beginning, stamp: int) -> None:
+        """Starts the track."""
+        body, start, both_ways, clicked = beginning
+        self._track.begin(body, start, observation, stamp, both_ways=both_ways, clicked=clicked)
 
     def _follow(
         self, observation: Observation, stamp: int, prediction: PosePrediction | None
@@ -277,11 +302,10 @@ class Tracker:
         wanted = {'containment', 'coverage'}
         wanted |= {term.name for term in TERMS if getattr(t, term.name).weight > 0}
         wanted |= {'intensity'} if textured else set()  # the textures hold it
-        foreground, unsure = None, None
-        if shape and mask is not None:
-            foreground = one_person(mask, self.background.settings, self._region())
-        elif shape and self.background.frames:
-            foreground, unsure = self.background.split(image, self._region())
+        silhouette = None
+        if shape:
+            silhouette = self.silhouettes.silhouette(image, mask, self._region())
+        foreground, unsure = (None, None) if silhouette is None else silhouette
         believed = foreground if self._track.believes_silhouettes else None
         found = observe(
             image, believed, keypoints,

@@ -35,6 +35,7 @@ class StubTracker:
         self.body, self.camera, self.seed = body, camera, seed
         self.settings = settings or TrackerSettings()
         self.background = background
+        self.silhouettes = SimpleNamespace(doubted=False, share=0.9, known='known')
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.seen: list[tuple[int, Any]] = []
         self.predictions: list[PosePrediction | None] = []

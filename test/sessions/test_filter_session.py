@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -485,6 +486,34 @@ def test_masks_without_images_are_forgotten(session, small_camera):
     for index in range(200):
         one.take(MASK, small_camera.mask(index))
     assert len(one._masks._content) == 64
+
+
+# The background.
+
+
+def test_a_person_in_the_background_is_told(session, small_camera, stub_tracker):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    assert one.state.trouble() == ''
+    step = stub_tracker.step
+
+    def doubts(self, *arguments):
+        self.silhouettes = SimpleNamespace(doubted=True, share=0.123, known='forgotten')
+        return step(self, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stub_tracker, 'step', doubts)
+        (warning,) = one.take(IMAGE, small_camera.image(1)).warnings
+        assert one.take(IMAGE, small_camera.image(2)).warnings == ()
+    assert warning.startswith(
+        'the background was learned with the person in it, of whom only 12% are foreground in the '
+        f'image of {small_camera.stamp(1)} ns'
+    )
+    assert 'give background_file' in warning
+    assert one.state.faults == {'background': 1}
+    assert one.state.trouble() == 'the background was learned with the person in it; forgotten'
+    assert dict(one.state.values())['background'] == 'forgotten'
 
 
 # Starts.

@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -72,6 +73,7 @@ class StandingStill:
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
         self.keypoints, self.predictions, self.masks = [], [], []
+        self.silhouettes = SimpleNamespace(doubted=False, known='known')
         StandingStill.made.append(self)
 
     def reset(self, start):
