@@ -199,8 +199,12 @@ class BackgroundModel:
             square = np.ones((3, 3), np.uint8)
             darkest, brightest = cv2.erode(empty, square), cv2.dilate(empty, square)
             margin = np.full_like(empty, BESIDE)
-            self._nearby = cv2.subtract(darkest, margin), cv2.add(brightest, margin)
-        return np.asarray(cv2.inRange(image, *self._nearby) > 0)
+            self._nearby = (
+                np.asarray(cv2.subtract(darkest, margin), dtype=np.uint8),
+                np.asarray(cv2.add(brightest, margin), dtype=np.uint8),
+            )
+        lowest, highest = self._nearby
+        return np.asarray(cv2.inRange(image, lowest, highest) > 0)
 
     def _learn_alone(self, background: Image) -> None:
         """Makes one image (H, W, 3) of the empty scene all that is known."""
