@@ -49,6 +49,7 @@ ARGUMENTS = (
     ('camera_info', '', 'topic of the calibration; empty: camera_info beside the images'),
     ('image_transport', 'raw', "'raw', or 'compressed' for images on <image>/compressed"),
     ('keypoints', '', 'topic of the keypoints of a 2D detector; empty: none'),
+    ('mask', '', 'topic of the masks of a segmenter, without /compressed; empty: none'),
     ('subject_file', '', 'file with the joints in one image; empty: a prediction starts the track'),
     ('background_file', '', 'image of the empty scene; empty: learned from the first images'),
     ('model_file', '', 'model written by train; empty: the one that comes with the package'),
@@ -112,9 +113,17 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
     remappings.append(('camera_info', info))
     if given['keypoints']:
         remappings.append(('keypoints', given['keypoints']))
+    mask = given['mask'].removesuffix('/compressed')
+    if mask:
+        remappings += [('mask', mask), ('mask/compressed', f'{mask}/compressed')]
 
     common = {'use_sim_time': sim_time, 'autostart': _truth(given, 'autostart')}
-    camera = {**common, 'image_transport': transport, **_named(given, 'background_file')}
+    camera = {
+        **common,
+        'image_transport': transport,
+        'use_mask': bool(mask),
+        **_named(given, 'background_file'),
+    }
     values: dict[str, dict[str, Any]] = {
         'filter_node': {
             **camera,

@@ -132,6 +132,7 @@ def test_three_nodes_in_the_namespace_of_a_person(actions):
         'use_sim_time': False,
         'autostart': True,
         'image_transport': 'raw',
+        'use_mask': False,
         'use_predictions': True,
         'use_keypoints': False,
         'frame_prefix': 'body_p1/',
@@ -168,6 +169,7 @@ def test_arguments(actions, tmp_path):
         image='/left/rect/compressed',
         image_transport='compressed',
         keypoints='/pose2d',
+        mask='/segmented/compressed',
         subject_file='12',
         background_file='wall.png',
         model_file='m.npz',
@@ -183,6 +185,7 @@ def test_arguments(actions, tmp_path):
         'use_sim_time': True,
         'autostart': False,
         'image_transport': 'compressed',
+        'use_mask': True,
         'background_file': 'wall.png',
         'subject_file': '12',
         'use_predictions': True,
@@ -190,11 +193,14 @@ def test_arguments(actions, tmp_path):
         'frame_prefix': 'body_anna/',
     }
     assert parameters(predicts)['model_file'] == 'm.npz'
+    assert parameters(predicts)['use_mask'] is True
     assert dict(tracks['remappings']) == {
         'image': '/left/rect',
         'image/compressed': '/left/rect/compressed',
         'camera_info': '/left/camera_info',
         'keypoints': '/pose2d',
+        'mask': '/segmented',
+        'mask/compressed': '/segmented/compressed',
     }
     # What the user's own file says goes before all else.
     assert tracks['parameters'][-1] == 'own.yaml'

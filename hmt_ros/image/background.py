@@ -2,7 +2,8 @@
 
 The background is either a given image of the empty scene or learned from frames in which the person
 is absent or moves. OpenCV's mixture (MOG2) or nearest-neighbour (KNN) model does the per-pixel
-work.
+work. A background that turns out to be useless can be put together anew, from the pixels of images
+where the person is not.
 """
 
 from __future__ import annotations
@@ -23,6 +24,10 @@ FOREGROUND, SHADOW = 255, 127
 # Grey levels by which a pixel may differ from the colours of the background around it: compression
 # and aliasing move its edges.
 BESIDE = 8
+# A pixel is known again when so many images without the person before it agree within so many grey
+# levels.
+AGREEING = 10
+AGREEMENT = 20.0
 # Learning rate at which nothing is learned; at 0 the KNN model would replace its samples at once.
 FROZEN = 1e-7
 
@@ -60,29 +65,28 @@ class Silhouette(NamedTuple):
     Attributes:
         foreground: (H, W) the person.
         unsure: (H, W) darker than the background in the same colour: a shadow, or clothes in the
-            colours of the scene.
+            colours of the scene; None: there is nothing unsure.
     """
 
     foreground: Mask
-    unsure: Mask
+    unsure: Mask | None = None
 
 
 class BackgroundModel:
-    """Learns an empty scene and finds what does not belong to it."""
+    """Learns an empty scene and finds what does not belong to it.
+
+    Attributes:
+        settings: how.
+        frames: number of images that were learned.
+    """
 
     def __init__(self, settings: BackgroundSettings | None = None) -> None:
         self.settings = settings or BackgroundSettings()
-        s = self.settings
-        self._model: cv2.BackgroundSubtractorMOG2 | cv2.BackgroundSubtractorKNN
-        if s.method == 'mog2':
-            self._model = cv2.createBackgroundSubtractorMOG2(varThreshold=s.threshold)
-        else:
-            self._model = cv2.createBackgroundSubtractorKNN(dist2Threshold=20.0 * s.threshold)
-        self._model.setDetectShadows(True)
-        self._model.setShadowThreshold(s.shadow_threshold)
+        self._model = _new_model(self.settings)
         self.frames = 0
         self._shape: tuple[int, ...] = ()
         self._nearby: tuple[Image, Image] | None = None
+        self._parts: _Parts | None = None
 
     @classmethod
     def from_image(
@@ -90,8 +94,7 @@ class BackgroundModel:
     ) -> BackgroundModel:
         """A model of one image of the empty scene, (H, W, 3) uint8."""
         model = cls(settings)
-        for _ in range(1 if model.settings.method == 'mog2' else 20):
-            model.learn(background)
+        model._learn_alone(background)
         return model
 
     def learn(self, image: Image) -> None:
@@ -106,6 +109,43 @@ class BackgroundModel:
         self.frames += 1
         self._model.apply(image, learningRate=1.0 / self.frames)
         self._nearby = None
+
+    def forget(self) -> None:
+        """Forgets all that was learned; `complete` puts the background together anew."""
+        shape = self._shape
+        if self.frames == 0:
+            return
+        self._parts = _Parts(shape)
+        self._learn_alone(np.zeros(shape, dtype=np.uint8))
+
+    def complete(self, image: Image, person: Mask) -> None:
+        """Takes the pixels of an image where the person (H, W) is not, if they are unknown.
+
+        Raises:
+            ValueError: the image is not like those before.
+        """
+        self._check(image)
+        if self._parts is None:
+            return
+        self._parts.add(image, ~person)
+        if not self._parts.unknown.any():
+            self._learn_alone(self._parts.image)
+            self._parts = None
+
+    @property
+    def unknown(self) -> Mask | None:
+        """Pixels (H, W) that have not been seen without the person since `forget`; None: none."""
+        return None if self._parts is None else self._parts.unknown
+
+    def foreground(self, image: Image) -> Mask:
+        """Pixels (H, W) that differ from the background and are no shadow.
+
+        None where the background is unknown. The model does not change.
+
+        Raises:
+            ValueError: no background was learned, or the image has another size.
+        """
+        return np.asarray(self._subtracted(image) == FOREGROUND)
 
     def silhouette(self, image: Image, region: Box | None = None) -> Mask:
         """Foreground (H, W) of an image: the largest piece and what is near it, without shadow.
@@ -124,31 +164,33 @@ class BackgroundModel:
 
     def split(self, image: Image, region: Box | None = None) -> Silhouette:
         """Foreground of an image, as for `silhouette`, and what may be person or shadow."""
+        raw = self._subtracted(image)
+        mask = raw == FOREGROUND
+        part, unsure = mask[_part(region)], np.zeros(mask.shape, dtype=np.bool_)
+        if part.size:
+            small, large = np.ones((3, 3), np.uint8), np.ones((5, 5), np.uint8)
+            pixels = np.ascontiguousarray(part).view(np.uint8)
+            opened = cv2.morphologyEx(pixels, cv2.MORPH_OPEN, small)
+            part[:] = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, large) > 0
+            pixels = np.ascontiguousarray(raw[_part(region)] == SHADOW).view(np.uint8)
+            unsure[_part(region)] = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, large) > 0
+        found = one_person(mask, self.settings, region)
+        return Silhouette(found, unsure & ~found)
+
+    def _subtracted(self, image: Image) -> Image:
+        """`FOREGROUND`, `SHADOW` or 0 (H, W)."""
         if self.frames == 0:
             raise ValueError('no background has been learned: give an image or some frames first')
         self._check(image)
-        raw = self._model.apply(image, learningRate=FROZEN)
-        mask = (raw == FOREGROUND).astype(np.uint8)
-        mask[self._is_beside(image)] = 0
-        result = np.zeros(mask.shape, dtype=np.bool_)
-        left, top, right, bottom = region or (0, 0, mask.shape[1], mask.shape[0])
-        part = np.ascontiguousarray(mask[top:bottom, left:right])
-        if part.size:
-            opened = cv2.morphologyEx(part, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-            closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-            result[top:bottom, left:right] = _pieces_of_one_person(
-                np.asarray(closed, dtype=np.uint8), self.settings
-            )
-        unsure = raw == SHADOW
-        shadow = np.zeros(mask.shape, dtype=np.bool_)
-        shadow[top:bottom, left:right] = (
-            cv2.morphologyEx(
-                np.ascontiguousarray(unsure[top:bottom, left:right]).view(np.uint8),
-                cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8),
-            )
-            > 0
-        )  # fmt: skip
-        return Silhouette(result, shadow & ~result)
+        parts = self._parts
+        if parts is not None and parts.changed:
+            self._learn_alone(parts.image)
+            parts.changed = False
+        raw = np.asarray(self._model.apply(image, learningRate=FROZEN), dtype=np.uint8)
+        raw[(raw == FOREGROUND) & self._is_beside(image)] = 0
+        if parts is not None:
+            raw[parts.unknown] = 0
+        return raw
 
     def _is_beside(self, image: Image) -> Mask:
         """Pixels (H, W) whose colour the background has beside them: its edges, slightly moved."""
@@ -157,8 +199,19 @@ class BackgroundModel:
             square = np.ones((3, 3), np.uint8)
             darkest, brightest = cv2.erode(empty, square), cv2.dilate(empty, square)
             margin = np.full_like(empty, BESIDE)
-            self._nearby = cv2.subtract(darkest, margin), cv2.add(brightest, margin)
-        return np.asarray(cv2.inRange(image, *self._nearby) > 0)
+            self._nearby = (
+                np.asarray(cv2.subtract(darkest, margin), dtype=np.uint8),
+                np.asarray(cv2.add(brightest, margin), dtype=np.uint8),
+            )
+        lowest, highest = self._nearby
+        return np.asarray(cv2.inRange(image, lowest, highest) > 0)
+
+    def _learn_alone(self, background: Image) -> None:
+        """Makes one image (H, W, 3) of the empty scene all that is known."""
+        self._model = _new_model(self.settings)
+        self.frames = 0
+        for _ in range(1 if self.settings.method == 'mog2' else 20):
+            self.learn(background)
 
     def _check(self, image: Image) -> None:
         # OpenCV would silently begin a new model.
@@ -166,15 +219,76 @@ class BackgroundModel:
             raise ValueError(f'the background has shape {self._shape}, saw an image {image.shape}')
 
 
-def _pieces_of_one_person(mask: Image, settings: BackgroundSettings) -> Mask:
-    """The largest piece of a mask and the pieces that are large enough and near enough to it."""
-    result = np.zeros(mask.shape, dtype=bool)
-    x, y, width, height = cv2.boundingRect(mask)
+def _new_model(
+    settings: BackgroundSettings,
+) -> cv2.BackgroundSubtractorMOG2 | cv2.BackgroundSubtractorKNN:
+    s = settings
+    model: cv2.BackgroundSubtractorMOG2 | cv2.BackgroundSubtractorKNN
+    if s.method == 'mog2':
+        model = cv2.createBackgroundSubtractorMOG2(varThreshold=s.threshold)
+    else:
+        model = cv2.createBackgroundSubtractorKNN(dist2Threshold=20.0 * s.threshold)
+    model.setDetectShadows(True)
+    model.setShadowThreshold(s.shadow_threshold)
+    return model
+
+
+class _Parts:
+    """A background that is put together from parts of images.
+
+    Args:
+        shape: (H, W, 3) of the images.
+
+    Attributes:
+        unknown: (H, W).
+        changed: whether pixels have become known since this was last set.
+    """
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self._mean = np.zeros(shape, dtype=np.float32)
+        self.unknown: Mask = np.ones(shape[:2], dtype=np.bool_)
+        self.changed = False
+        self._agreeing = np.zeros(shape[:2], dtype=np.int32)
+
+    @property
+    def image(self) -> Image:
+        """The background (H, W, 3), as far as it is known."""
+        return np.asarray(np.rint(self._mean), dtype=np.uint8)
+
+    def add(self, image: Image, empty: Mask) -> None:
+        """Takes the unknown pixels of an image where it is empty (H, W)."""
+        rows, columns = np.nonzero(empty & self.unknown)
+        values = image[rows, columns].astype(np.float32)
+        mean, agreeing = self._mean[rows, columns], self._agreeing[rows, columns]
+        # Who disagrees begins anew: somebody was there, then or now.
+        agreeing[np.abs(values - mean).max(1, initial=0.0) > AGREEMENT] = 0
+        agreeing += 1
+        self._mean[rows, columns] = mean + (values - mean) / agreeing[:, None]
+        self._agreeing[rows, columns] = agreeing
+        done = agreeing >= AGREEING
+        self.unknown[rows[done], columns[done]] = False
+        self.changed |= bool(done.any())
+
+
+def one_person(mask: Mask, settings: BackgroundSettings, region: Box | None = None) -> Mask:
+    """The largest piece of a mask (H, W) and what is large and near enough to belong to it.
+
+    Args:
+        mask: of all that is no background.
+        settings: what is large and near.
+        region: where the person can be, as for `BackgroundModel.silhouette`.
+    """
+    result = np.zeros(mask.shape, dtype=np.bool_)
+    part, found = mask[_part(region)], result[_part(region)]
+    if part.size == 0:
+        return result
+    pixels = np.ascontiguousarray(part).view(np.uint8)
+    x, y, width, height = cv2.boundingRect(pixels)
     if width == 0:
         return result
     # Most of an image is empty.
     inside = slice(y, y + height), slice(x, x + width)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask[inside], connectivity=8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(pixels[inside], connectivity=8)
     area = stats[1:, cv2.CC_STAT_AREA]
     main = 1 + int(np.argmax(area))
     keep = np.zeros(count, dtype=bool)
@@ -189,5 +303,11 @@ def _pieces_of_one_person(mask: Image, settings: BackgroundSettings) -> Mask:
     large = stats[:, cv2.CC_STAT_AREA] >= settings.smallest_part * area.max()
     keep |= near & large
     keep[0] = False
-    result[inside] = keep[labels]
+    found[inside] = keep[labels]
     return result
+
+
+def _part(region: Box | None) -> tuple[slice, slice]:
+    """Rows and columns of a region; None: all."""
+    left, top, right, bottom = region or (0, 0, None, None)
+    return slice(top, bottom), slice(left, right)

@@ -90,7 +90,9 @@ def observe(
     if known is not None and unsure is not None:
         doubtful = np.ascontiguousarray(unsure[rows, columns]).view(np.uint8)
     before = None if last_image is None else np.ascontiguousarray(last_image[rows, columns])
-    part = ImageWindow(np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful)
+    part = ImageWindow(
+        np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful
+    )
     evidence = {
         term.name: found
         for term in TERMS

@@ -12,7 +12,12 @@ from rclpy.serialization import deserialize_message
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
-from hmt_ros.nodes.subscribed_topic import CAMERA_INFO_TOPIC, SubscribedTopic, image_topic
+from hmt_ros.nodes.subscribed_topic import (
+    CAMERA_INFO_TOPIC,
+    MASK_TOPICS,
+    SubscribedTopic,
+    image_topic,
+)
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
 from msg_tools.files.error_line import error_line
@@ -32,6 +37,7 @@ class BmeNode(SessionNode[BmeSession, BmeParameters]):
 
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         yield CAMERA_INFO_TOPIC
+        yield from MASK_TOPICS
         yield image_topic(self._settings.image_transport)
 
     def _on_predict_pose(

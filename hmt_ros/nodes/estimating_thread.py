@@ -18,9 +18,6 @@ from hmt_ros.sessions.session import Session
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import deserialise
 
-# Small messages that wait while an estimate is made.
-SMALL_QUEUE = 100
-
 _RESTART = 'restart'
 
 
@@ -161,7 +158,7 @@ class EstimatingThread:
     ) -> None:
         self._session = session
         self._inputs: Mapping[str, SubscribedTopic] = {one.source: one for one in inputs}
-        limits = dict.fromkeys(self._inputs, SMALL_QUEUE)
+        limits = {one.source: one.waiting for one in self._inputs.values()}
         # Of several requests to start anew the last counts.
         limits[_RESTART] = 1
         limits[session.COUNTED] = queue_size

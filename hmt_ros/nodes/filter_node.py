@@ -12,6 +12,7 @@ from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
     CAMERA_INFO_TOPIC,
+    MASK_TOPICS,
     RELIABLE,
     SubscribedTopic,
     image_topic,
@@ -37,6 +38,7 @@ class FilterNode(SessionNode[FilterSession, FilterParameters]):
         yield CAMERA_INFO_TOPIC
         yield SubscribedTopic(KEYPOINTS, 'keypoints', 'hmt_msgs/msg/Keypoints2D')
         yield SubscribedTopic(PREDICTION, 'pose_prediction', 'hmt_msgs/msg/PoseMixture', RELIABLE)
+        yield from MASK_TOPICS
         yield image_topic(self._settings.image_transport)
 
     def _on_reset(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:

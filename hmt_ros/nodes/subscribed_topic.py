@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 
-from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK
 from msg_tools.messages.images import MAX_PIXELS
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -23,6 +23,9 @@ LATCHED = QoSProfile(
 # Largest messages that are taken, bytes. A mixture over the poses of a person is smaller.
 LARGEST_MESSAGE = 2**24
 LARGEST_IMAGE = 8 * MAX_PIXELS + 2**16
+LARGEST_MASK = MAX_PIXELS + 2**16
+# Messages that wait while an estimate is made: small ones, and masks.
+SMALL_QUEUE, MASK_QUEUE = 100, 20
 
 
 class SubscribedTopic(NamedTuple):
@@ -34,6 +37,7 @@ class SubscribedTopic(NamedTuple):
         msgtype: for example 'sensor_msgs/msg/Image'.
         qos: quality of service of the subscription.
         largest: size of the largest message that is taken, bytes.
+        waiting: maximum number of messages that wait while an estimate is made.
     """
 
     source: str
@@ -41,8 +45,21 @@ class SubscribedTopic(NamedTuple):
     msgtype: str
     qos: QoSProfile = qos_profile_sensor_data
     largest: int = LARGEST_MESSAGE
+    waiting: int = SMALL_QUEUE
 
 
+MASK_TOPICS = (
+    SubscribedTopic(
+        MASK, 'mask', 'sensor_msgs/msg/Image', largest=LARGEST_MASK, waiting=MASK_QUEUE
+    ),
+    SubscribedTopic(
+        COMPRESSED_MASK,
+        'mask/compressed',
+        'sensor_msgs/msg/CompressedImage',
+        largest=LARGEST_MASK,
+        waiting=MASK_QUEUE,
+    ),
+)
 CAMERA_INFO_TOPIC = SubscribedTopic(CAMERA_INFO, 'camera_info', 'sensor_msgs/msg/CameraInfo')
 
 

@@ -5,6 +5,8 @@ order give the same bytes. The rules, besides those of `CameraSession`:
 
 - Every image that can be used gets one prediction. One without components says that nobody was
   seen: the background is still being learned, or no silhouette has the height of a person.
+- With `use_mask` the mask of an image is its silhouette; an image whose mask shows somebody teaches
+  no background.
 - An image that is not younger than the one before is skipped, or is the first of a new sequence
   with `reset_on_time_jump`.
 - With `propagate` a prediction takes the one before into account, unless this is older than
@@ -28,7 +30,7 @@ from hmt_ros.experts.descriptor.contour import NoSilhouetteError
 from hmt_ros.experts.pose_predictor import SHIPPED, PosePredictor, Prediction, load_predictor
 from hmt_ros.experts.root_placement import SIZE_SPREAD
 from hmt_ros.experts.training_set import RATE
-from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.background import BackgroundModel, one_person
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
@@ -122,6 +124,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._background_in_use = threading.Lock()
         self._previous: _Previous | None = None
         self._height, self._support = 0, math.nan
+        self._masked = False
         self.state = self._present_state()
 
     def _forget(self) -> None:
@@ -149,12 +152,14 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def _mixture_of(self, waiting: WaitingImage, camera: Camera) -> GaussianMixture | None:
         """The prediction from an image; None if nobody is seen."""
-        p = self.parameters
-        if self._images_to_learn():
+        p, given = self.parameters, waiting.mask
+        self._masked = given is not None
+        if self._images_to_learn() and (given is None or not given.any()):
             with self._background_in_use:
                 self._background.learn(waiting.image)
             return None
-        mask = self._silhouette(waiting.image)
+        background = p.background
+        mask = self._silhouette(waiting.image) if given is None else one_person(given, background)
         self._height = _height(mask)
         if self._height < p.least_height:
             return None
@@ -251,7 +256,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def _status(self) -> tuple[str, str]:
         missing = self._images_to_learn()
-        if missing:
+        if missing and not self._masked:
             return 'learning', f'{missing} more images of the empty scene'
         return 'predicting' if len(self._weights) else 'nobody', ''
 

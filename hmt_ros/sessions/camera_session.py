@@ -1,7 +1,10 @@
 """Sessions that estimate from the images of one camera.
 
 Images are taken in the order of their stamps. They wait until a calibrated camera_info has come; at
-most `queue_size` wait, the oldest are dropped.
+most `queue_size` wait, the oldest are dropped. With `use_mask` an image also waits for the mask of
+exactly its stamp, for a mask of a later stamp, or for an image that is `mask_timeout` younger. A
+mask that can not be used counts as none; one without a pixel that is not zero says that nobody was
+seen.
 """
 
 from __future__ import annotations
@@ -12,20 +15,25 @@ from collections.abc import Callable
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from hmt_ros.body import Camera
-from hmt_ros.inference.arrays import Image
+from hmt_ros.inference.arrays import Image, Mask
+from hmt_ros.sessions.declared_parameters import CameraNodeParameters
 from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.session import Order, Parameters, Session, State, everything
+from hmt_ros.sessions.session import Order, Session, State, everything
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
-from msg_tools.messages.images import ImageError, decode_image, decode_picture
+from msg_tools.messages.headers import SECOND_NS
+from msg_tools.messages.images import ImageError, decode_image, decode_mask, decode_picture
 
 CAMERA_INFO, IMAGE = 'camera_info', 'image'
+MASK, COMPRESSED_MASK = 'mask', 'mask/compressed'
+MASKS = (MASK, COMPRESSED_MASK)
 FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a frame
 
 T = TypeVar('T')
+CameraParameters = TypeVar('CameraParameters', bound=CameraNodeParameters)
 
-# Stamps that `StampedInputs` remembers.
-_REMEMBERED = 256
+# Inputs that `StampedInputs` remembers, and masks, which are large.
+_REMEMBERED, _REMEMBERED_MASKS = 256, 64
 _LARGEST_PICTURE_FILE = 2**28  # bytes
 
 
@@ -36,14 +44,16 @@ class WaitingImage(NamedTuple):
         image: (H, W, 3) BGR.
         stamp_ns: of the image.
         frame_id: optical frame of the camera.
+        mask: (H, W) where a segmenter sees the person; None: no mask has come.
     """
 
     image: Image
     stamp_ns: int
     frame_id: str
+    mask: Mask | None = None
 
 
-class CameraSession(Session[Parameters, State]):
+class CameraSession(Session[CameraParameters, State]):
     """A session that estimates from images; see `Session` for arguments and attributes."""
 
     COUNTED = IMAGE
@@ -51,7 +61,7 @@ class CameraSession(Session[Parameters, State]):
 
     def __init__(
         self,
-        parameters: Parameters,
+        parameters: CameraParameters,
         publish: Callable[[Output], None],
         wanted: Callable[[str], bool] = everything,
     ) -> None:
@@ -60,6 +70,7 @@ class CameraSession(Session[Parameters, State]):
         self._frame = ''
         self._waiting: deque[WaitingImage] = deque()
         self._newest: int | None = None
+        self._masks: StampedInputs[Mask] = StampedInputs(_REMEMBERED_MASKS)
 
     @abstractmethod
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
@@ -71,17 +82,31 @@ class CameraSession(Session[Parameters, State]):
 
     def _is_ready(self, stamp: int) -> bool:
         """Whether an image need not wait for anything but a camera_info."""
-        return True
+        return self._has_mask(stamp)
 
-    def _report_dropped(self, stamp: int) -> None:
-        """Reports an image that is dropped while it waits for something else."""
+    def _missing_input(self, stamp: int) -> Fault:
+        """What an image is waiting for, besides a camera_info."""
+        return Fault.NO_MASK
 
     def _forget_inputs(self) -> None:
         """Drops what belongs to the images before a jump in time."""
+        self._masks.clear()
+
+    def _has_mask(self, stamp: int) -> bool:
+        p = self.parameters
+        return not p.use_mask or self._has(self._masks, stamp, p.mask_timeout)
+
+    def _has(self, inputs: StampedInputs[Any], stamp: int, timeout: float) -> bool:
+        """Whether an image need not wait any longer for an input."""
+        assert self._newest is not None
+        return inputs.is_settled(stamp) or self._newest - stamp > timeout * SECOND_NS
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
         if source == CAMERA_INFO:
             self._take_camera_info(message)
+        elif source in MASKS:
+            if self.parameters.use_mask:
+                self._masks.put(stamp, self._mask_in(message, stamp))
         else:
             self._take_image(message, stamp)
         self._estimate_what_is_ready()
@@ -120,6 +145,44 @@ class CameraSession(Session[Parameters, State]):
         self._newest = stamp
         self._waiting.append(WaitingImage(image, stamp, str(message.header.frame_id)))
 
+    def _mask_in(self, message: Any, stamp: int) -> Mask | None:
+        """The mask in a message; None where it can not be used."""
+        try:
+            mask = decode_mask(message)
+        except ImageError as error:
+            self._log.fault(Fault.MASK, str(error))
+            return None
+        if mask.all():
+            self._log.fault(
+                Fault.MASK,
+                f'mask of {stamp} ns is zero nowhere, wanted zero where the person is not',
+            )
+            return None
+        return mask
+
+    def _mask_of(self, image: Image, stamp: int) -> Mask | None:
+        """The mask of an image; None where there is none that fits."""
+        lone = self._masks.before(stamp)
+        for each in lone:
+            self._log.note(
+                Fault.LONE_MASK,
+                f'mask of {each} ns belongs to no image, or comes too late: wanted the stamp of '
+                'an image',
+            )
+        known = stamp in self._masks
+        mask = self._masks.take(stamp)
+        if not known:
+            self._log.note(Fault.NO_MASK, f'no mask has come for the image of {stamp} ns')
+        if mask is None or mask.shape == image.shape[:2]:
+            return mask
+        (height, width), (rows, columns) = mask.shape, image.shape[:2]
+        self._log.fault(
+            Fault.MASK,
+            f'mask of {stamp} ns has {width}x{height} pixels, wanted the {columns}x{rows} of its '
+            'image',
+        )
+        return None
+
     def _start_anew(self) -> None:
         self.restart()
 
@@ -138,7 +201,12 @@ class CameraSession(Session[Parameters, State]):
                     f'image of {stamp} ns is dropped: it waited for a calibrated camera_info',
                 )
             else:
-                self._report_dropped(stamp)
+                kind = self._missing_input(stamp)
+                self._log.fault(
+                    kind,
+                    f'image of {stamp} ns is dropped: {kind.value} of its stamp has come, and '
+                    f'queue_size is {self.parameters.queue_size}',
+                )
 
     def _estimate_next(self, camera: Camera) -> None:
         waiting = self._waiting.popleft()
@@ -148,7 +216,10 @@ class CameraSession(Session[Parameters, State]):
             self._log.skip(Fault.IMAGE_SIZE, str(error))
             return
         frame = waiting.frame_id or self._frame or FRAME_ID
-        self._estimate(waiting._replace(frame_id=frame), camera)
+        mask = None
+        if self.parameters.use_mask:
+            mask = self._mask_of(waiting.image, waiting.stamp_ns)
+        self._estimate(waiting._replace(frame_id=frame, mask=mask), camera)
 
     def _status_and_wants(self) -> tuple[str, str]:
         if self._camera is None:
@@ -160,22 +231,33 @@ class StampedInputs(Generic[T]):
     """Inputs that belong to the image of exactly their stamp; of several the last counts.
 
     None stands for an input that says nothing, as of a detector that saw nobody.
+
+    Args:
+        most: number of inputs that are remembered.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, most: int = _REMEMBERED) -> None:
+        self._most = most
         self._content: dict[int, T | None] = {}
         self._newest = -1
+
+    def __contains__(self, stamp_ns: int) -> bool:
+        return stamp_ns in self._content
 
     def put(self, stamp_ns: int, content: T | None) -> None:
         """Keeps an input for its image."""
         self._newest = max(self._newest, stamp_ns)
         self._content[stamp_ns] = content
-        while len(self._content) > _REMEMBERED:
+        while len(self._content) > self._most:
             del self._content[min(self._content)]
 
     def is_settled(self, stamp_ns: int) -> bool:
         """Whether the input for an image has come, or a later one."""
         return stamp_ns in self._content or self._newest > stamp_ns
+
+    def before(self, stamp_ns: int) -> list[int]:
+        """Stamps of the inputs that are older than an image."""
+        return [stamp for stamp in self._content if stamp < stamp_ns]
 
     def take(self, stamp_ns: int) -> T | None:
         """The input for an image, None where there is none; drops it and all that are older."""

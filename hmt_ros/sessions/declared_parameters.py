@@ -98,9 +98,15 @@ class CameraNodeParameters(NodeParameters):
     Attributes:
         image_transport: Transport of the images, 'raw' (topic image) or 'compressed' (topic
             image/compressed).
+        use_mask: If true, masks of a segmenter replace background subtraction, and an image waits
+            for the mask of its stamp.
+        mask_timeout: Maximum time that an image waits for its mask, measured by the stamps of later
+            images, s; a mask of a later stamp ends the wait at once.
     """
 
     image_transport: str = parameter_field('raw', NEXT_CONFIGURE)
+    use_mask: bool = parameter_field(False, AT_ONCE)
+    mask_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
 
     def __post_init__(self) -> None:
         if self.image_transport not in TRANSPORTS:

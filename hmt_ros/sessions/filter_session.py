@@ -27,7 +27,9 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
+    COMPRESSED_MASK,
     IMAGE,
+    MASK,
     CameraSession,
     StampedInputs,
     WaitingImage,
@@ -45,12 +47,22 @@ from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.keypoints import keypoints_of
 from msg_tools.messages.pose_mixtures import pose_mixture_of
 
-__all__ = ['CAMERA_INFO', 'IMAGE', 'KEYPOINTS', 'PREDICTION', 'FilterSession', 'FilterState']
+__all__ = [
+    'CAMERA_INFO',
+    'COMPRESSED_MASK',
+    'IMAGE',
+    'KEYPOINTS',
+    'MASK',
+    'PREDICTION',
+    'FilterSession',
+    'FilterState',
+]
 
 KEYPOINTS, PREDICTION = 'keypoints', 'pose_prediction'
 
 # A person hardly moves meanwhile.
 _SAME_MOMENT_NS = SECOND_NS // 5
+_IN_BACKGROUND = 'the background was learned with the person in it'
 
 
 @dataclass(frozen=True)
@@ -62,20 +74,26 @@ class FilterState(SessionState):
         modes: components of the posterior.
         misfit: share of the image that no mode explains.
         evaluations: of the likelihood in the last image.
+        background: what is known of it, in a few words.
+        doubted: whether it was learned with the person in it, and is not known again.
     """
 
     body: Body | None = None
     modes: int = 0
     misfit: float = 0.0
     evaluations: int = 0
+    background: str = 'unknown'
+    doubted: bool = False
 
     def summary(self) -> str:
         """The present estimate in a few words."""
         return f'{self.modes} modes'
 
     def trouble(self) -> str:
-        """Whether the track is lost."""
-        return f'lost: misfit {self.misfit:.2f}' if self.status == Status.LOST.value else ''
+        """Whether the track is lost, or the background of no use."""
+        if self.status == Status.LOST.value:
+            return f'lost: misfit {self.misfit:.2f}'
+        return f'{_IN_BACKGROUND}; {self.background}' if self.doubted else ''
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
@@ -83,6 +101,7 @@ class FilterState(SessionState):
             ('modes', str(self.modes)),
             ('entropy of the weights, nats', f'{self.entropy:.3f}'),
             ('misfit', f'{self.misfit:.3f}'),
+            ('background', self.background),
             ('evaluations of the likelihood', str(self.evaluations)),
         ]
 
@@ -143,6 +162,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._shown_body = None
 
     def _forget_inputs(self) -> None:
+        super()._forget_inputs()
         self._keypoints.clear()
         self._predictions.clear()
 
@@ -184,7 +204,9 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             return None
 
     def _is_ready(self, stamp: int) -> bool:
-        return self._has_keypoints(stamp) and self._has_prediction(stamp)
+        return (
+            super()._is_ready(stamp) and self._has_keypoints(stamp) and self._has_prediction(stamp)
+        )
 
     def _has_keypoints(self, stamp: int) -> bool:
         p = self.parameters
@@ -194,17 +216,10 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         p = self.parameters
         return not p.use_predictions or self._has(self._predictions, stamp, p.prediction_timeout)
 
-    def _has(self, inputs: StampedInputs[Any], stamp: int, timeout: float) -> bool:
-        assert self._newest is not None
-        return inputs.is_settled(stamp) or self._newest - stamp > timeout * SECOND_NS
-
-    def _report_dropped(self, stamp: int) -> None:
-        kind = Fault.NO_PREDICTION if self._has_keypoints(stamp) else Fault.NO_KEYPOINTS
-        self._log.fault(
-            kind,
-            f'image of {stamp} ns is dropped: {kind.value} of its stamp has come, and '
-            f'queue_size is {self.parameters.queue_size}',
-        )
+    def _missing_input(self, stamp: int) -> Fault:
+        if not self._has_keypoints(stamp):
+            return Fault.NO_KEYPOINTS
+        return Fault.NO_MASK if not self._has_mask(stamp) else Fault.NO_PREDICTION
 
     # Outputs.
 
@@ -216,7 +231,12 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         try:
             if self._tracker is None:
                 self._tracker = self.start.tracker(camera)
-            posterior, likelihood = self._tracker.step(waiting.image, stamp, keypoints, prediction)
+            trusted = not self._tracker.silhouettes.doubted
+            posterior, likelihood = self._tracker.step(
+                waiting.image, stamp, keypoints, prediction, waiting.mask
+            )
+            if trusted and self._tracker.silhouettes.doubted:
+                self._report_background(self._tracker.silhouettes.share, stamp)
             if starts and posterior is not None:
                 self._report_old_start(stamp)
             if posterior is not None and likelihood is not None:
@@ -229,6 +249,14 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             # The next image would fail as this one did, after as long a time.
             self._log.skip(Fault.START, f'no track starts at the image of {stamp} ns: {text}')
             self.restart(replace(self.start, background=None, initial=None))
+
+    def _report_background(self, share: float, stamp_ns: int) -> None:
+        self._log.note(
+            Fault.BACKGROUND,
+            f'{_IN_BACKGROUND}, of whom only {share:.0%} are foreground in the image of {stamp_ns} '
+            'ns: silhouettes are not used until the scene has been seen where the person is now; '
+            'give background_file, or begin with the empty scene',
+        )
 
     def _report_old_start(self, stamp_ns: int) -> None:
         initial = self.start.initial
@@ -285,6 +313,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
 
     def _present_state(self) -> FilterState:
         tracker = self._tracker if len(self._weights) else None
+        silhouettes = None if self._tracker is None else self._tracker.silhouettes
         return FilterState(
             *self._status_and_wants(),
             **self._totals(),
@@ -292,6 +321,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             modes=len(self._weights),
             misfit=math.nan if tracker is None else tracker.misfit,
             evaluations=0 if tracker is None else tracker.evaluations,
+            background='unknown' if silhouettes is None else silhouettes.known,
+            doubted=silhouettes is not None and silhouettes.doubted,
         )
 
     def _status(self) -> tuple[str, str]:

@@ -42,7 +42,7 @@ class TrackStart:
             ValueError: the background was taken by another camera.
         """
         p = self.parameters
-        background = None
+        background = BackgroundModel(p.background)
         if self.background is not None:
             height, width = self.background.shape[:2]
             if (width, height) != (camera.width, camera.height):
@@ -52,8 +52,6 @@ class TrackStart:
                 )
             background = BackgroundModel.from_image(self.background, p.background)
         tracker = Tracker(self.body, camera, p.tracker, background, p.random_seed)
-        if background is None:
-            tracker.background = BackgroundModel(p.background)
         tracker.reset(self.initial)
         return tracker
 

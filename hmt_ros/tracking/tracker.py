@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.observation import Box, Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
-from hmt_ros.inference.arrays import Array, Image
+from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.facing import Track
 from hmt_ros.tracking.hypotheses import Modes
@@ -33,6 +34,7 @@ from hmt_ros.tracking.initialisation import (
 from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
+from hmt_ros.tracking.silhouettes import Silhouettes
 from hmt_ros.tracking.subject import Subject
 
 # Fewest keypoints from which a lost track starts anew.
@@ -49,6 +51,22 @@ class Status(Enum):
     LOST = 'lost'
 
 
+class _Beginning(NamedTuple):
+    """What `Track.begin` is given of a start; see there."""
+
+    body: Body
+    start: GaussianMixture | Array
+    both_ways: bool
+    clicked: Keypoints | None = None
+
+    @property
+    def best(self) -> Array:
+        """The most probable pose (1, d)."""
+        if isinstance(self.start, GaussianMixture):
+            return self.start.means[[int(np.argmax(self.start.weights))]]
+        return self.start[:1]
+
+
 class Tracker:
     """Follows one person through images; the posterior over poses is a mixture.
 
@@ -56,10 +74,13 @@ class Tracker:
         body: model of the person; a subject's lengths replace the model's when a track starts.
         camera: calibrated.
         settings: how.
-        background: the empty scene; None: learned from images before the track starts, and if there
-            are none the silhouette is not used.
+        background: the empty scene; None, or a model that has learned nothing: learned from images
+            before the track starts, and if there are none the silhouette is not used.
         seed: of all randomness. The same images, settings and seed give the same numbers.
         extra: further energy terms of the posterior, such as what is known of the floor.
+
+    Attributes:
+        silhouettes: where those of the images come from.
     """
 
     def __init__(
@@ -74,9 +95,8 @@ class Tracker:
         self.settings = settings or TrackerSettings()
         self.model = body
         self.camera = camera
-        self.background = background or BackgroundModel()
+        self.silhouettes = Silhouettes(background or BackgroundModel())
         self.evaluations = 0
-        self._learning = background is None
         self._seed = seed
         self._start: Subject | GaussianMixture | None = None
         self._extra = tuple(extra)
@@ -109,6 +129,7 @@ class Tracker:
         stamp: int,
         keypoints: Keypoints | None = None,
         prediction: PosePrediction | None = None,
+        mask: Mask | None = None,
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """Takes the next image.
 
@@ -120,44 +141,57 @@ class Tracker:
                 that has no other start, with the lengths that they assume, are among the hypotheses
                 of every image, and of a lost track; they are no evidence, which would count the
                 image twice.
+            mask: (H, W) where a segmenter sees the person, which replaces background subtraction;
+                all false: it sees nobody; None: unknown.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses,
             heaviest first with weights that sum to 1; (None, None) while there is no track.
 
         Raises:
-            ValueError: an image of another size, a stamp that does not increase, or a prediction
-                of a body with other degrees of freedom.
+            ValueError: an image or a mask of another size, a stamp that does not increase, or a
+                prediction of a body with other degrees of freedom.
         """
         if prediction is not None:
             prediction.seen_as(self.body)
         size = (self.camera.height, self.camera.width)
         if image.shape[:2] != size:
             raise ValueError(f'the camera gives images of {size}, saw {image.shape[:2]}')
+        if mask is not None and mask.shape != size:
+            raise ValueError(f'the camera gives images of {size}, saw a mask of {mask.shape}')
         if self._last_stamp is not None and stamp <= self._last_stamp:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
         if self._track.begun:
-            observation = self._observe(image, keypoints)
+            observation = self._observe(image, keypoints, mask)
             self._follow(observation, stamp, prediction)
         else:
             start = self._start_at(stamp, prediction)
             if start is None:
                 self.evaluations = 0
-                if self._learning:
-                    self.background.learn(image)
+                self.silhouettes.learn(image, mask)
                 return None, None
-            observation = self._observe(image, keypoints)
-            self._begin(observation, start, stamp)
+            beginning = self._beginning(start, keypoints)
+            if mask is None:
+                self.silhouettes.check(image, beginning.body, self.camera, beginning.best)
+            observation = self._observe(image, keypoints, mask)
+            self._begin(observation, beginning, stamp)
             if not self._track.believes_silhouettes:
                 # The start is where the person is; the silhouette is not.
-                observation = self._observe(image, keypoints)
-                self._begin(observation, start, stamp)
+                observation = self._observe(image, keypoints, mask)
+                self._begin(observation, beginning, stamp)
+        if mask is None:
+            self.silhouettes.complete(image, self.body, self.camera, self.modes.poses)
         dt = 0.0 if self._last_stamp is None else (stamp - self._last_stamp) * 1e-9
         modes = self._track.modes
         self._point.update(self.body, modes.poses, np.exp(modes.log_weights), dt)
         self._last_image, self._last_stamp = image, stamp
         self.evaluations = self._track.evaluations
         return self.posterior, self._track.likelihood_mixture(observation)
+
+    @property
+    def background(self) -> BackgroundModel:
+        """The empty scene, as far as it is known."""
+        return self.silhouettes.background
 
     @property
     def status(self) -> Status:
@@ -213,26 +247,22 @@ class Tracker:
             return prediction
         return None if isinstance(start, Subject) and stamp < start.stamp_ns else start
 
-    def _begin(
-        self,
-        observation: Observation,
-        start: Subject | GaussianMixture | PosePrediction,
-        stamp: int,
-    ) -> None:
-        """Starts the track."""
+    def _beginning(
+        self, start: Subject | GaussianMixture | PosePrediction, keypoints: Keypoints | None
+    ) -> _Beginning:
+        """The body and the poses that a track begins with."""
         if isinstance(start, Subject):
             begun = start_from_keypoints(self.model, self.camera, start)
-            self._track.begin(
-                begun.body, begun.poses, observation, stamp,
-                both_ways=False, clicked=start.keypoints,
-            )  # fmt: skip
-        elif isinstance(start, PosePrediction):
-            self._track.begin(
-                start.body, start.both_ways(start.body), observation, stamp,
-                both_ways=observation.keypoints is None,
-            )  # fmt: skip
-        else:
-            self._track.begin(self.body, start, observation, stamp, both_ways=False)
+            return _Beginning(begun.body, begun.poses, both_ways=False, clicked=start.keypoints)
+        if isinstance(start, PosePrediction):
+            poses = start.both_ways(start.body)
+            return _Beginning(start.body, poses, both_ways=keypoints is None)
+        return _Beginning(self.body, start, both_ways=False)
+
+    def _begin(self, observation: Observation, beginning: _Beginning, stamp: int) -> None:
+        """Starts the track."""
+        body, start, both_ways, clicked = beginning
+        self._track.begin(body, start, observation, stamp, both_ways=both_ways, clicked=clicked)
 
     def _follow(
         self, observation: Observation, stamp: int, prediction: PosePrediction | None
@@ -265,16 +295,17 @@ class Tracker:
             found.append(prediction.both_ways(self.body).means)
         return np.concatenate(found) if found else None
 
-    def _observe(self, image: Image, keypoints: Keypoints | None) -> Observation:
+    def _observe(self, image: Image, keypoints: Keypoints | None, mask: Mask | None) -> Observation:
         t = self.settings.likelihood
         shape = t.containment.weight > 0 or t.coverage.weight > 0
         textured = any(getattr(t, term.name).weight > 0 for term in TERMS if term.needs_texture)
         wanted = {'containment', 'coverage'}
         wanted |= {term.name for term in TERMS if getattr(t, term.name).weight > 0}
         wanted |= {'intensity'} if textured else set()  # the textures hold it
-        foreground, unsure = None, None
-        if shape and self.background.frames:
-            foreground, unsure = self.background.split(image, self._region())
+        silhouette = None
+        if shape:
+            silhouette = self.silhouettes.silhouette(image, mask, self._region())
+        foreground, unsure = (None, None) if silhouette is None else silhouette
         believed = foreground if self._track.believes_silhouettes else None
         found = observe(
             image, believed, keypoints,

@@ -18,11 +18,14 @@ from msg_tools.messages.headers import header_message
 from msg_tools.messages.message_types import MessageFactory
 
 Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 # Larger pictures are taken for damage, before memory is spent on them.
 MAX_PIXELS = 2**26
 
 _PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
+# Where the header of a PNG says how many bits a channel has; the colour type follows, 0 is grey.
+_PNG_DEPTH = 24
 
 # A progressive JPEG has a dozen; each costs the decoder a pass over the whole picture.
 MAX_JPEG_SCANS = 100
@@ -69,6 +72,7 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     'nv12': ('u1', 1, cv2.COLOR_YUV2BGR_NV12),
     'nv21': ('u1', 1, cv2.COLOR_YUV2BGR_NV21),
 }
+_MASKS = ('mono8', '8UC1')
 # Chroma rows of half the height follow the picture.
 _PLANAR = ('nv12', 'nv21')
 # Two neighbours share their chroma, or a colour pattern repeats.
@@ -90,29 +94,18 @@ def decode_image(message: Any) -> Picture:
 
 
 def _decode_raw(message: Any) -> Picture:
-    height, width, step = int(message.height), int(message.width), int(message.step)
+    height, width = int(message.height), int(message.width)
     encoding = str(message.encoding)
     if encoding not in _ENCODINGS:
         raise ImageError(
             f'image encoding {encoding!r} is not known, wanted one of {", ".join(_ENCODINGS)}'
         )
     dtype, channels, conversion = _ENCODINGS[encoding]
-    _check_size(width, height)
     if (encoding in _EVEN_WIDTH and width % 2) or (encoding in _PLANAR and height % 2):
         raise ImageError(f'image of {width}x{height} can not be {encoding}, wanted even sizes')
-    row_bytes = width * channels * np.dtype(dtype).itemsize
-    if step < row_bytes:
-        raise ImageError(
-            f'image step is {step}, wanted at least {row_bytes} for {width} {encoding}'
-        )
     rows = height * 3 // 2 if encoding in _PLANAR else height
-    data = _bytes_of(message.data)
-    if len(data) != rows * step:
-        raise ImageError(
-            f'image has {len(data)} bytes, wanted {rows * step}: {rows} rows with a step of {step}'
-        )
     image: NDArray[Any]
-    image = pixels = np.ascontiguousarray(data.reshape(rows, step)[:, :row_bytes])
+    image = pixels = _rows_of(message, rows, width * channels * np.dtype(dtype).itemsize)
     if dtype == 'u2':
         image = pixels.view('>u2' if message.is_bigendian else '<u2').astype(np.uint16)
     image = image.reshape((rows, width, channels) if channels > 1 else (rows, width))
@@ -126,6 +119,52 @@ def _decode_raw(message: Any) -> Picture:
     return np.array(image, dtype=np.uint8, order='C')
 
 
+def _rows_of(message: Any, rows: int, row_bytes: int) -> Picture:
+    """The bytes (rows, row_bytes) of an Image, without what fills up its rows."""
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    _check_size(width, height)
+    if step < row_bytes:
+        raise ImageError(
+            f'image step is {step}, wanted at least {row_bytes} for {width} {message.encoding}'
+        )
+    data = _bytes_of(message.data)
+    if len(data) != rows * step:
+        raise ImageError(
+            f'image has {len(data)} bytes, wanted {rows * step}: {rows} rows with a step of {step}'
+        )
+    return np.ascontiguousarray(data.reshape(rows, step)[:, :row_bytes])
+
+
+def decode_mask(message: Any) -> Mask:
+    """The mask (H, W) of an Image, `mono8` or `8UC1`, or of a CompressedImage, a grey PNG.
+
+    True where the value is not zero. A JPEG is refused: it blurs the outline of the mask, and what
+    is zero is not zero any more.
+
+    Raises:
+        ImageError: another encoding, sizes that contradict each other, bytes that are no picture.
+    """
+    if hasattr(message, 'encoding'):
+        encoding = str(message.encoding)
+        if encoding not in _MASKS:
+            raise ImageError(f'mask has encoding {encoding!r}, wanted {" or ".join(_MASKS)}')
+        return _rows_of(message, int(message.height), int(message.width)) > 0
+    content = _bytes_of(message.data).tobytes()
+    if not content.startswith(_PNG_SIGNATURE):
+        raise ImageError(
+            f'compressed mask of format {str(message.format)!r} starts with {content[:4]!r}, '
+            'wanted png'
+        )
+    picture = decode_picture(content, f'format {str(message.format)!r}', cv2.IMREAD_GRAYSCALE)
+    depth, colours = content[_PNG_DEPTH : _PNG_DEPTH + 2]
+    if depth > 8 or colours != 0:
+        raise ImageError(
+            f'compressed mask is a png of {depth} bits and colour type {colours}, wanted grey of '
+            'at most 8 bits'
+        )
+    return picture > 0
+
+
 def _decode_compressed(message: Any) -> Picture:
     form = str(message.format)
     if 'compressedDepth' in form:
@@ -133,14 +172,17 @@ def _decode_compressed(message: Any) -> Picture:
     return decode_picture(_bytes_of(message.data).tobytes(), f'format {form!r}')
 
 
-def decode_picture(content: bytes, form: str = 'unknown format') -> Picture:
-    """The picture of a PNG or JPEG file, BGR (H, W, 3).
+def decode_picture(
+    content: bytes, form: str = 'unknown format', colours: int = cv2.IMREAD_COLOR
+) -> Picture:
+    """The picture of a PNG or JPEG file, BGR (H, W, 3) unless other colours are asked for.
 
     The size in the header of the file is checked before anything is decoded.
 
     Args:
         content: of the file.
         form: what it is said to be, for messages.
+        colours: flag of OpenCV for the channels of the picture.
 
     Raises:
         ImageError: another format, a damaged file, more pixels than `MAX_PIXELS`, more pixels than
@@ -161,12 +203,12 @@ def decode_picture(content: bytes, form: str = 'unknown format') -> Picture:
         raise ImageError(
             f'compressed image of {len(content)} bytes can not have a size of {width}x{height}'
         )
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    flags = colours | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     except cv2.error as error:
         raise ImageError(f'compressed image can not be decoded: {error.err}') from error
-    if image is None or image.shape != (height, width, 3):
+    if image is None or image.shape[:2] != (height, width):
         raise ImageError(f'compressed image of {len(content)} bytes and {form} is damaged')
     return np.array(image, dtype=np.uint8, order='C')
 

@@ -124,6 +124,61 @@ def test_other_people_outside_the_region(scene):
     assert not background.silhouette(image, (50, 0, 90, 120)).any()
 
 
+@pytest.mark.parametrize('method', METHODS)
+def test_a_background_with_a_person_in_it_is_put_together_anew(scene, method):
+    """The person stood at the left while it was learned, and walks to the right."""
+    background = BackgroundModel(BackgroundSettings(method=method))
+
+    def shown(left, seed):
+        image = noisy(scene, seed)
+        image[30:90, left : left + 30] = (10, 240, 30)
+        person = np.zeros(image.shape[:2], dtype=bool)
+        person[25:95, max(left - 5, 0) : left + 35] = True
+        return image, person
+
+    for i in range(10):
+        background.learn(shown(40, i)[0])
+    assert background.unknown is None
+    image, person = shown(40, 10)
+    assert background.silhouette(image)[30:90, 40:70].mean() < 0.02
+    background.complete(image, person)
+    assert background.unknown is None
+    background.forget()
+    assert background.unknown.all()
+    assert not background.foreground(image).any()
+    for i in range(10):
+        background.complete(*shown(40, 20 + i))
+    # What is unknown is where the person stood all the time, and no foreground.
+    assert np.array_equal(background.unknown, person)
+    assert not background.silhouette(image).any()
+    image[5:20, 100:130] = (10, 240, 30)
+    assert background.foreground(image).sum() == pytest.approx(450, abs=5)
+    for i in range(10):
+        background.complete(*shown(100, 30 + i))
+    assert background.unknown is None
+    image, person = shown(60, 50)
+    found = background.silhouette(image)
+    assert found[30:90, 60:90].mean() > 0.99
+    assert not found[~person].any()
+
+
+def test_pixels_that_do_not_agree_stay_unknown(scene):
+    """A lamp blinks."""
+    background = BackgroundModel.from_image(scene)
+    background.forget()
+    lamp = np.zeros(scene.shape[:2], dtype=bool)
+    nobody = lamp.copy()
+    lamp[5:10, 5:10] = True
+    for i in range(40):
+        image = noisy(scene, i)
+        image[lamp] = 250 * (i // 5 % 2)
+        background.complete(image, nobody)
+    assert np.array_equal(background.unknown, lamp)
+    assert not background.foreground(noisy(scene, 50)).any()
+    with pytest.raises(ValueError, match=r'\(120, 160, 3\), saw an image \(60'):
+        background.complete(scene[:60], nobody[:60])
+
+
 def test_unknown_method_is_refused():
     with pytest.raises(ValueError, match="'median'"):
         BackgroundSettings(method='median')

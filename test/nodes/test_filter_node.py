@@ -24,11 +24,17 @@ CONFIG = ROOT / 'hmt_ros' / 'config' / 'filter_node.yaml'
 @pytest.fixture
 def world(stub_tracker, subject_file, world_of):
     from hmt_msgs.msg import Keypoints2D
-    from sensor_msgs.msg import CameraInfo, Image
+    from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
     from hmt_ros.nodes.filter_node import FilterNode
 
-    inputs = {'image': Image, 'camera_info': CameraInfo, 'keypoints': Keypoints2D}
+    inputs = {
+        'image': Image,
+        'camera_info': CameraInfo,
+        'keypoints': Keypoints2D,
+        'mask': Image,
+        'mask/compressed': CompressedImage,
+    }
 
     def make(**values):
         values.setdefault('subject_file', str(subject_file))
@@ -140,7 +146,7 @@ def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
     assert running.node._thread.queue._limits['image'] == 2
 
 
-def test_one_warning_for_each_kind_and_the_node_lives(running, small_camera):
+def test_one_warning_for_each_kind_and_the_node_lives(running, small_camera, stub_tracker):
     def of_unknown_encoding(index):
         image = small_camera.image(index)
         image.encoding = 'yuv9'
@@ -166,6 +172,13 @@ def test_one_warning_for_each_kind_and_the_node_lives(running, small_camera):
         wrong = small_camera.keypoints(index, names=('head', 'neck'), u=np.array([np.nan, 1.0]))
         assert len(faults(running.send('keypoints', wrong))) == 1
     assert faults(running.send('image', small_camera.image(8))) == []
+    running.set(use_keypoints=False, use_mask=True)
+    for index in (9, 10):
+        assert len(faults(running.send('mask', small_camera.mask(index, fill=255)))) == 1
+        assert faults(running.send('image', small_camera.image(index))) == []
+    assert faults(running.send('mask/compressed', small_camera.compressed_mask(11))) == []
+    assert faults(running.send('image', small_camera.image(11))) == []
+    assert stub_tracker.made[-1].masks[-1].sum() == 240
     wanted = (
         'camera is not calibrated',
         'wanted stamps that increase',
@@ -173,16 +186,18 @@ def test_one_warning_for_each_kind_and_the_node_lives(running, small_camera):
         "encoding 'yuv9' is not known",
         'has 32x24 pixels, wanted the 64x48',
         'keypoint head lies at (nan',
+        'is zero nowhere, wanted zero where the person is not',
     )
     running.spin_until(lambda: len(running.warnings()) >= len(wanted))
     for text, part in zip(running.warnings(), wanted, strict=True):
         assert part in text
         assert '\n' not in text
     _, _, values = running.diagnosis()
-    assert values['images tracked'] == '2'
+    assert values['images tracked'] == '5'
     assert values['images skipped'] == '8'
     assert values['faults: camera_info'] == '3'
     assert values['faults: keypoints'] == '2'
+    assert values['faults: mask'] == '2'
 
 
 def test_bytes_that_are_no_message(running, small_camera):

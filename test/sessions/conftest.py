@@ -35,9 +35,11 @@ class StubTracker:
         self.body, self.camera, self.seed = body, camera, seed
         self.settings = settings or TrackerSettings()
         self.background = background
+        self.silhouettes = SimpleNamespace(doubted=False, share=0.9, known='known')
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.seen: list[tuple[int, Any]] = []
         self.predictions: list[PosePrediction | None] = []
+        self.masks: list[Any] = []
         self._start = None
         StubTracker.made.append(self)
 
@@ -48,7 +50,7 @@ class StubTracker:
     def modes(self):
         return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]))
 
-    def step(self, image, stamp, keypoints=None, prediction=None):
+    def step(self, image, stamp, keypoints=None, prediction=None, mask=None):
         assert image.shape == (self.camera.height, self.camera.width, 3)
         if self.fault is not None:
             raise self.fault
@@ -60,6 +62,7 @@ class StubTracker:
             return None, None
         self.seen.append((stamp, keypoints))
         self.predictions.append(prediction)
+        self.masks.append(mask)
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.125, 7
         means = np.tile(self.body.prior_mean, (2, 1))
         means[:, 2] = 4.0
@@ -100,6 +103,30 @@ class SmallCamera:
     def compressed(self, index):
         picture = self.picture(index)
         return compressed_image_message(self.messages, picture, self.stamp(index), 'lens')
+
+    def mask(self, index, size=(64, 48), fill=0, encoding='mono8'):
+        """A mask of one value, but for a person of 10x24 pixels."""
+        pixels = np.full((size[1], size[0]), fill, np.uint8)
+        pixels[12:36, 20:30] = 1
+        message = image_message(self.messages, pixels, self.stamp(index), 'lens')
+        message.encoding = encoding
+        return message
+
+    def nobody(self, index):
+        message = self.mask(index)
+        message.data[:] = 0
+        return message
+
+    def compressed_mask(self, index):
+        message = self.mask(index)
+        done, data = cv2.imencode('.png', message.data.reshape(48, 64))
+        assert done
+        return self.messages.create(
+            'sensor_msgs/msg/CompressedImage',
+            header=message.header,
+            format='mono8; png compressed ',
+            data=data.ravel(),
+        )
 
     def info(self, index=0, camera=None, frame_id='lens'):
         return camera_info_message(

@@ -6,6 +6,7 @@ import pytest
 from hmt_ros.body import Camera
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, BmeSession
+from hmt_ros.sessions.camera_session import MASK
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Handled
 from msg_tools.messages.cdr import deserialise
@@ -93,6 +94,29 @@ def test_background_is_learned_from_the_first_images(session, outputs, somebody)
     assert one.state.status == 'nobody'
     one.take(IMAGE, somebody.image(2))
     assert [len(message.components) for message in predictions(outputs)] == [0, 0, 2]
+
+
+def test_masks_are_the_silhouettes(session, outputs, somebody, stub_predictor):
+    """Without a background; what is far from the person is somebody else."""
+    one = session(background_file='', background_images=2, use_mask=True)
+    one.take(CAMERA_INFO, somebody.info())
+    mask = somebody.mask(0)
+    mask.data.reshape(48, 64)[20:26, 50:54] = 1
+    one.take(MASK, mask)
+    one.take(IMAGE, somebody.image(0))
+    assert [(found.sum(), found[12:36, 20:30].all()) for found, *_ in stub_predictor.asked] == [
+        (240, True)
+    ]
+    assert (one.state.status, one.state.height, one.state.wants) == ('predicting', 24, '')
+    # Images without a person are those that the background is learned from.
+    for index in (1, 2):
+        one.take(MASK, somebody.nobody(index))
+        one.take(IMAGE, somebody.empty(index))
+    assert one.state.status == 'nobody'
+    one.take(IMAGE, somebody.image(3))
+    one.take(MASK, somebody.mask(4))
+    assert stub_predictor.asked[1][0].sum() == pytest.approx(240, rel=0.1)
+    assert [len(message.components) for message in predictions(outputs)] == [2, 0, 0, 2]
 
 
 def test_predictions_take_those_before_into_account(session, somebody, stub_predictor):

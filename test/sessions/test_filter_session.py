@@ -2,12 +2,13 @@
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hmt_ros.body import Camera, load_body
-from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
@@ -365,6 +366,154 @@ def test_keypoints_are_forgotten(session, small_camera):
     for index in range(1000):
         one.take(KEYPOINTS, small_camera.keypoints(index))
     assert len(one._keypoints._content) <= 256
+
+
+# Masks.
+
+
+def masks(stub_tracker):
+    """Number of the person's pixels in the mask of each image, None where there was none."""
+    return [
+        None if mask is None else int(mask.sum())
+        for tracker in stub_tracker.made
+        for mask in tracker.masks
+    ]
+
+
+def test_masks_are_not_used_unless_asked_for(session, small_camera, stub_tracker):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    assert one.take(MASK, small_camera.mask(0, encoding='rgb8')).faults == ()
+    one.take(MASK, small_camera.mask(0))
+    one.take(IMAGE, small_camera.image(0))
+    assert masks(stub_tracker) == [None]
+
+
+@pytest.mark.parametrize('order', [(0, 1, 2, 3), (1, 0, 3, 2), (0, 2, 1, 3), (1, 3, 0, 2)])
+def test_masks_go_with_the_image_of_their_stamp(
+    session, small_camera, stub_tracker, order, outputs
+):
+    """In whatever order they come, compressed or not; a mask without a person says so."""
+    inputs = [
+        (IMAGE, small_camera.image(0)),
+        (COMPRESSED_MASK, small_camera.compressed_mask(0)),
+        (IMAGE, small_camera.image(1)),
+        (MASK, small_camera.nobody(1)),
+    ]
+    one = session(use_mask=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in order:
+        assert one.take(*inputs[index]).warnings == ()
+    assert masks(stub_tracker) == [240, 0]
+    assert stub_tracker.made[0].masks[0].dtype == bool
+    assert stub_tracker.made[0].masks[0][12:36, 20:30].all()
+    assert tracked(outputs) == [small_camera.stamp(0), small_camera.stamp(1)]
+
+
+def test_images_wait_for_masks(session, small_camera, stub_tracker, outputs):
+    one = session(use_mask=True, mask_timeout=0.25)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in (0, 1, 2):
+        one.take(IMAGE, small_camera.image(index))
+    assert tracked(outputs) == []
+    # An image that is over 0.25 s younger ends the wait.
+    handled = one.take(IMAGE, small_camera.image(3))
+    assert tracked(outputs) == [small_camera.stamp(0)]
+    assert handled.warnings == (f'no mask has come for the image of {small_camera.stamp(0)} ns',)
+    assert handled.faults == ()
+    # So does the mask of a later image.
+    one.take(MASK, small_camera.mask(2))
+    assert tracked(outputs)[1:] == [small_camera.stamp(1), small_camera.stamp(2)]
+    # Too late for 1.
+    one.take(MASK, small_camera.mask(1))
+    (warning,) = one.take(MASK, small_camera.mask(3)).warnings
+    assert f'mask of {small_camera.stamp(1)} ns belongs to no image' in warning
+    assert masks(stub_tracker) == [None, None, 240, 240]
+    assert one.state.faults == {'no mask': 2, 'mask without an image': 1}
+
+
+def test_images_wait_for_masks_and_keypoints(session, small_camera, stub_tracker, outputs):
+    one = session(use_mask=True, use_keypoints=True, queue_size=2, mask_timeout=60.0)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.take(MASK, small_camera.mask(0))
+    assert tracked(outputs) == []
+    one.take(KEYPOINTS, small_camera.keypoints(0))
+    assert tracked(outputs) == [small_camera.stamp(0)]
+    one.take(KEYPOINTS, small_camera.keypoints(3))
+    faults = [one.take(IMAGE, small_camera.image(index)).faults for index in (1, 2, 3)]
+    assert faults[:2] == [(), ()]
+    assert 'no mask of its stamp has come, and queue_size is 2' in faults[2][0]
+
+
+def broken(message):
+    message.data = message.data[:-1]
+    return message
+
+
+@pytest.mark.parametrize(
+    ('source', 'change', 'message'),
+    [
+        (MASK, lambda c: c.mask(0, encoding='bgr8'), "mask has encoding 'bgr8', wanted mono8 or"),
+        (MASK, lambda c: c.mask(0, size=(32, 48)), 'has 32x48 pixels, wanted the 64x48 of its'),
+        (MASK, lambda c: c.mask(0, fill=255), 'is zero nowhere, wanted zero where the person is'),
+        (MASK, lambda c: broken(c.mask(0)), 'image has 3071 bytes, wanted 3072'),
+        (
+            COMPRESSED_MASK,
+            lambda c: c.compressed(0),
+            "starts with b'\\xff\\xd8\\xff\\xe0', wanted png",
+        ),
+    ],
+)
+def test_bad_masks_are_told_and_not_used(
+    session, small_camera, stub_tracker, source, change, message, outputs
+):
+    """The image need not wait any longer; the next mask is used."""
+    one = session(use_mask=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    handled = [one.take(IMAGE, small_camera.image(0)), one.take(source, change(small_camera))]
+    (fault,) = [fault for each in handled for fault in each.faults]
+    assert message in fault
+    one.take(IMAGE, small_camera.image(1))
+    assert one.take(MASK, small_camera.mask(1)).faults == ()
+    assert masks(stub_tracker) == [None, 240]
+    assert one.state.faults == {'mask': 1}
+    assert tracked(outputs) == [small_camera.stamp(0), small_camera.stamp(1)]
+
+
+def test_masks_without_images_are_forgotten(session, small_camera):
+    one = session(use_mask=True)
+    for index in range(200):
+        one.take(MASK, small_camera.mask(index))
+    assert len(one._masks._content) == 64
+
+
+# The background.
+
+
+def test_a_person_in_the_background_is_told(session, small_camera, stub_tracker):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    assert one.state.trouble() == ''
+    step = stub_tracker.step
+
+    def doubts(self, *arguments):
+        self.silhouettes = SimpleNamespace(doubted=True, share=0.123, known='forgotten')
+        return step(self, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stub_tracker, 'step', doubts)
+        (warning,) = one.take(IMAGE, small_camera.image(1)).warnings
+        assert one.take(IMAGE, small_camera.image(2)).warnings == ()
+    assert warning.startswith(
+        'the background was learned with the person in it, of whom only 12% are foreground in the '
+        f'image of {small_camera.stamp(1)} ns'
+    )
+    assert 'give background_file' in warning
+    assert one.state.faults == {'background': 1}
+    assert one.state.trouble() == 'the background was learned with the person in it; forgotten'
+    assert dict(one.state.values())['background'] == 'forgotten'
 
 
 # Starts.

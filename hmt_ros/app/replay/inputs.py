@@ -1,11 +1,11 @@
-"""The input of the filter in a bag: images, their calibration, keypoints."""
+"""The input of the filter in a bag: images, their calibration, masks, keypoints."""
 
 from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
 
-from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
 from hmt_ros.sessions.filter_session import KEYPOINTS
 from msg_tools import BagError, BagMessage, BagReader, Topic
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
@@ -26,12 +26,14 @@ class RecordedInput:
     Attributes:
         image: topic of the images.
         camera_info: topic of their calibration.
+        mask: topic of masks of the person; None if the bag has none.
         keypoints: topic of 2D keypoints; None if the bag has none.
         ground_truth: topic of the ground truth; None if the bag has none.
     """
 
     image: Topic
     camera_info: Topic
+    mask: Topic | None
     keypoints: Topic | None
     ground_truth: Topic | None
 
@@ -47,6 +49,9 @@ class RecordedInput:
             BagError: the bag is damaged here; the messages before the damage were yielded.
         """
         sources = {self.image.name: IMAGE, self.camera_info.name: CAMERA_INFO}
+        if self.mask is not None:
+            raw = self.mask.msgtype == RAW
+            sources[self.mask.name] = MASK if raw else COMPRESSED_MASK
         if self.keypoints is not None:
             sources[self.keypoints.name] = KEYPOINTS
         if self.ground_truth is not None:
@@ -62,6 +67,7 @@ def recorded_input(
 
     Images come from `image/compressed`, else from `image`, else from the only topic of images.
     Calibration comes from `camera_info` beside the images, else from the only topic of its type.
+    Masks come from `mask`, else from `mask/compressed`.
 
     Args:
         bag: an open bag.
@@ -74,6 +80,7 @@ def recorded_input(
     return RecordedInput(
         image,
         _camera_info_topic(bag, image, camera_info_topic),
+        _named(bag, MASK, (RAW,)) or _named(bag, COMPRESSED_MASK, (COMPRESSED,)),
         _named(bag, 'keypoints', (_KEYPOINTS,)),
         _named(bag, GROUND_TRUTH, (POSE_MIXTURE,)),
     )
@@ -87,7 +94,7 @@ def _image_topic(bag: BagReader, name: str | None) -> Topic:
         topic = _named(bag, usual, kinds)
         if topic is not None:
             return topic
-    return _the_only(bag, kinds, '--image-topic')
+    return _the_only(bag, kinds, '--image-topic', besides=MASKS)
 
 
 def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
@@ -124,8 +131,14 @@ def _named(bag: BagReader, name: str, kinds: tuple[str, ...]) -> Topic | None:
     return None
 
 
-def _the_only(bag: BagReader, kinds: tuple[str, ...], option: str) -> Topic:
-    found = _with_messages(bag, kinds)
+def _the_only(
+    bag: BagReader, kinds: tuple[str, ...], option: str, besides: tuple[str, ...] = ()
+) -> Topic:
+    """The only topic of some types, except those of some names."""
+    every = _with_messages(bag, kinds)
+    found = [topic for topic in every if topic.name.lstrip('/') not in besides]
+    if len(found) == 1:
+        return found[0]
     if len(found) > 1:
         names = ', '.join(topic.name for topic in found)
         what = ' or '.join(kind.rpartition('/')[2] for kind in kinds)

@@ -8,14 +8,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from hmt_ros.app.replay.background import ReadAhead, WriteBehind
 from hmt_ros.app.replay.inputs import COMPRESSED, GROUND_TRUTH, RecordedInput, recorded_input
-from hmt_ros.app.replay.options import ReplayOptions, node_parameters
+from hmt_ros.app.replay.options import NodeParameters, ReplayOptions, node_parameters
 from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PlayedTrack
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
-from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, MASK
 from hmt_ros.sessions.filter_session import KEYPOINTS
 from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.track_start import prepare_start
@@ -70,9 +71,7 @@ def replay_bag(source: Path, target: Path, options: ReplayOptions, tell: Tell) -
         subject = prepare_start(parameters.filter).initial
         if subject is None and not options.quiet:
             tell(f'no --subject: the track starts from a prediction{_subject_hint(source)}')
-        with_keypoints = parameters.filter.use_keypoints
-        if not with_keypoints:
-            recorded = replace(recorded, keypoints=None)
+        recorded = _used(recorded, parameters)
         with BagWriter(target, overwrite=options.overwrite) as out:
             topics = dict(track_messages.TOPICS)
             if parameters.smoother is not None:
@@ -94,10 +93,7 @@ def replay_bag(source: Path, target: Path, options: ReplayOptions, tell: Tell) -
                         disable=options.quiet or None,  # None: shown where stderr is a terminal
                     ) as bar,
                 ):
-                    result = _play(
-                        options, bag, recorded, track, out, behind, bar, tell,
-                        with_keypoints=with_keypoints,
-                    )  # fmt: skip
+                    result = _play(options, bag, recorded, track, out, behind, bar, tell)
             if not result.tracked:
                 raise ValueError(f'{source}: {_why_nothing(result, subject)}')
     return result
@@ -108,9 +104,19 @@ def _subject_hint(bag: Path) -> str:
     return f'; there is {beside} beside the bag' if beside.is_file() else ''
 
 
+def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
+    """The topics that some node uses."""
+    mask, bme = parameters.filter.use_mask, parameters.bme
+    if not mask and (bme is None or not bme.use_mask):
+        recorded = replace(recorded, mask=None)
+    if not parameters.filter.use_keypoints:
+        recorded = replace(recorded, keypoints=None)
+    return recorded
+
+
 def _play(
     options: ReplayOptions, bag: BagReader, recorded: RecordedInput, track: PlayedTrack,
-    out: BagWriter, behind: WriteBehind, bar: tqdm, tell: Tell, *, with_keypoints: bool,
+    out: BagWriter, behind: WriteBehind, bar: tqdm, tell: Tell,
 ) -> Replayed:  # fmt: skip
     """Hands the messages of the bag to the nodes, and copies those that the new bag keeps."""
     result = Replayed()
@@ -140,9 +146,11 @@ def _play(
                 result.images += 1
                 result.last_stamp = time_ns(stored.message.header.stamp)
                 bar.update()
-        if with_keypoints:
-            # The last images need not wait any longer.
+        # The last images need not wait any longer.
+        if recorded.keypoints is not None:
             check(track.take(KEYPOINTS, _nobody(result.last_stamp)))
+        if recorded.mask is not None:
+            check(track.take(MASK, _mask_after(result.last_stamp)))
         check(track.finish())
     return result
 
@@ -195,6 +203,11 @@ def _nobody(stamp_ns: int) -> Any:
     return messages.create(
         'hmt_msgs/msg/Keypoints2D', header=header_message(messages, stamp_ns, '')
     )
+
+
+def _mask_after(stamp_ns: int) -> Any:
+    """sensor_msgs/Image with a mask of an image after the last: no mask of an earlier one comes."""
+    return image_message(RosbagsMessages(), np.zeros((1, 1), np.uint8), stamp_ns + 1, '')
 
 
 def _why_nothing(result: Replayed, subject: object) -> str:

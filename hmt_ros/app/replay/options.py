@@ -131,6 +131,7 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
         if value is not None:
             values[name] = str(value) if isinstance(value, Path) else value
     values.setdefault('use_keypoints', recorded.keypoints is not None)
+    values.setdefault('use_mask', recorded.mask is not None)
     values['image_transport'] = recorded.transport
     return with_values(FilterParameters(), values)
 
@@ -150,6 +151,8 @@ def _bme_parameters(
 ) -> BmeParameters:
     values = {
         'background_file': tracking.background_file,
+        'use_mask': tracking.use_mask,
+        'mask_timeout': tracking.mask_timeout,
         **_given_values(options, BME),
         'image_transport': recorded.transport,
     }

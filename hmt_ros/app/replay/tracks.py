@@ -17,7 +17,7 @@ from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER, NodeParameters
 from hmt_ros.app.replay.player import Player
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_session import BmeSession
-from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
 from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
@@ -26,7 +26,7 @@ from msg_tools.messages.cdr import deserialise
 # Topics of the filter that the smoother takes, as sources of the same names.
 HANDED_ON = (MIXTURE,)
 # Sources in the bag that the BME takes.
-SEEN_BY_BME = (CAMERA_INFO, IMAGE)
+SEEN_BY_BME = (CAMERA_INFO, IMAGE, *MASKS)
 
 Write = Callable[[str, int, bytes], None]
 
@@ -124,10 +124,12 @@ class LiveTrack(PlayedTrack):
             inputs = {
                 CAMERA_INFO: ('camera_info', 'sensor_msgs/msg/CameraInfo'),
                 KEYPOINTS: ('keypoints', 'hmt_msgs/msg/Keypoints2D'),
+                MASK: ('mask', 'sensor_msgs/msg/Image'),
+                COMPRESSED_MASK: ('mask/compressed', 'sensor_msgs/msg/CompressedImage'),
                 IMAGE: (topic, f'sensor_msgs/msg/{kind}'),
             }
             live = partial(LiveNode, player, opened, write=self._write)
-            sensors = (f'/{topic}', '/camera_info')
+            sensors = (f'/{topic}', '/camera_info', *(f'/{each}' for each in MASKS))
             if self._parameters.bme is not None:
                 self._bme = live(
                     BME, self._parameters.bme, inputs={}, topics=bme_session.TOPICS, sensors=sensors

@@ -2,7 +2,9 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -70,7 +72,8 @@ class StandingStill:
     def __init__(self, body, camera, settings, background, seed):
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
-        self.keypoints, self.predictions = [], []
+        self.keypoints, self.predictions, self.masks = [], [], []
+        self.silhouettes = SimpleNamespace(doubted=False, known='known')
         StandingStill.made.append(self)
 
     def reset(self, start):
@@ -82,9 +85,10 @@ class StandingStill:
 
     log_likelihoods = np.zeros(1)
 
-    def step(self, image, stamp, keypoints=None, prediction=None):
+    def step(self, image, stamp, keypoints=None, prediction=None, mask=None):
         self.keypoints.append(None if keypoints is None else keypoints.names)
         self.predictions.append(prediction)
+        self.masks.append(None if mask is None else int(mask.sum()))
         if stamp < self.start.stamp_ns:
             return None, None
         mean = self.body.prior_mean[None].copy()
@@ -273,6 +277,39 @@ def test_keypoints_of_the_bag_are_used(still, entries, tmp_path):
     assert still[-1].keypoints == [None] * IMAGES
 
 
+def mask(picture, stamp):
+    pixels = np.zeros(picture.shape[:2], np.uint8)
+    pixels[50:150, 100:140] = 255
+    return image_message(MESSAGES, pixels, stamp, '')
+
+
+def packed(message):
+    pixels = message.data.reshape(message.height, message.width)
+    done, data = cv2.imencode('.png', pixels)
+    assert done
+    return MESSAGES.create(
+        'sensor_msgs/msg/CompressedImage', header=message.header, format='png', data=data.ravel()
+    )
+
+
+@pytest.mark.parametrize('topic', ['mask', 'mask/compressed'])
+def test_masks_of_the_bag_are_used(still, entries, tmp_path, topic):
+    """The segmenter is late, and drops the last image; the images are not named as usual."""
+    pictures = [entry for entry in entries if entry[0] == 'image/compressed']
+    stamp = pictures[0][1]
+    message = mask(decode_image(pictures[0][2]), stamp)
+    extra = [(topic, stamp + 1000, message if topic == 'mask' else packed(message))]
+    names = {'image/compressed': '/cam/image_raw/compressed'}
+    given = renamed(entries, names) + extra
+    bag = write(tmp_path / 'bag', sorted(given, key=lambda entry: entry[1]))
+    options = [*SUBJECT, '--quiet', '-o']
+    assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
+    assert still[-1].masks == [4000, None]
+    assert len(read(tmp_path / 'out')['pose_mixture']) == IMAGES
+    assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_mask=false']) == 0
+    assert still[-1].masks == [None] * IMAGES
+
+
 def renamed(entries, names):
     return [(names.get(topic, topic), time, message) for topic, time, message in entries]
 
@@ -356,7 +393,7 @@ def test_the_bag_that_is_read_is_never_replaced(still, entries, tmp_path, capsys
 
 
 def test_interruption_leaves_nothing(short, tmp_path, monkeypatch, capsys):
-    def interrupted(self, image, stamp, keypoints=None, prediction=None):
+    def interrupted(self, image, stamp, keypoints=None, prediction=None, mask=None):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(track_start, 'Tracker', StandingStill)

@@ -100,8 +100,8 @@ def test_same_without_a_subject(tmp_path, capsys):
     assert content(offline) == content(live)
 
 
-def test_same_of_raw_images_with_keypoints_and_faults(tmp_path, capsys):
-    """Keypoints that come late, an image of another size, a time that jumps."""
+def test_same_of_raw_images_with_keypoints_masks_and_faults(tmp_path, capsys):
+    """Keypoints and masks that come late, an image of another size, a time that jumps."""
     entries = []
     for topic, time, message in recorded(2):
         if topic == 'image/compressed':
@@ -118,6 +118,10 @@ def test_same_of_raw_images_with_keypoints_and_faults(tmp_path, capsys):
             entries.append(('image', time, image_message(MESSAGES, picture, stamp, '')))
             entries.append(('image', time + 5000, half))
             entries.append(('keypoints', time + 9000, seen))
+            shown = picture.max(2) > 128
+            mask = image_message(MESSAGES, shown.astype(np.uint8), stamp, '')
+            mask.encoding = '8UC1' if len(entries) < 4 else 'rgb8'
+            entries.append(('mask', time + 10_000, mask))
         elif topic == 'camera_info':
             entries.append((topic, time + 1000, message))
     again = next(message for topic, _, message in entries if topic == 'image')
@@ -130,6 +134,7 @@ def test_same_of_raw_images_with_keypoints_and_faults(tmp_path, capsys):
     assert one == other
     assert one[0] == 0
     assert "keypoints ['nose'] are no joints" in one[2]
+    assert "mask has encoding 'rgb8', wanted mono8 or 8UC1" in one[2]
     assert 'has 480x180 pixels' in one[2]
     assert 'the track starts anew' in one[2]
     assert len(messages(offline, 'pose_mixture')) == 3

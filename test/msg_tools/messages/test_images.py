@@ -17,6 +17,7 @@ from msg_tools.messages.images import (
     ImageError,
     compressed_image_message,
     decode_image,
+    decode_mask,
     decode_picture,
     encode_jpeg,
     image_message,
@@ -334,6 +335,50 @@ def test_jpeg_with_scans_without_end_is_refused_undecoded() -> None:
     bomb = plain[:-2] + last * 500 + plain[-2:]
     with pytest.raises(ImageError, match=r'jpeg has 5\d\d scans, the limit is 100'):
         decode_image(compressed(bomb))
+
+
+# Masks
+
+SHAPE = np.where(MOSAIC > 99, MOSAIC - np.uint8(99), np.uint8(0))
+
+
+@pytest.mark.parametrize('padding', [0, 3])
+@pytest.mark.parametrize('encoding', ['mono8', '8UC1'])
+def test_masks_are_true_where_they_are_not_zero(encoding: str, padding: int) -> None:
+    mask = decode_mask(raw(SHAPE, encoding, padding=padding))
+    assert mask.dtype == np.bool_
+    np.testing.assert_array_equal(mask, SHAPE > 0)
+
+
+@pytest.mark.parametrize('values', [SHAPE, SHAPE // 100])
+def test_masks_as_png(values: Any) -> None:
+    np.testing.assert_array_equal(
+        decode_mask(compressed(encoded('.png', values), 'mono8; png compressed ')), values > 0
+    )
+    done, packed = cv2.imencode('.png', SHAPE // 100, [cv2.IMWRITE_PNG_BILEVEL, 1])
+    assert done
+    np.testing.assert_array_equal(decode_mask(compressed(bytes(packed), 'png')), SHAPE >= 100)
+
+
+@pytest.mark.parametrize(
+    ('message', 'error'),
+    [
+        (raw(BGR, 'bgr8'), r"mask has encoding 'bgr8', wanted mono8 or 8UC1"),
+        (raw(WORDS, 'mono16'), r"mask has encoding 'mono16', wanted mono8 or 8UC1"),
+        (raw(SHAPE, 'mono8', width=45), r'image step is 44, wanted at least 45 for 45 mono8'),
+        (raw(SHAPE, 'mono8', height=31), r'image has 1320 bytes, wanted 1364'),
+        (raw(SHAPE, 'mono8', width=0), r'image has size 0x30'),
+        (raw(SHAPE, 'mono8', data=b''), r'image has 0 bytes'),
+        (compressed(encoded('.jpg', GREY)), r"of format 'jpeg' starts with .*, wanted png"),
+        (compressed(b''), r"starts with b'', wanted png"),
+        (compressed(encoded('.png', BGR), 'png'), r'a png of 8 bits and colour type 2, wanted'),
+        (compressed(encoded('.png', WORDS), 'png'), r'a png of 16 bits and colour type 0, wanted'),
+        (compressed(encoded('.png', GREY)[:-20], 'png'), r'breaks off or is damaged'),
+    ],
+)
+def test_defects_of_masks(message: Any, error: str) -> None:
+    with pytest.raises(ImageError, match=error):
+        decode_mask(message)
 
 
 def test_pictures_of_files() -> None:

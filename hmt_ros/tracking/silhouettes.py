@@ -1,0 +1,118 @@
+"""Where the silhouette of an image comes from, and whether the background is to be trusted.
+
+A mask of a segmenter is taken as it is, else the background is subtracted. One that was learned
+while the person stood in it is worse than none: the person is missing in the silhouettes, and where
+the person stood something is left behind. When a track starts, the pose is known, and
+
+    f = |foreground and area of the body| / |area of the body|
+
+is near 1 before an empty scene, and less in clothes of the colours of the room. Below
+`LEAST_FOREGROUND` the background is forgotten and put together anew, pixel by pixel, from the
+images that follow: where no mode of the posterior has the person. Until it is known around the
+person, images are tracked without silhouettes.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.image.background import BackgroundModel, Silhouette, one_person
+from hmt_ros.image.observation import Box
+from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.rendering.renderer import render_silhouettes
+
+# Least share of the person that is foreground before a background without the person.
+LEAST_FOREGROUND = 0.35
+# Margins of the area of a body, as a fraction of its height: of what is surely the person, and of
+# what may be.
+INSIDE, AROUND = 0.01, 0.06
+# Largest share of the person's area that may be unknown where silhouettes are used.
+MOST_UNKNOWN = 0.02
+
+
+class Silhouettes:
+    """The silhouettes of one person before one camera.
+
+    Args:
+        background: the empty scene, or a model that is to learn it.
+
+    Attributes:
+        background: as it is known so far.
+        share: f, the share of the person that was foreground when it was last asked; NaN: never.
+        doubted: whether the background was learned with the person in it, and is not known again.
+    """
+
+    def __init__(self, background: BackgroundModel) -> None:
+        self.background = background
+        self.share = np.nan
+        self.doubted = False
+        self._learning = background.frames == 0
+
+    @property
+    def known(self) -> str:
+        """What is known of the background, in a few words."""
+        unknown = self.background.unknown
+        if unknown is not None:
+            return f'forgotten, {1 - unknown.mean():.0%} known again'
+        return 'known' if self.background.frames else 'unknown'
+
+    def learn(self, image: Image, mask: Mask | None) -> None:
+        """Learns the background from an image before the track, unless a mask shows somebody."""
+        if self._learning and not self.doubted and (mask is None or not mask.any()):
+            self.background.learn(image)
+
+    def silhouette(self, image: Image, mask: Mask | None, region: Box | None) -> Silhouette | None:
+        """The silhouette in an image; None: unknown.
+
+        Args:
+            image: (H, W, 3).
+            mask: (H, W) of a segmenter, if any.
+            region: where the person can be; None: anywhere.
+        """
+        if mask is not None:
+            return Silhouette(one_person(mask, self.background.settings, region))
+        if self.doubted or not self.background.frames:
+            return None
+        return self.background.split(image, region)
+
+    def check(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
+        """Doubts the background if too little of the person, in poses (K, d), is foreground."""
+        if not self.background.frames:
+            return
+        inside = _resized(_area(body, camera, poses), -INSIDE)
+        if not inside.any():
+            return
+        self.share = float(self.background.foreground(image)[inside].mean())
+        if self.share < LEAST_FOREGROUND:
+            self.doubted = True
+            self.background.forget()
+
+    def complete(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
+        """Puts a forgotten background together, where the person in poses (K, d) is not."""
+        if self.background.unknown is None:
+            return
+        area = _area(body, camera, poses)
+        around = _resized(area, AROUND)
+        self.background.complete(image, around)
+        unknown = self.background.unknown
+        known = unknown is None or (unknown & around).sum() <= MOST_UNKNOWN * area.sum()
+        trusted, self.doubted = not self.doubted, not known
+        if known and not trusted:
+            self.check(image, body, camera, poses[:1])
+
+
+def _area(body: Body, camera: Camera, poses: Array) -> Mask:
+    """Where some of the poses (K, d) have the body, (H, W)."""
+    return np.asarray(render_silhouettes(body, poses, camera).any(0), dtype=np.bool_)
+
+
+def _resized(area: Mask, margin: float) -> Mask:
+    """An area (H, W) with a margin, as a fraction of its height; negative: without it."""
+    pixels = area.view(np.uint8)
+    size = max(round(abs(margin) * cv2.boundingRect(pixels)[3]), 1)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
+    change = cv2.dilate if margin > 0 else cv2.erode
+    return np.asarray(change(pixels, kernel), dtype=np.uint8) > 0

@@ -1,0 +1,161 @@
+"""Where silhouettes come from: masks of a segmenter, and backgrounds that show the person."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmt_ros.body.camera import Viewpoint
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.motion.procedural_motion import procedural_motion
+from hmt_ros.rendering.renderer import render_frames, render_silhouettes
+from hmt_ros.rendering.scene import Scene
+from hmt_ros.tracking import Status, Subject, Tracker, TrackerSettings
+from hmt_ros.tracking.silhouettes import Silhouettes
+from test.tracking.test_tracker import best_error, in_bytes
+
+FRAME = 100_000_000
+SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, flesh_images=2)
+
+
+@pytest.fixture(scope='module')
+def film(filmed, camera):
+    """Poses, images and the empty scene of a person who walks."""
+    return filmed('walk', 0.6, camera)
+
+
+@pytest.fixture(scope='module')
+def subject(film, human32, keypoints_of) -> Subject:
+    return Subject(0, keypoints_of(human32, film[0][0]), dict(human32.segment_lengths))
+
+
+def test_masks_replace_the_background(film, subject, human32, camera):
+    """The same with and without a background; somebody else in the mask does not matter."""
+    poses, images, empty = film
+    masks = render_silhouettes(human32, poses, camera)
+    masks[1:, 20:40, 5:15] = True
+    runs = []
+    for background in (None, BackgroundModel.from_image(empty)):
+        tracker = Tracker(human32, camera, SETTINGS, background)
+        tracker.reset(subject)
+        runs.append(
+            [
+                tracker.step(image, i * FRAME, mask=mask)
+                for i, (image, mask) in enumerate(zip(images, masks, strict=True))
+            ]
+        )
+        assert tracker.status is Status.TRACKING
+        assert tracker.misfit < 0.2
+    assert in_bytes(runs[0]) == in_bytes(runs[1])
+    errors = [
+        best_error(tracker.body, posterior, human32, pose)
+        for (posterior, _), pose in zip(runs[0], poses, strict=True)
+    ]
+    assert max(errors) < 0.1
+
+
+def test_a_mask_without_a_person_is_no_silhouette(film, subject, human32, camera):
+    """Although the background is known."""
+    _, images, empty = film
+    nobody = np.zeros(images[0].shape[:2], dtype=bool)
+    runs = []
+    for background, mask in ((None, None), (BackgroundModel.from_image(empty), nobody)):
+        tracker = Tracker(human32, camera, SETTINGS, background)
+        tracker.reset(subject)
+        runs.append([tracker.step(images[0], 0, mask=mask)])
+    assert in_bytes(runs[0]) == in_bytes(runs[1])
+
+
+def test_no_background_is_learned_from_what_a_mask_shows_a_person_in(film, human32, camera):
+    _, images, _ = film
+    mask = np.zeros(images[0].shape[:2], dtype=bool)
+    tracker = Tracker(human32, camera)
+    tracker.step(images[0], 0, mask=mask)
+    assert tracker.background.frames == 1
+    mask[50:60, 50:60] = True
+    tracker.step(images[1], 1, mask=mask)
+    assert tracker.background.frames == 1
+    with pytest.raises(ValueError, match=r'images of \(240, 320\), saw a mask of \(120, 320\)'):
+        tracker.step(images[1], 2, mask=mask[::2])
+
+
+@pytest.fixture(scope='module')
+def crossing(human32, camera):
+    """Poses and images of a person who stands and then walks aside, and the empty scene."""
+    view = Viewpoint(distance=4.5)
+    pose = procedural_motion('reach', human32, 0.1, 10.0, 3, viewpoint=view)[0]
+    poses = np.tile(pose, (36, 1))
+    poses[:, 0] += np.concatenate([np.zeros(4), np.minimum(np.arange(32) * 0.08, 1.6)]) - 0.8
+    scene = Scene(viewpoint=view, seed=2)
+    images = [frame.image for frame in render_frames(human32, poses, camera, scene)]
+    return poses, images, np.rint(scene.background(camera)).astype(np.uint8)
+
+
+def test_a_background_with_the_person_in_it_is_noticed_and_mended(crossing, human32, camera):
+    """As the person leaves the place where the background was learned."""
+    poses, images, empty = crossing
+    silhouettes = Silhouettes(BackgroundModel())
+    for image in images[:4]:
+        silhouettes.learn(image, None)
+    assert silhouettes.known == 'known'
+    silhouettes.check(images[4], human32, camera, poses[4:5])
+    assert silhouettes.share < 0.05
+    assert silhouettes.doubted
+    assert silhouettes.silhouette(images[4], None, None) is None
+    assert silhouettes.known == 'forgotten, 0% known again'
+    doubted = []
+    for image, pose in zip(images[4:], poses[4:], strict=True):
+        silhouettes.complete(image, human32, camera, pose[None])
+        doubted.append(silhouettes.doubted)
+    # Once, from the image on in which the person has left.
+    assert doubted == sorted(doubted, reverse=True)
+    assert 10 < doubted.index(False) < 31
+    assert silhouettes.share > 0.9
+    mask = render_silhouettes(human32, poses[-1:], camera)[0]
+    found = silhouettes.silhouette(images[-1], None, None).foreground
+    wanted = BackgroundModel.from_image(empty).silhouette(images[-1])
+    for one in (found, wanted):
+        assert (one & mask).sum() / (one | mask).sum() > 0.8
+
+
+def test_backgrounds_that_are_not_doubted(crossing, human32, camera):
+    """An empty scene; nothing learned; nobody in view."""
+    poses, images, empty = crossing
+    known = Silhouettes(BackgroundModel.from_image(empty))
+    known.learn(images[0], None)
+    assert known.background.frames == 1
+    known.check(images[0], human32, camera, poses[:1])
+    assert known.share > 0.9
+    assert known.silhouette(images[0], None, None).foreground.any()
+    far = poses[:1].copy()
+    far[:, 2] = -3.0
+    known.check(empty, human32, camera, far)
+    assert not known.doubted
+    nothing = Silhouettes(BackgroundModel())
+    nothing.check(images[0], human32, camera, poses[:1])
+    nothing.complete(images[0], human32, camera, poses[:1])
+    assert (nothing.doubted, nothing.known) == (False, 'unknown')
+    assert nothing.silhouette(images[0], None, None) is None
+
+
+def test_tracking_where_the_background_was_learned_with_the_person_in_it(
+    crossing, human32, camera, keypoints_of
+):
+    """Without silhouettes at first, then with them."""
+    poses, images, _ = crossing
+    tracker = Tracker(human32, camera, SETTINGS)
+    seen = keypoints_of(human32, poses[4])
+    tracker.reset(Subject(4 * FRAME, seen, dict(human32.segment_lengths)))
+    errors, doubted = [], []
+    for i, image in enumerate(images):
+        posterior, _ = tracker.step(image, i * FRAME)
+        if posterior is not None:
+            errors.append(best_error(tracker.body, posterior, human32, poses[i]))
+            doubted.append(tracker.silhouettes.doubted)
+    assert len(errors) == 32
+    known = doubted.index(False)
+    assert 10 < known < 28
+    assert not any(doubted[known:])
+    # Without silhouettes the track of who slides aside falls behind.
+    assert max(errors) > 0.2
+    assert max(errors[-3:]) < 0.13
