@@ -222,10 +222,6 @@ class MixtureFilter:
         predicted, covariances = predict(modes, self.body, dt, s.velocity_kept)
         precisions = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
         beta = self.beta
-        lasting = s.error_correlation * (modes.energies - modes.energies.min())
-        predicted = replace(
-            predicted, log_weights=predicted.log_weights + beta * lasting
-        )
         predicted = follow_flow(predicted, precisions, observation, posterior)
         base = posterior.minimise(
             posterior.given(observation, predicted, precisions), predicted.poses, s.base_iterations
@@ -261,8 +257,9 @@ class MixtureFilter:
             hypotheses = replace(hypotheses, log_weights=np.zeros(len(hypotheses)))
             before = GaussianMixture(np.exp(modes.log_weights), predicted.poses, covariances)
         least = self._weigh_and_select(
-            Optimised(hypotheses, solved), velocities, observation, before
-        )
+            Optimised(hypotheses, solved), velocities, observation, before,
+            modes.energies - modes.energies.min(),
+        )  # fmt: skip
         # Of the error of an energy only what is new counts.
         self.log_evidence -= beta * (
             least - s.error_correlation * float(modes.energies.min())
@@ -371,6 +368,7 @@ class MixtureFilter:
         velocities: Array,
         observation: Observation,
         before: GaussianMixture | None = None,
+        excess: Array | None = None,
     ) -> float:
         """Makes the modes of this image; returns the least energy.
 
@@ -379,6 +377,7 @@ class MixtureFilter:
             velocities: (N, d) of them, per second.
             observation: of the image.
             before: the prediction that modes inherit their weights from; None: from ancestors.
+            excess: (K,) of the ancestors' energies over the least in the image before.
         """
         s, solved = self.settings, optimised.minima
         usable = np.flatnonzero(np.isfinite(solved.value))
@@ -387,6 +386,11 @@ class MixtureFilter:
         log_weights = weigh(
             optimised.hypotheses.log_weights[usable], solved.value[usable], self.beta
         )
+        if excess is not None:
+            # What a pose cost more than the best before, it costs for the same reason again.
+            lasting = excess[optimised.hypotheses.ancestors[usable]]
+            over = solved.value[usable] - solved.value[usable].min()
+            log_weights += self.beta * s.error_correlation * np.minimum(over, lasting)
         if before is None and self.body.trunk_pairs:
             log_weights = self._with_facing(optimised, usable, log_weights)
         reference = solved.x[usable[np.argmax(log_weights)]]
