@@ -468,9 +468,11 @@ class MixtureFilter:
 
     def _learn_recall(self, observation: Observation) -> None:
         textures = self.modes.textures
-        if textures is not None and observation.foreground is not None:
+        # An empty silhouette says that nobody is there, and nothing of the clothes.
+        foreground = observation.foreground
+        if textures is not None and foreground is not None and foreground.any():
             row = int(self.modes.texture_rows[0])
-            self.recall.update(textures, row, observation.foreground)
+            self.recall.update(textures, row, foreground)
 
     def _fit_flesh(self, observation: Observation) -> bool:
         """Moves the widths of the flesh by what an image says; False where it says nothing more."""

@@ -85,10 +85,16 @@ class Modes(Hypotheses):
     log_likelihoods: Array
     energies: Array
 
-    @property
-    def mixture(self) -> GaussianMixture:
-        """The modes as a mixture over poses."""
-        return GaussianMixture(np.exp(self.log_weights), self.poses, self.covariances)
+    def mixture(self, share: float) -> GaussianMixture:
+        """The modes as a mixture over poses.
+
+        Args:
+            share: of the evidence that is believed; see `trust`. The log weights of an image are
+                nearly those of the next, and so are their errors.
+        """
+        log_weights = share * self.log_weights
+        weights = np.exp(log_weights - np.logaddexp.reduce(log_weights))
+        return GaussianMixture(weights, self.poses, self.covariances)
 
 
 def new_hypotheses(poses: Array, log_weights: Array) -> Hypotheses:

@@ -39,6 +39,8 @@ from hmt_ros.tracking.subject import Subject
 
 # Fewest keypoints from which a lost track starts anew.
 FEWEST_KEYPOINTS = 6
+# The person may be where modes say that have at least this log weight, nats; the sign is changed.
+LIKELY = 4.0
 # Margin around all joints of all modes, as a fraction of their extent: where the silhouette may be.
 REGION_MARGIN = 0.3
 
@@ -180,7 +182,8 @@ class Tracker:
                 observation = self._observe(image, keypoints, mask)
                 self._begin(observation, beginning, stamp)
         if mask is None:
-            self.silhouettes.complete(image, self.body, self.camera, self.modes.poses)
+            likely = self.modes.log_weights > -LIKELY
+            self.silhouettes.complete(image, self.body, self.camera, self.modes.poses[likely])
         dt = 0.0 if self._last_stamp is None else (stamp - self._last_stamp) * 1e-9
         modes = self._track.modes
         self._point.update(self.body, modes.poses, np.exp(modes.log_weights), dt)
@@ -233,7 +236,7 @@ class Tracker:
     @property
     def posterior(self) -> GaussianMixture:
         """The present posterior."""
-        return self.modes.mixture
+        return self.modes.mixture(1.0 - self.settings.error_correlation)
 
     def _new_track(self, body: Body) -> Track:
         return Track(body, self.camera, self.settings, self._seed, self._extra)

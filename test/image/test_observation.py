@@ -55,8 +55,9 @@ def test_the_window_holds_the_silhouette_and_its_margin():
 
 def test_outline_points_are_even_and_their_normals_point_outwards():
     window = ImageWindow(grey(), 0, 0, disc().astype(np.uint8), None)
-    pixels, normals = outline(window, 60)
+    pixels, normals, beliefs = outline(window, 60)
     assert len(pixels) == 60
+    assert (beliefs == 1.0).all()
     offset = pixels - [80, 60]
     radius = np.linalg.norm(offset, axis=1)
     assert np.allclose(radius, 25, atol=0.8)
@@ -64,6 +65,26 @@ def test_outline_points_are_even_and_their_normals_point_outwards():
     assert np.allclose(np.linalg.norm(normals, axis=1), 1)
     gaps = np.linalg.norm(np.roll(pixels, -1, axis=0) - pixels, axis=1)
     assert gaps.max() < 1.5 * gaps.mean()
+
+
+def test_what_may_be_the_person_forbids_nothing_and_its_border_is_doubted():
+    mask = disc()
+    unsure = np.zeros_like(mask)
+    unsure[:, 80:] = disc(radius=40)[:, 80:] & ~mask[:, 80:]
+    sure, found = (observe(grey(), mask, unsure=x) for x in (None, unsure))
+    column, row = (int(x) for x in (80 + 35, 60))
+    at = [
+        float(x.evidence['containment'].values[0, row - x.evidence['containment'].top,
+                                               column - x.evidence['containment'].left])
+        for x in (sure, found)
+    ]  # fmt: skip
+    assert at[0] == pytest.approx(10.0, abs=1.0)
+    assert at[1] <= 0.0
+    pixels, _, beliefs = found.outline
+    right, left = pixels[:, 0] > 84, pixels[:, 0] < 76
+    assert (beliefs[left] == 1.0).all()
+    assert (beliefs[right] < 0.5).all()
+    assert (sure.outline.beliefs == 1.0).all()
 
 
 def test_outline_of_holes_points_into_them():

@@ -32,6 +32,7 @@ def modes(human32) -> Modes:
         covariances=np.tile(np.eye(d), (K, 1, 1)),
         filtered=root @ root.transpose(0, 2, 1),
         log_likelihoods=np.zeros(K),
+        energies=np.zeros(K),
     )
 
 

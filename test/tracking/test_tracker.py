@@ -144,12 +144,14 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     follow, camera, human32, motion, keypoints_of
 ):
     """exp(-beta * energy) at the modes of the posterior, normalised."""
-    tracker, mixtures, _ = follow(frames=4, inverse_temperature=0.4)
+    tracker, mixtures, _ = follow(frames=4, trust=0.4)
     posterior, likelihood = mixtures[-1]
     seen = Observation(keypoints=keypoints_of(human32, motion[3], 1.0, 3))
     likelihood_of = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).given(seen)
     energies = likelihood_of.energy(posterior.means).value
-    weights = np.exp(-0.4 * (energies - energies.min()))
+    beta = tracker._track._filters[0].beta
+    assert 0.1 < beta < 0.4
+    weights = np.exp(-beta * (energies - energies.min()))
     assert np.allclose(likelihood.weights, np.sort(weights / weights.sum())[::-1], atol=1e-12)
 
 
@@ -292,7 +294,7 @@ def jumped(motion):
 
 
 def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion, keypoints_of):
-    tracker = started(energy_rise=1e9, lost_images=2)
+    tracker = started(energy_rise=1e9, lost_images=2, reversal_probability=0.0)
     other = jumped(motion)
     seen, misfits, errors = [], [], []
     for i in range(8):
@@ -338,7 +340,7 @@ def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, mot
     other = jumped(motion)
     errors = {}
     for given in (False, True):
-        tracker = started(energy_rise=1e9, lost_images=2)
+        tracker = started(energy_rise=1e9, lost_images=2, reversal_probability=0.0)
         statuses = []
         for i in range(6):
             seen = keypoints_of(human32, motion[i] if i < 3 else other, 1.0, i)
@@ -358,7 +360,7 @@ def test_predictions_are_among_the_hypotheses(human32, started, black, motion, k
     """Search is off: nothing else finds the jump in its image."""
     errors = {}
     for given in (False, True):
-        tracker = started(energy_rise=1e9)
+        tracker = started(energy_rise=1e9, reversal_probability=0.0)
         for i in range(4):
             pose = motion[i] if i < 3 else jumped(motion)
             prediction = predicted(human32, pose) if given else None
@@ -400,7 +402,7 @@ def test_surprising_images_are_searched_again(human32, started, black, motion, k
     """With rounds of search the same jump is found at once, or an image later."""
     evaluations, quiet = {}, {}
     for rounds in (1, 3):
-        tracker = started(rounds=rounds)
+        tracker = started(rounds=rounds, reversal_probability=0.0)
         for i in range(6):
             pose = motion[i] if i < 3 else jumped(motion)
             posterior, _ = tracker.step(black, i * FRAME, keypoints_of(human32, pose, 1.0, i))
