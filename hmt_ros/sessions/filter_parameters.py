@@ -74,7 +74,7 @@ class FilterParameters(CameraNodeParameters):
         overlay_modes: Maximum number of modes drawn on the image, the heaviest; 0 switches the
             overlay off.
         overlay_quality: JPEG quality of the overlay.
-        publish_tf: If true, the links of the heaviest mode are published on /tf.
+        publish_tf: If true, the links of the point estimate are published on /tf.
         frame_prefix: Prefix of the names of the links on /tf and in human_description, which tells
             several persons apart.
         tracker: settings of the tracker.

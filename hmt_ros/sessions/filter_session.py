@@ -287,6 +287,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             posterior=posterior,
             likelihood=likelihood,
             log_likelihoods=tracker.modes.log_likelihoods,
+            point=tracker.point_estimate,
             starts=starts,
         )
         presentation = Presentation(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body import Body, Camera
-from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.overlay import draw_modes
@@ -24,7 +24,7 @@ from msg_tools.messages.bodies import description_message, message_of_body
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.markers import skeleton_markers
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
-from msg_tools.messages.states import heaviest_joint_state, transforms_message
+from msg_tools.messages.states import joint_state_message, transforms_message
 from msg_tools.messages.urdf import link_frames
 
 # In the order in which they are published.
@@ -51,6 +51,7 @@ class TrackedImage:
         body, camera: of the track.
         posterior, likelihood: mixtures over poses, heaviest first.
         log_likelihoods: (K,) of the image at the means of the posterior.
+        point: (d,) the point estimate, for those who want one pose.
         starts: whether the body is a new one, with other lengths than the image before.
     """
 
@@ -62,6 +63,7 @@ class TrackedImage:
     posterior: GaussianMixture
     likelihood: GaussianMixture
     log_likelihoods: Array
+    point: Array
     starts: bool
 
 
@@ -131,9 +133,10 @@ def track_messages(
     if wanted('likelihood_mixture'):
         publish('likelihood_mixture', pose_mixture_message(messages, likelihood))
     if wanted('joint_states'):
-        publish('joint_states', heaviest_joint_state(messages, posterior))
+        names = posterior.dof_names
+        publish('joint_states', joint_state_message(messages, names, track.point, stamp, frame))
     if presentation.publish_tf and wanted('/tf'):
-        publish('/tf', _link_transforms(messages, track, frames, presentation.frame_prefix))
+        publish('/tf', _link_transforms(messages, track, presentation.frame_prefix))
     if wanted('markers'):
         names = track.body.joint_names
         publish(
@@ -164,14 +167,10 @@ def track_messages(
         )
 
 
-def _link_transforms(
-    messages: MessageFactory, track: TrackedImage, frames: Frames, prefix: str
-) -> Any:
-    """Every link of the URDF in the heaviest mode, seen from the camera."""
-    heaviest = int(np.argmax(track.posterior.weights))
-    names, rotations, origins = link_frames(
-        track.body.skeleton, frames, track.posterior.means[heaviest], heaviest
-    )
+def _link_transforms(messages: MessageFactory, track: TrackedImage, prefix: str) -> Any:
+    """Every link of the URDF in the point estimate, seen from the camera."""
+    frames = forward(track.body.skeleton, track.point[None])
+    names, rotations, origins = link_frames(track.body.skeleton, frames, track.point, 0)
     return transforms_message(
         messages,
         [track.frame_id] * len(names),

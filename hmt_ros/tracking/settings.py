@@ -59,6 +59,8 @@ class TrackerSettings:
             depth, for a reversal that turns the person by little; 0 proposes none.
         reach: Log weight below the heaviest mode, nats, to which the best mode of another heading,
             lean or order of the legs is kept.
+        facing_gain: Share of the trust with which a difference of energies between the two ways to
+            face is counted in every image.
         facing_trial: Maximum time for which both facing directions are followed after a start from
             silhouettes or predictions alone, s; 0 keeps the better one at once. The trial doubles
             the cost of an image.

@@ -50,6 +50,11 @@ class StubTracker:
     def modes(self):
         return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]))
 
+    @property
+    def point_estimate(self):
+        start = self._start
+        return self.body.prior_mean if isinstance(start, Subject) else start.means[0]
+
     def step(self, image, stamp, keypoints=None, prediction=None, mask=None):
         assert image.shape == (self.camera.height, self.camera.width, 3)
         if self.fault is not None:

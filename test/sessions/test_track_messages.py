@@ -43,6 +43,7 @@ def track(body):
         posterior=GaussianMixture(np.array([0.5, 0.3, 0.2]), poses, covariances),
         likelihood=GaussianMixture(np.array([0.6, 0.4]), poses[:2], covariances[:2]),
         log_likelihoods=np.array([-3.0, -2.0, -1.0]),
+        point=poses[1],
         starts=True,
     )
 
@@ -82,14 +83,14 @@ def test_mixtures(track, body):
     assert np.isnan([c.log_likelihood for c in found['likelihood_mixture'].components]).all()
 
 
-def test_joint_states_are_those_of_the_heaviest(track, body):
+def test_joint_states_are_those_of_the_point_estimate(track, body):
     state = made(track)['joint_states']
     assert tuple(state.name) == body.dof_names
-    assert np.array_equal(state.position, track.posterior.means[0])
+    assert np.array_equal(state.position, track.point)
 
 
 def test_transforms_lead_from_the_camera_to_the_segments(track, body):
-    frames = forward(body.skeleton, track.posterior.means[:1])
+    frames = forward(body.skeleton, track.point[None])
     transforms = {t.child_frame_id: t for t in made(track)['/tf'].transforms}
     for index, name in enumerate(body.skeleton.segment_names):
         transform = transforms[f'anna/{name}']
@@ -158,6 +159,7 @@ def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
                 'posterior': mixture,
                 'likelihood': mixture,
                 'log_likelihoods': np.zeros(2),
+                'point': poses[1],
             }
         )
     )
