@@ -48,7 +48,13 @@ class BackgroundSettings:
 
 
 class BackgroundModel:
-    """Learns an empty scene and finds what does not belong to it."""
+    """Learns an empty scene and finds what does not belong to it.
+
+    Attributes:
+        frames: number of frames that were learned.
+        changed: share of the pixels of the last image that differ from the background, shadows
+            among them.
+    """
 
     def __init__(self, settings: BackgroundSettings | None = None) -> None:
         self.settings = settings or BackgroundSettings()
@@ -61,6 +67,7 @@ class BackgroundModel:
         self._model.setDetectShadows(True)
         self._model.setShadowThreshold(s.shadow_threshold)
         self.frames = 0
+        self.changed = 0.0
         self._shape: tuple[int, ...] = ()
 
     @classmethod
@@ -102,6 +109,7 @@ class BackgroundModel:
             raise ValueError('no background has been learned: give an image or some frames first')
         self._check(image)
         raw = self._model.apply(image, learningRate=FROZEN)
+        self.changed = cv2.countNonZero(raw) / raw.size
         mask = (raw == 255).astype(np.uint8)
         result = np.zeros(mask.shape, dtype=np.bool_)
         left, top, right, bottom = region or (0, 0, mask.shape[1], mask.shape[0])

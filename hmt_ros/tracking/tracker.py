@@ -1,9 +1,12 @@
-"""Follows one person through images: starts a track, moves it on, notices when it is lost.
+"""Follows one person through images: starts tracks, moves them on, notices when they are lost.
 
     WAITING -> (a start) -> TRACKING -> (unexplained images) -> LOST -> (started anew) -> TRACKING
+    TRACKING, LOST -> (the person is not in view) -> NOBODY -> (somebody is seen) -> TRACKING
 
 The tracker knows images, background and starts; the `Track` knows the person, its filters carry the
-mixture.
+mixture; `Presence` says whether the person is there. A lost track goes on with its modes and those
+that its image suggests; after NOBODY a new track begins, of which the old one leaves the lengths of
+the body.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from hmt_ros.image.observation import Box, Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.facing import Track
 from hmt_ros.tracking.hypotheses import Modes
@@ -29,12 +33,22 @@ from hmt_ros.tracking.initialisation import (
     poses_from_outline,
     start_from_keypoints,
 )
+from hmt_ros.tracking.prediction import predict
+from hmt_ros.tracking.presence import (
+    FEWEST_KEYPOINTS,
+    MOST_CHANGED,
+    Presence,
+    View,
+    looks_like_person,
+    sees_person,
+)
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.subject import Subject
 
-# Fewest keypoints from which a lost track starts anew.
-FEWEST_KEYPOINTS = 6
+# A new track starts when somebody has been seen for so long, s; if a side of the image may cut the
+# silhouette, when it has been seen for the longer time.
+ARRIVAL, ARRIVAL_AT_BORDER = 0.2, 0.6
 # Margin around all joints of all modes, as a fraction of their extent: where the silhouette may be.
 REGION_MARGIN = 0.3
 
@@ -45,6 +59,7 @@ class Status(Enum):
     WAITING = 'waiting'  # for the image that the subject's joints were seen in
     TRACKING = 'tracking'
     LOST = 'lost'
+    NOBODY = 'nobody'  # is in view
 
 
 class Tracker:
@@ -58,6 +73,10 @@ class Tracker:
             are none the silhouette is not used.
         seed: of all randomness. The same images, settings and seed give the same numbers.
         extra: further energy terms of the posterior, such as what is known of the floor.
+
+    Attributes:
+        evaluations: of the likelihood in the last image.
+        track_id: number of the present track, or of the last one; 0 before the first.
     """
 
     def __init__(
@@ -74,13 +93,17 @@ class Tracker:
         self.camera = camera
         self.background = background or BackgroundModel()
         self.evaluations = 0
+        self.track_id = 0
         self._learning = background is None
         self._seed = seed
         self._start: Subject | GaussianMixture | None = None
         self._extra = tuple(extra)
         self._track = self._new_track(body)
+        self._presence = Presence(self.settings.absence_time)
+        self._arrived: int | None = None
         self._last_image: Image | None = None
         self._last_stamp: int | None = None
+        self._followed: int | None = None
 
     def reset(self, start: Subject | GaussianMixture | None = None) -> None:
         """Drops the track; the next image starts a new one.
@@ -96,8 +119,9 @@ class Tracker:
             )
         if start is not None:
             self._start = start
-        self._track = self._new_track(self.body)
-        self._last_image, self._last_stamp = None, None
+        self._drop_track()
+        self._presence = Presence(self.settings.absence_time)
+        self._last_stamp = None
 
     def step(
         self,
@@ -105,21 +129,26 @@ class Tracker:
         stamp: int,
         keypoints: Keypoints | None = None,
         prediction: PosePrediction | None = None,
+        *,
+        nobody_predicted: bool = False,
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """Takes the next image.
 
         Args:
             image: (H, W, 3) BGR uint8, of the camera's size.
             stamp: of the image, ns; later than the one before.
-            keypoints: joints seen in this image, if any.
+            keypoints: joints seen in this image; without any that was seen: the detector saw
+                nobody. None: there is no detector, or it has not answered.
             prediction: poses that a regression expects by this image, if any. They start a track
                 that has no other start, with the lengths that they assume, are among the hypotheses
                 of every image, and of a lost track; they are no evidence, which would count the
                 image twice.
+            nobody_predicted: whether that regression saw nobody in this image.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses,
-            heaviest first with weights that sum to 1; (None, None) while there is no track.
+            heaviest first with weights that sum to 1; (None, None) while there is no track, before
+            the first or because nobody is in view.
 
         Raises:
             ValueError: an image of another size, a stamp that does not increase, or a prediction
@@ -132,25 +161,15 @@ class Tracker:
             raise ValueError(f'the camera gives images of {size}, saw {image.shape[:2]}')
         if self._last_stamp is not None and stamp <= self._last_stamp:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
-        if self._track.begun:
-            observation = self._observe(image, keypoints)
-            self._follow(observation, stamp, prediction)
-        else:
-            start = self._start_at(stamp, prediction)
-            if start is None:
-                self.evaluations = 0
-                if self._learning:
-                    self.background.learn(image)
-                return None, None
-            observation = self._observe(image, keypoints)
-            self._begin(observation, start, stamp)
-        self._last_image, self._last_stamp = image, stamp
-        self.evaluations = self._track.evaluations
-        return self.posterior, self._track.likelihood_mixture(observation)
+        found = self._take(image, stamp, keypoints, prediction, nobody_predicted)
+        self._last_stamp = stamp
+        return found
 
     @property
     def status(self) -> Status:
         """What the tracker is doing."""
+        if self._presence.absent:
+            return Status.NOBODY
         if not self._track.begun:
             return Status.WAITING
         return Status.LOST if self._track.lost else Status.TRACKING
@@ -182,6 +201,65 @@ class Tracker:
     def _new_track(self, body: Body) -> Track:
         return Track(body, self.camera, self.settings, self._seed, self._extra)
 
+    def _drop_track(self) -> None:
+        """Keeps nothing but the body."""
+        self._track = self._new_track(self.body)
+        self._arrived = None
+        self._last_image, self._followed = None, None
+
+    def _take(
+        self,
+        image: Image,
+        stamp: int,
+        keypoints: Keypoints | None,
+        prediction: PosePrediction | None,
+        nobody_predicted: bool,
+    ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
+        """See `step`."""
+        self.evaluations = 0
+        start = None
+        if not self._track.begun and not self._presence.absent:
+            start = self._start_at(stamp, prediction)
+            if start is None:
+                if self._learning:
+                    self.background.learn(image)
+                return None, None
+        view = self._view(image, keypoints, nobody_predicted)
+        if self._track.begun:
+            seen = self._is_seen(view, stamp)
+            if self._presence.absent:
+                self._drop_track()
+                return None, None
+            if not seen and view.silhouette is not None:
+                # Nothing is there to fit modes to.
+                return self._expected(stamp), self._track.likelihood_mixture(Observation())
+        elif start is None and not self._has_arrived(view, stamp, prediction):
+            return None, None
+        observation = self._observe(view)
+        if self._track.begun:
+            self._follow(observation, stamp, prediction)
+        else:
+            if start is not None:
+                self._begin(observation, start, stamp)
+            else:
+                self._begin_next(observation, stamp, prediction)
+            self.track_id += 1
+            self._presence = Presence(self.settings.absence_time)
+            self._is_seen(view, stamp)
+        self._last_image, self._followed = image, stamp
+        self.evaluations = self._track.evaluations
+        return self.posterior, self._track.likelihood_mixture(observation)
+
+    def _expected(self, stamp: int) -> GaussianMixture:
+        """The posterior of a time at which nothing is seen."""
+        assert self._followed is not None
+        s, modes, body = self.settings, self.modes, self.body
+        dt = (stamp - self._followed) * 1e-9
+        moved, _ = predict(modes, body, dt, s.velocity_kept)
+        dynamics = LinearGaussianDynamics.random_walk(body.rates)
+        _, covariances = dynamics.predict(modes.poses, modes.covariances, dt)
+        return GaussianMixture(np.exp(modes.log_weights), moved.poses, covariances)
+
     def _start_at(
         self, stamp: int, prediction: PosePrediction | None
     ) -> Subject | GaussianMixture | PosePrediction | None:
@@ -212,14 +290,46 @@ class Tracker:
         else:
             self._track.begin(self.body, start, observation, stamp, both_ways=False)
 
+    def _is_seen(self, view: View, stamp: int) -> bool:
+        return self._presence.sees(view, stamp, self.body, self.camera, self.modes.poses[0])
+
+    def _has_arrived(self, view: View, stamp: int, prediction: PosePrediction | None) -> bool:
+        """Whether somebody has been in view for long enough to start the next track."""
+        if not self._shows_somebody(view, prediction):
+            self._arrived = None
+            return False
+        if self._arrived is None:
+            self._arrived = stamp
+        wanted = ARRIVAL
+        if view.silhouette is not None and view.silhouette[:, [0, -1]].any():
+            wanted = ARRIVAL_AT_BORDER
+        return stamp - self._arrived >= wanted * 1e9
+
+    def _begin_next(
+        self, observation: Observation, stamp: int, prediction: PosePrediction | None
+    ) -> None:
+        """Starts a track of who has come into view."""
+        poses = self._poses_to_search(observation, prediction)
+        assert poses is not None
+        both_ways = observation.keypoints is None
+        self._track.begin(self.body, poses, observation, stamp, both_ways=both_ways)
+
+    def _shows_somebody(self, view: View, prediction: PosePrediction | None) -> bool:
+        """Whether somebody is in an image, of whom a track does not know yet."""
+        if sees_person(view.keypoints):
+            return True
+        if view.silhouette is None:
+            return prediction is not None
+        return view.changed <= MOST_CHANGED and looks_like_person(view.silhouette)
+
     def _follow(
         self, observation: Observation, stamp: int, prediction: PosePrediction | None
     ) -> None:
         """Takes the next image of a track."""
-        assert self._last_stamp is not None
+        assert self._followed is not None
         poses = self._poses_to_search(observation, prediction) if self._track.lost else None
         if poses is None:
-            dt = (stamp - self._last_stamp) * 1e-9
+            dt = (stamp - self._followed) * 1e-9
             self._track.propagate(observation, stamp, dt, prediction)
         else:
             both_ways = observation.keypoints is None
@@ -243,17 +353,26 @@ class Tracker:
             found.append(prediction.both_ways(self.body).means)
         return np.concatenate(found) if found else None
 
-    def _observe(self, image: Image, keypoints: Keypoints | None) -> Observation:
+    def _view(self, image: Image, keypoints: Keypoints | None, nobody_predicted: bool) -> View:
         t = self.settings.likelihood
-        shape = t.containment.weight > 0 or t.coverage.weight > 0
+        silhouette, changed = None, 0.0
+        if (t.containment.weight > 0 or t.coverage.weight > 0) and self.background.frames:
+            silhouette = self.background.silhouette(image, self._region())
+            changed = self.background.changed
+        return View(image, silhouette, changed, keypoints, nobody_predicted)
+
+    def _observe(self, view: View) -> Observation:
+        t = self.settings.likelihood
         textured = any(getattr(t, term.name).weight > 0 for term in TERMS if term.needs_texture)
         wanted = {'containment', 'coverage'}
         wanted |= {term.name for term in TERMS if getattr(t, term.name).weight > 0}
         wanted |= {'intensity'} if textured else set()  # the textures hold it
-        silhouette = None
-        if shape and self.background.frames:
-            silhouette = self.background.silhouette(image, self._region())
-        return observe(image, silhouette, keypoints, last_image=self._last_image, wanted=wanted)
+        keypoints = view.keypoints
+        if keypoints is not None and not keypoints.seen.any():
+            keypoints = None
+        return observe(
+            view.image, view.silhouette, keypoints, last_image=self._last_image, wanted=wanted
+        )
 
     def _region(self) -> Box | None:
         """Where the person can be in the next image; None: anywhere."""

@@ -29,6 +29,7 @@ class StubTracker:
     """What `hmt_ros.tracking.Tracker` shows to the outside; its two modes are where it was told."""
 
     made: list[StubTracker] = []  # noqa: RUF012
+    empty: set[int] = set()  # noqa: RUF012  # stamps of images without a person
     fault: Exception | None = None
 
     def __init__(self, body, camera, settings=None, background=None, seed=0):
@@ -36,8 +37,10 @@ class StubTracker:
         self.settings = settings or TrackerSettings()
         self.background = background
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
+        self.track_id = 0
         self.seen: list[tuple[int, Any]] = []
         self.predictions: list[PosePrediction | None] = []
+        self.nobody_predicted: list[bool] = []
         self._start = None
         StubTracker.made.append(self)
 
@@ -48,7 +51,7 @@ class StubTracker:
     def modes(self):
         return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]))
 
-    def step(self, image, stamp, keypoints=None, prediction=None):
+    def step(self, image, stamp, keypoints=None, prediction=None, *, nobody_predicted=False):
         assert image.shape == (self.camera.height, self.camera.width, 3)
         if self.fault is not None:
             raise self.fault
@@ -60,6 +63,11 @@ class StubTracker:
             return None, None
         self.seen.append((stamp, keypoints))
         self.predictions.append(prediction)
+        self.nobody_predicted.append(nobody_predicted)
+        if stamp in self.empty:
+            self.status = Status.NOBODY
+            return None, None
+        self.track_id += self.status is not Status.TRACKING
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.125, 7
         means = np.tile(self.body.prior_mean, (2, 1))
         means[:, 2] = 4.0
@@ -76,6 +84,7 @@ def stub_tracker(monkeypatch):
     monkeypatch.setattr(track_start, 'Tracker', StubTracker)
     monkeypatch.setattr(StubTracker, 'made', [])
     monkeypatch.setattr(StubTracker, 'fault', None)
+    monkeypatch.setattr(StubTracker, 'empty', set())
     return StubTracker
 
 
