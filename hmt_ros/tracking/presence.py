@@ -9,15 +9,16 @@ yes; nobody is there when the person has not been seen for `absence_time`.
     keypoints    yes:  6 or more, with confidences that sum to 3 at least
                  no:   the detector reports no joint, or confidences that sum to 1 at most
     prediction   no:   the predictor saw nobody
-    colours      yes:  mean of p(M | colour) over M  >= outside + 0.4 (inside - outside)
+    colours      yes:  m >= outside + 0.65 (inside - outside) and m - n >= 0.25 (inside - outside)
                  no:   otherwise, or where the colours on M were not seen before
     border       no:   no more than a tenth of the joints lie in the image
 
 M are the pixels that the model covers and F those of the silhouette. Where the clothes have the
 colours of the room only a part of M is foreground: usual is what this track has seen so far, with
-time constant `MEMORY`. Colours are asked where the silhouette can not be used: p(M | colour) is the
-ratio of two histograms, over M and over its surroundings; inside and outside are its usual means
-there. When they are alike the colours say nothing.
+time constant `MEMORY`. Colours are asked where the silhouette can not be used: m and n are the
+means of p(M | colour), the ratio of two histograms, over M and over its surroundings; inside and
+outside are usual values of m and n. When they are alike the colours say nothing. Colours are
+learned slowly and from clear images, or else they would become those of the room.
 """
 
 from __future__ import annotations
@@ -65,9 +66,11 @@ LEAST_FILLED, MOST_FILLED = 0.04, 0.9
 # Height of the raster that areas and colours are taken at, px.
 RASTER = 240
 # Where between the usual values outside and inside a mean colour belongs to the person; how far
-# apart they must be, and how much of the colours must have been seen before.
-INSIDE = 0.4
+# apart they must be, what of this contrast the image must show, and how much of the colours must
+# have been seen before.
+INSIDE, CLEARLY_INSIDE = 0.65, 0.8
 LEAST_CONTRAST = 0.2
+LEAST_APART = 0.25
 LEAST_FAMILIAR = 0.3
 # Bins of a colour channel.
 BINS = 8
@@ -148,12 +151,12 @@ class Presence:
             usable = usable and step**2 * _count(silhouette) <= MOST_AREA * self._area
             cues.append(usable and self._on_silhouette(view.silhouette, model, step, dt))
         image = _at(view.image, model)
-        familiar = None
+        score = None
         if not usable and True not in cues:
-            familiar = self._colours.see(image, model)
-            cues.append(familiar)
+            score = self._colours.score(image, model)
+            cues.append(None if score is None else score >= INSIDE)
         seen = True in cues or False not in cues
-        if seen and familiar is not False:
+        if seen and (score is None or score >= CLEARLY_INSIDE):
             self._colours.learn(image, model, dt)
         return seen
 
@@ -249,22 +252,29 @@ class Colours:
     usual_outside: float = 0.0
     usual_familiar: float = 1.0
 
-    def see(self, image: Image, model: Mask) -> bool | None:
-        """Whether the colours of an image (H, W, 3) on the model are the person's; None: unknown.
+    def score(self, image: Image, model: Mask) -> float | None:
+        """How far the colours of an image on the model are the person's.
+
+        About 1 where they are, about 0 where they are those of the surroundings, minus infinity
+        where they are strange; None: they can not be told apart.
 
         Args:
-            image: BGR.
+            image: (H, W, 3) BGR.
             model: (H, W) pixels that the model covers.
         """
-        if self.inside is None or not model.any():
+        around = surroundings(model)
+        if self.inside is None or not model.any() or not around.any():
             return None
         on = histogram(image, model)
         if np.minimum(on, self.inside).sum() < LEAST_FAMILIAR * self.usual_familiar:
-            return False
+            return -np.inf
         contrast = self.usual_inside - self.usual_outside
         if contrast < LEAST_CONTRAST:
             return None
-        return bool(on @ self._ratio() >= self.usual_outside + INSIDE * contrast)
+        ratio = self._ratio()
+        if (on - histogram(image, around)) @ ratio < LEAST_APART * contrast:
+            return -np.inf
+        return float(on @ ratio - self.usual_outside) / contrast
 
     def learn(self, image: Image, model: Mask, dt: float) -> None:
         """Takes in the colours of an image in which the person is seen; `dt` s after the last."""
@@ -274,6 +284,8 @@ class Colours:
         on, off = histogram(image, model), histogram(image, around)
         if self.inside is None or self.outside is None:
             self.inside, self.outside = on, off
+            ratio = self._ratio()
+            self.usual_inside, self.usual_outside = float(on @ ratio), float(off @ ratio)
             return
         gain = min(dt / MEMORY, 1.0)
         ratio = self._ratio()
