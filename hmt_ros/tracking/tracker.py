@@ -37,6 +37,7 @@ from hmt_ros.tracking.prediction import predict
 from hmt_ros.tracking.presence import (
     FEWEST_KEYPOINTS,
     MOST_CHANGED,
+    ROUNDING,
     Presence,
     View,
     looks_like_person,
@@ -303,7 +304,7 @@ class Tracker:
         wanted = ARRIVAL
         if view.silhouette is not None and view.silhouette[:, [0, -1]].any():
             wanted = ARRIVAL_AT_BORDER
-        return stamp - self._arrived >= wanted * 1e9
+        return (stamp - self._arrived) * 1e-9 + ROUNDING >= wanted
 
     def _begin_next(
         self, observation: Observation, stamp: int, prediction: PosePrediction | None
