@@ -78,12 +78,15 @@ class BackgroundModel:
     Attributes:
         settings: how.
         frames: number of images that were learned.
+        changed: share of the pixels of the last image that differ from the background, shadows
+            among them.
     """
 
     def __init__(self, settings: BackgroundSettings | None = None) -> None:
         self.settings = settings or BackgroundSettings()
         self._model = _new_model(self.settings)
         self.frames = 0
+        self.changed = 0.0
         self._shape: tuple[int, ...] = ()
         self._nearby: tuple[Image, Image] | None = None
         self._parts: _Parts | None = None
@@ -190,6 +193,7 @@ class BackgroundModel:
         raw[(raw == FOREGROUND) & self._is_beside(image)] = 0
         if parts is not None:
             raw[parts.unknown] = 0
+        self.changed = cv2.countNonZero(raw) / raw.size
         return raw
 
     def _is_beside(self, image: Image) -> Mask:

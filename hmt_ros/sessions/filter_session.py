@@ -9,6 +9,8 @@ order give the same bytes. The rules, besides those of `CameraSession`:
   stamp, or for an image that is `keypoints_timeout` younger; with `use_predictions` and
   `prediction_timeout` for a pose_prediction in the same way. Of several of one stamp the last
   counts; keypoints without names, and mixtures without components, say that nobody was seen.
+- When the person is no longer in view one mixture without components of either kind goes out, with
+  markers that remove those before, and then nothing until a new track starts.
 - A camera_info with another calibration, and ~/reset, start the track anew.
 - What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
@@ -37,7 +39,13 @@ from hmt_ros.sessions.camera_session import (
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.session import SessionState, everything
-from hmt_ros.sessions.track_messages import TOPICS, Presentation, TrackedImage, track_messages
+from hmt_ros.sessions.track_messages import (
+    TOPICS,
+    Presentation,
+    TrackedImage,
+    nobody_messages,
+    track_messages,
+)
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker
 from msg_tools import MessageError
@@ -60,6 +68,8 @@ __all__ = [
 
 KEYPOINTS, PREDICTION = 'keypoints', 'pose_prediction'
 
+# Keypoints of a detector that saw nobody.
+NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 # A person hardly moves meanwhile.
 _SAME_MOMENT_NS = SECOND_NS // 5
 _IN_BACKGROUND = 'the background was learned with the person in it'
@@ -67,7 +77,7 @@ _IN_BACKGROUND = 'the background was learned with the person in it'
 
 @dataclass(frozen=True)
 class FilterState(SessionState):
-    """State of the filter: its status is 'no camera', 'waiting', 'tracking' or 'lost'.
+    """State of the filter: its status is 'no camera', or a value of `Status`.
 
     Attributes:
         body: of the present track; None: there is none.
@@ -76,6 +86,7 @@ class FilterState(SessionState):
         evaluations: of the likelihood in the last image.
         background: what is known of it, in a few words.
         doubted: whether it was learned with the person in it, and is not known again.
+        track_id: number of the present track, or of the last one; 0 before the first.
     """
 
     body: Body | None = None
@@ -84,13 +95,16 @@ class FilterState(SessionState):
     evaluations: int = 0
     background: str = 'unknown'
     doubted: bool = False
+    track_id: int = 0
 
     def summary(self) -> str:
         """The present estimate in a few words."""
         return f'{self.modes} modes'
 
     def trouble(self) -> str:
-        """Whether the track is lost, or the background of no use."""
+        """Whether the track is lost, nobody is in view, or the background is of no use."""
+        if self.status == Status.NOBODY.value:
+            return 'nobody in view'
         if self.status == Status.LOST.value:
             return f'lost: misfit {self.misfit:.2f}'
         return f'{_IN_BACKGROUND}; {self.background}' if self.doubted else ''
@@ -98,6 +112,7 @@ class FilterState(SessionState):
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
         return [
+            ('track', str(self.track_id)),
             ('modes', str(self.modes)),
             ('entropy of the weights, nats', f'{self.entropy:.3f}'),
             ('misfit', f'{self.misfit:.3f}'),
@@ -130,7 +145,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
         self._keypoints: StampedInputs[Keypoints] = StampedInputs()
-        self._predictions: StampedInputs[PosePrediction] = StampedInputs()
+        self._predictions: StampedInputs[PosePrediction | Status] = StampedInputs()
         self.state = self._present_state()
 
     def restart(self, start: TrackStart | None = None) -> None:
@@ -177,9 +192,9 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self.restart(self.start)
 
     def _keypoints_in(self, message: Any) -> Keypoints | None:
-        """The keypoints that were seen; None where there are none."""
+        """The keypoints that were seen, maybe none; None: they can not be used."""
         if len(message.names) == 0:
-            return None
+            return NO_KEYPOINTS
         try:
             content = keypoints_of(message, self.parameters.keypoint_sigma_px)
         except MessageError as error:
@@ -189,13 +204,14 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if strange:
             text = f'keypoints {strange} are no joints of the body'
             self._log.note(Fault.KEYPOINT_NAMES, text)
-        seen = known[np.flatnonzero(known.seen)]
-        return seen if seen.names else None
-
-    def _prediction_in(self, message: Any) -> PosePrediction | None:
-        """The mixture and its body, see `body_of`; None where nobody was seen."""
-        if len(message.components) == 0:
+        if not known.names:
             return None
+        return known[np.flatnonzero(known.seen)]
+
+    def _prediction_in(self, message: Any) -> PosePrediction | Status | None:
+        """The mixture and its body, see `body_of`; `NOBODY`: was seen; None: not to be used."""
+        if len(message.components) == 0:
+            return Status.NOBODY
         try:
             content = pose_mixture_of(message)
             return PosePrediction(content.mixture, body_of(content, self.start.body))
@@ -233,7 +249,12 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 self._tracker = self.start.tracker(camera)
             trusted = not self._tracker.silhouettes.doubted
             posterior, likelihood = self._tracker.step(
-                waiting.image, stamp, keypoints, prediction, waiting.mask
+                waiting.image,
+                stamp,
+                keypoints,
+                prediction if isinstance(prediction, PosePrediction) else None,
+                waiting.mask,
+                nobody_predicted=prediction is Status.NOBODY,
             )
             if trusted and self._tracker.silhouettes.doubted:
                 self._report_background(self._tracker.silhouettes.share, stamp)
@@ -241,6 +262,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 self._report_old_start(stamp)
             if posterior is not None and likelihood is not None:
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
+            elif len(self._weights):
+                self._publish_nobody(self._tracker, waiting)
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
             if not starts:
@@ -310,6 +333,22 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._weights = posterior.weights
         self._log.counts['tracked'] += 1
 
+    def _publish_nobody(self, tracker: Tracker, waiting: WaitingImage) -> None:
+        """The end of a track whose person is no longer in view."""
+        p = self.parameters
+        nobody_messages(
+            self._messages,
+            tracker.body,
+            tracker.settings.max_hypotheses,
+            waiting.stamp_ns,
+            waiting.frame_id,
+            waiting.image if p.overlay_modes else None,
+            p.overlay_quality,
+            self._wanted,
+            lambda topic, message: self._publish(topic, waiting.stamp_ns, message),
+        )
+        self._weights = np.empty(0)
+
     # State.
 
     def _present_state(self) -> FilterState:
@@ -324,6 +363,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             evaluations=0 if tracker is None else tracker.evaluations,
             background='unknown' if silhouettes is None else silhouettes.known,
             doubted=silhouettes is not None and silhouettes.doubted,
+            track_id=0 if self._tracker is None else self._tracker.track_id,
         )
 
     def _status(self) -> tuple[str, str]:

@@ -144,6 +144,35 @@ def final_messages(
         publish('smoothed_joint_states', heaviest_joint_state(messages, content))
 
 
+def nobody_messages(
+    messages: MessageFactory,
+    of: SmoothedBody,
+    stamp_ns: int,
+    *,
+    wanted: Callable[[str], bool],
+    publish: Callable[[str, Any], None],
+) -> None:
+    """Makes the messages of a time from which on nobody is in view.
+
+    Args:
+        messages: factory.
+        of: person of the poses before.
+        stamp_ns: the time.
+        wanted, publish: as for `window_messages`.
+    """
+    body, frame = of.body, of.frame_id
+    if wanted('trajectory_markers'):
+        names = body.joint_names
+        nothing = np.empty((0, 0, len(names), 3))
+        markers = trajectory_markers(
+            messages, nothing, names, TRACED, [], np.empty(0), stamp_ns, frame, ranks=DRAWN
+        )
+        publish('trajectory_markers', markers)
+    if wanted('smoothed_pose_mixture'):
+        content = PoseMixture.of_body(body, None, MixtureKind.SMOOTHED, stamp_ns, frame)
+        publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
+
+
 def _without_covariances(found: TrajectoryMixture) -> dict[str, Any]:
     """As `TrajectoryMixture.message_content`, which would compute them."""
     assert found.stamps_ns is not None

@@ -11,6 +11,8 @@ same order give the same bytes. The rules:
 - A mixture names its body and carries the segment lengths of the person; without lengths it is
   about the model at its own lengths. Another body, other lengths or another frame are a new track,
   and start a new window.
+- A likelihood without components says that nobody is in view any more: the window ends, and a
+  smoothed mixture without components and markers that remove those before go out.
 - The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
 - What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
@@ -30,6 +32,7 @@ from hmt_ros.sessions.smoothed_messages import (
     TOPICS,
     SmoothedBody,
     final_messages,
+    nobody_messages,
     trajectory_content,
     window_messages,
 )
@@ -46,11 +49,12 @@ from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
 MIXTURE = 'likelihood_mixture'
 FINISH = 'finish'  # what `finish` calls the end of the stream
+NOBODY = 'nobody'  # status while nobody is in view
 
 
 @dataclass(frozen=True)
 class SmootherState(SessionState):
-    """State of the smoother: its status is 'waiting' or 'smoothing'.
+    """State of the smoother: its status is 'waiting', 'smoothing' or 'nobody'.
 
     Attributes:
         window: poses in the window.
@@ -67,6 +71,10 @@ class SmootherState(SessionState):
     def summary(self) -> str:
         """The present estimate in a few words."""
         return f'{self.trajectories} trajectories of {self.window} poses'
+
+    def trouble(self) -> str:
+        """Whether nobody is in view."""
+        return 'nobody in view' if self.status == NOBODY else ''
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
@@ -120,6 +128,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._resolved: tuple[Any, SmoothedBody] | None = None
         self._window: SlidingWindow | None = None
         self._newest: int | None = None
+        self._nobody = False
         self._gaps, self._longest_gap = 0, 0.0
         self.kept = KeptMixtures(None, ())
         self.state = self._present_state()
@@ -136,11 +145,15 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def _forget(self) -> None:
         self._window = None
         self._newest = None
+        self._nobody = False
         self.kept = KeptMixtures(self._of, ())
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
         try:
             content = pose_mixture_of(message)
+            if content.kind is MixtureKind.LIKELIHOOD and not len(content.weights):
+                self._take_nobody(stamp)
+                return
             mixture, of = content.mixture, self._whose(content)
         except MessageError as error:
             self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
@@ -179,7 +192,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._log.skip(Fault.ESTIMATE, f'mixture of {stamp} ns can not be smoothed: {text}')
             self._end_window()
             return
-        self._newest = stamp
+        self._newest, self._nobody = stamp, False
         self._log.counts['smoothed'] += 1
         self.kept = KeptMixtures(of, (*self.kept.items, (stamp, mixture))[-p.window_length :])
         self._weights = update.trajectories.weights
@@ -193,6 +206,22 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         )
         for pose in update.final:
             self._publish_final(pose, of)
+
+    def _take_nobody(self, stamp: int) -> None:
+        """Ends the window: the person is no longer in view."""
+        if self._order(stamp, self._newest) is Order.SKIPPED:
+            return
+        of, smooths = self._of, self._window is not None
+        self._end_window()
+        self._nobody = True
+        if of is not None and smooths:
+            nobody_messages(
+                self._messages,
+                of,
+                stamp,
+                wanted=self._wanted,
+                publish=lambda topic, made: self._publish(topic, stamp, made),
+            )
 
     def _whose(self, content: PoseMixture) -> SmoothedBody:
         """The person that a mixture is about; the same object while that does not change.
@@ -295,6 +324,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def _present_state(self) -> SmootherState:
         smooths = self._newest is not None
         status, wants = ('smoothing', '') if smooths else ('waiting', 'likelihood_mixture')
+        if self._nobody:
+            status, wants = NOBODY, ''
         return SmootherState(
             status,
             wants,

@@ -167,6 +167,45 @@ def track_messages(
         )
 
 
+def nobody_messages(
+    messages: MessageFactory,
+    body: Body,
+    ranks: int,
+    stamp_ns: int,
+    frame_id: str,
+    image: NDArray[np.uint8] | None,
+    quality: int,
+    wanted: Callable[[str], bool],
+    publish: Callable[[str, Any], None],
+) -> None:
+    """Makes the messages of an image that ends a track: nobody is in view any more.
+
+    Args:
+        messages: factory.
+        body: of the track.
+        ranks: maximum number of modes of the track, whose markers are removed.
+        stamp_ns, frame_id: of the image.
+        image: (H, W, 3) BGR, shown without modes; None: no overlay.
+        quality: of its JPEG, 1 to 100.
+        wanted, publish: as for `track_messages`.
+    """
+    kinds = {'pose_mixture': MixtureKind.POSTERIOR, 'likelihood_mixture': MixtureKind.LIKELIHOOD}
+    for topic, kind in kinds.items():
+        if wanted(topic):
+            content = PoseMixture.of_body(body, None, kind, stamp_ns, frame_id)
+            publish(topic, pose_mixture_message(messages, content))
+    if wanted('markers'):
+        names = body.joint_names
+        nothing = np.empty((0, len(names), 3))
+        markers = skeleton_markers(
+            messages, nothing, names, [], np.empty(0), stamp_ns, frame_id, ranks=ranks
+        )
+        publish('markers', markers)
+    if image is not None and wanted('overlay/compressed'):
+        picture = compressed_image_message(messages, image, stamp_ns, frame_id, quality)
+        publish('overlay/compressed', picture)
+
+
 def _link_transforms(messages: MessageFactory, track: TrackedImage, prefix: str) -> Any:
     """Every link of the URDF in the point estimate, seen from the camera."""
     frames = forward(track.body.skeleton, track.point[None])

@@ -261,9 +261,7 @@ class MixtureFilter:
             modes.energies - modes.energies.min(),
         )  # fmt: skip
         # Of the error of an energy only what is new counts.
-        self.log_evidence -= beta * (
-            least - s.error_correlation * float(modes.energies.min())
-        )
+        self.log_evidence -= beta * (least - s.error_correlation * float(modes.energies.min()))
         posterior.trust.update(least)
         self._fit_flesh(observation)
         self._learn_recall(observation)
@@ -295,9 +293,7 @@ class MixtureFilter:
         if observation.evidence:
             covariances = self._posterior.covariances(fit, free)
         nothing = np.zeros(len(poses))
-        weights = np.exp(
-            normalised(weigh(nothing, fit.energy.value, self.beta))
-        )
+        weights = np.exp(normalised(weigh(nothing, fit.energy.value, self.beta)))
         return GaussianMixture(weights, means, covariances).sorted()
 
     # The steps.

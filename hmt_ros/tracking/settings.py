@@ -55,8 +55,8 @@ class TrackerSettings:
         jump_probability: Prior probability that a limb flips between two images.
         prediction_probability: Prior probability that a pose comes from a single-image prediction
             and not from the image before.
-        reversal_probability: Prior probability that the track has taken the pose for its reversal in
-            depth, for a reversal that turns the person by little; 0 proposes none.
+        reversal_probability: Prior probability that the track has taken the pose for its reversal
+            in depth, for a reversal that turns the person by little; 0 proposes none.
         reach: Log weight below the heaviest mode, nats, to which the best mode of another heading,
             lean or order of the legs is kept.
         facing_gain: Share of the trust with which a difference of energies between the two ways to
@@ -66,7 +66,7 @@ class TrackerSettings:
             the cost of an image.
         base_iterations: Number of Newton steps on the predictions.
         iterations: Number of Newton steps on the candidates.
-        trust: Share of the energy of an image that is believed when hypotheses are weighed, at most;
+        trust: Largest share of the energy of an image that is believed when hypotheses are weighed;
             values below 1 allow for correlated errors of neighbouring measurements.
         error_correlation: Correlation of the errors of an image, such as a shape that the model
             lacks, with those of the image before.
@@ -79,6 +79,8 @@ class TrackerSettings:
         lost_misfit: Fraction of the outline, or of the keypoints, left unexplained by every mode
             above which an image counts as lost.
         lost_images: Number of consecutive lost images after which the track restarts.
+        absence_time: Time after which the track of a person who is not in view ends, s; it is
+            measured by the stamps of the images.
         likelihood: settings of the likelihood.
         search: settings of the search of limbs.
     """
@@ -114,6 +116,7 @@ class TrackerSettings:
     flesh_images: int = 15
     lost_misfit: float = 0.35
     lost_images: int = 5
+    absence_time: float = 0.5
     likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
     search: LimbSearchSettings = field(default_factory=LimbSearchSettings)
 
@@ -131,7 +134,7 @@ class TrackerSettings:
             )
         least = {'samples': 1, 'rounds': 1, 'iterations': 1, 'base_iterations': 1, 'lost_images': 1}
         least |= {'combinations': 1, 'alternatives': 1, 'trust': 0, 'exploration': 0}
-        least |= {'facing_trial': 0}
+        least |= {'facing_trial': 0, 'absence_time': 0}
         for name, bound in least.items():
             if not getattr(self, name) >= bound:
                 raise ValueError(f'{name} must be at least {bound}, saw {getattr(self, name)}')

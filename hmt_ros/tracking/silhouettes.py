@@ -79,8 +79,11 @@ class Silhouettes:
         return self.background.split(image, region)
 
     def check(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
-        """Doubts the background if too little of the person, in poses (K, d), is foreground."""
-        if not self.background.frames:
+        """Doubts the background if too little of the person, in poses (K, d), is foreground.
+
+        One that was given and not learned is the empty scene: then nobody is there.
+        """
+        if not self.background.frames or not self._learning:
             return
         inside = _resized(_area(body, camera, poses), -INSIDE)
         if not inside.any():

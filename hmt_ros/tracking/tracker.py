@@ -23,6 +23,7 @@ from hmt_ros.image.observation import Box, Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.facing import Track
 from hmt_ros.tracking.hypotheses import Modes
@@ -32,13 +33,24 @@ from hmt_ros.tracking.initialisation import (
     start_from_keypoints,
 )
 from hmt_ros.tracking.point_estimate import PointEstimate
+from hmt_ros.tracking.prediction import predict
+from hmt_ros.tracking.presence import (
+    FEWEST_KEYPOINTS,
+    MOST_CHANGED,
+    ROUNDING,
+    Presence,
+    View,
+    looks_like_person,
+    sees_person,
+)
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.silhouettes import Silhouettes
 from hmt_ros.tracking.subject import Subject
 
-# Fewest keypoints from which a lost track starts anew.
-FEWEST_KEYPOINTS = 6
+# A new track starts when somebody has been seen for so long, s; if a side of the image may cut the
+# silhouette, when it has been seen for the longer time.
+ARRIVAL, ARRIVAL_AT_BORDER = 0.2, 0.6
 # The person may be where modes say that have at least this log weight, nats; the sign is changed.
 LIKELY = 4.0
 # Margin around all joints of all modes, as a fraction of their extent: where the silhouette may be.
@@ -51,6 +63,7 @@ class Status(Enum):
     WAITING = 'waiting'  # for the image that the subject's joints were seen in
     TRACKING = 'tracking'
     LOST = 'lost'
+    NOBODY = 'nobody'  # is in view
 
 
 class _Beginning(NamedTuple):
@@ -83,6 +96,8 @@ class Tracker:
 
     Attributes:
         silhouettes: where those of the images come from.
+        evaluations: of the likelihood in the last image.
+        track_id: number of the present track, or of the last one; 0 before the first.
     """
 
     def __init__(
@@ -99,13 +114,17 @@ class Tracker:
         self.camera = camera
         self.silhouettes = Silhouettes(background or BackgroundModel())
         self.evaluations = 0
+        self.track_id = 0
         self._seed = seed
         self._start: Subject | GaussianMixture | None = None
         self._extra = tuple(extra)
         self._track = self._new_track(body)
         self._point = PointEstimate()
+        self._presence = Presence(self.settings.absence_time)
+        self._arrived: int | None = None
         self._last_image: Image | None = None
         self._last_stamp: int | None = None
+        self._followed: int | None = None
 
     def reset(self, start: Subject | GaussianMixture | None = None) -> None:
         """Drops the track; the next image starts a new one.
@@ -121,9 +140,9 @@ class Tracker:
             )
         if start is not None:
             self._start = start
-        self._track = self._new_track(self.body)
-        self._point = PointEstimate()
-        self._last_image, self._last_stamp = None, None
+        self._drop_track()
+        self._presence = Presence(self.settings.absence_time)
+        self._last_stamp = None
 
     def step(
         self,
@@ -132,23 +151,28 @@ class Tracker:
         keypoints: Keypoints | None = None,
         prediction: PosePrediction | None = None,
         mask: Mask | None = None,
+        *,
+        nobody_predicted: bool = False,
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """Takes the next image.
 
         Args:
             image: (H, W, 3) BGR uint8, of the camera's size.
             stamp: of the image, ns; later than the one before.
-            keypoints: joints seen in this image, if any.
+            keypoints: joints seen in this image; without any that was seen: the detector saw
+                nobody. None: there is no detector, or it has not answered.
             prediction: poses that a regression expects by this image, if any. They start a track
                 that has no other start, with the lengths that they assume, are among the hypotheses
                 of every image, and of a lost track; they are no evidence, which would count the
                 image twice.
             mask: (H, W) where a segmenter sees the person, which replaces background subtraction;
                 all false: it sees nobody; None: unknown.
+            nobody_predicted: whether that regression saw nobody in this image.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses,
-            heaviest first with weights that sum to 1; (None, None) while there is no track.
+            heaviest first with weights that sum to 1; (None, None) while there is no track, before
+            the first or because nobody is in view.
 
         Raises:
             ValueError: an image or a mask of another size, a stamp that does not increase, or a
@@ -163,33 +187,11 @@ class Tracker:
             raise ValueError(f'the camera gives images of {size}, saw a mask of {mask.shape}')
         if self._last_stamp is not None and stamp <= self._last_stamp:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
-        if self._track.begun:
-            observation = self._observe(image, keypoints, mask)
-            self._follow(observation, stamp, prediction)
-        else:
-            start = self._start_at(stamp, prediction)
-            if start is None:
-                self.evaluations = 0
-                self.silhouettes.learn(image, mask)
-                return None, None
-            beginning = self._beginning(start, keypoints)
-            if mask is None:
-                self.silhouettes.check(image, beginning.body, self.camera, beginning.best)
-            observation = self._observe(image, keypoints, mask)
-            self._begin(observation, beginning, stamp)
-            if not self._track.believes_silhouettes:
-                # The start is where the person is; the silhouette is not.
-                observation = self._observe(image, keypoints, mask)
-                self._begin(observation, beginning, stamp)
-        if mask is None:
-            likely = self.modes.log_weights > -LIKELY
-            self.silhouettes.complete(image, self.body, self.camera, self.modes.poses[likely])
-        dt = 0.0 if self._last_stamp is None else (stamp - self._last_stamp) * 1e-9
-        modes = self._track.modes
-        self._point.update(self.body, modes.poses, np.exp(modes.log_weights), dt)
-        self._last_image, self._last_stamp = image, stamp
-        self.evaluations = self._track.evaluations
-        return self.posterior, self._track.likelihood_mixture(observation)
+        self.evaluations = 0
+        view = self._view(image, keypoints, mask, nobody_predicted)
+        found = self._take(view, stamp, prediction, masked=mask is not None)
+        self._last_stamp = stamp
+        return found
 
     @property
     def background(self) -> BackgroundModel:
@@ -199,6 +201,8 @@ class Tracker:
     @property
     def status(self) -> Status:
         """What the tracker is doing."""
+        if self._presence.absent:
+            return Status.NOBODY
         if not self._track.begun:
             return Status.WAITING
         return Status.LOST if self._track.lost else Status.TRACKING
@@ -241,6 +245,115 @@ class Tracker:
     def _new_track(self, body: Body) -> Track:
         return Track(body, self.camera, self.settings, self._seed, self._extra)
 
+    def _drop_track(self) -> None:
+        """Keeps nothing but the body."""
+        self._track = self._new_track(self.body)
+        self._point = PointEstimate()
+        self._arrived = None
+        self._last_image, self._followed = None, None
+
+    def _take(
+        self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool
+    ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
+        """See `step`."""
+        if self._track.begun:
+            seen = self._is_seen(view, stamp)
+            if self._presence.absent:
+                self._drop_track()
+                return None, None
+            if not seen and view.silhouette is not None:
+                # Nothing is there to fit modes to.
+                return self._expected(stamp), self._track.likelihood_mixture(Observation())
+            observation = self._observe(view)
+            self._follow(observation, stamp, prediction)
+        else:
+            begun = self._start_track(view, stamp, prediction, masked=masked)
+            if begun is None:
+                return None, None
+            observation = begun
+        if not masked:
+            likely = self.modes.log_weights > -LIKELY
+            poses = self.modes.poses[likely]
+            self.silhouettes.complete(view.image, self.body, self.camera, poses)
+        dt = 0.0 if self._followed is None else (stamp - self._followed) * 1e-9
+        self._point.update(self.body, self.modes.poses, np.exp(self.modes.log_weights), dt)
+        self._last_image, self._followed = view.image, stamp
+        self.evaluations = self._track.evaluations
+        return self.posterior, self._track.likelihood_mixture(observation)
+
+    def _start_track(
+        self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool
+    ) -> Observation | None:
+        """Starts a track, if it starts at this image; returns what it was started with."""
+        if self._presence.absent:
+            if not self._has_arrived(view, stamp, prediction):
+                return None
+            observation = self._observe(view)
+            self._begin_next(observation, stamp, prediction)
+        else:
+            start = self._start_at(stamp, prediction)
+            if start is None:
+                mask = view.silhouette if masked else None
+                self.silhouettes.learn(view.image, mask)
+                return None
+            beginning = self._beginning(start, view.keypoints)
+            if not masked:
+                self.silhouettes.check(view.image, beginning.body, self.camera, beginning.best)
+                if self.silhouettes.doubted:
+                    view = view._replace(silhouette=None, unsure=None)
+            observation = self._observe(view)
+            self._begin(observation, beginning, stamp)
+            if not self._track.believes_silhouettes:
+                # The start is where the person is; the silhouette is not.
+                observation = self._observe(view)
+                self._begin(observation, beginning, stamp)
+        self.track_id += 1
+        self._presence = Presence(self.settings.absence_time)
+        self._is_seen(view, stamp)
+        return observation
+
+    def _expected(self, stamp: int) -> GaussianMixture:
+        """The posterior of a time at which nothing is seen."""
+        assert self._followed is not None
+        s, modes, body = self.settings, self.modes, self.body
+        dt = (stamp - self._followed) * 1e-9
+        moved, _ = predict(modes, body, dt, s.velocity_kept)
+        dynamics = LinearGaussianDynamics.random_walk(body.rates)
+        _, covariances = dynamics.predict(modes.poses, modes.covariances, dt)
+        return GaussianMixture(self.posterior.weights, moved.poses, covariances)
+
+    def _is_seen(self, view: View, stamp: int) -> bool:
+        return self._presence.sees(view, stamp, self.body, self.camera, self.modes.poses[0])
+
+    def _has_arrived(self, view: View, stamp: int, prediction: PosePrediction | None) -> bool:
+        """Whether somebody has been in view for long enough to start the next track."""
+        if not self._shows_somebody(view, prediction):
+            self._arrived = None
+            return False
+        if self._arrived is None:
+            self._arrived = stamp
+        wanted = ARRIVAL
+        if view.silhouette is not None and view.silhouette[:, [0, -1]].any():
+            wanted = ARRIVAL_AT_BORDER
+        return (stamp - self._arrived) * 1e-9 + ROUNDING >= wanted
+
+    def _begin_next(
+        self, observation: Observation, stamp: int, prediction: PosePrediction | None
+    ) -> None:
+        """Starts a track of who has come into view."""
+        poses = self._poses_to_search(observation, prediction)
+        assert poses is not None
+        both_ways = observation.keypoints is None
+        self._track.begin(self.body, poses, observation, stamp, both_ways=both_ways)
+
+    def _shows_somebody(self, view: View, prediction: PosePrediction | None) -> bool:
+        """Whether somebody is in an image, of whom a track does not know yet."""
+        if sees_person(view.keypoints):
+            return True
+        if view.silhouette is None:
+            return prediction is not None
+        return view.changed <= MOST_CHANGED and looks_like_person(view.silhouette)
+
     def _start_at(
         self, stamp: int, prediction: PosePrediction | None
     ) -> Subject | GaussianMixture | PosePrediction | None:
@@ -271,10 +384,10 @@ class Tracker:
         self, observation: Observation, stamp: int, prediction: PosePrediction | None
     ) -> None:
         """Takes the next image of a track."""
-        assert self._last_stamp is not None
+        assert self._followed is not None
         poses = self._poses_to_search(observation, prediction) if self._track.lost else None
         if poses is None:
-            dt = (stamp - self._last_stamp) * 1e-9
+            dt = (stamp - self._followed) * 1e-9
             self._track.propagate(observation, stamp, dt, prediction)
         else:
             both_ways = observation.keypoints is None
@@ -298,23 +411,36 @@ class Tracker:
             found.append(prediction.both_ways(self.body).means)
         return np.concatenate(found) if found else None
 
-    def _observe(self, image: Image, keypoints: Keypoints | None, mask: Mask | None) -> Observation:
+    def _view(
+        self,
+        image: Image,
+        keypoints: Keypoints | None,
+        mask: Mask | None,
+        nobody_predicted: bool,
+    ) -> View:
         t = self.settings.likelihood
-        shape = t.containment.weight > 0 or t.coverage.weight > 0
+        found, changed = None, 0.0
+        if t.containment.weight > 0 or t.coverage.weight > 0:
+            found = self.silhouettes.silhouette(image, mask, self._region())
+            changed = 0.0 if found is None or mask is not None else self.background.changed
+        foreground, unsure = (None, None) if found is None else found
+        return View(image, foreground, changed, keypoints, nobody_predicted, unsure)
+
+    def _observe(self, view: View) -> Observation:
+        t = self.settings.likelihood
         textured = any(getattr(t, term.name).weight > 0 for term in TERMS if term.needs_texture)
         wanted = {'containment', 'coverage'}
         wanted |= {term.name for term in TERMS if getattr(t, term.name).weight > 0}
         wanted |= {'intensity'} if textured else set()  # the textures hold it
-        silhouette = None
-        if shape:
-            silhouette = self.silhouettes.silhouette(image, mask, self._region())
-        foreground, unsure = (None, None) if silhouette is None else silhouette
-        believed = foreground if self._track.believes_silhouettes else None
+        keypoints = view.keypoints
+        if keypoints is not None and not keypoints.seen.any():
+            keypoints = None
+        believed = view.silhouette if self._track.believes_silhouettes else None
         found = observe(
-            image, believed, keypoints,
-            last_image=self._last_image, wanted=wanted, unsure=unsure,
+            view.image, believed, keypoints,
+            last_image=self._last_image, wanted=wanted, unsure=view.unsure,
         )  # fmt: skip
-        return replace(found, foreground=foreground)
+        return replace(found, foreground=view.silhouette)
 
     def _region(self) -> Box | None:
         """Where the person can be in the next image; None: anywhere."""

@@ -401,3 +401,29 @@ def test_wrong_arguments_are_one_line(arguments, message, executable):
     line = executable('filter_node', *arguments).refusal()
     assert line.startswith('filter_node: ')
     assert message in line
+
+
+def test_an_empty_view_is_a_warning_and_no_error(running, small_camera, stub_tracker):
+    from hmt_msgs.msg import PoseMixture
+    from visualization_msgs.msg import Marker, MarkerArray
+
+    mixtures, markers = [], []
+    running.listen(PoseMixture, 'pose_mixture', mixtures)
+    running.listen(MarkerArray, 'markers', markers)
+    running.spin_until(lambda: running.node._is_wanted('pose_mixture'))
+    running.spin_until(lambda: running.node._is_wanted('markers'))
+    running.send('camera_info', small_camera.info())
+    stub_tracker.empty |= {small_camera.stamp(index) for index in (1, 2)}
+    outcomes = [published(running.send('image', small_camera.image(i))) for i in range(4)]
+    assert outcomes[1:] == [['pose_mixture', 'markers'], [], ['pose_mixture', 'markers']]
+    running.spin_until(lambda: len(mixtures) == len(markers) == 3)
+    assert [len(message.components) for message in mixtures] == [2, 0, 2]
+    assert {marker.action for marker in markers[1].markers} == {Marker.DELETE}
+    told = [
+        (status.level[0], status.message)
+        for array in running.diagnostics
+        for status in array.status
+        if {x.key: x.value for x in status.values}.get('status') == 'nobody'
+    ]
+    assert set(told) == {(1, 'nobody in view')}
+    assert running.diagnosis()[2]['track'] == '2'

@@ -29,6 +29,7 @@ class StubTracker:
     """What `hmt_ros.tracking.Tracker` shows to the outside; its two modes are where it was told."""
 
     made: list[StubTracker] = []  # noqa: RUF012
+    empty: set[int] = set()  # noqa: RUF012  # stamps of images without a person
     fault: Exception | None = None
 
     def __init__(self, body, camera, settings=None, background=None, seed=0):
@@ -37,9 +38,11 @@ class StubTracker:
         self.background = background
         self.silhouettes = SimpleNamespace(doubted=False, share=0.9, known='known')
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
+        self.track_id = 0
         self.seen: list[tuple[int, Any]] = []
         self.predictions: list[PosePrediction | None] = []
         self.masks: list[Any] = []
+        self.nobody_predicted: list[bool] = []
         self._start = None
         StubTracker.made.append(self)
 
@@ -55,7 +58,9 @@ class StubTracker:
         start = self._start
         return self.body.prior_mean if isinstance(start, Subject) else start.means[0]
 
-    def step(self, image, stamp, keypoints=None, prediction=None, mask=None):
+    def step(
+        self, image, stamp, keypoints=None, prediction=None, mask=None, *, nobody_predicted=False
+    ):
         assert image.shape == (self.camera.height, self.camera.width, 3)
         if self.fault is not None:
             raise self.fault
@@ -68,6 +73,11 @@ class StubTracker:
         self.seen.append((stamp, keypoints))
         self.predictions.append(prediction)
         self.masks.append(mask)
+        self.nobody_predicted.append(nobody_predicted)
+        if stamp in self.empty:
+            self.status = Status.NOBODY
+            return None, None
+        self.track_id += self.status is not Status.TRACKING
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.125, 7
         means = np.tile(self.body.prior_mean, (2, 1))
         means[:, 2] = 4.0
@@ -84,6 +94,7 @@ def stub_tracker(monkeypatch):
     monkeypatch.setattr(track_start, 'Tracker', StubTracker)
     monkeypatch.setattr(StubTracker, 'made', [])
     monkeypatch.setattr(StubTracker, 'fault', None)
+    monkeypatch.setattr(StubTracker, 'empty', set())
     return StubTracker
 
 

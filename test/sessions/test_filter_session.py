@@ -16,7 +16,7 @@ from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.track_start import prepare_start
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
-from test.sessions.conftest import Likelihoods
+from test.sessions.conftest import JOINTS, Likelihoods
 
 MIXTURES = ['pose_mixture', 'likelihood_mixture']
 STARTS = ['body', 'human_description']
@@ -237,6 +237,49 @@ def test_messages_that_can_not_be_read_are_counted(session):
     assert one.state.faults == {'message': 2}
 
 
+# Nobody in view.
+
+
+def read(output):
+    return deserialise(output.data, TOPICS[output.topic].msgtype)
+
+
+def test_nobody_in_view_is_told_once(session, outputs, small_camera, stub_tracker):
+    one = session(max_hypotheses=3)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    stub_tracker.empty |= {small_camera.stamp(index) for index in (1, 2)}
+    del outputs[:]
+    handled = [one.take(IMAGE, small_camera.image(index)) for index in (1, 2)]
+    shown = [*MIXTURES, 'markers', 'overlay/compressed']
+    assert handled[0].published == tuple((topic, small_camera.stamp(1)) for topic in shown)
+    assert handled[1].published == ()
+    assert handled[0].faults == handled[0].warnings == ()
+    messages = {output.topic: read(output) for output in outputs}
+    for topic, kind in zip(MIXTURES, (MixtureKind.POSTERIOR, MixtureKind.LIKELIHOOD), strict=True):
+        content = pose_mixture_of(messages[topic])
+        assert (len(content.weights), content.kind, content.frame_id) == (0, kind, 'lens')
+    removed = {(marker.ns, marker.id): marker.action for marker in messages['markers'].markers}
+    assert removed == {(f'mode_{rank}', key): 2 for rank in range(3) for key in (0, 1)}
+    state = one.state
+    assert (state.status, state.trouble(), state.wants) == ('nobody', 'nobody in view', '')
+    assert (state.modes, state.track_id, state.counts['tracked']) == (0, 1, 1)
+    # The next person is another track of the same body.
+    handled = one.take(IMAGE, small_camera.image(3))
+    assert [topic for topic, _ in handled.published] == ONE_IMAGE
+    assert (one.state.status, one.state.track_id) == ('tracking', 2)
+    assert one.state.trouble() == ''
+
+
+def test_an_empty_view_that_nobody_wants_to_see(session, outputs, small_camera, stub_tracker):
+    one = session(wanted=lambda topic: topic == 'joint_states')
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    stub_tracker.empty.add(small_camera.stamp(1))
+    assert one.take(IMAGE, small_camera.image(1)).published == ()
+    assert one.state.status == 'nobody'
+
+
 # Keypoints.
 
 
@@ -296,7 +339,8 @@ def test_images_wait_for_keypoints(session, small_camera, stub_tracker, outputs)
     assert tracked(outputs)[3:] == []
     one.take(KEYPOINTS, small_camera.keypoints(5))
     assert tracked(outputs)[3:] == [small_camera.stamp(i) for i in (3, 4, 5)]
-    assert [names is None for names in seen(stub_tracker)] == [True] * 5 + [False]
+    # Nobody seen is not the same as no answer.
+    assert seen(stub_tracker) == [None, (), None, None, None, JOINTS]
 
 
 def test_last_keypoints_of_a_stamp_count(session, small_camera, stub_tracker):
@@ -498,9 +542,9 @@ def test_a_person_in_the_background_is_told(session, small_camera, stub_tracker)
     assert one.state.trouble() == ''
     step = stub_tracker.step
 
-    def doubts(self, *arguments):
+    def doubts(self, *arguments, **named):
         self.silhouettes = SimpleNamespace(doubted=True, share=0.123, known='forgotten')
-        return step(self, *arguments)
+        return step(self, *arguments, **named)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stub_tracker, 'step', doubts)
@@ -537,6 +581,7 @@ def test_predictions_start_a_track(session, small_camera, likelihoods, stub_trac
         list(first.body.segment_lengths.values()), list(likelihoods.body.segment_lengths.values())
     )
     assert second is None
+    assert stub_tracker.made[0].nobody_predicted == [False, True]
 
 
 def test_images_wait_for_predictions(session, small_camera, likelihoods, outputs):

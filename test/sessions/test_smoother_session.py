@@ -190,6 +190,29 @@ def test_a_new_body_begins_a_new_window(session, outputs, likelihoods):
     assert windows[2].segment_lengths == other.segment_lengths
 
 
+def test_nobody_in_view_ends_the_window(session, outputs, likelihoods):
+    one = session(longest_interval=0.5)
+    for index in range(3):
+        one.take(MIXTURE, likelihoods.message(index))
+    del outputs[:]
+    nobody = change(likelihoods.message(4), components=[])
+    handled = one.take(MIXTURE, nobody)
+    assert handled.faults == handled.warnings == ()
+    # The poses that were still open, and that there are no more.
+    assert smoothed(outputs) == [likelihoods.stamp(index) for index in (1, 2, 4)]
+    *_, last = read(outputs, 'smoothed_pose_mixture')
+    assert (len(last.components), last.kind) == (0, int(MixtureKind.SMOOTHED))
+    (markers,) = read(outputs, 'trajectory_markers')
+    assert {marker.action for marker in markers.markers} == {2}
+    assert (one.state.status, one.state.trouble()) == ('nobody', 'nobody in view')
+    # A second one tells nothing new, and what comes after a while is no gap to bridge.
+    assert one.take(MIXTURE, change(likelihoods.message(5), components=[])).published == ()
+    handled = one.take(MIXTURE, likelihoods.message(30))
+    assert handled.faults == handled.warnings == ()
+    assert (one.state.status, one.state.window, one.state.gaps) == ('smoothing', 1, 0)
+    assert one.state.counts == {'received': 6, 'smoothed': 4}
+
+
 def change(message, **fields):
     for name, value in fields.items():
         setattr(message, name, value)
@@ -210,7 +233,10 @@ def nan_in_mean(message):
 
 
 BAD = {
-    'no components': (lambda m: change(m, components=[]), 'mixture has no components'),
+    'no components': (
+        lambda m: change(m, components=[], kind=int(MixtureKind.PREDICTION)),
+        'mixture has no components',
+    ),
     'dof_names': (
         lambda m: change(m, dof_names=[*m.dof_names[:-1], 'tail']),
         "has 'tail' at 36, wanted ",

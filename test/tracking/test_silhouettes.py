@@ -121,9 +121,14 @@ def test_a_background_with_the_person_in_it_is_noticed_and_mended(crossing, huma
 def test_backgrounds_that_are_not_doubted(crossing, human32, camera):
     """An empty scene; nothing learned; nobody in view."""
     poses, images, empty = crossing
-    known = Silhouettes(BackgroundModel.from_image(empty))
-    known.learn(images[0], None)
-    assert known.background.frames == 1
+    given = Silhouettes(BackgroundModel.from_image(empty))
+    given.learn(images[0], None)
+    assert given.background.frames == 1
+    # Nobody is before an empty scene that was given.
+    given.check(empty, human32, camera, poses[:1])
+    assert not given.doubted
+    known = Silhouettes(BackgroundModel())
+    known.learn(empty, None)
     known.check(images[0], human32, camera, poses[:1])
     assert known.share > 0.9
     assert known.silhouette(images[0], None, None).foreground.any()

@@ -95,9 +95,7 @@ class CovarianceScaledSamples:
         )
         kept = choose_hypotheses(
             relative_joints(body, poses),
-            weigh(
-                sources.log_weights[rows], energies, self.posterior.trust.inverse_temperature
-            ),
+            weigh(sources.log_weights[rows], energies, self.posterior.trust.inverse_temperature),
             s.candidates,
             same=s.hypothesis_merge_distance,
         ).chosen

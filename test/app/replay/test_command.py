@@ -74,6 +74,7 @@ class StandingStill:
     def __init__(self, body, camera, settings, background, seed):
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
+        self.track_id = 1
         self.keypoints, self.predictions, self.masks = [], [], []
         self.silhouettes = SimpleNamespace(doubted=False, known='known')
         StandingStill.made.append(self)
@@ -91,7 +92,9 @@ class StandingStill:
     def point_estimate(self):
         return self.body.prior_mean
 
-    def step(self, image, stamp, keypoints=None, prediction=None, mask=None):
+    def step(
+        self, image, stamp, keypoints=None, prediction=None, mask=None, *, nobody_predicted=False
+    ):
         self.keypoints.append(None if keypoints is None else keypoints.names)
         self.predictions.append(prediction)
         self.masks.append(None if mask is None else int(mask.sum()))

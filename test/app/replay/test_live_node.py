@@ -5,6 +5,7 @@ import socket
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -97,6 +98,40 @@ def test_same_without_a_subject(tmp_path, capsys):
     assert one[0] == 0
     for topic in ('pose_prediction', 'pose_mixture'):
         assert len(messages(offline, topic)) == 3
+    assert content(offline) == content(live)
+
+
+def test_same_of_a_person_who_leaves_and_returns(tmp_path, capsys):
+    """One mixture without components, once, and a new track."""
+    entries, period = recorded(3), 10**9 // 15
+    images = [(x[1], decode_image(x[2])) for x in entries if x[0] == 'image/compressed']
+    empty = cv2.imread(str(REACH / 'background.png'))
+    shown = [*(image for _, image in images), *[empty] * 5, *[images[0][1]] * 5]
+    camera = next(x for x in entries if x[0] == 'camera_info')
+    stamps = [images[0][0] + i * period for i in range(len(shown))]
+    pictures = [
+        ('image', stamp, image_message(MESSAGES, picture, stamp, ''))
+        for stamp, picture in zip(stamps, shown, strict=True)
+    ]
+    bag = write(tmp_path / 'bag', [camera, *pictures])
+    options = ['--set', 'max_hypotheses=2', '--set', 'candidates=3', '--set', 'absence_time=0.2']
+    options += ['--set', 'facing_trial=0.0', '--set', 'smoother.fixed_lag=1']
+    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
+    assert one == other
+    assert one[0] == 0
+    assert '7 of 13 images tracked' in one[1]
+    for topic in ('pose_mixture', 'likelihood_mixture', 'smoothed_pose_mixture'):
+        with BagReader(offline) as bag_out:
+            found = [
+                (stamps.index(stored.log_time_ns), len(stored.message.components))
+                for stored in bag_out.messages([topic])
+            ]
+        # The person is there in 0 to 2 and from 8 on; who comes is watched for 0.2 s.
+        assert [index for index, _ in found] == [0, 1, 2, 3, 4, 5, 11, 12]
+        assert [index for index, count in found if count == 0] == [5]
+    for topic in ('joint_states', '/tf'):
+        assert len(messages(offline, topic)) == 7
+    assert [stamps.index(stamp) for stamp, _ in messages(offline, 'markers')][5] == 5
     assert content(offline) == content(live)
 
 
