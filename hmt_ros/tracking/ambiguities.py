@@ -28,7 +28,7 @@ def ambiguity_classes(body: Body, poses: Array, reference: Array) -> Index:
         return joints[:, body.skeleton.joint_index([name])[0]]
 
     left = at('left_shoulder') + at('left_hip') - at('right_shoulder') - at('right_hip')
-    result = (left[1:] @ left[0] < 0).astype(np.intp)
+    result: Index = (left[1:] @ left[0] < 0).astype(np.intp)
     ray = joints[:, 0] / np.linalg.norm(joints[:, 0], axis=1, keepdims=True)
     trunk = at('neck') - joints[:, 0]
     lean = (trunk * ray).sum(1) / np.linalg.norm(trunk, axis=1)

@@ -437,7 +437,7 @@ class MixtureFilter:
         odds, solved = self._facing, optimised.minima
         poses = solved.x[usable]
         back = odds.back(self.body, poses)
-        known = ~optimised.hypotheses.jumped[usable].all(1)
+        known = np.asarray(~optimised.hypotheses.jumped[usable].all(1), dtype=np.bool_)
         gamma = self.settings.facing_gain * self._posterior.trust.inverse_temperature
         odds.update(back, solved.value[usable], known, poses[0, :3], gamma)
         log_weights = odds.shared(back, log_weights)

@@ -1,7 +1,7 @@
 """How far the silhouette is believed on each segment of the body.
 
-    recall_s <- recall_s + gain (m_s - recall_s),      m_s = share of the visible points of s that lie
-                                                             in the foreground
+    recall_s <- recall_s + gain (m_s - recall_s)    m_s: share of the visible points of segment s
+                                                    that lie in the foreground
     belief_s = clip((recall_s - low) / (high - low), 0, 1)
 
 Clothes in the colours of the scene are no foreground where the person is: the silhouette has holes,

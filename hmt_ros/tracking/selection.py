@@ -72,7 +72,8 @@ def heads_of_classes(classes: Index, log_weights: Array, reach: float, most: int
         most: how many.
     """
     order = np.argsort(-log_weights, kind='stable')
-    seen, result = {int(classes[order[0]])}, []
+    seen = {int(classes[order[0]])}
+    result: list[int] = []
     for i in order[1:]:
         if log_weights[i] < log_weights[order[0]] - reach or len(result) == most:
             break
