@@ -3,7 +3,7 @@
 predict     x_k | ancestor       motion prior, optical flow                       prediction
 propose     x_k^0                jumps, samples, predictions of others            proposals
 optimise    x_k = argmin E(x)    bounded Newton from x_k^0                        posterior
-weigh       log w_k = log p(ancestor) + log p(jumps) - beta E(x_k)                weighting
+weigh       log w_k = log p(ancestor) + log p(jumps) - beta E(x_k)                weighting, trust
 select      K of N hypotheses    the least expected distance to one that is kept  selection
 """
 

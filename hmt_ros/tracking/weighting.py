@@ -1,9 +1,11 @@
 """The weight of a hypothesis (KJS figure 4, steps 4 and 5).
 
-    log w_k = log p(ancestor) + log p(jumps) - beta E(x_k)                                     (1)
+    log w_k = log p(ancestor) + log p(jumps) - beta (E(x_k) - rho min(e_k, e_ancestor))        (1)
 
 E is the energy of the posterior at the optimum x_k, motion prior included. The inverse temperature
-beta is below 1, because neighbouring measurements of an image err together. The normaliser
+beta is below 1, because neighbouring measurements of an image err together; errors also last from
+image to image, so that of the excess e over the least energy only what is new counts (`trust`). The
+two ways to face have odds of their own (`facing_odds`). The normaliser
 |S_k|^(1/2) of a mode is left out, as in the paper: the Hessian shows how well the image fixes a
 pose, and what it fixes badly (depth, a limb behind the trunk) would gain weight by being unseen.
 
