@@ -86,18 +86,23 @@ def heads_of_classes(classes: Index, log_weights: Array, reach: float, most: int
 @njit(cache=True, nogil=True)
 def _choose(joints, weights, count, same, cap, first):  # type: ignore[no-untyped-def]
     n, j = joints.shape[0], joints.shape[1]
-    distance = np.zeros((n, n))
+    # One row a coordinate, so that the innermost loops run along memory.
+    rows = np.ascontiguousarray(joints.reshape(n, 3 * j).T)
+    distance = np.empty((n, n))
     for a in range(n):
-        for b in range(a):
-            total = 0.0
-            for k in range(j):
-                x = joints[a, k, 0] - joints[b, k, 0]
-                y = joints[a, k, 1] - joints[b, k, 1]
-                z = joints[a, k, 2] - joints[b, k, 2]
-                total += min(np.sqrt(x * x + y * y + z * z), cap)
-            distance[a, b] = max(total / j - same, 0.0)
-            distance[b, a] = distance[a, b]
+        total = distance[a]
+        total[:] = 0.0
+        for k in range(j):
+            xs, ys, zs = rows[3 * k], rows[3 * k + 1], rows[3 * k + 2]
+            xa, ya, za = xs[a], ys[a], zs[a]
+            for b in range(n):
+                x, y, z = xa - xs[b], ya - ys[b], za - zs[b]
+                gap = np.sqrt(x * x + y * y + z * z)
+                total[b] += gap if gap < cap else cap
+        for b in range(n):
+            total[b] = max(total[b] / j - same, 0.0)
     nearest = np.full(n, cap)
+    gains = np.full(n, np.inf)
     chosen = np.empty(min(count, n), np.intp)
     owner = np.zeros(n, np.intp)
     kept = 0
@@ -108,14 +113,24 @@ def _choose(joints, weights, count, same, cap, first):  # type: ignore[no-untype
         elif kept <= len(first):
             best = first[kept - 1]
         else:
-            for c in range(n):
-                if nearest[c] == 0.0:
-                    continue  # the same as one that is kept
+            # Gains only shrink as more are kept: a candidate whose last gain is no larger than the
+            # best of this round need not be looked at again.
+            likely = int(np.argmax(gains))
+            for turn in range(-1, n):
+                c = likely if turn < 0 else turn
+                if (
+                    turn == likely
+                    or nearest[c] == 0.0  # the same as one that is kept
+                    or gains[c] < best_gain
+                    or (gains[c] == best_gain and c > best >= 0)
+                ):
+                    continue
                 gain = 0.0
+                away = distance[c]
                 for i in range(n):
-                    if distance[i, c] < nearest[i]:
-                        gain += weights[i] * (nearest[i] - distance[i, c])
-                if gain > best_gain:
+                    gain += weights[i] * max(nearest[i] - away[i], 0.0)
+                gains[c] = gain
+                if gain > best_gain or (gain == best_gain and gain > 0.0 and c < best):
                     best, best_gain = c, gain
         if best < 0:
             break
