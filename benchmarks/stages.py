@@ -20,7 +20,7 @@ from hmt_ros.tracking.proposals.sampling import CovarianceScaledSamples
 # Part of the tracker -> name of the stage; time in a part that another part calls is its own.
 Stages = Sequence[tuple[Any, str, str]]
 STAGES: Stages = (
-    (BackgroundModel, 'silhouette', 'background'),
+    (BackgroundModel, 'split', 'background'),
     (tracker_module, 'observe', 'observation'),
     (Track, 'begin', 'start of the track'),
     (filter_module, 'follow_flow', 'motion'),

@@ -284,7 +284,7 @@ def test_keypoints_of_the_bag_are_used(still, entries, tmp_path):
     bag = write(tmp_path / 'bag', sorted(entries + extra, key=lambda entry: entry[1]))
     options = [*SUBJECT, '--quiet', '-o']
     assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
-    assert still[-1].keypoints == [('head', 'left_hip', 'right_hip'), None]
+    assert still[-1].keypoints == [('head', 'left_hip', 'right_hip'), ()]
     assert len(read(tmp_path / 'out')['pose_mixture']) == IMAGES
     assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_keypoints=false']) == 0
     assert still[-1].keypoints == [None] * IMAGES
@@ -406,7 +406,7 @@ def test_the_bag_that_is_read_is_never_replaced(still, entries, tmp_path, capsys
 
 
 def test_interruption_leaves_nothing(short, tmp_path, monkeypatch, capsys):
-    def interrupted(self, image, stamp, keypoints=None, prediction=None, mask=None):
+    def interrupted(self, *_inputs, **_named):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(track_start, 'Tracker', StandingStill)
