@@ -62,10 +62,10 @@ def held_estimate(stub_tracker, monkeypatch, world):
     begun, go = threading.Event(), threading.Event()
     step = stub_tracker.step
 
-    def slow(self, *arguments):
+    def slow(self, *arguments, **named):
         begun.set()
         assert go.wait(PATIENCE)
-        return step(self, *arguments)
+        return step(self, *arguments, **named)
 
     monkeypatch.setattr(stub_tracker, 'step', slow)
     yield begun, go
