@@ -31,6 +31,7 @@ from test.sessions.conftest import (  # noqa: F401
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 60.0  # s
+DISCOVERY = 5.0  # s, after which a client that no service has answered is made once more
 
 
 class World:
@@ -121,9 +122,21 @@ class World:
         kind = getattr(import_module(f'{package}.msg'), name)
         return deserialize_message(serialise(message), kind)
 
+    def client(self, kind, service):
+        """A client that its service knows; discovery now and then loses one that is new."""
+        end = time.monotonic() + PATIENCE
+        while True:
+            client = self.other.create_client(kind, f'{self.name}/{service}')
+            again = time.monotonic() + DISCOVERY
+            while time.monotonic() < again:
+                if client.service_is_ready():
+                    return client
+                self.executor.spin_once(timeout_sec=0.05)
+            self.other.destroy_client(client)
+            assert time.monotonic() < end, f'waited in vain for {service}'
+
     def call(self, kind, service, **fields):
-        client = self.other.create_client(kind, f'{self.name}/{service}')
-        self.spin_until(client.service_is_ready, service)
+        client = self.client(kind, service)
         future = client.call_async(kind.Request(**fields))
         self.spin_until(future.done, f'an answer of {service}')
         self.other.destroy_client(client)
