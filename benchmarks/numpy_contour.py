@@ -24,6 +24,7 @@ class Contour:
         points: (2R, 3, N) camera frame, m.
         normals: (2R, 3, N) outward unit normals, camera frame; perpendicular to the ray.
         exists: (2R, N) false where a ring is seen from its end and has no contour.
+        turns: (2R, 2, N) cosine and sine of the angle around the ring.
     """
 
     segments: Index
@@ -32,6 +33,7 @@ class Contour:
     points: Array
     normals: Array
     exists: NDArray[np.bool_]
+    turns: Array
 
 
 def occluding_contour(flesh: Flesh, frames: Frames) -> Contour:
@@ -81,8 +83,9 @@ def occluding_contour(flesh: Flesh, frames: Frames) -> Contour:
     normals = c[:, 0] * normal[:, 0, None] + c[:, 1] * normal[:, 1, None]
     normals += c[:, 2] * normal[:, 2, None]
     return Contour(
-        both, np.tile(flesh.ring_parts, 2), local, points, normals, np.tile(exists, (2, 1))
-    )
+        both, np.tile(flesh.ring_parts, 2), local, points, normals, np.tile(exists, (2, 1)),
+        powers.reshape(count, 2, -1),
+    )  # fmt: skip
 
 
 def _bracketed_angles(

@@ -19,7 +19,7 @@ from hmt_ros.body.kinematics import Frames, assemble, forward, segment_sums
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import COVER, HIDDEN
+from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
 from hmt_ros.image.terms.edges import FEWEST
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.silhouette import SPACING, TURN, Outline
@@ -94,10 +94,12 @@ def _terms(
     body, camera, s = likelihood.body, likelihood.camera, likelihood.settings
     result: dict[str, Residuals] = {}
     surface = project_surface(body, camera, frames)
+    blur = observation.magnification * surface.noise
     seen = {k: v for k, v in observation.evidence.items() if getattr(s, k).weight > 0}
     for name, term in (('containment', containment), ('coverage', coverage), ('edges', edges)):
         if name in seen:
-            result[name] = term(surface, seen[name], getattr(s, name))
+            own = getattr(s, name)
+            result[name] = term(surface, seen[name], own, np.hypot(own.sigma, blur))
     if textures is None or which is None:
         return result
     for name, textured in (('intensity', intensity), ('motion', motion)):
@@ -191,7 +193,7 @@ class Surface:
         segments: (P,).
         points: (P, 3, N) camera frame, m.
         pixels, projection, normals: (2, P, N), (2, 3, P, N), (2, P, N).
-        valid, covered, hidden: (P, N), see `hmt_ros.image.surface.Contour`.
+        valid, covered, hidden, noise: (P, N), see `hmt_ros.image.surface.Contour`.
     """
 
     segments: Index
@@ -202,6 +204,7 @@ class Surface:
     valid: Mask
     covered: Mask
     hidden: Mask
+    noise: Array
 
 
 def project_surface(body: Body, camera: Camera, frames: Frames) -> Surface:
@@ -213,9 +216,11 @@ def project_surface(body: Body, camera: Camera, frames: Frames) -> Surface:
     normals = np.stack([contour.normals[:, 0] / camera.fx, contour.normals[:, 1] / camera.fy])
     normals /= np.maximum(np.hypot(normals[0], normals[1]), 1e-12)
     covered, hidden = visibility(body, frames, contour.points, contour.parts)
+    deviations = np.tile(flesh_table_of(body).ring_noise, (2, 1))
+    noise = np.sqrt(((contour.turns * deviations[..., None]) ** 2).sum(1))
     return Surface(
         contour.segments, contour.points, np.nan_to_num(pixels), np.nan_to_num(projection),
-        normals, valid, covered, hidden,
+        normals, valid, covered, hidden, noise,
     )  # fmt: skip
 
 
@@ -239,28 +244,33 @@ def visibility(body: Body, frames: Frames, points: Array, parts: Index) -> tuple
     return through.any(1).T, before.any(1).T
 
 
-def containment(surface: Surface, distance: ImageMap, term: TermSettings) -> Residuals:
+def containment(
+    surface: Surface, distance: ImageMap, term: TermSettings, sigma: Array
+) -> Residuals:
     """Contour points outside the silhouette pay their distance to it."""
     value, gradient = sample_distance(distance, surface.pixels)
     out = surface.valid & (value > 0)
-    residual = np.where(out, value / term.sigma, 0.0)
+    residual = np.where(out, value / sigma, 0.0)
     each = term.weight / len(residual)
     rho, pull, curvature = geman_mcclure(residual, term.scale, each)
     return Residuals(
         rho.sum(0), surface.segments, surface.points,
-        _through(gradient / term.sigma, surface.projection), pull, np.where(out, curvature, 0.0),
+        _through(gradient / sigma, surface.projection), pull, np.where(out, curvature, 0.0),
     )  # fmt: skip
 
 
-def coverage(surface: Surface, outline: Outline, term: TermSettings) -> Residuals:
+def coverage(
+    surface: Surface, outline: Outline, term: TermSettings, sigma: Array
+) -> Residuals:
     """Points on the outline pay their distance to the nearest contour of the model."""
     match = nearest_contour_points(surface, outline)  # (M, N)
     batch = np.arange(match.shape[1])
     offset = surface.pixels[:, match, batch] - outline.pixels.T[:, :, None]
     nx, ny = outline.normals.T[:, :, None]
-    across = (nx * offset[0] + ny * offset[1]) / term.sigma
+    sigma = sigma[match, batch]
+    across = (nx * offset[0] + ny * offset[1]) / sigma
     along = nx * offset[1] - ny * offset[0]
-    beyond = np.sign(along) * np.maximum(np.abs(along) - SPACING, 0.0) / term.sigma
+    beyond = np.sign(along) * np.maximum(np.abs(along) - SPACING, 0.0) / sigma
     # One kernel on the length of the two residuals together.
     each = term.weight / max(len(match), 1)
     rho, _, curvature = geman_mcclure(np.hypot(across, beyond), term.scale, each)
@@ -271,7 +281,8 @@ def coverage(surface: Surface, outline: Outline, term: TermSettings) -> Residual
     projection = surface.projection[:, :, match, batch]  # (2, 3, M, N)
     toward = nx * projection[0] + ny * projection[1]
     sideways = nx * projection[1] - ny * projection[0]
-    directions = np.concatenate([toward, sideways], axis=1).transpose(1, 0, 2) / term.sigma
+    directions = np.concatenate([toward, sideways], axis=1).transpose(1, 0, 2)
+    directions = directions / np.tile(sigma, (2, 1))[:, None]
     return Residuals(
         rho.sum(0),
         np.tile(surface.segments[match], (2, 1)),
@@ -306,7 +317,9 @@ def nearest_contour_points(surface: Surface, outline: Outline) -> Index:
     return np.ascontiguousarray((samples @ features).argmin(2).T)
 
 
-def edges(surface: Surface, image_map: ImageMap, term: TermSettings) -> Residuals:
+def edges(
+    surface: Surface, image_map: ImageMap, term: TermSettings, sigma: Array
+) -> Residuals:
     """Visible contour points pay their distance to the nearest edge of their direction."""
     bins = image_map.values.shape[0]
     angle = np.arctan2(surface.normals[1], surface.normals[0])
@@ -314,9 +327,9 @@ def edges(surface: Surface, image_map: ImageMap, term: TermSettings) -> Residual
     value, gradient = sample_distance(image_map, surface.pixels, channels)
     seen = surface.valid & ~surface.hidden
     each = np.where(seen, term.weight / np.maximum(seen.sum(0), FEWEST), 0.0)
-    residual = np.where(seen, value / term.sigma, 0.0)
+    residual = np.where(seen, value / sigma, 0.0)
     rho, pull, curvature = geman_mcclure(residual, term.scale, each)
-    directions = _through(gradient / term.sigma, surface.projection)
+    directions = _through(gradient / sigma, surface.projection)
     return Residuals(rho.sum(0), surface.segments, surface.points, directions, pull, curvature)
 
 

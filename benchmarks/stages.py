@@ -30,7 +30,7 @@ STAGES: Stages = (
     (KinematicJumps, '_rate', 'rating'),
     (Posterior, 'minimise', 'candidates'),
     (MixtureFilter, '_weigh_and_select', 'keeping'),
-    (MixtureFilter, '_fit_flesh', 'flesh'),
+    (MixtureFilter, '_fit_shape', 'shape'),
     (MixtureFilter, 'likelihood_mixture', 'likelihood modes'),
 )
 # In these, minimisation is part of the stage.

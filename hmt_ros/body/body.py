@@ -15,19 +15,28 @@ from hmt_ros.body.skeleton import Skeleton, sided_pairs
 from hmt_ros.inference.arrays import Array
 
 
+# How a part of the flesh differs from that of the model, column by column: logarithms of factors on
+# the x and y radii, distances by which it exceeds the start and the end of its segment more than
+# the model's, and its shift along the y axis, m.
+GROWTH = ('width', 'depth', 'start', 'end', 'shift')
+# Half of the least height of a part, m.
+LEAST_HEIGHT = 5e-3
+
+
 @dataclass(frozen=True)
 class PartShape:
     """How a part of the flesh follows from the lengths of the body.
 
     Attributes:
         segment: index of the segment that carries the part.
-        length: index of the length that the part spans; None for a part of fixed size.
+        length: index of the length that the part spans; None for a part of fixed proportions.
         centre: centre of the part in its segment's frame, m; with a length, its shift from the
             middle of that length.
         radii: semi-axes (x, y) with a length, else (x, y, z), m.
         exponents, taper, bend: shape parameters, as in `Superquadric`.
         extend: distances by which the part exceeds the start and the end of the length, m.
         rings: number of rings at which the contour of the part is sampled.
+        size: index of the length with which the part grows in all directions; None: the whole body.
     """
 
     segment: int
@@ -39,20 +48,30 @@ class PartShape:
     bend: tuple[float, float] = (0.0, 0.0)
     extend: tuple[float, float] = (0.0, 0.0)
     rings: int = 5
+    size: int | None = None
 
-    def part(self, lengths: Array, scale: float, width: float) -> Superquadric:
-        """The part at given lengths (L,), overall scale and width factor."""
-        start, end = (scale * x for x in self.extend)
+    def part(self, lengths: Array, scale: float, growth: Array) -> Superquadric:
+        """The part.
+
+        Args:
+            lengths: (L,) of the body, m.
+            scale: of the part against the model file.
+            growth: (5,) see `GROWTH`.
+        """
+        width, depth, more_start, more_end, shift = (float(x) for x in growth)
+        start, end = scale * self.extend[0] + more_start, scale * self.extend[1] + more_end
         cx, cy, cz = (scale * x for x in self.centre)
-        rx, ry = (scale * width * x for x in self.radii[:2])
+        rx, ry = (scale * x * float(np.exp(g)) for x, g in zip(self.radii, (width, depth)))
         if self.length is None:
-            rz = scale * self.radii[2]
+            rz = scale * self.radii[2] + 0.5 * (more_start + more_end)
+            cz += 0.5 * (more_start - more_end)
         else:
             span = float(lengths[self.length])
-            rz = max(0.5 * (span + start + end), 1e-3)
+            rz = 0.5 * (span + start + end)
             cz -= 0.5 * (span + end - start)
+        rz = max(rz, LEAST_HEIGHT)
         return Superquadric(
-            self.segment, (cx, cy, cz), (rx, ry, rz), self.exponents, self.taper, self.bend
+            self.segment, (cx, cy + shift, cz), (rx, ry, rz), self.exponents, self.taper, self.bend
         )
 
 
@@ -73,7 +92,7 @@ class Body:
         stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra (m,
             at the default lengths; it scales with them).
         default_lengths: (L,) lengths of the model file, m.
-        widths: factors on the x and y radii of each part.
+        growth: (B, 5) how each part differs from the model's; see `GROWTH`.
         keypoint_aliases: other names of joints, as keypoint detectors use them.
     """
 
@@ -86,14 +105,18 @@ class Body:
     stature_lengths: tuple[str, ...]
     stature_extra: float
     default_lengths: Array
-    widths: tuple[float, ...] = field(default=())
+    growth: Array = field(default_factory=lambda: np.zeros((0, len(GROWTH))))
     keypoint_aliases: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not self.widths and self.shapes:
-            object.__setattr__(self, 'widths', (1.0,) * len(self.shapes))
-        if len(self.widths) != len(self.shapes):
-            raise ValueError(f'{len(self.widths)} widths for {len(self.shapes)} parts')
+        wanted = (len(self.shapes), len(GROWTH))
+        growth = np.array(self.growth, dtype=np.float64) if len(self.growth) else np.zeros(wanted)
+        if growth.shape != wanted or not np.isfinite(growth).all():
+            raise ValueError(
+                f'{self.name}: growth must be {wanted} finite numbers, saw {growth.shape}'
+            )
+        growth.setflags(write=False)
+        object.__setattr__(self, 'growth', growth)
         if self.rates.shape != (self.dimension,) or not (self.rates > 0).all():
             raise ValueError(
                 f'{self.name}: rates must be {self.dimension} positive numbers, saw {self.rates}'
@@ -164,12 +187,25 @@ class Body:
         """Ratio of the size of the body to that of its model file."""
         return self._sum_of(self.skeleton.lengths) / self._sum_of(self.default_lengths)
 
+    def scale_of(self, shape: PartShape) -> float:
+        """Ratio of the size of one part to that in the model file, apart from its growth."""
+        if shape.size is None:
+            return self.scale
+        return float(self.skeleton.lengths[shape.size] / self.default_lengths[shape.size])
+
+    def scale_rates(self, shape: PartShape) -> dict[int, float]:
+        """Derivatives of `scale_of` with respect to the lengths that it depends on, 1/m."""
+        if shape.size is not None:
+            return {shape.size: 1.0 / float(self.default_lengths[shape.size])}
+        names, whole = self.skeleton.length_names, self._sum_of(self.default_lengths)
+        return {names.index(name): 1.0 / whole for name in self.stature_lengths}
+
     @cached_property
     def flesh(self) -> Flesh:
-        """The flesh at the present lengths and widths."""
+        """The flesh at the present lengths and growth."""
         parts = tuple(
-            shape.part(self.skeleton.lengths, self.scale, width)
-            for shape, width in zip(self.shapes, self.widths, strict=True)
+            shape.part(self.skeleton.lengths, self.scale_of(shape), growth)
+            for shape, growth in zip(self.shapes, self.growth, strict=True)
         )
         return Flesh(parts, tuple(shape.rings for shape in self.shapes))
 
@@ -206,9 +242,21 @@ class Body:
         skeleton = replace(self.skeleton, lengths=self.skeleton.lengths * factor)
         return replace(self, skeleton=skeleton)
 
+    def with_growth(self, growth: ArrayLike) -> Body:
+        """The same body with parts that differ otherwise from the model's, (B, 5); see `GROWTH`.
+
+        Raises:
+            ValueError: another shape, or numbers that are not finite.
+        """
+        return replace(self, growth=np.asarray(growth, dtype=np.float64))
+
     def with_widths(self, widths: Sequence[float]) -> Body:
-        """The same body with other factors on the x and y radii of its parts."""
-        return replace(self, widths=tuple(float(x) for x in widths))
+        """The same body, the x and y radii of its parts (B,) multiplied by these factors."""
+        if len(widths) != len(self.shapes):
+            raise ValueError(f'{len(widths)} widths for {len(self.shapes)} parts')
+        growth = self.growth.copy()
+        growth[:, :2] += np.log(np.asarray(widths, dtype=np.float64))[:, None]
+        return self.with_growth(growth)
 
     def _sum_of(self, lengths: Array) -> float:
         names = self.skeleton.length_names

@@ -113,6 +113,10 @@ class Camera:
             jacobian[i, 2] = -(jacobian[i, 0] * a + jacobian[i, 1] * b)
         return pixels, jacobian
 
+    def magnification(self, depth: float) -> float:
+        """Pixels for a metre across the optical axis at a depth, m."""
+        return float(np.sqrt(self.fx * self.fy)) / max(depth, NEAR)
+
     def rays(self, pixels: ArrayLike) -> Array:
         """Unit rays (..., 3) through pixels (..., 2).
 

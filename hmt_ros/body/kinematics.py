@@ -149,20 +149,45 @@ def point_jacobians(frames: Frames, segments: Index, points: Array) -> Array:
     return result
 
 
-def joint_length_jacobians(skeleton: Skeleton, poses: ArrayLike) -> Array:
-    """Derivatives (N, J, 3, L) of the joint positions with respect to the lengths."""
-    frames = forward(skeleton, poses)
+def directed_derivatives(
+    frames: Frames, segments: Index, points: Array, directions: Array
+) -> Array:
+    """How far points move in given directions with each degree of freedom.
+
+    Args:
+        frames: of one pose.
+        segments: (M,) that carry the points.
+        points, directions: (M, 3) camera frame.
+
+    Returns:
+        (M, d) a . dp / dx.
+    """
+    skeleton = frames.skeleton
+    axes, origins = (x[0] for x in frames.dofs_by_pose())
+    turns = np.cross(points, directions) @ axes.T - directions @ np.cross(axes, origins).T
+    result: Array = np.where(skeleton.dof_is_rotation, turns, directions @ axes.T)
+    return result * skeleton.moves[segments]
+
+
+def origin_length_jacobians(skeleton: Skeleton, frames: Frames) -> Array:
+    """Derivatives (S, 3, L, N) of the origins of the segments with respect to the lengths."""
     n, count = frames.count, len(skeleton.length_names)
-    of_origin = np.zeros((len(skeleton.parents), 3, count, n))
+    result = np.zeros((len(skeleton.parents), 3, count, n))
     for s, parent in enumerate(skeleton.parents):
         if parent >= 0:
-            of_origin[s] = of_origin[parent] + np.einsum(
+            result[s] = result[parent] + np.einsum(
                 'ixn,il->xln', frames.columns[parent], skeleton.offset_basis[s]
             )
         else:
-            of_origin[s] = skeleton.offset_basis[s][..., None]
+            result[s] = skeleton.offset_basis[s][..., None]
+    return result
+
+
+def joint_length_jacobians(skeleton: Skeleton, poses: ArrayLike) -> Array:
+    """Derivatives (N, J, 3, L) of the joint positions with respect to the lengths."""
+    frames = forward(skeleton, poses)
     segments = skeleton.joint_segments
-    result = of_origin[segments] + np.einsum(
+    result = origin_length_jacobians(skeleton, frames)[segments] + np.einsum(
         'jixn,jil->jxln', frames.columns[segments], skeleton.joint_basis
     )
     return np.ascontiguousarray(result.transpose(3, 0, 1, 2))

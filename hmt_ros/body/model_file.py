@@ -125,7 +125,7 @@ KEYS = {
 SEGMENT_KEYS = {
     'name', 'parent', 'offset', 'points', 'x_axis', 'length', 'diffusion', 'dofs', 'flesh',
 }  # fmt: skip
-FLESH_KEYS = {'centre', 'radii', 'exponents', 'taper', 'bend', 'extend', 'rings'}
+FLESH_KEYS = {'centre', 'radii', 'exponents', 'taper', 'bend', 'extend', 'rings', 'size'}
 
 
 def _check_keys(entry: dict[str, Any], known: set[str], what: str) -> None:
@@ -192,7 +192,7 @@ def _build(content: dict[str, Any]) -> Body:
             dofs.append((dof_name, segment, *_dof(dof, mirrored)))
             rates.append(diffusions[-1][int(dofs[-1][3])] ** 2)
         if 'flesh' in entry:
-            shapes.append(_shape(entry['flesh'], segment, own_length[-1], mirrored))
+            shapes.append(_shape(entry['flesh'], segment, own_length[-1], length_names, mirrored))
     if left_over:
         raise ValueError(f'`fixed` names {sorted(left_over)}, which the body does not have')
 
@@ -275,8 +275,15 @@ def _dof(entry: list[Any], mirrored: bool) -> tuple[int, bool, float, float, flo
     return axis, is_rotation, low, high, mean, sigma
 
 
-def _shape(flesh: dict[str, Any], segment: int, length: int | None, mirrored: bool) -> PartShape:
+def _shape(
+    flesh: dict[str, Any],
+    segment: int,
+    length: int | None,
+    length_names: tuple[str, ...],
+    mirrored: bool,
+) -> PartShape:
     _check_keys(flesh, FLESH_KEYS, 'flesh')
+    size = _named(flesh['size'], length_names, 'flesh: size') if 'size' in flesh else length
     radii = tuple(float(x) for x in flesh['radii'])
     if len(radii) not in (2, 3) or not all(r > 0 for r in radii):
         raise ValueError(f'radii must be two or three positive numbers, saw {list(radii)}')
@@ -299,4 +306,5 @@ def _shape(flesh: dict[str, Any], segment: int, length: int | None, mirrored: bo
         bend=(sign * bx, by),
         extend=(start, end),
         rings=int(flesh.get('rings', 5)),
+        size=size,
     )

@@ -23,11 +23,17 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames
 from hmt_ros.body.pose_terms import AnglePrior, FrameTerm, Posed, SelfIntersection
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.surface import flesh_table_of, lens_of
+from hmt_ros.image.surface import flesh_table_of, grown, lens_of
 from hmt_ros.image.terms.image_term import Request, TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import KEYPOINTS, KeypointTerm
-from hmt_ros.image.terms.registry import TERMS, Model, Placement, add_energies
-from hmt_ros.image.terms.residuals import tree_of
+from hmt_ros.image.terms.registry import (
+    TERMS,
+    Model,
+    Placement,
+    add_energies,
+    record_residuals,
+)
+from hmt_ros.image.terms.residuals import RECORDED, tree_of
 from hmt_ros.image.texture import Textures, no_textures
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
@@ -172,19 +178,9 @@ class ImageLikelihood:
             derivatives: whether gradient and Hessian are wanted.
         """
         n, d = frames.count, self.body.dimension
-        beliefs = observation.beliefs
-        if beliefs is None:
-            beliefs = np.ones(len(self.body.skeleton.parents))
-        request = Request(n, explained, beliefs)
         textured = textures is not None and len(textures.counts) > 0
-        inputs, running = [], []
-        for term in TERMS:
-            s: TermSettings = getattr(self.settings, term.name)
-            evidence = observation.evidence.get(term.name)
-            on = evidence is not None and (textured or not term.needs_texture)
-            weighting = Weighting(float(s.weight) if on else 0.0, float(s.sigma), float(s.scale))
-            inputs.append(term.inputs(weighting, evidence, request))
-            running.append(bool(inputs[-1].term.weight > 0))
+        inputs = self._inputs(observation, n, explained, textured=textured)
+        running = [bool(x.term.weight > 0) for x in inputs]
         energies = np.zeros((n, len(TERMS)))
         gradient = np.zeros((n if derivatives else 0, d))
         hessian = np.zeros((n if derivatives else 0, d, d))
@@ -195,7 +191,7 @@ class ImageLikelihood:
 
             def work(first: int, last: int) -> None:
                 add_energies(
-                    first, last, self._model, tuple(inputs), shape, textures or no_textures(),
+                    first, last, self._model, inputs, shape, textures or no_textures(),
                     rows, placement, energies, gradient, hessian,
                 )  # fmt: skip
 
@@ -208,20 +204,54 @@ class ImageLikelihood:
             return ImageEnergy(result, costs, None, None)
         return ImageEnergy(result, costs, gradient, hessian)
 
-    def with_scaled_widths(self, factors: Array) -> ImageLikelihood:
-        """The likelihood with the x and y radii of the parts (B,) multiplied.
+    def residuals(self, frames: Frames, observation: Observation) -> Array:
+        """The residuals of the contour terms at the frames of one pose.
 
-        Made from what is compiled for this one: much cheaper than from a body with other widths,
+        Returns:
+            (M, RECORDED) their points and derivatives; see `residuals.add_residual`.
+        """
+        inputs = self._inputs(observation, 1, None, textured=False)
+        outline = observation.outline
+        samples = 0 if outline is None else len(outline.pixels)
+        most = 1 + 4 * len(self._model.flesh.ring_parts) + 2 * samples
+        result = np.zeros((most, RECORDED))
+        if any(x.term.weight > 0 for x in inputs):
+            columns, origins = frames.by_pose()
+            record_residuals(
+                self._model, inputs, no_textures(), columns[0], origins[0],
+                np.zeros(len(TERMS)), result,
+            )  # fmt: skip
+        return result[1 : 1 + int(result[0, 0])]
+
+    def with_growth(self, growth: Array) -> ImageLikelihood:
+        """The likelihood of a body whose parts have grown by (B, 5) more; see `body.GROWTH`.
+
+        Made from what is compiled for this one: much cheaper than from a body with other flesh,
         which `body` does not become.
         """
-        flesh = self._model.flesh
-        radii = flesh.part_radii.copy()
-        radii[:, :2] *= factors[:, None]
-        rings = flesh.ring_radii * factors[flesh.ring_parts][:, None]
-        scaled = self._model._replace(flesh=flesh._replace(part_radii=radii, ring_radii=rings))
         result = replace(self)
-        result.__dict__['_model'] = scaled
+        result.__dict__['_model'] = self._model._replace(flesh=grown(self._model.flesh, growth))
         return result
+
+    def _inputs(
+        self, observation: Observation, poses: int, explained: Array | None, *, textured: bool
+    ) -> tuple[Any, ...]:
+        """What the kernels of all terms read, for so many poses; textures may be missing."""
+        beliefs = observation.beliefs
+        if beliefs is None:
+            beliefs = np.ones(len(self.body.skeleton.parents))
+        request = Request(poses, explained, beliefs)
+        result = []
+        for term in TERMS:
+            s: TermSettings = getattr(self.settings, term.name)
+            evidence = observation.evidence.get(term.name)
+            on = evidence is not None and (textured or not term.needs_texture)
+            weight = float(s.weight) if on else 0.0
+            weighting = Weighting(
+                weight, float(s.sigma), float(s.scale), float(observation.magnification)
+            )
+            result.append(term.inputs(weighting, evidence, request))
+        return tuple(result)
 
     @cached_property
     def _model(self) -> Model:

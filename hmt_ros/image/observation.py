@@ -32,6 +32,8 @@ class Observation:
         evidence: by the name of the term; what the image lacks is left out.
         foreground: (H, W) what differs from the background, believed or not; None: unknown.
         beliefs: (S,) how far the silhouette is believed on each segment, 0 to 1; None: wholly.
+        magnification: px for a metre at the distance of the person; 0: unknown, the contours of
+            people are taken to be as the model's.
     """
 
     silhouette: Mask | None = None
@@ -39,6 +41,7 @@ class Observation:
     evidence: Mapping[str, Any] = field(default_factory=dict)
     foreground: Mask | None = None
     beliefs: Array | None = None
+    magnification: float = 0.0
 
     @property
     def outline(self) -> Outline | None:

@@ -6,15 +6,18 @@ likelihood: on every ring of the flesh the two points whose normal is perpendicu
 
 from __future__ import annotations
 
+from functools import lru_cache
+from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hmt_ros.body.body import Body
+from hmt_ros.body.body import LEAST_HEIGHT, Body
 from hmt_ros.body.camera import NEAR, Camera
 from hmt_ros.inference.arrays import Array, Mask
+from msg_tools.files.plain_yaml import load_plain_yaml
 
 Ints = NDArray[np.int64]
 
@@ -35,7 +38,11 @@ class Lens(NamedTuple):
 
 
 class FleshTable(NamedTuple):
-    """The flesh as the compiled code reads it: parts (B,), and rings (R,) of `flesh.Rings`."""
+    """The flesh as the compiled code reads it: parts (B,), and rings (R,) of `flesh.Rings`.
+
+    `ring_noise` (R, 2) tells how far contours of people lie from the model's, standard deviations
+    at the sides and in front and behind, m; see `contour_noise.yaml`.
+    """
 
     part_segments: Ints
     part_centres: Array
@@ -46,6 +53,7 @@ class FleshTable(NamedTuple):
     ring_slopes: Array
     ring_leans: Array
     ring_exponents: Array
+    ring_noise: Array
 
 
 class Contour(NamedTuple):
@@ -60,6 +68,7 @@ class Contour(NamedTuple):
         valid: (P,) the point exists and lies before the camera.
         covered: (P,) another part lies on the same ray, before or behind.
         hidden: (P,) another part lies on the same ray, before.
+        noise: (P,) how far contours of people lie from the point, a standard deviation, m.
     """
 
     parts: Ints
@@ -70,6 +79,7 @@ class Contour(NamedTuple):
     valid: Mask
     covered: Mask
     hidden: Mask
+    noise: Array
 
 
 def lens_of(camera: Camera) -> Lens:
@@ -94,6 +104,48 @@ def flesh_table_of(body: Body) -> FleshTable:
         ring.slope,
         ring.lean,
         ring.exponent,
+        _contour_noise(body)[flesh.ring_parts],
+    )
+
+
+@lru_cache(maxsize=1)
+def _noise_of_parts() -> dict[str, list[float]]:
+    file = resources.files('hmt_ros.image') / 'contour_noise.yaml'
+    content: dict[str, list[float]] = load_plain_yaml(file.read_text('utf-8'))
+    return content
+
+
+def _contour_noise(body: Body) -> Array:
+    """Standard deviations (B, 2) of contours at the sides of each part, and in front, m."""
+    known, names = _noise_of_parts(), body.skeleton.segment_names
+    plain = [names[p.segment].removeprefix('left_').removeprefix('right_') for p in body.shapes]
+    return np.array([known.get(name, known['other']) for name in plain]).reshape(-1, 2)
+
+
+def grown(flesh: FleshTable, growth: Array) -> FleshTable:
+    """The flesh with parts that have grown by (B, 5) more; see `body.GROWTH`.
+
+    The same as of a body with more growth, at a fraction of the time.
+    """
+    of_ring = flesh.ring_parts
+    factors = np.exp(growth[:, :2])
+    radii, centres = flesh.part_radii.copy(), flesh.part_centres.copy()
+    radii[:, :2] *= factors
+    radii[:, 2] = np.maximum(radii[:, 2] + 0.5 * (growth[:, 2] + growth[:, 3]), LEAST_HEIGHT)
+    centres[:, 1] += growth[:, 4]
+    centres[:, 2] += 0.5 * (growth[:, 2] - growth[:, 3])
+    stretch = (radii[:, 2] / flesh.part_radii[:, 2])[of_ring]
+    rings = flesh.ring_centres.copy()
+    rings[:, 1] += growth[of_ring, 4]
+    along = flesh.ring_centres[:, 2] - flesh.part_centres[of_ring, 2]
+    rings[:, 2] = centres[of_ring, 2] + along * stretch
+    return flesh._replace(
+        part_centres=centres,
+        part_radii=radii,
+        ring_centres=rings,
+        ring_radii=flesh.ring_radii * factors[of_ring],
+        ring_slopes=flesh.ring_slopes / stretch[:, None],
+        ring_leans=flesh.ring_leans / stretch[:, None],
     )
 
 
@@ -104,7 +156,7 @@ def empty_contour(rings):  # type: ignore[no-untyped-def]
     return Contour(
         np.empty(count, np.int64), np.empty((count, 3)), np.empty((count, 2)),
         np.empty((count, 2, 3)), np.empty((count, 2)), np.empty(count, np.bool_),
-        np.empty(count, np.bool_), np.empty(count, np.bool_),
+        np.empty(count, np.bool_), np.empty(count, np.bool_), np.empty(count),
     )  # fmt: skip
 
 
@@ -213,6 +265,8 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
             else:
                 outline_x, outline_y = _signed_power(c, e), _signed_power(sn, e)
                 lateral_x, lateral_y = _signed_power(c, 2.0 - e), _signed_power(sn, 2.0 - e)
+            across, ahead = c * flesh.ring_noise[r, 0], sn * flesh.ring_noise[r, 1]
+            contour.noise[r + side * rings] = np.sqrt(across * across + ahead * ahead)
             px, py = cx + rx * outline_x, cy + ry * outline_y
             nx, ny = lateral_x / rx, lateral_y / ry
             nz = -(kx * c * c + ky * sn * sn) - (nx * lx + ny * ly)

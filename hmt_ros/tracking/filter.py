@@ -23,7 +23,6 @@ from hmt_ros.inference.bounded_newton import Minimum, resting
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.ambiguities import ambiguity_classes
 from hmt_ros.tracking.facing_odds import FacingOdds
-from hmt_ros.tracking.flesh_fitting import FleshFit
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses, relative_joints
 from hmt_ros.tracking.loss import unexplained_share
 from hmt_ros.tracking.posterior import Posterior, free_covariances
@@ -35,12 +34,15 @@ from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples
 from hmt_ros.tracking.reliability import SilhouetteRecall
 from hmt_ros.tracking.selection import choose_hypotheses, heads_of_classes
 from hmt_ros.tracking.settings import TrackerSettings
+from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from hmt_ros.tracking.weighting import at_least, inherited_log_weights, normalised, weigh
 
 # How far the usual energy follows that of the last image.
 USUAL_GAIN = 0.1
 # Number of images from one reversal that is proposed to the next.
 REVERSED_EVERY = 3
+# How often the shape is fitted to the first image.
+FIRST_FITS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +76,8 @@ class MixtureFilter:
         extra: further energy terms.
 
     Attributes:
-        body: with the widths that have been estimated.
+        body: with the lengths and the flesh that have been estimated.
+        shape: the estimate of them.
         misfit: share of the last image that no mode explains.
         recall: how far silhouettes are believed.
         log_evidence: sum over images of -beta times the least energy, for comparison with another
@@ -97,13 +100,14 @@ class MixtureFilter:
         self._seed = seed
         self._rng = np.random.default_rng(seed)
         self._modes: Modes | None = None
-        self._flesh = FleshFit(body)
+        self.shape = ShapeEstimate(body)
         self.recall = SilhouetteRecall(len(body.skeleton.parents))
         self._observed: tuple[Observation, Observation] | None = None
         self._usual_energy = np.inf
         self._outline_costs = np.empty((0, 0))
         self._bad_images = 0
         self._images = 0
+        self._shape_age = 0.0
         self._facing = FacingOdds()
         self._posterior = Posterior(body, camera, settings, extra)
         self._proposal = PROPOSALS[settings.proposals](self._posterior)
@@ -156,14 +160,14 @@ class MixtureFilter:
         """Starts from expected poses (N, d); returns the minimum that each of them led to.
 
         Args:
-            body: of the person; its widths are fitted.
+            body: of the person; its shape is estimated.
             poses: (N, d).
             log_weights: (N,).
             precisions: (N, d, d) of the poses.
             observation: of the first image.
         """
         self._use_body(body)
-        self._flesh = FleshFit(body)
+        self.shape = ShapeEstimate(body)
 
         def settle(starts: Array, iterations: int) -> Minimum:
             term = self._posterior.around(observation, poses, precisions)
@@ -172,8 +176,8 @@ class MixtureFilter:
             return solved
 
         solved = settle(poses, 3 * self.settings.iterations)
-        for _ in range(3):
-            if not self._fit_flesh(observation):
+        for _ in range(FIRST_FITS):
+            if not self._fit_shape(observation, self.settings.trust / FIRST_FITS):
                 break
             solved = settle(solved.x, self.settings.iterations)
         self._learn_recall(observation)
@@ -197,7 +201,7 @@ class MixtureFilter:
         """Another filter of the same person, without modes, with random numbers of its own."""
         extra = self._posterior.extra
         other = MixtureFilter(self.body, self.camera, self.settings, self._seed + 1, extra)
-        other._flesh = deepcopy(self._flesh)
+        other.shape = deepcopy(self.shape)
         return other
 
     def absorb(self, modes: Modes, observation: Observation) -> None:
@@ -263,7 +267,11 @@ class MixtureFilter:
         # Of the error of an energy only what is new counts.
         self.log_evidence -= beta * (least - s.error_correlation * float(modes.energies.min()))
         posterior.trust.update(least)
-        self._fit_flesh(observation)
+        self._shape_age += dt
+        if self._images < s.shape_images or (
+            s.shape_interval > 0 and self._images % s.shape_interval == 0
+        ):
+            self._fit_shape(observation, s.trust)
         self._learn_recall(observation)
 
     def assess(self, observation: Observation) -> None:
@@ -414,6 +422,10 @@ class MixtureFilter:
         covariances = filtered
         if observation.evidence:
             covariances = self._posterior.covariances(fit, solved.free[rows])
+            covariances = covariances + self.shape.considered(
+                self._posterior.likelihood, self._believed(observation), poses,
+                self._posterior.given_way(poses, observation)[1],
+            )  # fmt: skip
         h = optimised.hypotheses[rows]
         self._modes = Modes(
             poses=poses,
@@ -470,16 +482,21 @@ class MixtureFilter:
             row = int(self.modes.texture_rows[0])
             self.recall.update(textures, row, foreground)
 
-    def _fit_flesh(self, observation: Observation) -> bool:
-        """Moves the widths of the flesh by what an image says; False where it says nothing more."""
-        if self._flesh.images >= self.settings.flesh_images or observation.outline is None:
+    def _fit_shape(self, observation: Observation, trust: float) -> bool:
+        """Moves the shape by what an image says of it; False where that is nothing."""
+        if self.settings.shape_images == 0:
             return False
-        m = self.modes
-        poses, weights = m.poses[:4], np.exp(m.log_weights[:4])
-        body = self._flesh.update(
-            self._posterior.likelihood, observation, poses, weights / weights.sum()
-        )
-        self._posterior.evaluations += len(poses) * (2 * len(self._flesh.widths) + 1)
+        if observation.outline is None and observation.keypoints is None:
+            return False
+        observation = self._believed(observation)
+        poses, weights = self.modes.poses[:4], np.exp(self.modes.log_weights[:4])
+        gradients, covariances = self._posterior.given_way(poses, observation)
+        body = self.shape.update(
+            self._posterior.likelihood, observation, poses, weights / weights.sum(),
+            gradients, covariances, trust=trust, dt=self._shape_age,
+        )  # fmt: skip
+        self._shape_age = 0.0
+        self._posterior.evaluations += len(poses)
         self._use_body(body)
         return True
 

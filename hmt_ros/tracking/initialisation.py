@@ -74,6 +74,8 @@ def start_from_keypoints(
     d = body.dimension
     lengths = (weights / weights.sum()) @ fits.x[best, d:]
     body = body.with_segment_lengths(dict(zip(body.skeleton.length_names, lengths, strict=True)))
+    spread = np.linalg.inv(fits.hessian[best[0]])[d:, d:]
+    body = replace(body, length_sigma=np.sqrt(np.diagonal(spread)))
 
     least_squares = LikelihoodSettings.of_terms(keypoints=TermSettings(1.0, 1.0, np.inf))
     settings = replace(least_squares, prior_weight=prior_weight)

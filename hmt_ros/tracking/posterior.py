@@ -22,7 +22,7 @@ from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures, capture_textures
 from hmt_ros.inference.arrays import Array, Index, Mask
-from hmt_ros.inference.bounded_newton import Minimum, minimise
+from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
 from hmt_ros.inference.energy import (
     Derivatives,
     Energy,
@@ -169,6 +169,19 @@ class Posterior:
         fit = ImageFit(add_energies([seen, *priors]), seen.value, image.hessian, image.costs)
         self._last_fit = (poses, observation, fit)
         return fit
+
+    def given_way(self, poses: Array, observation: Observation) -> tuple[Array, Array]:
+        """How poses (K, d) give way when something else changes, without what was expected.
+
+        Returns:
+            Gradients (K, d) of the energy of the image and of what is known of the body, 0 for
+            variables that rest on a limit, and inverse Hessians (K, d, d), in which they do not
+            move.
+        """
+        gradient, hessian = self.fit(poses, observation).energy.derivatives()
+        free = ~resting(poses, gradient, self.body.lower, self.body.upper)
+        both = free[:, :, None] & free[:, None, :]
+        return gradient * free, np.where(both, free_covariances(hessian, free), 0.0)
 
     def covariances(self, fit: ImageFit, free: Mask) -> Array:
         """Covariances (K, d, d) that an image alone leaves, on the free variables (K, d).

@@ -74,8 +74,9 @@ class TrackerSettings:
         least_log_weight: Smallest log weight of a mode that is kept, nats.
         velocity_kept: Share of a mode's velocity that lasts to the next image; 0 is a random walk.
         velocity_gain: Share of the newest displacement in a mode's velocity.
-        flesh_images: Number of images from which the widths of the body parts are estimated; 0
-            keeps those of the model.
+        shape_images: Number of images at the start of a track that are all used to estimate the
+            lengths and the flesh of the person; 0 keeps those that the track started with.
+        shape_interval: After these, one image of so many is used to estimate them; 0 uses none.
         lost_misfit: Fraction of the outline, or of the keypoints, left unexplained by every mode
             above which an image counts as lost.
         lost_images: Number of consecutive lost images after which the track restarts.
@@ -113,7 +114,8 @@ class TrackerSettings:
     least_log_weight: float = -14.0
     velocity_kept: float = 0.7
     velocity_gain: float = 0.5
-    flesh_images: int = 15
+    shape_images: int = 15
+    shape_interval: int = 3
     lost_misfit: float = 0.35
     lost_images: int = 5
     absence_time: float = 0.5

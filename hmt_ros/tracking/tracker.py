@@ -264,7 +264,7 @@ class Tracker:
             if not seen and view.silhouette is not None:
                 # Nothing is there to fit modes to.
                 return self._expected(stamp), self._track.likelihood_mixture(Observation())
-            observation = self._observe(view)
+            observation = self._observe(view, self.modes.poses[0])
             self._follow(observation, stamp, prediction)
         else:
             begun = self._start_track(view, stamp, prediction, masked=masked)
@@ -288,7 +288,7 @@ class Tracker:
         if self._presence.absent:
             if not self._has_arrived(view, stamp, prediction):
                 return None
-            observation = self._observe(view)
+            observation = self._observe(view, None)
             self._begin_next(observation, stamp, prediction)
         else:
             start = self._start_at(stamp, prediction)
@@ -301,11 +301,11 @@ class Tracker:
                 self.silhouettes.check(view.image, beginning.body, self.camera, beginning.best)
                 if self.silhouettes.doubted:
                     view = view._replace(silhouette=None, unsure=None)
-            observation = self._observe(view)
+            observation = self._observe(view, beginning.best[0])
             self._begin(observation, beginning, stamp)
             if not self._track.believes_silhouettes:
                 # The start is where the person is; the silhouette is not.
-                observation = self._observe(view)
+                observation = self._observe(view, beginning.best[0])
                 self._begin(observation, beginning, stamp)
         self.track_id += 1
         self._presence = Presence(self.settings.absence_time)
@@ -343,6 +343,8 @@ class Tracker:
         """Starts a track of who has come into view."""
         poses = self._poses_to_search(observation, prediction)
         assert poses is not None
+        magnification = self.camera.magnification(float(np.median(poses[:, 2])))
+        observation = replace(observation, magnification=magnification)
         both_ways = observation.keypoints is None
         self._track.begin(self.body, poses, observation, stamp, both_ways=both_ways)
 
@@ -426,7 +428,8 @@ class Tracker:
         foreground, unsure = (None, None) if found is None else found
         return View(image, foreground, changed, keypoints, nobody_predicted, unsure)
 
-    def _observe(self, view: View) -> Observation:
+    def _observe(self, view: View, pose: Array | None) -> Observation:
+        """What an image says of a person who is about at a pose (d,), if it is known."""
         t = self.settings.likelihood
         textured = any(getattr(t, term.name).weight > 0 for term in TERMS if term.needs_texture)
         wanted = {'containment', 'coverage'}
@@ -440,7 +443,8 @@ class Tracker:
             view.image, believed, keypoints,
             last_image=self._last_image, wanted=wanted, unsure=view.unsure,
         )  # fmt: skip
-        return replace(found, foreground=view.silhouette)
+        magnification = 0.0 if pose is None else self.camera.magnification(float(pose[2]))
+        return replace(found, foreground=view.silhouette, magnification=magnification)
 
     def _region(self) -> Box | None:
         """Where the person can be in the next image; None: anywhere."""

@@ -186,7 +186,7 @@ def test_two_balls_by_hand(small, random_poses):
     radius = 0.12
     segments = [small.skeleton.segment_names.index(f'{side}_hand') for side in ('left', 'right')]
     balls = tuple(PartShape(s, None, (0.0, 0.0, 0.0), (radius,) * 3) for s in segments)
-    body = replace(small, shapes=balls, widths=())
+    body = replace(small, shapes=balls, growth=())
     poses = folded(body, 2000, 6, random_poses)
     wrists = body.skeleton.joint_index(['left_wrist', 'right_wrist'])
     places = body.joint_positions(poses)[:, wrists]
@@ -206,7 +206,7 @@ def test_two_balls_by_hand(small, random_poses):
 
 def test_one_part_overlaps_nothing(small, random_poses):
     value, gradient, hessian = energy_of(
-        replace(small, shapes=small.shapes[3:4], widths=()), folded(small, 3, 7, random_poses)
+        replace(small, shapes=small.shapes[3:4], growth=()), folded(small, 3, 7, random_poses)
     )
     assert np.array_equal(value, np.zeros(3))
     assert (gradient.shape, hessian.shape) == ((3, 32), (3, 32, 32))
@@ -215,7 +215,7 @@ def test_one_part_overlaps_nothing(small, random_poses):
 
 
 def test_a_skeleton_without_flesh_costs_nothing(small, random_poses):
-    bare = replace(small, shapes=(), widths=())
+    bare = replace(small, shapes=(), growth=())
     value, gradient, hessian = energy_of(bare, random_poses(small, 3, 8))
     assert np.array_equal(value, np.zeros(3))
     assert (gradient.shape, hessian.shape) == ((3, 32), (3, 32, 32))

@@ -15,7 +15,7 @@ from hmt_ros.tracking.facing import faces_like, left_directions
 
 FRAME = 100_000_000  # ns
 SMALL = TrackerSettings(
-    candidates=8, max_hypotheses=4, flesh_images=0, rounds=1, searched_chains=1, combinations=32
+    candidates=8, max_hypotheses=4, shape_images=0, rounds=1, searched_chains=1, combinations=32
 )
 
 

@@ -15,7 +15,7 @@ from hmt_ros.tracking.silhouettes import Silhouettes
 from test.tracking.test_tracker import best_error, in_bytes
 
 FRAME = 100_000_000
-SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, flesh_images=2)
+SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, shape_images=2)
 
 
 @pytest.fixture(scope='module')

@@ -22,7 +22,7 @@ FRAME = 100_000_000  # ns
 
 def keypoint_settings(**values) -> TrackerSettings:
     return TrackerSettings(
-        **{'candidates': 8, 'likelihood': ONLY_KEYPOINTS, 'flesh_images': 0, **values}
+        **{'candidates': 8, 'likelihood': ONLY_KEYPOINTS, 'shape_images': 0, **values}
     )
 
 
@@ -489,7 +489,7 @@ def test_images_alone(film, human32, camera, keypoints_of):
     poses, images, empty = film
     runs = []
     for seed in (5, 5, 6):
-        settings = TrackerSettings(candidates=8, max_hypotheses=4, flesh_images=2)
+        settings = TrackerSettings(candidates=8, max_hypotheses=4, shape_images=2)
         tracker = Tracker(human32, camera, settings, BackgroundModel.from_image(empty), seed=seed)
         tracker.reset(Subject(0, keypoints_of(human32, poses[0]), dict(human32.segment_lengths)))
         runs.append([tracker.step(image, i * FRAME) for i, image in enumerate(images)])

@@ -23,7 +23,7 @@ from hmt_ros.image.terms.image_term import (
     TermSettings,
     Weighting,
 )
-from hmt_ros.image.terms.residuals import add_contour_residual, geman_mcclure
+from hmt_ros.image.terms.residuals import add_contour_residual, contour_sigma, geman_mcclure
 
 ORIENTATIONS = 4
 # Canny's thresholds.
@@ -94,11 +94,12 @@ def add_edges(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
         angle = np.arctan2(contour.normals[i, 1], contour.normals[i, 0])
         channel = int(np.round(angle * (bins / np.pi))) % bins
         value, gu, gv = sample_distance(edges, channel, contour.pixels[i, 0], contour.pixels[i, 1])
-        rho, pull, curvature = geman_mcclure(value / term.sigma, term.scale, each)
+        sigma = contour_sigma(term, contour.noise[i])
+        rho, pull, curvature = geman_mcclure(value / sigma, term.scale, each)
         energy += rho
         add_contour_residual(
             wrenches, stiffnesses, view.owners[contour.parts[i]], contour, i,
-            gu / term.sigma, gv / term.sigma, pull, curvature,
+            gu / sigma, gv / sigma, pull, curvature,
         )  # fmt: skip
     return energy
 
@@ -106,7 +107,7 @@ def add_edges(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
 EDGES = ImageTerm(
     'edges',
     'Distance of the visible contours from image edges.',
-    TermSettings(20.0, 2.5, 3.0),
+    TermSettings(20.0, 1.5, 3.0),
     edge_distances,
     _inputs,
     add_edges,

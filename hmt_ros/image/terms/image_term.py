@@ -31,7 +31,8 @@ class TermSettings:
         weight: Number of independent measurements that the term counts for (a plain factor for
             keypoints); 0 switches the term off.
         sigma: Standard deviation of one measurement, px (grey levels for the intensity, a factor on
-            the detector's own deviation for keypoints).
+            the detector's own deviation for keypoints); that of a contour comes on top of what
+            contours of people differ from the model's, in metres.
         scale: Width of the Geman-McClure kernel, in standard deviations.
     """
 
@@ -89,11 +90,15 @@ def _signed_distance(mask: Image) -> NDArray[np.float32]:
 
 
 class Weighting(NamedTuple):
-    """`TermSettings` as compiled code reads them; weight 0: off."""
+    """`TermSettings` as compiled code reads them; weight 0: off.
+
+    `magnification`, px for a metre at the person, turns errors of the body into pixels.
+    """
 
     weight: float
     sigma: float
     scale: float
+    magnification: float
 
 
 class PoseView(NamedTuple):
@@ -131,6 +136,7 @@ class Request:
         poses: number of poses, N.
         explained: (N, M) or (1, M) what each sample of the outline costs at most, because something
             else explains it; None: nothing does.
+        beliefs: (S,) how far the silhouette is believed on each segment.
     """
 
     poses: int

@@ -112,10 +112,43 @@ class KeypointTerm:
         )  # fmt: skip
         return Energy(value, gradient, hessian) if derivatives else Energy(value)
 
+    def residuals(self, frames: Frames) -> tuple[Index, Array, Array, Array, Array]:
+        """The residuals at the frames of one pose.
+
+        Returns:
+            (M,) joint of the skeleton, (M, 3) its position, (M, 3) derivative of the residual by
+            the position, (M,) derivative and (M,) curvature of the energy by the residual; two
+            residuals a keypoint. Joints behind the camera have none.
+        """
+        k, seen = self.keypoints, self._counted
+        names = [name for name, ok in zip(k.names, seen, strict=True) if ok]
+        joints = self.skeleton.joint_index(names)
+        points = frames.joints()[joints, :, 0]
+        pixels, projection = self.camera.project_with_derivative(points.T)
+        shown = np.flatnonzero(np.isfinite(pixels).all(0))
+        whiteners = self._joints.whiteners[shown]
+        error = np.einsum('kab,kb->ka', whiteners, pixels.T[shown] - self._joints.pixels[shown])
+        by_point = np.einsum('kab,bik->kai', whiteners, projection[..., shown])
+        s = self.settings
+        shrink = 1.0 / (1.0 + error**2 / s.scale**2)
+        curvature = s.weight / s.sigma**2 * shrink**2
+        return (
+            np.repeat(joints[shown], 2),
+            np.repeat(points[shown], 2, axis=0),
+            by_point.reshape(-1, 3),
+            (curvature * error).reshape(-1),
+            curvature.reshape(-1),
+        )
+
+    @property
+    def _counted(self) -> NDArray[np.bool_]:
+        k = self.keypoints
+        return np.asarray(k.seen & (k.confidences > 0), dtype=np.bool_)
+
     @cached_property
     def _joints(self) -> _Joints:
         k, skeleton = self.keypoints, self.skeleton
-        seen = k.seen & (k.confidences > 0)
+        seen = self._counted
         which = skeleton.joint_index([name for name, ok in zip(k.names, seen, strict=True) if ok])
         precision = np.linalg.inv(k.covariances[seen])
         precision *= k.confidences[seen][:, None, None]

@@ -88,6 +88,21 @@ _run_terms = _one_after_the_other(TERMS)
 
 
 @njit(cache=True, nogil=True)
+def _view(n, model, textures, texture_row, shape, contour, columns, origins):  # type: ignore[no-untyped-def]
+    """A pose as kernels see it; fills the contour, if shape is asked for."""
+    if shape:
+        trace_contour(model.flesh, model.traced, model.lens, columns, origins, contour)
+        mark_visibility(
+            model.flesh, model.occluders, columns, origins, contour.parts, contour.points,
+            contour.valid, contour.covered, contour.hidden,
+        )  # fmt: skip
+    return PoseView(
+        n, texture_row, textures, contour, model.contour_points, model.flesh.part_segments,
+        model.textured, model.lens, columns, origins,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
 def add_energies(  # type: ignore[no-untyped-def]
     first, last, model, inputs, shape, textures, texture_rows, placement,
     energies, gradients, hessians,
@@ -111,19 +126,25 @@ def add_energies(  # type: ignore[no-untyped-def]
         wrenches[:] = 0.0
         stiffnesses[:] = 0.0
         columns, origins = placement.columns[n], placement.origins[n]
-        if shape:
-            trace_contour(model.flesh, model.traced, model.lens, columns, origins, contour)
-            mark_visibility(
-                model.flesh, model.occluders, columns, origins, contour.parts, contour.points,
-                contour.valid, contour.covered, contour.hidden,
-            )  # fmt: skip
-        view = PoseView(
-            n, texture_rows[n], textures, contour, model.contour_points,
-            model.flesh.part_segments, model.textured, model.lens, columns, origins,
-        )  # fmt: skip
+        view = _view(n, model, textures, texture_rows[n], shape, contour, columns, origins)
         _run_terms(view, inputs, 0, energies[n], wrenches, stiffnesses)
         if len(hessians) > 0:
             assemble_pose(
                 model.tree, placement.axes[n], placement.dof_origins[n], wrenches, stiffnesses,
                 gradients[n], hessians[n],
             )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def record_residuals(model, inputs, textures, columns, origins, energies, residuals):  # type: ignore[no-untyped-def]
+    """Lists the residuals of one pose, instead of summing them.
+
+    Args:
+        model, inputs, textures: as for `add_energies`; the contour is traced.
+        columns, origins: (S, 3, 3), (S, 3) frames of the segments.
+        energies: (terms,) result.
+        residuals: (M, RECORDED) result, see `residuals.add_residual`; entry (0, 0) must be 0.
+    """
+    contour = empty_contour(len(model.flesh.ring_parts))
+    view = _view(0, model, textures, -1, True, contour, columns, origins)
+    _run_terms(view, inputs, 0, energies, residuals, np.empty((0, 6, 6)))

@@ -77,11 +77,32 @@ def geman_mcclure(residual, scale, weight):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
+def contour_sigma(term, noise):  # type: ignore[no-untyped-def]
+    """Standard deviation of a contour point, px, whose noise on the body is given in m."""
+    blur = term.magnification * noise
+    return np.sqrt(term.sigma * term.sigma + blur * blur)
+
+
+# Columns of a list of residuals: segment, point (3), derivative (3), pull, curvature.
+RECORDED = 9
+
+
+@njit(cache=True, nogil=True, inline='always')
 def add_residual(wrenches, stiffnesses, s, p0, p1, p2, a0, a1, a2, pull, curvature):  # type: ignore[no-untyped-def]
     """Adds a residual at the point p with derivative a to segment s.
 
-    Everything is a scalar: a small array a call would cost more than the arithmetic.
+    Everything is a scalar: a small array a call would cost more than the arithmetic. Wrenches with
+    the columns `RECORDED` are a list of residuals instead of sums: entry (0, 0) counts them.
     """
+    if wrenches.shape[1] == RECORDED:
+        n = int(wrenches[0, 0]) + 1
+        if n < len(wrenches):
+            wrenches[0, 0] = n
+            wrenches[n, 0] = s
+            wrenches[n, 1], wrenches[n, 2], wrenches[n, 3] = p0, p1, p2
+            wrenches[n, 4], wrenches[n, 5], wrenches[n, 6] = a0, a1, a2
+            wrenches[n, 7], wrenches[n, 8] = pull, curvature
+        return
     a3 = p1 * a2 - p2 * a1
     a4 = p2 * a0 - p0 * a2
     a5 = p0 * a1 - p1 * a0

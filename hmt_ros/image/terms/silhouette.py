@@ -27,7 +27,12 @@ from hmt_ros.image.terms.image_term import (
     TermSettings,
     Weighting,
 )
-from hmt_ros.image.terms.residuals import add_contour_residual, add_residual, geman_mcclure
+from hmt_ros.image.terms.residuals import (
+    add_contour_residual,
+    add_residual,
+    contour_sigma,
+    geman_mcclure,
+)
 from hmt_ros.inference.arrays import Array
 
 # Samples on the outline.
@@ -177,11 +182,12 @@ def add_containment(view, inputs, wrenches, stiffnesses):  # type: ignore[no-unt
             continue
         segment = view.owners[contour.parts[i]]
         believed = each * inputs.beliefs[segment]
-        rho, pull, curvature = geman_mcclure(value / term.sigma, term.scale, believed)
+        sigma = contour_sigma(term, contour.noise[i])
+        rho, pull, curvature = geman_mcclure(value / sigma, term.scale, believed)
         energy += rho
         add_contour_residual(
             wrenches, stiffnesses, segment, contour, i,
-            gu / term.sigma, gv / term.sigma, pull, curvature,
+            gu / sigma, gv / sigma, pull, curvature,
         )  # fmt: skip
     return energy
 
@@ -237,15 +243,16 @@ def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untype
         while gaps[nearest] != least:
             nearest += 1
         i = use[nearest]
+        sigma = contour_sigma(term, contour.noise[i])
         du, dv = contour.pixels[i, 0] - pixels[m, 0], contour.pixels[i, 1] - pixels[m, 1]
         nx, ny = normals[m, 0], normals[m, 1]
-        across = (nx * du + ny * dv) / term.sigma
+        across = (nx * du + ny * dv) / sigma
         along = nx * dv - ny * du
         beyond = 0.0
         if along > SPACING:
-            beyond = (along - SPACING) / term.sigma
+            beyond = (along - SPACING) / sigma
         elif along < -SPACING:
-            beyond = (along + SPACING) / term.sigma
+            beyond = (along + SPACING) / sigma
         length = np.sqrt(across * across + beyond * beyond)
         rho, _, curvature = geman_mcclure(length, term.scale, each)
         if rho >= explained[m]:
@@ -256,7 +263,7 @@ def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untype
         energy += rho
         segment = part_segments[contour.parts[i]]
         p, j = contour.points, contour.projections
-        nx, ny = nx / term.sigma, ny / term.sigma
+        nx, ny = nx / sigma, ny / sigma
         add_residual(
             wrenches, stiffnesses, segment, p[i, 0], p[i, 1], p[i, 2],
             nx * j[i, 0, 0] + ny * j[i, 1, 0], nx * j[i, 0, 1] + ny * j[i, 1, 1],
@@ -274,7 +281,7 @@ def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untype
 CONTAINMENT = ImageTerm(
     'containment',
     "Distance of the model's contour from the inside of the silhouette.",
-    TermSettings(30.0, 3.0, 8.0),
+    TermSettings(30.0, 1.5, 8.0),
     distance_map,
     _containment_inputs,
     add_containment,
@@ -283,7 +290,7 @@ CONTAINMENT = ImageTerm(
 COVERAGE = ImageTerm(
     'coverage',
     "Distance of the silhouette's outline from the model's contour.",
-    TermSettings(30.0, 3.0, 8.0),
+    TermSettings(30.0, 1.5, 8.0),
     outline,
     _coverage_inputs,
     add_coverage,

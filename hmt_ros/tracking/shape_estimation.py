@@ -1,0 +1,187 @@
+"""The shape of the person as a slow state: lengths and flesh, estimated as long as a track lasts.
+
+    S_k = H_tt - H_tp C_k H_pt,    g_k = h_t - H_tp C_k h_p,    C_k = H_pp^-1            at mode k
+    P <- (( P + Q dt )^-1 + tau sum_k w_k S_k)^-1,    theta <- theta - tau P sum_k w_k g_k
+    J_k = -C_k H_pt                                                                 dx_k / dtheta
+
+theta is the shape (see `body.shape`), x_k the pose of mode k, h and H are gradient and Gauss-Newton
+Hessian of the energy of one image over both. A pose gives way to a wrong shape: what is left of the
+information when it does is the Schur complement S. Of every image only the share tau is believed,
+as its errors are those of its neighbours. What is not known of the shape is not known of the pose
+either: J P J' is added to the covariances of modes (a consider covariance, [Schmidt 1966]).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmt_ros.body.body import GROWTH, Body
+from hmt_ros.body.kinematics import Frames, directed_derivatives, forward
+from hmt_ros.body.shape import ShapeSpace
+from hmt_ros.image.likelihood import ImageLikelihood
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.keypoints import KeypointTerm
+from hmt_ros.inference.arrays import Array
+
+# Standard deviations over people and clothes, by kind of growth: logarithms, m.
+SPREAD = dict(zip(GROWTH, (0.2, 0.2, 0.02, 0.02, 0.02), strict=True))
+# A length is hardly ever known better, m.
+LEAST_LENGTH_SIGMA = 0.008
+# What a shape wanders by itself in a second: a share of its standard deviation over people.
+WANDERING = 0.02
+# Largest change by one image, and in all, in standard deviations over people.
+LARGEST_STEP, LARGEST = 0.5, 3.0
+# A pose gives way by this much at most while its shape is estimated, rad or m.
+LARGEST_SHIFT = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """The energy of an image over shape and pose, to second order, at one pose.
+
+    Attributes:
+        by_shape: (P,) gradient.
+        curvature: (P, P) Gauss-Newton Hessian.
+        mixed: (P, d) Gauss-Newton Hessian between shape and pose.
+    """
+
+    by_shape: Array
+    curvature: Array
+    mixed: Array
+
+
+class ShapeEstimate:
+    """Estimates the shape of one person.
+
+    Args:
+        body: that the estimate starts from; its `length_sigma` tells how well its lengths are
+            known.
+
+    Attributes:
+        covariance: (P, P) of the shape.
+        images: number of images that have been used.
+    """
+
+    def __init__(self, body: Body) -> None:
+        self._space = ShapeSpace(body)
+        count = len(self._space.groups)
+        lengths = np.maximum(body.length_sigma, LEAST_LENGTH_SIGMA)
+        grown = np.tile(np.array(list(SPREAD.values())), count)
+        self._spread = np.concatenate([lengths, grown])
+        self.covariance = np.diag(self._spread**2)
+        self._offset = np.zeros(self._space.size)
+        self.images = 0
+
+    @property
+    def body(self) -> Body:
+        """The person."""
+        return self._space.body
+
+    @property
+    def deviations(self) -> dict[str, tuple[float, float]]:
+        """By the name of a variable: how far it is from the start, and its standard deviation."""
+        sigma = np.sqrt(np.diagonal(self.covariance))
+        rows = zip(self._space.names, self._offset, sigma, strict=True)
+        return {name: (float(x), float(s)) for name, x, s in rows}
+
+    def update(
+        self,
+        likelihood: ImageLikelihood,
+        observation: Observation,
+        poses: Array,
+        weights: Array,
+        gradients: Array,
+        covariances: Array,
+        *,
+        trust: float,
+        dt: float,
+    ) -> Body:
+        """Uses one more image; returns the person.
+
+        Args:
+            likelihood: of the present body.
+            observation: of the image.
+            poses, weights: (K, d), (K,) modes at the image.
+            gradients: (K, d) of the energy of the image and the body's prior, by the pose.
+            covariances: (K, d, d) inverse Hessians of that energy; on a limit a variable has none.
+            trust: tau, share of the image that is believed.
+            dt: time since the last image that was used, s.
+        """
+        size = self._space.size
+        information, pull = np.zeros((size, size)), np.zeros(size)
+        for pose, weight, gradient, covariance in zip(
+            poses, weights, gradients, covariances, strict=True
+        ):
+            linear = self.linearised(likelihood, observation, pose)
+            given_way = covariance @ linear.mixed.T
+            shift = covariance @ gradient
+            shift *= min(1.0, LARGEST_SHIFT / max(float(np.abs(shift).max()), 1e-12))
+            information += weight * (linear.curvature - linear.mixed @ given_way)
+            pull += weight * (linear.by_shape - linear.mixed @ shift)
+        before = self.covariance + np.diag((WANDERING * self._spread) ** 2 * dt)
+        precision = np.linalg.inv(before) + trust * 0.5 * (information + information.T)
+        after = np.linalg.inv(precision)
+        self.covariance = 0.5 * (after + after.T)
+        move = -trust * self.covariance @ pull
+        furthest = np.abs(move / self._spread).max()
+        move *= min(1.0, LARGEST_STEP / max(float(furthest), 1e-12))
+        limit = LARGEST * self._spread
+        offset = np.clip(self._offset + move, -limit, limit)
+        self._space = ShapeSpace(self._space.moved(offset - self._offset))
+        self._offset = offset
+        self.images += 1
+        return self._space.body
+
+    def considered(
+        self,
+        likelihood: ImageLikelihood,
+        observation: Observation,
+        poses: Array,
+        covariances: Array,
+    ) -> Array:
+        """What the uncertain shape adds to the covariances of modes: J P J', (K, d, d).
+
+        Arguments as for `update`.
+        """
+        result = np.empty_like(covariances)
+        for k, (pose, covariance) in enumerate(zip(poses, covariances, strict=True)):
+            moved = covariance @ self.linearised(likelihood, observation, pose).mixed.T
+            result[k] = moved @ self.covariance @ moved.T
+        return result
+
+    def linearised(
+        self, likelihood: ImageLikelihood, observation: Observation, pose: Array
+    ) -> Linearised:
+        """The energy of the contours and keypoints of an image around a pose (d,)."""
+        frames = forward(self._space.body.skeleton, pose[None])
+        found = likelihood.residuals(frames, observation)
+        segments, points, directions = found[:, 0].astype(np.intp), found[:, 1:4], found[:, 4:7]
+        pull, curvature = found[:, 7], found[:, 8]
+        by_pose = directed_derivatives(frames, segments, points, directions)
+        by_shape = self._space.point_derivatives(frames, segments, points, directions)
+        keypoints, s = observation.keypoints, likelihood.settings.keypoints
+        if keypoints is not None and s.weight > 0:
+            term = KeypointTerm(self._space.body.skeleton, likelihood.camera, keypoints, s)
+            of_joints = self._of_keypoints(frames, term)
+            pull, curvature, by_pose, by_shape = (
+                np.concatenate(pair)
+                for pair in zip((pull, curvature, by_pose, by_shape), of_joints, strict=True)
+            )
+        weighted = by_shape * curvature[:, None]
+        return Linearised(by_shape.T @ pull, weighted.T @ by_shape, weighted.T @ by_pose)
+
+    def _of_keypoints(
+        self, frames: Frames, term: KeypointTerm
+    ) -> tuple[Array, Array, Array, Array]:
+        """Pull, curvature (M,) and derivatives (M, d), (M, P) of the residuals of keypoints."""
+        joints, points, directions, pull, curvature = term.residuals(frames)
+        skeleton = term.skeleton
+        by_pose = directed_derivatives(frames, skeleton.joint_segments[joints], points, directions)
+        lengths = self._space.joint_derivatives(frames, joints)
+        by_shape = np.zeros((len(joints), self._space.size))
+        by_shape[:, : self._space.lengths] = np.einsum('mk,mkl->ml', directions, lengths)
+        return pull, curvature, by_pose, by_shape
+
+
