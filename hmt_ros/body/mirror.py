@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton, other_side
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 
 # Axes of the root's rotations, in the order in which they act.
 ROOT_AXES = 'zyx'
@@ -23,12 +23,17 @@ ROOT_AXES = 'zyx'
 def mirror(body: Body, poses: ArrayLike) -> Array:
     """Poses (N, d) of the mirror image, left for right: x in the camera frame changes its sign."""
     q = np.array(poses, dtype=np.float64, ndmin=2)
-    skeleton = body.skeleton
+    order, signs = mirror_order(body.skeleton)
+    result: Array = q[:, order] * signs
+    return result
+
+
+def mirror_order(skeleton: Skeleton) -> tuple[Index, Array]:
+    """Order (d,) and signs (d,): the mirror image of a pose q (d,) is q[order] * signs."""
     order = skeleton.dof_index(tuple(other_side(name) for name in skeleton.dof_names))
     along_x = skeleton.dof_axes == 0
     signs = np.where(along_x == skeleton.dof_is_rotation, 1.0, -1.0)
-    result: Array = q[:, order] * signs
-    return result
+    return np.asarray(order, dtype=np.intp), signs
 
 
 def reverse_depth(body: Body, poses: ArrayLike) -> Array:

@@ -224,7 +224,7 @@ def training_set(
         raise ValueError('no motions to learn from')
     PoseEncoding(body)  # checks the root
     rng = np.random.default_rng(s.seed)
-    pool = [_novel(body, sequence.poses, s.novelty) for sequence in sequences]
+    pool = [novel_frames(body, sequence.poses, s.novelty) for sequence in sequences]
     which = np.repeat(np.arange(len(pool)), [len(x) for x in pool])
     frames = np.concatenate(pool)
     chosen = _drawn(len(which), s.samples, rng)
@@ -250,7 +250,7 @@ def training_set(
     return TrainingSet(poses, previous, packed, activities, which, frames)
 
 
-def _novel(body: Body, poses: Array, distance: float) -> Index:
+def novel_frames(body: Body, poses: Array, distance: float) -> Index:
     """Frames (n,) of poses (T, d) that differ from the last one kept, whatever the heading."""
     still = poses.copy()
     still[:, :3] = 0.0

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames
-from hmt_ros.body.pose_terms import AnglePrior, FrameTerm, Posed, SelfIntersection
+from hmt_ros.body.pose_prior import LEARNED, check_kind, pose_prior
+from hmt_ros.body.pose_terms import FrameTerm, Posed, SelfIntersection
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.surface import flesh_table_of, grown, lens_of
 from hmt_ros.image.terms.image_term import Request, TermSettings, Weighting
@@ -54,7 +55,11 @@ class LikelihoodSettings(_ImageTerms):  # type: ignore[misc]
 
     keypoints: TermSettings = KEYPOINTS
     prior_weight: float = 1.0
+    pose_prior: str = LEARNED
     self_intersection_sigma: float = 0.03
+
+    def __post_init__(self) -> None:
+        check_kind(self.pose_prior)
 
     @classmethod
     def of_terms(cls, **settings: TermSettings) -> LikelihoodSettings:
@@ -72,6 +77,8 @@ LikelihoodSettings.__doc__ = '\n'.join(
         *(f'    {term.name}: {term.meaning}' for term in TERMS),
         '    keypoints: Distance of the joints from the keypoints.',
         '    prior_weight: Factor on the soft prior of the joint angles.',
+        '    pose_prior: Soft prior of the joint angles: "learned", from motion capture, where the',
+        '        body has one, or "angles", an independent Gaussian for each.',
         '    self_intersection_sigma: Overlap of two body parts that costs an energy of 1/2, m;',
         '        inf switches the term off.',
     ]
@@ -151,10 +158,15 @@ class ImageLikelihood:
     def priors(self) -> tuple[FrameTerm, ...]:
         """What is known of a pose without any image: joint angles, parts that do not intersect."""
         s = self.settings
-        angles = AnglePrior(self.body, s.prior_weight)
         if not np.isfinite(s.self_intersection_sigma):
-            return (angles,)
-        return (angles, SelfIntersection(self.body, s.self_intersection_sigma))
+            return (self.pose_prior,)
+        return (self.pose_prior, SelfIntersection(self.body, s.self_intersection_sigma))
+
+    @cached_property
+    def pose_prior(self) -> FrameTerm:
+        """The soft prior of the joint angles."""
+        s = self.settings
+        return pose_prior(self.body, s.pose_prior, s.prior_weight)
 
     def energies(
         self,

@@ -47,6 +47,7 @@ _TRACKER = {
     **{f'likelihood.{term.name}.weight': NOT_NEGATIVE for term in TERMS},
     'likelihood.keypoints.weight': NOT_NEGATIVE,
     'likelihood.prior_weight': NOT_NEGATIVE,
+    'likelihood.pose_prior': None,
     'likelihood.self_intersection_sigma': NOT_NEGATIVE,
 }
 BACKGROUND = {'method': None, 'threshold': NOT_NEGATIVE, 'shadow_threshold': FRACTION}

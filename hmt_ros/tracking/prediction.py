@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.pose_terms import AnglePrior, Posed
+from hmt_ros.body.pose_terms import Posed
 from hmt_ros.image.likelihood import ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array
@@ -65,7 +65,7 @@ def follow_flow(
     )
     term = Sum(
         (
-            Posed(body.skeleton, (seen, AnglePrior(body, s.prior_weight))),
+            Posed(body.skeleton, (seen, posterior.likelihood.pose_prior)),
             Quadratic(predicted.poses, precisions),
         )
     )

@@ -20,7 +20,7 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import minimise
-from hmt_ros.inference.energy import Derivatives, Quadratic, Restricted, Student, Sum
+from hmt_ros.inference.energy import Derivatives, Restricted, Student, Sum
 from hmt_ros.tracking.posterior import Posterior
 
 # Degrees of freedom of the Student prior that keeps a limb near its prediction: heavy tails.
@@ -82,12 +82,10 @@ class LimbSearch:
         )
         rows = np.full(len(samples), row)
         seen = self._own.seen(observation, textures, rows, explained=others.costs)
-        seen = (*seen, *self.posterior.extra)
-        weight = s.likelihood.prior_weight
+        seen = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.extra)
         term = Sum(
             (
                 Restricted(Posed(body.skeleton, seen), pose, own),
-                Quadratic(body.prior_mean[own], weight * body.prior_sigma[own] ** -2.0),
                 Student(pose[own], np.asarray(np.linalg.inv(block)), TAILS),
             )
         )

@@ -1,0 +1,290 @@
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+
+from hmt_ros.body import Body, load_body
+from hmt_ros.body.angle_mixture import AngleMixture, read_pose_prior, shipped_prior
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.mirror import mirror
+from hmt_ros.body.pose_prior import MixturePrior, pose_prior
+from hmt_ros.body.pose_terms import AnglePrior
+from hmt_ros.experts.model_file import write_arrays
+from hmt_ros.image.likelihood import LikelihoodSettings
+from hmt_ros.inference.bounded_newton import minimise
+from hmt_ros.inference.energy import Derivatives, EnergyFunction
+from hmt_ros.inference.mixture import GaussianMixture
+
+HUMAN = load_body('human37')
+ARMS = tuple(
+    f'{side}_{joint}'
+    for side in ('right', 'left')
+    for joint in ('shoulder_x', 'shoulder_y', 'shoulder_z', 'elbow')
+)
+COVERED = ('trunk_y', *ARMS, 'trunk_x')
+
+
+def made_mixture(seed: int = 0, count: int = 4, dofs: tuple[str, ...] = COVERED) -> AngleMixture:
+    rng = np.random.default_rng(seed)
+    own = HUMAN.skeleton.dof_index(dofs)
+    n = len(dofs)
+    means = HUMAN.prior_mean[own] + rng.normal(size=(count, n)) * HUMAN.prior_sigma[own]
+    factors = 0.2 * rng.normal(size=(count, n, n))
+    weights = rng.uniform(0.5, 1.0, count)
+    covariances = factors @ factors.transpose(0, 2, 1) + 0.05 * np.eye(n)
+    mixture = GaussianMixture(weights / weights.sum(), means, covariances)
+    return AngleMixture(HUMAN.skeleton, dofs, mixture, {'source': 'made up'})
+
+
+def poses(count: int, seed: int = 1, body: Body = HUMAN) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    sigma = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 1.0)
+    return body.prior_mean + sigma * rng.normal(size=(count, body.dimension))
+
+
+def energy(prior, x, derivatives=Derivatives.POSITIVE):
+    frames = forward(prior.body.skeleton, x)
+    return prior.energy(frames, np.arange(len(x)), derivatives=derivatives)
+
+
+def plain_log_density(mixture: AngleMixture, x: np.ndarray) -> np.ndarray:
+    """log p of poses, component by component."""
+    own = HUMAN.skeleton.dof_index(mixture.dofs)
+    image = mirror(HUMAN, x)[:, own]
+    terms = []
+    for i, (w, m, s) in enumerate(
+        zip(
+            mixture.components.weights,
+            mixture.components.means,
+            mixture.components.covariances,
+            strict=True,
+        )
+    ):
+        density = multivariate_normal(m, s)
+        if i == 0:
+            terms.append(np.log(w) + density.logpdf(x[:, own]))
+        else:
+            terms += [np.log(w / 2) + density.logpdf(side) for side in (x[:, own], image)]
+    return logsumexp(terms, axis=0)
+
+
+def test_values_are_those_of_the_density():
+    mixture, x = made_mixture(), poses(30)
+    # The broad component is its own mirror image where its mean and covariance are.
+    prior = MixturePrior(HUMAN, mixture, 0.3)
+    rest = np.setdiff1d(np.arange(37), mixture.indices)
+    z = (x - HUMAN.prior_mean)[:, rest] / HUMAN.prior_sigma[rest]
+    wanted = 0.3 * (mixture.highest - plain_log_density(mixture, x) + 0.5 * (z**2).sum(1))
+    assert np.allclose(energy(prior, x).value, wanted, atol=1e-9)
+    assert np.allclose(mixture.log_density(x), plain_log_density(mixture, x), atol=1e-9)
+
+
+def numerical(function, x, step=1e-6):
+    columns = []
+    for j in range(x.shape[1]):
+        shift = np.zeros(x.shape[1])
+        shift[j] = step
+        columns.append((function(x + shift) - function(x - shift)) / (2.0 * step))
+    return np.stack(columns, axis=-1)
+
+
+@pytest.mark.parametrize('weight', [1.0, 0.3])
+def test_gradient_and_exact_hessian_against_differences(weight):
+    prior, x = MixturePrior(HUMAN, made_mixture(), weight), poses(6)
+    x[:, prior.mixture.indices] = prior.mixture.whole.sample(6, np.random.default_rng(2))
+    _, gradient, hessian = energy(prior, x, Derivatives.EXACT)
+    values = numerical(lambda y: energy(prior, y, Derivatives.NONE).value, x)
+    assert np.allclose(gradient, values, atol=1e-5, rtol=1e-6)
+    slopes = numerical(lambda y: energy(prior, y).gradient, x)
+    assert np.allclose(hessian, slopes, atol=1e-5, rtol=1e-6)
+
+
+def test_positive_hessian_weighs_precisions_and_lies_above_the_exact_one():
+    mixture, x = made_mixture(), poses(20)
+    prior = MixturePrior(HUMAN, mixture)
+    whole, own = mixture.whole, mixture.indices
+    log = whole.component_log_densities(x[:, own]) + np.log(whole.weights)
+    shares = np.exp(log - logsumexp(log, axis=1, keepdims=True))
+    wanted = np.einsum('nc,cij->nij', shares, np.linalg.inv(whole.covariances))
+    positive, exact = energy(prior, x).hessian, energy(prior, x, Derivatives.EXACT).hessian
+    assert np.allclose(positive[:, own[:, None], own], wanted, atol=1e-6)
+    scale = np.abs(positive).max()
+    assert np.linalg.eigvalsh(positive).min() > -1e-12 * scale
+    assert np.linalg.eigvalsh(positive - exact).min() > -1e-9 * scale
+    # The quadratic that touches the energy lies above it, near and far.
+    value, gradient, _ = energy(prior, x)
+    step = 0.7 * np.random.default_rng(3).normal(size=x.shape)
+    above = value + (gradient * step).sum(1)
+    above += 0.5 * np.einsum('ni,nij,nj->n', step, positive, step)
+    assert (energy(prior, x + step).value <= above + 1e-9).all()
+
+
+def test_derivatives_come_as_they_are_asked_for():
+    prior, x = MixturePrior(HUMAN, made_mixture()), poses(3)
+    assert energy(prior, x, Derivatives.NONE)[1:] == (None, None)
+    # Terms are added wherever there is a gradient: with it comes a Hessian.
+    for wanted in (Derivatives.GRADIENT, Derivatives.POSITIVE):
+        found = energy(prior, x, wanted)
+        assert np.array_equal(found.value, energy(prior, x, Derivatives.NONE).value)
+        assert found.gradient.shape == (3, 37)
+        assert found.hessian.shape == (3, 37, 37)
+    assert energy(prior, x[:0]).hessian.shape == (0, 37, 37)
+
+
+def test_the_most_probable_pose_costs_nothing():
+    mixture = made_mixture(5)
+    prior = MixturePrior(HUMAN, mixture)
+    term = EnergyFunction(lambda y, _: tuple(energy(prior, y)))
+    starts = np.repeat(HUMAN.prior_mean[None], len(mixture.whole), axis=0)
+    starts[:, mixture.indices] = mixture.whole.means
+    wide = np.full(37, 50.0)
+    found = minimise(term, starts, -wide, wide, step_scale=np.full(37, 0.5), max_iterations=200)
+    assert found.value.min() == pytest.approx(0.0, abs=1e-6)
+    assert energy(prior, poses(500, 9)).value.min() > 0.0
+
+
+def test_limits_hold_under_the_prior():
+    prior = pose_prior(HUMAN, 'learned', 1.0)
+    term = EnergyFunction(lambda y, _: tuple(energy(prior, y)))
+    inner = np.clip(poses(20, 4), HUMAN.lower, HUMAN.upper)
+    found = minimise(
+        term, inner, HUMAN.lower, HUMAN.upper, step_scale=np.full(37, 0.3), max_iterations=50
+    ).x
+    assert (found >= HUMAN.lower).all()
+    assert (found <= HUMAN.upper).all()
+
+
+# The prior that ships.
+
+
+def test_the_shipped_prior_is_its_own_mirror_image_and_small():
+    mixture = shipped_prior(HUMAN)
+    assert isinstance(mixture, AngleMixture)
+    x = poses(200)
+    assert np.allclose(mixture.log_density(x), mixture.log_density(mirror(HUMAN, x)), atol=1e-9)
+    assert np.allclose(mixture.log_density(x), plain_log_density(mixture, x), atol=1e-6)
+    assert 'mocap.cs.cmu.edu' in mixture.card['source']
+    assert 'NSF EIA-0196217' in mixture.card['source']
+    assert shipped_path().stat().st_size < 150_000
+
+
+def shipped_path():
+    from importlib import resources
+
+    return resources.files('hmt_ros.body') / 'models' / 'human37_prior.npz'
+
+
+def test_no_pose_costs_much_more_than_under_the_model_file():
+    mixture = shipped_prior(HUMAN)
+    own = mixture.indices
+    sigma = HUMAN.prior_sigma[own]
+    x = np.concatenate([poses(300, 6), HUMAN.prior_mean + 6.0 * (poses(300, 7) - HUMAN.prior_mean)])
+    z = (x[:, own] - HUMAN.prior_mean[own]) / sigma
+    usual = -0.5 * (z**2).sum(1) - np.log(sigma * np.sqrt(2.0 * np.pi)).sum()
+    loss = usual - mixture.log_density(x)
+    assert loss.max() <= -np.log(mixture.components.weights[0]) + 1e-4
+    assert loss.max() < 1.0
+
+
+def test_hanging_arms_are_likelier_than_bent_elbows():
+    mixture = shipped_prior(HUMAN)
+    standing = np.tile(HUMAN.prior_mean, (2, 1))
+    for side in ('left', 'right'):
+        for joint, angle in (
+            ('shoulder_x', -5.0),
+            ('elbow', 25.0),
+            ('hip_x', 0.0),
+            ('knee', -10.0),
+        ):
+            standing[:, HUMAN.dof_names.index(f'{side}_{joint}')] = np.radians(angle)
+        standing[1, HUMAN.dof_names.index(f'{side}_elbow')] = np.radians(60.0)
+    hanging, bent = mixture.log_density(standing)
+    assert hanging > bent
+
+
+def test_which_bodies_have_a_learned_prior():
+    assert isinstance(pose_prior(HUMAN, 'learned', 0.5), MixturePrior)
+    assert isinstance(pose_prior(HUMAN, 'angles', 0.5), AnglePrior)
+    assert isinstance(pose_prior(load_body('human34'), 'learned', 0.5), AnglePrior)
+    tall = HUMAN.with_stature(1.9).with_segment_lengths({'forearm': 0.3})
+    assert pose_prior(tall, 'learned', 1.0).mixture is shipped_prior(HUMAN)
+    # Another body under the name: its frames at rest differ.
+    mounts = HUMAN.skeleton.mounts.copy()
+    mounts[5] = mounts[5][:, [1, 2, 0]]
+    other = replace(HUMAN, skeleton=replace(HUMAN.skeleton, mounts=mounts))
+    assert isinstance(pose_prior(other, 'learned', 1.0), AnglePrior)
+    with pytest.raises(ValueError, match=r"pose_prior must be one of .*learned.*, saw 'none'"):
+        pose_prior(HUMAN, 'none', 1.0)
+    with pytest.raises(ValueError, match='pose_prior must be one of'):
+        LikelihoodSettings(pose_prior='none')
+
+
+# Files.
+
+
+def test_a_file_gives_the_mixture_back(tmp_path):
+    mixture = made_mixture()
+    path = write_arrays(tmp_path / 'prior', mixture.arrays())
+    found = read_pose_prior(path, HUMAN)
+    assert found.dofs == mixture.dofs
+    assert found.card == {'source': 'made up'}
+    x = poses(20)
+    assert np.allclose(found.log_density(x), mixture.log_density(x), rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'format': np.array('other')}, r"not a pose prior \(its format is 'other'\)"),
+        ({'weights': None}, r'not a pose prior \(it lacks weights\)'),
+        ({'version': np.array(7)}, 'pose prior of version 7, wanted 1'),
+        ({'body': np.array('human34')}, "of the body 'human34', wanted one of 'human37'"),
+        ({'mounts': np.zeros((2, 3, 3))}, 'frames at rest'),
+        ({'mounts': np.array('none')}, 'frames at rest'),
+        ({'means': np.zeros((4, 3))}, r'damaged pose prior \(means \(4, 3\)'),
+        ({'means': np.full((4, 10), np.nan)}, 'not finite'),
+        ({'factors': np.zeros((4, 55))}, 'not positive definite'),
+        ({'factors': np.full((4, 55), np.inf)}, 'wanted finite ones'),
+        ({'weights': np.full(4, 0.5)}, 'weights must be positive and sum to 1'),
+        ({'weights': np.array(1.0)}, 'damaged pose prior'),
+        ({'dofs': np.array(['trunk_q'] * 10)}, 'has no degrees of freedom'),
+        ({'dofs': np.array(['trunk_x'] * 10)}, 'wanted different angles'),
+        ({'dofs': np.array(1)}, 'damaged pose prior'),
+        ({'card': np.array('{')}, 'damaged pose prior'),
+        ({'card': np.array('[]')}, 'the card is a list'),
+    ],
+)
+def test_faults_of_a_file_are_named(tmp_path, change, message):
+    arrays = made_mixture().arrays() | change
+    path = write_arrays(tmp_path / 'p', {k: v for k, v in arrays.items() if v is not None})
+    with pytest.raises(ValueError, match=message) as caught:
+        read_pose_prior(path, HUMAN)
+    assert str(path) in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+def test_damaged_and_missing_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match='learn-prior'):
+        read_pose_prior(tmp_path / 'none.npz', HUMAN)
+    whole = shipped_path().read_bytes()
+    path = tmp_path / 'cut.npz'
+    for content in (b'', b'text', whole[: len(whole) // 2], whole[:-4]):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match='not a pose prior'):
+            read_pose_prior(path, HUMAN)
+    shutil.copy(shipped_path(), path)
+    assert read_pose_prior(path, HUMAN).dofs == shipped_prior(HUMAN).dofs
+
+
+def test_mixtures_without_their_mirror_image_are_refused():
+    with pytest.raises(ValueError, match='mirror images of'):
+        made_mixture(dofs=('left_elbow', 'left_knee'))
+    with pytest.raises(ValueError, match='wanted different angles'):
+        made_mixture(dofs=('trunk_x', 'trunk_x'))
+    with pytest.raises(ValueError, match='wanted 2 to'):
+        made_mixture(count=1)
