@@ -20,6 +20,10 @@ COMMANDS = {
     ),
     'make-bag': ('hmt_ros.app.make_bag', 'render a motion into a bag with ground truth'),
     'train': ('hmt_ros.app.train', 'learn a predictor of poses from silhouettes'),
+    'learn-motion': (
+        'hmt_ros.app.learn_motion',
+        'learn how poses move, from recorded motions',
+    ),
     'report': (
         'hmt_ros.app.report.command',
         'show the mixtures in a bag: pictures, and a page with a 3D view',

@@ -16,6 +16,7 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Index
@@ -26,8 +27,9 @@ from hmt_ros.tracking.facing_odds import FacingOdds
 from hmt_ros.tracking.flesh_fitting import FleshFit
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses, relative_joints
 from hmt_ros.tracking.loss import unexplained_share
+from hmt_ros.tracking.motion_states import PredictedStates
 from hmt_ros.tracking.posterior import Posterior, free_covariances
-from hmt_ros.tracking.prediction import follow_flow, predict, updated_velocities
+from hmt_ros.tracking.prediction import follow_flow, predict
 from hmt_ros.tracking.proposals import PROPOSALS, PredictedPoses, Proposal
 from hmt_ros.tracking.proposals.headings import Headings
 from hmt_ros.tracking.proposals.reversals import Reversals
@@ -190,7 +192,7 @@ class MixtureFilter:
     def hold(self, solved: Minimum, log_weights: Array, observation: Observation) -> None:
         """Makes modes at rest from minima and their log prior weights (N,)."""
         optimised = Optimised(new_hypotheses(solved.x, log_weights), solved)
-        least = self._weigh_and_select(optimised, np.zeros_like(solved.x), observation)
+        least = self._weigh_and_select(optimised, None, observation)
         self.log_evidence = -self.beta * least
 
     def twin(self) -> MixtureFilter:
@@ -219,7 +221,8 @@ class MixtureFilter:
         """
         s, modes, posterior = self.settings, self.modes, self._posterior
         observation = self._believed(observation)
-        predicted, covariances = predict(modes, self.body, dt, s.velocity_kept)
+        predicted, states = predict(modes, self.body, dt)
+        covariances = states.pose_covariances
         precisions = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
         beta = self.beta
         predicted = follow_flow(predicted, precisions, observation, posterior)
@@ -246,18 +249,12 @@ class MixtureFilter:
             optimised = self._search_again(optimised, covariances, precisions, observation)
         self._learn_usual_energy(float(optimised.minima.value.min()))
         hypotheses, solved = optimised.hypotheses, optimised.minima
-        ancestors = hypotheses.ancestors
-        velocities = updated_velocities(
-            modes.velocities[ancestors], modes.poses[ancestors], solved.x, dt, s.velocity_gain
-        )
-        # Where a limb has jumped, its displacement is no motion.
-        velocities = np.where(hypotheses.jumped, 0.0, velocities)
         before = None
         if s.reweighting == 'bhattacharyya':
             hypotheses = replace(hypotheses, log_weights=np.zeros(len(hypotheses)))
             before = GaussianMixture(np.exp(modes.log_weights), predicted.poses, covariances)
         least = self._weigh_and_select(
-            Optimised(hypotheses, solved), velocities, observation, before,
+            Optimised(hypotheses, solved), states, observation, before,
             modes.energies - modes.energies.min(),
         )  # fmt: skip
         # Of the error of an energy only what is new counts.
@@ -361,7 +358,7 @@ class MixtureFilter:
     def _weigh_and_select(
         self,
         optimised: Optimised,
-        velocities: Array,
+        states: PredictedStates | None,
         observation: Observation,
         before: GaussianMixture | None = None,
         excess: Array | None = None,
@@ -370,7 +367,7 @@ class MixtureFilter:
 
         Args:
             optimised: hypotheses at their optima.
-            velocities: (N, d) of them, per second.
+            states: of the ancestors, predicted; None: the modes begin.
             observation: of the image.
             before: the prediction that modes inherit their weights from; None: from ancestors.
             excess: (K,) of the ancestors' energies over the least in the image before.
@@ -415,6 +412,11 @@ class MixtureFilter:
         if observation.evidence:
             covariances = self._posterior.covariances(fit, solved.free[rows])
         h = optimised.hypotheses[rows]
+        if states is None:
+            velocities = np.zeros_like(poses)
+            state_covariances = motion_prior(self.body).states(filtered)
+        else:
+            velocities, state_covariances = states.given(h.ancestors, h.jumped, poses, filtered)
         self._modes = Modes(
             poses=poses,
             log_weights=weights[order],
@@ -423,11 +425,12 @@ class MixtureFilter:
             jumped=h.jumped,
             textures=self._posterior.textures(poses, observation),
             texture_rows=np.arange(len(rows)),
-            velocities=velocities[rows],
+            velocities=velocities,
             covariances=covariances,
             filtered=filtered,
             log_likelihoods=-fit.image_energy,
             energies=solved.value[rows],
+            state_covariances=state_covariances,
         )
         self._outline_costs = fit.outline_costs
         return float(solved.value[usable].min())

@@ -77,6 +77,8 @@ class Modes(Hypotheses):
             image to image.
         log_likelihoods: (N,) of the image.
         energies: (N,) of the posterior at the optimum, nats.
+        state_covariances: (N, n, n) of poses and velocities, as far as the motion prior has them;
+            those of the poses are `filtered`.
     """
 
     velocities: Array
@@ -84,6 +86,7 @@ class Modes(Hypotheses):
     filtered: Array
     log_likelihoods: Array
     energies: Array
+    state_covariances: Array
 
     def mixture(self, share: float) -> GaussianMixture:
         """The modes as a mixture over poses.

@@ -72,8 +72,6 @@ class TrackerSettings:
             lacks, with those of the image before.
         tails: Degrees of freedom of the Student motion prior; small numbers give heavy tails.
         least_log_weight: Smallest log weight of a mode that is kept, nats.
-        velocity_kept: Share of a mode's velocity that lasts to the next image; 0 is a random walk.
-        velocity_gain: Share of the newest displacement in a mode's velocity.
         flesh_images: Number of images from which the widths of the body parts are estimated; 0
             keeps those of the model.
         lost_misfit: Fraction of the outline, or of the keypoints, left unexplained by every mode
@@ -111,8 +109,6 @@ class TrackerSettings:
     error_correlation: float = 0.8
     tails: float = 8.0
     least_log_weight: float = -14.0
-    velocity_kept: float = 0.7
-    velocity_gain: float = 0.5
     flesh_images: int = 15
     lost_misfit: float = 0.35
     lost_images: int = 5
@@ -143,6 +139,3 @@ class TrackerSettings:
         for name in ('jump_probability', 'prediction_probability'):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f'{name} must lie in (0, 1), saw {getattr(self, name)}')
-        for name in ('velocity_kept', 'velocity_gain'):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f'{name} must lie in [0, 1], saw {getattr(self, name)}')
