@@ -27,7 +27,7 @@ from hmt_ros.tracking.facing_odds import FacingOdds
 from hmt_ros.tracking.flesh_fitting import FleshFit
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses, relative_joints
 from hmt_ros.tracking.loss import unexplained_share
-from hmt_ros.tracking.motion_states import PredictedStates
+from hmt_ros.tracking.motion_states import PredictedStates, fused
 from hmt_ros.tracking.posterior import Posterior, free_covariances
 from hmt_ros.tracking.prediction import follow_flow, predict
 from hmt_ros.tracking.proposals import PROPOSALS, PredictedPoses, Proposal
@@ -222,7 +222,7 @@ class MixtureFilter:
         s, modes, posterior = self.settings, self.modes, self._posterior
         observation = self._believed(observation)
         predicted, states = predict(modes, self.body, dt)
-        covariances = states.pose_covariances
+        covariances, searched = states.pose_covariances, states.searched
         precisions = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
         beta = self.beta
         predicted = follow_flow(predicted, precisions, observation, posterior)
@@ -240,13 +240,13 @@ class MixtureFilter:
             elsewhere = PredictedPoses(self.body, expected, s.prediction_probability)
             proposals.insert(0, elsewhere)
         candidates, *others = (
-            x.propose(base, predicted, covariances, observation, self._rng) for x in proposals
+            x.propose(base, predicted, searched, observation, self._rng) for x in proposals
         )
         for more in others:
             candidates = candidates.joined(more)
-        optimised = self._optimise(candidates, precisions, observation)
+        optimised = self._optimise(candidates, states, precisions, observation)
         if self._proposal.iterated:
-            optimised = self._search_again(optimised, covariances, precisions, observation)
+            optimised = self._search_again(optimised, states, precisions, observation)
         self._learn_usual_energy(float(optimised.minima.value.min()))
         hypotheses, solved = optimised.hypotheses, optimised.minima
         before = None
@@ -296,17 +296,24 @@ class MixtureFilter:
     # The steps.
 
     def _optimise(
-        self, hypotheses: Hypotheses, precisions: Array, observation: Observation
+        self,
+        hypotheses: Hypotheses,
+        states: PredictedStates,
+        precisions: Array,
+        observation: Observation,
     ) -> Optimised:
-        term = self._posterior.given(observation, hypotheses, precisions)
+        # Each has a precision of its own, where it jumped a lower one.
+        own = states.precisions_of(hypotheses.ancestors, hypotheses.jumped, precisions)
+        each = replace(hypotheses, ancestors=np.arange(len(hypotheses)))
+        term = self._posterior.given(observation, each, own)
         solved = self._posterior.minimise(term, hypotheses.poses, self.settings.iterations)
-        hessian = self._posterior.gaussian_hessians(solved, hypotheses, precisions)
+        hessian = self._posterior.gaussian_hessians(solved, each, own)
         return Optimised(hypotheses, replace(solved, hessian=hessian))
 
     def _search_again(
         self,
         optimised: Optimised,
-        covariances: Array,
+        states: PredictedStates,
         precisions: Array,
         observation: Observation,
     ) -> Optimised:
@@ -314,17 +321,17 @@ class MixtureFilter:
         for _ in range(self.settings.rounds - 1):
             if optimised.minima.value.min() < self._usual_energy + self.settings.energy_rise:
                 break
-            around = self._sources_around(optimised, covariances, precisions, observation)
+            around = self._sources_around(optimised, states, precisions, observation)
             more = self._proposal.propose(
-                around.minima, around.hypotheses, covariances, observation, self._rng
+                around.minima, around.hypotheses, states.searched, observation, self._rng
             )
-            optimised = optimised.joined(self._optimise(more, precisions, observation))
+            optimised = optimised.joined(self._optimise(more, states, precisions, observation))
         return optimised
 
     def _sources_around(
         self,
         optimised: Optimised,
-        covariances: Array,
+        states: PredictedStates,
         precisions: Array,
         observation: Observation,
     ) -> Optimised:
@@ -337,7 +344,7 @@ class MixtureFilter:
         best = order[: max(s.max_hypotheses // 2, 1)]
         lead = best[:1]
         drawn = covariance_scaled_samples(
-            self.body, optimised.minima.x[lead], covariances[h.ancestors[lead]], s.samples,
+            self.body, optimised.minima.x[lead], states.searched[h.ancestors[lead]], s.samples,
             s.sample_scale, self._rng,
         )[0]  # fmt: skip
         rows = np.full(len(drawn), h.texture_rows[lead[0]])
@@ -353,7 +360,7 @@ class MixtureFilter:
             h.textures,
             rows[:n],
         )
-        return optimised[best].joined(self._optimise(sampled, precisions, observation))
+        return optimised[best].joined(self._optimise(sampled, states, precisions, observation))
 
     def _weigh_and_select(
         self,
@@ -416,7 +423,11 @@ class MixtureFilter:
             velocities = np.zeros_like(poses)
             state_covariances = motion_prior(self.body).states(filtered)
         else:
-            velocities, state_covariances = states.given(h.ancestors, h.jumped, poses, filtered)
+            found = filtered
+            if states.wandered.any() and observation.evidence:
+                # Errors of images last: what is propagated believes a share of them, too.
+                found = fused(states.covariances_of(h.ancestors, h.jumped), covariances)
+            velocities, state_covariances = states.given(h.ancestors, h.jumped, poses, found)
         self._modes = Modes(
             poses=poses,
             log_weights=weights[order],

@@ -6,7 +6,8 @@ at x* with the covariance P*, the prediction N((x, v), P) is conditioned on it,
     G = P_vx P_xx^-1,    v* = v + G (x* - x),    P*_vv = P_vv - G P_xv + G P* G',    P*_vx = G P*
 
 which is the Kalman filter where the energy of the image is quadratic. Where a limb has jumped its
-displacement is no motion: nothing is known of its velocity then.
+displacement is no motion: nothing is known of its velocity then. Where it jumped to is known as
+well as a random walk would say, at the rates of the body; so far jumps are searched, too.
 """
 
 from __future__ import annotations
@@ -30,11 +31,14 @@ class PredictedStates:
         dynamics: that predicted them.
         means: (K, n); the first d are the pose, which may lie beyond the limits of the body.
         covariances: (K, n, n).
+        wandered: (d,) variances by which jumps may miss; zeros where the poses walk randomly, which
+            leaves room enough.
     """
 
     dynamics: LinearGaussianDynamics
     means: Array
     covariances: Array
+    wandered: Array
 
     @property
     def poses(self) -> Array:
@@ -46,6 +50,26 @@ class PredictedStates:
         """Covariances (K, d, d) of the poses."""
         d = self.dynamics.dimension
         return self.covariances[:, :d, :d]
+
+    @property
+    def searched(self) -> Array:
+        """Covariances (K, d, d) of the poses among which jumps are searched."""
+        return self.pose_covariances + np.diag(self.wandered)
+
+    def covariances_of(self, ancestors: Index, jumped: Mask) -> Array:
+        """Covariances (N, d, d) of the motion prior of hypotheses; see `given`."""
+        result = self.pose_covariances[ancestors]
+        diagonal = np.arange(result.shape[1])
+        result[:, diagonal, diagonal] += np.where(jumped, self.wandered, 0.0)
+        return result
+
+    def precisions_of(self, ancestors: Index, jumped: Mask, precisions: Array) -> Array:
+        """Inverses (N, d, d) of `covariances_of`, given those of the modes (K, d, d)."""
+        result = precisions[ancestors]
+        rows = np.flatnonzero(jumped.any(1))
+        if self.wandered.any() and len(rows):
+            result[rows] = np.linalg.inv(self.covariances_of(ancestors[rows], jumped[rows]))
+        return result
 
     def given(
         self, ancestors: Index, jumped: Mask, poses: Array, found: Array
@@ -82,3 +106,9 @@ class PredictedStates:
         covariances[:, d:, :d] = together
         covariances[:, :d, d:] = together.swapaxes(1, 2)
         return np.where(jumped, 0.0, velocities), covariances
+
+
+def fused(a: Array, b: Array) -> Array:
+    """Covariances (N, d, d) of products of Gaussians of covariances (N, d, d) both."""
+    result = a - a @ np.linalg.solve(a + b, a)
+    return 0.5 * (result + result.swapaxes(1, 2))

@@ -50,7 +50,9 @@ def predicted_states(modes: Modes, covariances: Array, body: Body, dt: float) ->
     dynamics = motion_prior(body)
     known = np.concatenate([modes.poses, modes.velocities], axis=1)
     means = known[:, : dynamics.state_dimension]
-    return PredictedStates(dynamics, *dynamics.predict(means, covariances, dt))
+    has_velocities = dynamics.state_dimension > dynamics.dimension
+    wandered = body.rates * dt if has_velocities else np.zeros(body.dimension)
+    return PredictedStates(dynamics, *dynamics.predict(means, covariances, dt), wandered)
 
 
 def follow_flow(

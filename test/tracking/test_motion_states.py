@@ -6,7 +6,7 @@ import numpy as np
 
 from hmt_ros.inference.damped_velocity import DampedVelocity
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
-from hmt_ros.tracking.motion_states import PredictedStates
+from hmt_ros.tracking.motion_states import PredictedStates, fused
 
 D = 3
 DYNAMICS = DampedVelocity.of(
@@ -20,7 +20,10 @@ def predicted(seed: int = 0, count: int = 1) -> PredictedStates:
     rng = np.random.default_rng(seed)
     root = 0.3 * rng.normal(size=(count, 2 * D, 2 * D))
     return PredictedStates(
-        DYNAMICS, rng.normal(size=(count, 2 * D)), root @ root.swapaxes(1, 2) + 1e-3 * np.eye(2 * D)
+        DYNAMICS,
+        rng.normal(size=(count, 2 * D)),
+        root @ root.swapaxes(1, 2) + 1e-3 * np.eye(2 * D),
+        np.array([0.1, 0.2, 0.4]),
     )
 
 
@@ -34,7 +37,7 @@ def test_over_a_sequence_it_is_the_kalman_filter():
     for interval in rng.uniform(0.01, 0.3, 12):
         seen = rng.normal(size=D)
         # The filter: an optimum, its inverse Hessian, and the velocity from both.
-        states = PredictedStates(DYNAMICS, *DYNAMICS.predict(x, known, interval))
+        states = PredictedStates(DYNAMICS, *DYNAMICS.predict(x, known, interval), np.zeros(D))
         prior, image = np.linalg.inv(states.pose_covariances[0]), np.linalg.inv(noise)
         found = np.linalg.inv(prior + image)
         pose = found @ (prior @ states.poses[0] + image @ seen)
@@ -87,7 +90,26 @@ def test_covariances_stay_positive_definite_when_poses_are_hardly_known_or_exact
 
 def test_a_random_walk_has_no_velocities():
     walk = LinearGaussianDynamics.random_walk(np.ones(D))
-    states = PredictedStates(walk, np.zeros((1, D)), np.eye(D)[None])
+    states = PredictedStates(walk, np.zeros((1, D)), np.eye(D)[None], np.zeros(D))
     velocities, covariances = states.given(FIRST, STILL, np.ones((1, D)), 2.0 * np.eye(D)[None])
     assert not velocities.any()
     np.testing.assert_array_equal(covariances[0], 2.0 * np.eye(D))
+
+
+def test_limbs_that_jumped_may_miss_by_what_the_body_wanders():
+    states = predicted(1, 3)
+    ancestors = np.array([2, 0])
+    jumped = np.array([[False, False, False], [True, False, True]])
+    own = states.covariances_of(ancestors, jumped)
+    np.testing.assert_array_equal(own[0], states.pose_covariances[2])
+    np.testing.assert_allclose(own[1] - states.pose_covariances[0], np.diag([0.1, 0.0, 0.4]))
+    precisions = states.precisions_of(ancestors, jumped, np.linalg.inv(states.pose_covariances))
+    np.testing.assert_allclose(precisions @ own, np.tile(np.eye(D), (2, 1, 1)), atol=1e-9)
+    searched = states.searched - states.pose_covariances
+    np.testing.assert_allclose(searched, np.tile(np.diag([0.1, 0.2, 0.4]), (3, 1, 1)))
+
+
+def test_fused_covariances_are_those_of_products():
+    a, b = predicted(1, 3).pose_covariances, predicted(2, 3).pose_covariances
+    wanted = np.linalg.inv(np.linalg.inv(a) + np.linalg.inv(b))
+    np.testing.assert_allclose(fused(a, b), wanted, atol=1e-12)
