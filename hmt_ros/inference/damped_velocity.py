@@ -6,7 +6,7 @@ with a diagonal damping G, a diagonal W and a full D: joints that move together 
 velocities together. The velocity has the stationary covariance S_ij = D_ij / (G_i + G_j), and
 
     x(t) ~ x + a v,   v(t) ~ b v,     a = (1 - exp(-G t)) / G,   b = exp(-G t)
-    Q_xx = int a a' D + W t,   Q_xv = int a b' D,   Q_vv = int b b' D      (entry by entry, over 0..t)
+    Q_xx = int a a' D + W t,   Q_xv = int a b' D,   Q_vv = int b b' D    (entry by entry, 0..t)
 
 The integrals are sums of exponentials; over short times, where these cancel, they are taken by
 Gaussian quadrature [Uhlenbeck and Ornstein 1930; Van Loan 1978 for the general case].

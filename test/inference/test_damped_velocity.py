@@ -1,4 +1,4 @@
-"""Damped velocities with coupled noise against the general transition, simulation and their sums."""
+"""Damped velocities with coupled noise against the general transition and small steps."""
 
 from __future__ import annotations
 

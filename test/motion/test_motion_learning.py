@@ -27,7 +27,7 @@ def simulated(dynamics: DampedVelocity, times: int, seed: int) -> np.ndarray:
 
 @pytest.fixture(scope='module')
 def truth(human32) -> DampedVelocity:
-    """Damping 2 to 8 per second; neighbours are coupled, as mirror images and translations allow."""
+    """Damping 2 to 8 per second, coupled as mirror images and translations allow."""
     d = human32.dimension
     root = np.random.default_rng(2).normal(size=(d, d)) / np.sqrt(d)
     noise = 6.0 * (root @ root.T + 0.5 * np.eye(d))
