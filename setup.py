@@ -72,6 +72,7 @@ setup(
             'make-bag = hmt_ros.app.make_bag:main',
             'train = hmt_ros.app.train:main',
             'learn-prior = hmt_ros.app.learn_prior:main',
+            'learn-motion = hmt_ros.app.learn_motion:main',
             'report = hmt_ros.app.report.command:main',
             'evaluate = hmt_ros.app.evaluate:main',
         ],

@@ -13,6 +13,7 @@ BENCHMARKS = {
     'flips': 'time per leaf of the interpretation trees',
     'kernels': 'the compiled likelihood against vectorised numpy',
     'kjs': 'kinematic jumps against random sampling at finding minima',
+    'motion_prior': 'how well the motion prior predicts motions of other people',
     'nodes': 'images at the rate of a camera, through DDS',
     'smoothing': 'exactness, speed and peers of the smoother',
     'soak': 'nodes and files under load and fault',

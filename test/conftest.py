@@ -74,6 +74,11 @@ def human32() -> Body:
     return load_body('human32')
 
 
+@pytest.fixture(scope='session')
+def human37() -> Body:
+    return load_body('human37')
+
+
 RandomPoses = Callable[[Body, int, int], np.ndarray]
 
 

@@ -24,6 +24,10 @@ COMMANDS = {
         'hmt_ros.app.learn_prior',
         'learn the prior of the joint angles from motion files',
     ),
+    'learn-motion': (
+        'hmt_ros.app.learn_motion',
+        'learn how poses move, from recorded motions',
+    ),
     'report': (
         'hmt_ros.app.report.command',
         'show the mixtures in a bag: pictures, and a page with a 3D view',

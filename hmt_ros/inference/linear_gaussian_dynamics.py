@@ -11,6 +11,7 @@ velocity, and what is white is the acceleration.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +19,9 @@ from scipy.linalg import expm, logm
 
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockTridiagonal
+
+# Number of intervals whose transitions are kept.
+MOST_INTERVALS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +66,7 @@ class TrajectoryPrior:
 class LinearGaussianDynamics:
     """Dynamics of a state of n variables, of which the first d are the pose.
 
-    Use `random_walk`, `constant_velocity` or `discrete`.
+    Use `random_walk`, `constant_velocity` or `discrete`, or `DampedVelocity.of`.
 
     Attributes:
         drift: (n, n) F, per second.
@@ -204,7 +208,57 @@ class LinearGaussianDynamics:
         return len(self.drift)
 
     def transition(self, interval: float) -> tuple[Array, Array]:
-        """A and Q, both (n, n), over an interval in seconds."""
+        """A and Q, both (n, n), over an interval in seconds; those of the last ones are kept."""
+        known = self._transitions.get(interval)
+        if known is None:
+            known = self._transition(interval)
+            for part in known:
+                part.setflags(write=False)
+            if len(self._transitions) >= MOST_INTERVALS:
+                self._transitions.clear()
+            self._transitions[interval] = known
+        return known
+
+    @cached_property
+    def _transitions(self) -> dict[float, tuple[Array, Array]]:
+        return {}
+
+    @cached_property
+    def unknown_velocity(self) -> Array:
+        """Covariance (n - d, n - d) of the first velocity."""
+        d = self.dimension
+        result = np.linalg.inv(self.initial_precision[d:, d:])
+        return np.asarray(0.5 * (result + result.T), dtype=np.float64)
+
+    def states(self, covariances: Array) -> Array:
+        """Covariances (K, n, n) of states with poses of covariances (K, d, d).
+
+        What is known of the velocities is what is known of the first one.
+        """
+        d, n = self.dimension, self.state_dimension
+        if n == d:
+            return covariances
+        result = np.zeros((len(covariances), n, n))
+        result[:, :d, :d] = covariances
+        result[:, d:, d:] = self.unknown_velocity
+        return result
+
+    def predict_poses(
+        self, means: Array, covariances: Array, interval: float
+    ) -> tuple[Array, Array]:
+        """Means (K, d) and covariances (K, d, d) of poses, of whose velocities nothing is known.
+
+        Args:
+            means, covariances: (K, d) and (K, d, d) of the poses.
+            interval: s.
+        """
+        d = self.dimension
+        first = np.broadcast_to(self.initial_mean[d:], (len(means), self.state_dimension - d))
+        states = np.concatenate([means, first], axis=1)
+        moved, spread = self.predict(states, self.states(covariances), interval)
+        return moved[:, :d], spread[:, :d, :d]
+
+    def _transition(self, interval: float) -> tuple[Array, Array]:
         n = self.state_dimension
         if not self.drift.any():
             return np.eye(n), self.diffusion * interval

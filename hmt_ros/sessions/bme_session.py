@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body import Camera
+from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
 from hmt_ros.experts.pose_predictor import SHIPPED, PosePredictor, Prediction, load_predictor
 from hmt_ros.experts.root_placement import SIZE_SPREAD
@@ -33,7 +34,6 @@ from hmt_ros.experts.training_set import RATE
 from hmt_ros.image.background import BackgroundModel, one_person
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Mask
-from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
@@ -182,8 +182,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             return None
         # By what exceeds the step that dynamics were learned for, poses change as the body may.
         m, beyond = previous.mixture, max(interval - 1.0 / RATE, 0.0)
-        dynamics = LinearGaussianDynamics.random_walk(self._predictor.body.rates)
-        return GaussianMixture(m.weights, *dynamics.predict(m.means, m.covariances, beyond))
+        dynamics = motion_prior(self._predictor.body)
+        return GaussianMixture(m.weights, *dynamics.predict_poses(m.means, m.covariances, beyond))
 
     def _seen(self, mask: Mask, camera: Camera, previous: GaussianMixture | None) -> Prediction:
         return self._predictor.observe(

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hmt_ros.body import Body
+from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     NEXT_WINDOW,
@@ -22,17 +23,19 @@ from hmt_ros.sessions.declared_parameters import (
 from hmt_ros.sessions.parameter_file import parameter_file_text
 from hmt_ros.smoothing import LinearGaussianDynamics
 
-MODELS = ('random_walk', 'constant_velocity')
+MODELS = ('random_walk', 'constant_velocity', 'learned')
 METHODS = ('paths', 'variational')
 
 
 @dataclass(frozen=True)
 class SmootherDynamics:
-    """Motion model of the smoother, with the rates of the body.
+    """Motion model of the smoother.
 
     Attributes:
-        model: Motion model: 'random_walk', or 'constant_velocity', whose state has velocities
-            besides the pose and costs several times as much.
+        model: Motion model: 'random_walk' with the rates of the body, 'constant_velocity', whose
+            state has velocities besides the pose and costs several times as much, or 'learned',
+            that of the filter: damped velocities that are coupled, where the body ships with them,
+            else the random walk.
         velocity_time: Time for which a velocity lasts at constant velocity, s; velocities then gain
             so much that after it poses have moved as far as the random walk.
     """
@@ -48,6 +51,8 @@ class SmootherDynamics:
 
     def of(self, body: Body) -> LinearGaussianDynamics:
         """The dynamics of the poses of a body."""
+        if self.model == 'learned':
+            return motion_prior(body)
         rates = body.rates
         if self.model == 'random_walk':
             return LinearGaussianDynamics.random_walk(rates)

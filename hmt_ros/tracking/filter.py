@@ -16,6 +16,7 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Index
@@ -25,8 +26,9 @@ from hmt_ros.tracking.ambiguities import ambiguity_classes
 from hmt_ros.tracking.facing_odds import FacingOdds
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses, relative_joints
 from hmt_ros.tracking.loss import unexplained_share
+from hmt_ros.tracking.motion_states import PredictedStates, fused
 from hmt_ros.tracking.posterior import Posterior, free_covariances
-from hmt_ros.tracking.prediction import follow_flow, predict, updated_velocities
+from hmt_ros.tracking.prediction import follow_flow, predict
 from hmt_ros.tracking.proposals import PROPOSALS, PredictedPoses, Proposal
 from hmt_ros.tracking.proposals.headings import Headings
 from hmt_ros.tracking.proposals.reversals import Reversals
@@ -194,7 +196,7 @@ class MixtureFilter:
     def hold(self, solved: Minimum, log_weights: Array, observation: Observation) -> None:
         """Makes modes at rest from minima and their log prior weights (N,)."""
         optimised = Optimised(new_hypotheses(solved.x, log_weights), solved)
-        least = self._weigh_and_select(optimised, np.zeros_like(solved.x), observation)
+        least = self._weigh_and_select(optimised, None, observation)
         self.log_evidence = -self.beta * least
 
     def twin(self) -> MixtureFilter:
@@ -223,7 +225,8 @@ class MixtureFilter:
         """
         s, modes, posterior = self.settings, self.modes, self._posterior
         observation = self._believed(observation)
-        predicted, covariances = predict(modes, self.body, dt, s.velocity_kept)
+        predicted, states = predict(modes, self.body, dt)
+        covariances, searched = states.pose_covariances, states.searched
         precisions = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
         beta = self.beta
         predicted = follow_flow(predicted, precisions, observation, posterior)
@@ -241,27 +244,21 @@ class MixtureFilter:
             elsewhere = PredictedPoses(self.body, expected, s.prediction_probability)
             proposals.insert(0, elsewhere)
         candidates, *others = (
-            x.propose(base, predicted, covariances, observation, self._rng) for x in proposals
+            x.propose(base, predicted, searched, observation, self._rng) for x in proposals
         )
         for more in others:
             candidates = candidates.joined(more)
-        optimised = self._optimise(candidates, precisions, observation)
+        optimised = self._optimise(candidates, states, precisions, observation)
         if self._proposal.iterated:
-            optimised = self._search_again(optimised, covariances, precisions, observation)
+            optimised = self._search_again(optimised, states, precisions, observation)
         self._learn_usual_energy(float(optimised.minima.value.min()))
         hypotheses, solved = optimised.hypotheses, optimised.minima
-        ancestors = hypotheses.ancestors
-        velocities = updated_velocities(
-            modes.velocities[ancestors], modes.poses[ancestors], solved.x, dt, s.velocity_gain
-        )
-        # Where a limb has jumped, its displacement is no motion.
-        velocities = np.where(hypotheses.jumped, 0.0, velocities)
         before = None
         if s.reweighting == 'bhattacharyya':
             hypotheses = replace(hypotheses, log_weights=np.zeros(len(hypotheses)))
             before = GaussianMixture(np.exp(modes.log_weights), predicted.poses, covariances)
         least = self._weigh_and_select(
-            Optimised(hypotheses, solved), velocities, observation, before,
+            Optimised(hypotheses, solved), states, observation, before,
             modes.energies - modes.energies.min(),
         )  # fmt: skip
         # Of the error of an energy only what is new counts.
@@ -307,17 +304,24 @@ class MixtureFilter:
     # The steps.
 
     def _optimise(
-        self, hypotheses: Hypotheses, precisions: Array, observation: Observation
+        self,
+        hypotheses: Hypotheses,
+        states: PredictedStates,
+        precisions: Array,
+        observation: Observation,
     ) -> Optimised:
-        term = self._posterior.given(observation, hypotheses, precisions)
+        # Each has a precision of its own, where it jumped a lower one.
+        own = states.precisions_of(hypotheses.ancestors, hypotheses.jumped, precisions)
+        each = replace(hypotheses, ancestors=np.arange(len(hypotheses)))
+        term = self._posterior.given(observation, each, own)
         solved = self._posterior.minimise(term, hypotheses.poses, self.settings.iterations)
-        hessian = self._posterior.gaussian_hessians(solved, hypotheses, precisions)
+        hessian = self._posterior.gaussian_hessians(solved, each, own)
         return Optimised(hypotheses, replace(solved, hessian=hessian))
 
     def _search_again(
         self,
         optimised: Optimised,
-        covariances: Array,
+        states: PredictedStates,
         precisions: Array,
         observation: Observation,
     ) -> Optimised:
@@ -325,17 +329,17 @@ class MixtureFilter:
         for _ in range(self.settings.rounds - 1):
             if optimised.minima.value.min() < self._usual_energy + self.settings.energy_rise:
                 break
-            around = self._sources_around(optimised, covariances, precisions, observation)
+            around = self._sources_around(optimised, states, precisions, observation)
             more = self._proposal.propose(
-                around.minima, around.hypotheses, covariances, observation, self._rng
+                around.minima, around.hypotheses, states.searched, observation, self._rng
             )
-            optimised = optimised.joined(self._optimise(more, precisions, observation))
+            optimised = optimised.joined(self._optimise(more, states, precisions, observation))
         return optimised
 
     def _sources_around(
         self,
         optimised: Optimised,
-        covariances: Array,
+        states: PredictedStates,
         precisions: Array,
         observation: Observation,
     ) -> Optimised:
@@ -348,7 +352,7 @@ class MixtureFilter:
         best = order[: max(s.max_hypotheses // 2, 1)]
         lead = best[:1]
         drawn = covariance_scaled_samples(
-            self.body, optimised.minima.x[lead], covariances[h.ancestors[lead]], s.samples,
+            self.body, optimised.minima.x[lead], states.searched[h.ancestors[lead]], s.samples,
             s.sample_scale, self._rng,
         )[0]  # fmt: skip
         rows = np.full(len(drawn), h.texture_rows[lead[0]])
@@ -364,12 +368,12 @@ class MixtureFilter:
             h.textures,
             rows[:n],
         )
-        return optimised[best].joined(self._optimise(sampled, precisions, observation))
+        return optimised[best].joined(self._optimise(sampled, states, precisions, observation))
 
     def _weigh_and_select(
         self,
         optimised: Optimised,
-        velocities: Array,
+        states: PredictedStates | None,
         observation: Observation,
         before: GaussianMixture | None = None,
         excess: Array | None = None,
@@ -378,7 +382,7 @@ class MixtureFilter:
 
         Args:
             optimised: hypotheses at their optima.
-            velocities: (N, d) of them, per second.
+            states: of the ancestors, predicted; None: the modes begin.
             observation: of the image.
             before: the prediction that modes inherit their weights from; None: from ancestors.
             excess: (K,) of the ancestors' energies over the least in the image before.
@@ -419,14 +423,23 @@ class MixtureFilter:
         rows, filtered = rows[order], filtered[order]
         poses = solved.x[rows]
         fit = self._posterior.fit(poses, observation)
-        covariances = filtered
+        covariances = alone = filtered
         if observation.evidence:
-            covariances = self._posterior.covariances(fit, solved.free[rows])
-            covariances = covariances + self.shape.considered(
+            alone = self._posterior.covariances(fit, solved.free[rows])
+            covariances = alone + self.shape.considered(
                 self._posterior.likelihood, self._believed(observation), poses,
                 self._posterior.given_way(poses, observation)[1],
             )  # fmt: skip
         h = optimised.hypotheses[rows]
+        if states is None:
+            velocities = np.zeros_like(poses)
+            state_covariances = motion_prior(self.body).states(filtered)
+        else:
+            found = filtered
+            if states.wandered.any() and observation.evidence:
+                # Errors of images last: what is propagated believes a share of them, too.
+                found = fused(states.covariances_of(h.ancestors, h.jumped), alone)
+            velocities, state_covariances = states.given(h.ancestors, h.jumped, poses, found)
         self._modes = Modes(
             poses=poses,
             log_weights=weights[order],
@@ -435,11 +448,12 @@ class MixtureFilter:
             jumped=h.jumped,
             textures=self._posterior.textures(poses, observation),
             texture_rows=np.arange(len(rows)),
-            velocities=velocities[rows],
+            velocities=velocities,
             covariances=covariances,
             filtered=filtered,
             log_likelihoods=-fit.image_energy,
             energies=solved.value[rows],
+            state_covariances=state_covariances,
         )
         self._outline_costs = fit.outline_costs
         return float(solved.value[usable].min())

@@ -73,10 +73,12 @@ class Modes(Hypotheses):
     Attributes:
         velocities: (N, d) per second.
         covariances: (N, d, d) of the posterior.
-        filtered: (N, d, d) covariances that are propagated, as if errors were independent from
-            image to image.
+        filtered: (N, d, d) covariances as if errors were independent from image to image.
         log_likelihoods: (N,) of the image.
         energies: (N,) of the posterior at the optimum, nats.
+        state_covariances: (N, n, n) that are propagated, of poses and velocities. Of a random walk
+            they are `filtered`; with velocities only a share of the images is believed, because
+            their errors last.
     """
 
     velocities: Array
@@ -84,6 +86,7 @@ class Modes(Hypotheses):
     filtered: Array
     log_likelihoods: Array
     energies: Array
+    state_covariances: Array
 
     def mixture(self, share: float) -> GaussianMixture:
         """The modes as a mixture over poses.

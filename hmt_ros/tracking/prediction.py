@@ -1,9 +1,9 @@
 """Predict: where hypotheses are expected in the next image (KJS figure 4, step 1).
 
-    x_{t+1} ~ N(x_t + kappa dt v_t, S_t + Q dt)
+    (x, v)_{t+1} ~ N(A (x, v)_t, A S_t A' + Q)
 
-v is the velocity of the mode, of which a share kappa lasts, and Q holds the rates of the body's
-degrees of freedom. The optical flow then corrects the means, before shapes are compared.
+v is the velocity of the mode; A and Q are those of the motion prior of the body (`motion_prior`).
+The optical flow then corrects the means, before shapes are compared.
 """
 
 from __future__ import annotations
@@ -13,37 +13,46 @@ from dataclasses import replace
 import numpy as np
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.body.pose_terms import Posed
 from hmt_ros.image.likelihood import ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.energy import Quadratic, Sum
-from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses
+from hmt_ros.tracking.motion_states import PredictedStates
 from hmt_ros.tracking.posterior import Posterior
 
 # Newton steps that follow the optical flow.
 FLOW_ITERATIONS = 5
 
 
-def predict(modes: Modes, body: Body, dt: float, velocity_kept: float) -> tuple[Hypotheses, Array]:
-    """Hypotheses that the modes predict, within the limits, and their covariances (K, d, d).
+def predict(modes: Modes, body: Body, dt: float) -> tuple[Hypotheses, PredictedStates]:
+    """Hypotheses that the modes predict, within the limits, and their states.
 
     Args:
         modes: that were selected in the last image.
         body: with the motion prior and the limits.
         dt: time since the last image, s.
-        velocity_kept: share kappa of the velocity that lasts.
     """
-    dynamics = LinearGaussianDynamics.random_walk(body.rates)
-    means, covariances = dynamics.predict(modes.poses, modes.filtered, dt)
-    moved = np.clip(means + velocity_kept * dt * modes.velocities, body.lower, body.upper)
+    states = predicted_states(modes, modes.state_covariances, body, dt)
+    moved = np.clip(states.poses, body.lower, body.upper)
     predicted = replace(
         new_hypotheses(moved, modes.log_weights),
         textures=modes.textures,
         texture_rows=modes.texture_rows,
     )
-    return predicted, covariances
+    return predicted, states
+
+
+def predicted_states(modes: Modes, covariances: Array, body: Body, dt: float) -> PredictedStates:
+    """States of modes with covariances (K, n, n) after dt seconds."""
+    dynamics = motion_prior(body)
+    known = np.concatenate([modes.poses, modes.velocities], axis=1)
+    means = known[:, : dynamics.state_dimension]
+    has_velocities = dynamics.state_dimension > dynamics.dimension
+    wandered = body.rates * dt if has_velocities else np.zeros(body.dimension)
+    return PredictedStates(dynamics, *dynamics.predict(means, covariances, dt), wandered)
 
 
 def follow_flow(
@@ -71,17 +80,3 @@ def follow_flow(
     )
     moved = posterior.minimise(term, predicted.poses, FLOW_ITERATIONS).x
     return replace(predicted, poses=moved, expected=moved)
-
-
-def updated_velocities(
-    velocities: Array, before: Array, after: Array, dt: float, gain: float
-) -> Array:
-    """Velocities (N, d) of modes that moved from `before` to `after` (N, d) in dt seconds.
-
-    Args:
-        velocities: (N, d) before, per second.
-        before, after: (N, d).
-        dt: s.
-        gain: how far velocities follow the newest displacement, 0 to 1.
-    """
-    return (1.0 - gain) * velocities + gain * (after - before) / dt

@@ -72,8 +72,6 @@ class TrackerSettings:
             lacks, with those of the image before.
         tails: Degrees of freedom of the Student motion prior; small numbers give heavy tails.
         least_log_weight: Smallest log weight of a mode that is kept, nats.
-        velocity_kept: Share of a mode's velocity that lasts to the next image; 0 is a random walk.
-        velocity_gain: Share of the newest displacement in a mode's velocity.
         shape_images: Number of images at the start of a track that are all used to estimate the
             lengths and the flesh of the person; 0 keeps those that the track started with.
         shape_interval: After these, one image of so many is used to estimate them; 0 uses none.
@@ -112,8 +110,6 @@ class TrackerSettings:
     error_correlation: float = 0.8
     tails: float = 8.0
     least_log_weight: float = -14.0
-    velocity_kept: float = 0.7
-    velocity_gain: float = 0.5
     shape_images: int = 15
     shape_interval: int = 3
     lost_misfit: float = 0.35
@@ -145,6 +141,3 @@ class TrackerSettings:
         for name in ('jump_probability', 'prediction_probability'):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f'{name} must lie in (0, 1), saw {getattr(self, name)}')
-        for name in ('velocity_kept', 'velocity_gain'):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f'{name} must lie in [0, 1], saw {getattr(self, name)}')

@@ -23,7 +23,6 @@ from hmt_ros.image.observation import Box, Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
-from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.facing import Track
 from hmt_ros.tracking.hypotheses import Modes
@@ -33,7 +32,7 @@ from hmt_ros.tracking.initialisation import (
     start_from_keypoints,
 )
 from hmt_ros.tracking.point_estimate import PointEstimate
-from hmt_ros.tracking.prediction import predict
+from hmt_ros.tracking.prediction import predicted_states
 from hmt_ros.tracking.presence import (
     FEWEST_KEYPOINTS,
     MOST_CHANGED,
@@ -315,12 +314,15 @@ class Tracker:
     def _expected(self, stamp: int) -> GaussianMixture:
         """The posterior of a time at which nothing is seen."""
         assert self._followed is not None
-        s, modes, body = self.settings, self.modes, self.body
+        modes, body, d = self.modes, self.body, self.body.dimension
         dt = (stamp - self._followed) * 1e-9
-        moved, _ = predict(modes, body, dt, s.velocity_kept)
-        dynamics = LinearGaussianDynamics.random_walk(body.rates)
-        _, covariances = dynamics.predict(modes.poses, modes.covariances, dt)
-        return GaussianMixture(self.posterior.weights, moved.poses, covariances)
+        known = modes.state_covariances.copy()
+        # What is published of the poses is less certain than what is propagated.
+        known[:, :d, :] = known[:, :, :d] = 0.0
+        known[:, :d, :d] = modes.covariances
+        states = predicted_states(modes, known, body, dt)
+        means = np.clip(states.poses, body.lower, body.upper)
+        return GaussianMixture(self.posterior.weights, means, states.pose_covariances)
 
     def _is_seen(self, view: View, stamp: int) -> bool:
         return self._presence.sees(view, stamp, self.body, self.camera, self.modes.poses[0])

@@ -146,8 +146,9 @@ def test_variational_smoothing_is_chosen_by_a_parameter(session, likelihoods):
     assert one.state.counts['smoothed'] == 1
 
 
-def test_constant_velocity(session, outputs, likelihoods):
-    one = session(dynamics=SmootherDynamics(model='constant_velocity'))
+@pytest.mark.parametrize('model', ['constant_velocity', 'learned'])
+def test_motion_models_with_velocities(model, session, outputs, likelihoods):
+    one = session(dynamics=SmootherDynamics(model=model))
     for index in range(4):
         assert one.take(MIXTURE, likelihoods.message(index)).faults == ()
     assert len(smoothed(outputs)) == 2

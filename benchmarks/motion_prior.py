@@ -1,0 +1,144 @@
+"""How well the motion prior predicts motions of people from whom it did not learn.
+
+Poses are filtered with a noise of 0.01 rad or m. In every step the surprise is compared with the
+prediction: its log density, and the share of steps whose surprise lies inside the region of 90 %,
+of all degrees of freedom together and of each one alone. Beside the learned prior stand the random
+walk at the rates of the body, and the same with 0.7 of a velocity that is kept.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from benchmarks.clips import ROOT
+from benchmarks.command import benchmark_parser, show
+from hmt_ros.body import Body, load_body
+from hmt_ros.body.motion_prior import motion_prior
+from hmt_ros.experts.training_set import RATE, motion_files, recorded_sequence
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
+from hmt_ros.tracking.motion_states import PredictedStates
+
+Array = NDArray[np.float64]
+# What is seen before a pose: how far it may be from where it was predicted, and what that costs.
+Surprises = Iterator[tuple[Array, Array]]
+
+NOISE = 0.01  # rad and m
+STEPS = (1, 3, 6)  # frames of 30 Hz
+KEPT, GAIN = 0.7, 0.5  # of the velocity, for the random walk that keeps one
+# Motions of the folder whose second part is faulty, and where that begins.
+CUT = {'cmu_14_traffic': 720}
+
+
+def filtered(dynamics: LinearGaussianDynamics, poses: Array, interval: float) -> Surprises:
+    """Surprises (d,) of a filter and their covariances (d, d)."""
+    d = dynamics.dimension
+    noise = NOISE**2 * np.eye(d)
+    state = np.zeros((1, dynamics.state_dimension))
+    state[0, :d] = poses[0]
+    known = dynamics.states(noise[None])
+    nowhere, still = np.zeros((1, d), dtype=np.bool_), np.zeros(d)
+    for pose in poses[1:]:
+        states = PredictedStates(dynamics, *dynamics.predict(state, known, interval), still)
+        spread = states.pose_covariances[0] + noise
+        surprise = pose - states.poses[0]
+        yield surprise, spread
+        gain = np.linalg.solve(spread, states.pose_covariances[0]).T
+        found = gain @ noise
+        pose_found = states.poses + gain @ surprise
+        velocities, known = states.given(
+            np.zeros(1, dtype=np.intp), nowhere, pose_found, 0.5 * (found + found.T)[None]
+        )
+        state[:, :d], state[:, d:] = pose_found, velocities[:, : state.shape[1] - d]
+
+
+def walking(rates: Array, kept: float) -> Callable[[Array, float], Surprises]:
+    """Surprises of a random walk with a share of a velocity that follows the displacements."""
+
+    def surprises(poses: Array, interval: float) -> Surprises:
+        velocity = np.zeros(poses.shape[1])
+        spread = np.diag(rates * interval + 2 * NOISE**2)
+        for before, pose in pairwise(poses):
+            yield pose - before - kept * interval * velocity, spread
+            velocity = (1.0 - GAIN) * velocity + GAIN * (pose - before) / interval
+
+    return surprises
+
+
+def scores(surprises: list[tuple[Array, Array]]) -> dict[str, float]:
+    """Mean log density, and shares inside the region of 90 %."""
+    densities, inside, alone = [], [], []
+    for surprise, spread in surprises:
+        factor = np.linalg.cholesky(spread)
+        scaled = np.linalg.solve(factor, surprise)
+        distance = float(scaled @ scaled)
+        log_det = 2.0 * np.log(np.diagonal(factor)).sum()
+        densities.append(-0.5 * (distance + log_det + len(surprise) * np.log(2.0 * np.pi)))
+        inside.append(distance < chi2.ppf(0.9, len(surprise)))
+        alone.append(surprise**2 / np.diagonal(spread) < chi2.ppf(0.9, 1))
+    return {
+        'log_density': float(np.mean(densities)),
+        'inside_90': float(np.mean(inside)),
+        'dof_inside_90': float(np.mean(alone)),
+    }
+
+
+def measure(folder: Path, *, quick: bool = False) -> dict[str, Any]:
+    """Scores by interval and model, over the motions of a folder."""
+    body: Body = load_body('human37')
+    motions = []
+    for path in motion_files(folder)[: 2 if quick else None]:
+        poses = recorded_sequence(path, body).poses
+        motions.append(poses[: CUT.get(path.stem)])
+    learned = motion_prior(body)
+    models: dict[str, Callable[[Array, float], Surprises]] = {
+        'random walk': walking(body.rates, 0.0),
+        f'random walk, {KEPT} of the velocity kept': walking(body.rates, KEPT),
+        'learned': lambda poses, interval: filtered(learned, poses, interval),
+    }
+    result: dict[str, Any] = {'motions': len(motions)}
+    for step in STEPS:
+        found = {
+            name: scores([x for poses in motions for x in model(poses[::step], step / RATE)])
+            for name, model in models.items()
+        }
+        result[f'{step / RATE:.3f} s'] = found
+    return result
+
+
+def as_text(result: dict[str, Any]) -> str:
+    """A table."""
+    head = '| interval | model | log density a step | all inside 90 % | each inside 90 % |'
+    lines = [head, '|---|---|---:|---:|---:|']
+    for interval, models in result.items():
+        if isinstance(models, dict):
+            for name, one in models.items():
+                lines.append(
+                    f'| {interval} | {name} | {one["log_density"]:.1f} | '
+                    f'{100 * one["inside_90"]:.0f} % | {100 * one["dof_inside_90"]:.0f} % |'
+                )
+    return '\n'.join(lines)
+
+
+def main(argv: list[str]) -> int:
+    """Runs the benchmark; 1: there are no motions."""
+    parser = benchmark_parser('motion_prior', __doc__, quick='two motions')
+    shared = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared'))
+    parser.add_argument(
+        '--mocap', type=Path, default=shared / 'mocap' / 'dev', help='folder of motions'
+    )
+    options = parser.parse_args(argv)
+    try:
+        result = measure(options.mocap, quick=options.quick)
+    except (ValueError, OSError) as error:
+        print(f'motion_prior: {error}', file=sys.stderr)
+        return 1
+    return show(result, as_text, as_json=options.json)

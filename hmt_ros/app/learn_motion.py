@@ -1,0 +1,159 @@
+"""learn-motion: learns the motion prior of a body from recorded motions.
+
+    learn-motion FILES_OR_FOLDERS ... -o human37_motion.npz
+
+The filter, the smoother and the prediction of poses take the file that lies beside the body's YAML
+file, in `hmt_ros/body/models`, as BODY_motion.npz.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+from hmt_ros.app.command_line import CommandParser, run_command
+from hmt_ros.body import Body, load_body
+from hmt_ros.experts.model_file import write_arrays
+from hmt_ros.experts.training_set import (
+    MOTION_SUFFIXES,
+    RATE,
+    PoseSequence,
+    motion_files,
+    recorded_sequence,
+)
+from hmt_ros.motion.motion_file import read_motion
+from hmt_ros.motion.motion_learning import learned_motion
+from msg_tools.files.error_line import error_line
+
+# Relative difference of a motion's rate from that of the poses which is put up with.
+SAME_RATE = 0.01
+
+
+@dataclass(frozen=True)
+class LearningOptions:
+    """Options of the command.
+
+    Attributes:
+        motions: Files or folders of recorded motions.
+        output: File to write; '.npz' is appended where it is missing.
+        without: Names of motions that are left out, without suffix.
+        body: Body model: a name or a YAML file.
+        acknowledgement: What to say of the sources in the file.
+        overwrite: Whether an existing file is replaced.
+        quiet: Whether progress and summary are suppressed.
+    """
+
+    motions: list[Path]
+    output: Path
+    without: list[str]
+    body: str
+    acknowledgement: str
+    overwrite: bool
+    quiet: bool
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command; returns 0, or 1 after bad input, which one line on stderr explains."""
+    return run_command(
+        _parser(), lambda arguments: _learn(LearningOptions(**vars(arguments))), argv
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = CommandParser(
+        prog='learn-motion', description='Learns how the poses of a body move, from motions.'
+    )
+    parser.add_argument(
+        'motions', nargs='+', type=Path, metavar='MOTION',
+        help='file (.bvh, or .amc beside its .asf), or folder of them with its subfolders',
+    )  # fmt: skip
+    parser.add_argument(
+        '-o', '--output', type=Path, required=True, metavar='FILE.npz', help='file to write'
+    )
+    parser.add_argument(
+        '--without', nargs='+', default=[], metavar='NAME',
+        help='motions to leave out, names of files without suffix',
+    )  # fmt: skip
+    parser.add_argument(
+        '--body', default='human37', help='body model: a name or a YAML file (human37)'
+    )
+    parser.add_argument(
+        '--acknowledgement', default='', metavar='TEXT', help='what the file says of the sources'
+    )
+    parser.add_argument('--overwrite', action='store_true', help='replace an existing file')
+    parser.add_argument('--quiet', action='store_true', help='no progress bar, no summary')
+    return parser
+
+
+def _learn(options: LearningOptions) -> int:
+    output = options.output
+    if output.suffix != '.npz':
+        output = output.with_name(output.name + '.npz')
+    if output.exists() and not options.overwrite:
+        raise ValueError(f'{output} exists: --overwrite replaces it')
+    if not output.parent.is_dir():
+        raise ValueError(f'there is no folder {output.parent} for {output.name}')
+    body = load_body(options.body)
+    paths = _chosen(options)
+    hidden = True if options.quiet else None
+    read = [
+        _sequence(path, body) for path in tqdm(paths, 'reading', unit=' motions', disable=hidden)
+    ]
+    sequences = [one for one in read if one is not None]
+    if not sequences:
+        raise ValueError(f'none of the {len(paths)} motions can be used')
+    card = _card(sequences, options.acknowledgement)
+    model = learned_motion(body, [one.poses for one in sequences], RATE, card)
+    write_arrays(output, model.arrays())
+    if not options.quiet:
+        skipped = len(paths) - len(sequences)
+        skips = f', {skipped} skipped' if skipped else ''
+        size = output.stat().st_size / 1e3
+        print(f'{output}: {len(sequences)} motions{skips}, {size:.0f} kB', flush=True)
+    return 0
+
+
+def _chosen(options: LearningOptions) -> list[Path]:
+    """The motion files, without those that are left out."""
+    found: list[Path] = []
+    for path in options.motions:
+        if path.is_dir():
+            found += motion_files(path)
+        elif path.suffix.lower() in MOTION_SUFFIXES:
+            found.append(path)
+        else:
+            raise ValueError(f'{path}: wanted a folder or a motion ({", ".join(MOTION_SUFFIXES)})')
+    names = {path.stem for path in found}
+    unknown = [name for name in options.without if name not in names]
+    if unknown:
+        raise ValueError(f'--without: there is no motion {unknown[0]!r}')
+    return [path for path in found if path.stem not in options.without]
+
+
+def _sequence(path: Path, body: Body) -> PoseSequence | None:
+    """The motion of a file; None, with one line on stderr, if the file cannot be used."""
+    try:
+        fps = read_motion(path).fps
+        rate = fps / max(round(fps / RATE), 1)
+        if abs(rate / RATE - 1.0) > SAME_RATE:
+            raise ValueError(f'{fps:g} frames per second, wanted a multiple of {RATE:g}')
+        return recorded_sequence(path, body)
+    except (ValueError, OSError, ArithmeticError) as error:
+        tqdm.write(f'learn-motion: skipped {path.name}: {error_line(error)}', file=sys.stderr)
+        return None
+
+
+def _card(sequences: list[PoseSequence], acknowledgement: str) -> str:
+    """What the file says of its motions."""
+    seconds = sum(len(one.poses) for one in sequences) / RATE
+    names = ', '.join(sorted(one.name for one in sequences))
+    said = f'{acknowledgement.strip()}\n' if acknowledgement.strip() else ''
+    return f'{said}Learned from {len(sequences)} motions, {seconds:.0f} s: {names}.'
+
+
+if __name__ == '__main__':
+    sys.exit(main())

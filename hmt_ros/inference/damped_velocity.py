@@ -1,0 +1,138 @@
+"""Second-order dynamics: the velocity of a pose is damped and driven by noise that is coupled.
+
+    dx = v dt + dn,  E[dn dn'] = W dt              dv = -G v dt + dw,  E[dw dw'] = D dt
+
+with a diagonal damping G, a diagonal W and a full D: joints that move together change their
+velocities together. The velocity has the stationary covariance S_ij = D_ij / (G_i + G_j), and
+
+    x(t) ~ x + a v,   v(t) ~ b v,     a = (1 - exp(-G t)) / G,   b = exp(-G t)
+    Q_xx = int a a' D + W t,   Q_xv = int a b' D,   Q_vv = int b b' D    (entry by entry, 0..t)
+
+The integrals are sums of exponentials; over short times, where these cancel, they are taken by
+Gaussian quadrature [Uhlenbeck and Ornstein 1930; Van Loan 1978 for the general case].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
+
+# Nodes of the quadrature; it is exact to rounding while G t stays below the limit.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
+_LONGEST = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class DampedVelocity(LinearGaussianDynamics):
+    """Dynamics of poses and damped velocities, n = 2 d; made by `of`."""
+
+    @classmethod
+    def of(
+        cls, damping: ArrayLike, diffusion: ArrayLike, white: ArrayLike, *, step: float = 1.0
+    ) -> DampedVelocity:
+        """The dynamics, which begin with a velocity of the stationary covariance.
+
+        Args:
+            damping: (d,) G, share of the velocity lost per second.
+            diffusion: (d, d) D, covariance that the velocity gains per second.
+            white: (d,) W, variance that the pose gains per second besides.
+            step: interval between observations without stamps, s.
+
+        Raises:
+            ValueError: shapes that do not fit, damping or white noise that is not positive, or a
+                diffusion that is not positive definite.
+        """
+        rates = np.atleast_1d(np.asarray(damping, dtype=np.float64))
+        own = np.atleast_1d(np.asarray(white, dtype=np.float64))
+        driven = np.atleast_2d(np.asarray(diffusion, dtype=np.float64))
+        d = len(rates)
+        if driven.shape != (d, d) or own.shape != (d,):
+            raise ValueError(
+                f'dynamics: damping {rates.shape}, diffusion {driven.shape} and white noise '
+                f'{own.shape} do not fit, wanted (d,), (d, d) and (d,)'
+            )
+        for name, value in (('damping', rates), ('white noise', own)):
+            if not (np.isfinite(value).all() and (value > 0).all()):
+                raise ValueError(f'dynamics: {name} must be positive, saw {value.min()}')
+        stationary = driven / (rates[:, None] + rates)
+        try:
+            np.linalg.cholesky(stationary)
+        except np.linalg.LinAlgError:
+            raise ValueError(
+                'dynamics: the diffusion of the velocity is not positive definite'
+            ) from None
+        drift, noise, precision = np.zeros((3, 2 * d, 2 * d))
+        drift[:d, d:] = np.eye(d)
+        drift[d:, d:] = -np.diag(rates)
+        noise[:d, :d], noise[d:, d:] = np.diag(own), driven
+        inverse = np.linalg.inv(stationary)
+        precision[d:, d:] = 0.5 * (inverse + inverse.T)
+        return cls(drift, noise, d, np.zeros(2 * d), precision, step)
+
+    @cached_property
+    def damping(self) -> Array:
+        """(d,) G, per second."""
+        d = self.dimension
+        return -np.diagonal(self.drift)[d:]
+
+    def _transition(self, interval: float) -> tuple[Array, Array]:
+        d = self.dimension
+        a, b = self._decay(interval)
+        moved = np.eye(2 * d)
+        moved[:d, d:], moved[d:, d:] = np.diag(a), np.diag(b)
+        noise = np.empty((2 * d, 2 * d))
+        noise[:d, :d], noise[:d, d:], noise[d:, d:] = self._integrals(interval)
+        noise[d:, :d] = noise[:d, d:].T
+        noise *= np.tile(self.diffusion[d:, d:], (2, 2))
+        noise[:d, :d] += self.diffusion[:d, :d] * interval
+        return moved, noise
+
+    def _decay(self, interval: float) -> tuple[Array, Array]:
+        """a and b (d,): what a velocity moves the pose by, and what of it lasts."""
+        lost: Array = -np.expm1(-self.damping * interval)
+        return lost / self.damping, 1.0 - lost
+
+    def _integrals(self, interval: float) -> tuple[Array, Array, Array]:
+        """Integrals (d, d) over the interval of a a', a b' and b b'."""
+        g = self.damping
+        if g.max() * interval < _LONGEST:
+            times = 0.5 * interval * (_NODES + 1.0)
+            root = np.sqrt(0.5 * interval * _WEIGHTS)[:, None]
+            lost = -np.expm1(-times[:, None] * g)
+            a, b = root * lost / g, root * (1.0 - lost)
+            return a.T @ a, a.T @ b, b.T @ b
+        a, _ = self._decay(interval)
+        total = g[:, None] + g
+        both = -np.expm1(-total * interval) / total
+        return (
+            (interval - a[:, None] - a + both) / np.outer(g, g),
+            (a[None, :] - both) / g[:, None],
+            both,
+        )
+
+    def predict(self, means: Array, covariances: Array, interval: float) -> tuple[Array, Array]:
+        """Means (K, n) and covariances (K, n, n) of states after an interval in seconds."""
+        d = self.dimension
+        a, b = self._decay(interval)
+        _, noise = self.transition(interval)
+        moved = np.concatenate([means[:, :d] + a * means[:, d:], b * means[:, d:]], axis=1)
+        own, cross, velocity = (
+            covariances[:, :d, :d],
+            covariances[:, :d, d:],
+            covariances[:, d:, d:],
+        )
+        result = np.empty_like(covariances)
+        carried = cross + a[:, None] * velocity
+        half = cross * a
+        result[:, :d, :d] = own + half + (carried * a).swapaxes(1, 2)
+        result[:, :d, d:] = carried * b
+        result[:, d:, :d] = result[:, :d, d:].swapaxes(1, 2)
+        result[:, d:, d:] = np.outer(b, b) * velocity
+        result += noise
+        return moved, result

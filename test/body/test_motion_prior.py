@@ -1,0 +1,111 @@
+"""The motion prior of a body: the file that ships, damaged files, bodies without one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_ros.body.mirror import mirror
+from hmt_ros.body.motion_prior import (
+    LearnedMotion,
+    motion_prior,
+    read_motion_prior,
+    shipped_motion,
+)
+
+SMALL = LearnedMotion(
+    'stick', ('a', 'b'), np.array([1.0, 4.0]), np.array([[2.0, 0.5], [0.5, 1.0]]),
+    np.array([1e-3, 2e-3]), 'two motions',
+)  # fmt: skip
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    return tmp_path / 'stick_motion.npz'
+
+
+def test_what_was_written_is_read(path):
+    np.savez(path, **SMALL.arrays())
+    found = read_motion_prior(path)
+    assert (found.body, found.dof_names, found.card) == ('stick', ('a', 'b'), 'two motions')
+    np.testing.assert_allclose(found.damping, SMALL.damping)
+    np.testing.assert_allclose(found.diffusion, SMALL.diffusion)
+    np.testing.assert_allclose(found.white, SMALL.white, rtol=1e-6)
+    assert found.dynamics.dimension == 2
+
+
+def test_the_shipped_file_moves_left_and_right_alike_wherever_the_camera_stands(human37):
+    dynamics = motion_prior(human37)
+    d = human37.dimension
+    assert dynamics.dimension == d
+    assert dynamics.state_dimension == 2 * d
+    assert motion_prior(human37) is dynamics
+    diffusion = dynamics.diffusion[d:, d:]
+    mirrored = mirror(human37, np.eye(d))
+    np.testing.assert_allclose(mirrored @ diffusion @ mirrored.T, diffusion, atol=1e-4)
+    root = human37.skeleton.dof_index(('root_tx', 'root_ty', 'root_tz'))
+    assert len({float(diffusion[i, i]) for i in root}) == 1
+    alone = diffusion[root].copy()
+    alone[[0, 1, 2], root] = 0.0
+    assert not alone.any()
+
+
+def test_the_shipped_file_is_small_and_names_its_source():
+    learned = shipped_motion('human37')
+    assert learned is not None
+    assert 'mocap.cs.cmu.edu' in learned.card
+    assert 'EIA-0196217' in learned.card
+
+
+def test_bodies_without_a_file_walk_randomly(human32, human37):
+    walk = motion_prior(human32)
+    assert walk.state_dimension == human32.dimension
+    np.testing.assert_array_equal(np.diagonal(walk.diffusion), human32.rates)
+    # So does one that has the name of another body, but not its degrees of freedom.
+    other = replace(human32, skeleton=replace(human32.skeleton, name='human37'))
+    assert motion_prior(other).state_dimension == human32.dimension
+    assert shipped_motion('../models/human37') is None
+
+
+def test_a_file_that_is_not_there(path):
+    with pytest.raises(FileNotFoundError, match='learn-motion'):
+        read_motion_prior(path)
+
+
+@pytest.mark.parametrize(
+    ('changes', 'message'),
+    [
+        ({'format': np.array('model')}, 'it is model'),
+        ({'version': np.array(7)}, 'version 7, wanted 1'),
+        ({'damping': np.array([1.0, np.nan])}, 'damping has values that are not finite'),
+        ({'damping': np.array([1.0, -1.0])}, 'damping must be positive'),
+        ({'damping': np.array(['a', 'b'])}, 'not finite numbers'),
+        ({'diffusion': np.eye(3)}, 'do not fit'),
+        ({'diffusion': np.array([[1.0, 2.0], [2.0, 1.0]])}, 'not positive definite'),
+        ({'dof_names': np.array(['a'])}, '1 degrees of freedom are named, and 2 move'),
+    ],
+)
+def test_damaged_files_are_refused_in_one_line(path, changes, message):
+    np.savez(path, **{**SMALL.arrays(), **changes})
+    with pytest.raises(ValueError, match=message) as caught:
+        read_motion_prior(path)
+    assert str(path) in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+def test_other_files_are_refused(path):
+    arrays = SMALL.arrays()
+    del arrays['white']
+    np.savez(path, **arrays)
+    with pytest.raises(ValueError, match=r"lacks \['white'\]"):
+        read_motion_prior(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match='not a motion prior'):
+        read_motion_prior(path)
+    path.write_bytes(b'damping: 1')
+    with pytest.raises(ValueError, match='not a motion prior'):
+        read_motion_prior(path)
