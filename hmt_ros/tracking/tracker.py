@@ -14,6 +14,7 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
@@ -26,6 +27,7 @@ from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.facing import Track
+from hmt_ros.tracking.ground import Ground, GroundEstimator, KnownGround
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.initialisation import (
     poses_from_keypoints,
@@ -92,7 +94,8 @@ class Tracker:
         background: the empty scene; None, or a model that has learned nothing: learned from images
             before the track starts, and if there are none the silhouette is not used.
         seed: of all randomness. The same images, settings and seed give the same numbers.
-        extra: further energy terms of the posterior, such as what is known of the floor.
+        extra: further energy terms of the posterior.
+        known_ground: gravity and floor, as far as they are known; the rest is estimated.
 
     Attributes:
         silhouettes: where those of the images come from.
@@ -108,6 +111,7 @@ class Tracker:
         background: BackgroundModel | None = None,
         seed: int = 0,
         extra: Sequence[FrameTerm] = (),
+        known_ground: KnownGround | None = None,
     ) -> None:
         self.settings = settings or TrackerSettings()
         self.model = body
@@ -118,6 +122,7 @@ class Tracker:
         self._seed = seed
         self._start: Subject | GaussianMixture | None = None
         self._extra = tuple(extra)
+        self._ground = GroundEstimator(known_ground)
         self._track = self._new_track(body)
         self._point = PointEstimate()
         self._presence = Presence(self.settings.absence_time)
@@ -211,6 +216,30 @@ class Tracker:
     def body(self) -> Body:
         """The person, with what has been estimated of lengths and widths."""
         return self._track.body
+
+    @property
+    def ground(self) -> Ground:
+        """Gravity and floor, as far as they are known or estimated."""
+        return self._ground.estimate
+
+    def set_gravity(self, up: ArrayLike) -> None:
+        """Takes a newer direction against gravity, before the image that it belongs to.
+
+        Args:
+            up: (3,) unit vector in the camera frame.
+
+        Raises:
+            ValueError: it is no unit vector.
+        """
+        self._ground.set_gravity(up)
+
+    @property
+    def contacts(self) -> dict[str, float]:
+        """Probability by foot, 'left_foot' and 'right_foot', that the heaviest mode rests on it.
+
+        Empty while there is no track, and for a body without feet.
+        """
+        return {}
 
     @property
     def misfit(self) -> float:
