@@ -57,6 +57,8 @@ ARRIVAL, ARRIVAL_AT_BORDER = 0.2, 0.6
 LIKELY = 4.0
 # Margin around all joints of all modes, as a fraction of their extent: where the silhouette may be.
 REGION_MARGIN = 0.3
+# Share of the time for which somebody stands on both feet, where contact is unknown.
+RESTING = 0.3
 
 
 class Status(Enum):
@@ -193,6 +195,8 @@ class Tracker:
         if self._last_stamp is not None and stamp <= self._last_stamp:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
         self.evaluations = 0
+        known = self.background.frames > 0 and not self.silhouettes.doubted
+        self._ground.still = known and not self._ground.turning
         view = self._view(image, keypoints, mask, nobody_predicted)
         found = self._take(view, stamp, prediction, masked=mask is not None)
         self._last_stamp = stamp
@@ -237,9 +241,10 @@ class Tracker:
     def contacts(self) -> dict[str, float]:
         """Probability by foot, 'left_foot' and 'right_foot', that the heaviest mode rests on it.
 
-        Empty while there is no track, and for a body without feet.
+        Empty while it is unknown: there is no track, the body has no feet, the terms of the ground
+        are off, or the camera moves. It stands still where there is a background image.
         """
-        return {}
+        return self._track.contacts if self._ground.still else {}
 
     @property
     def misfit(self) -> float:
@@ -272,12 +277,13 @@ class Tracker:
         return self.modes.mixture(1.0 - self.settings.error_correlation)
 
     def _new_track(self, body: Body) -> Track:
-        return Track(body, self.camera, self.settings, self._seed, self._extra)
+        return Track(body, self.camera, self.settings, self._seed, self._extra, self._ground)
 
     def _drop_track(self) -> None:
         """Keeps nothing but the body."""
         self._track = self._new_track(self.body)
         self._point = PointEstimate()
+        self._ground.reset()
         self._arrived = None
         self._last_image, self._followed = None, None
 
@@ -305,6 +311,9 @@ class Tracker:
             poses = self.modes.poses[likely]
             self.silhouettes.complete(view.image, self.body, self.camera, poses)
         dt = 0.0 if self._followed is None else (stamp - self._followed) * 1e-9
+        if self.settings.ground.on:
+            resting = min(self.contacts.values(), default=RESTING)
+            self._ground.update(self.body, self.modes, resting, dt)
         self._point.update(self.body, self.modes.poses, np.exp(self.modes.log_weights), dt)
         self._last_image, self._followed = view.image, stamp
         self.evaluations = self._track.evaluations

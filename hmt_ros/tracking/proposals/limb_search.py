@@ -82,7 +82,7 @@ class LimbSearch:
         )
         rows = np.full(len(samples), row)
         seen = self._own.seen(observation, textures, rows, explained=others.costs)
-        seen = (*seen, *self.posterior.extra)
+        seen = (*seen, *self.posterior.known)
         weight = s.likelihood.prior_weight
         term = Sum(
             (
