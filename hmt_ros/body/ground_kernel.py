@@ -31,7 +31,7 @@ class Constants(NamedTuple):
         height: of the camera over the floor, m.
         upright: (U,) segments that are upright.
         axes: (U, 3, 3) their axes: to the side, ahead, up.
-        lean: (3,) deviations of gravity along these, rad.
+        lean: (U, 3) deviations of gravity along these, rad.
         soles: (P,) segments of the points of the soles.
         local: (P, 3) their places there, m.
         per_floor: 1 / deviation of the height of the floor, 1/m.
@@ -165,7 +165,7 @@ def _upright(c, columns, axes, row, n, wanted, gradient, hessian):  # type: igno
                 for m in range(3):
                     axis[i, k] += c.axes[u, i, m] * columns[s, m, k]
                 along += axis[i, k] * c.up[k]
-            residual[i] = (along - (1.0 if i == 2 else 0.0)) / c.lean[i]
+            residual[i] = (along - (1.0 if i == 2 else 0.0)) / c.lean[u, i]
             square += residual[i] * residual[i]
         value, factor = _student(square, c.tails, 2.0)
         total += c.weights[0] * value
@@ -179,7 +179,7 @@ def _upright(c, columns, axes, row, n, wanted, gradient, hessian):  # type: igno
             for j in range(len(row)):
                 row[j] = 0.0
                 if c.moves[s, j] and c.dof_is_rotation[j]:
-                    row[j] = (axes[j, 0] * x + axes[j, 1] * y + axes[j, 2] * z) / c.lean[i]
+                    row[j] = (axes[j, 0] * x + axes[j, 1] * y + axes[j, 2] * z) / c.lean[u, i]
             k = c.weights[0] * factor
             _add(row, k * residual[i], k, gradient[n], hessian[n])
     return total

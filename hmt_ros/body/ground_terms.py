@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +29,10 @@ from hmt_ros.body.soles import soles
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
 
-# Standard deviations of the lean of pelvis and trunk: sideways, and forwards or back, rad.
-ASIDE, FORWARDS = np.radians(10.0), np.radians(20.0)
+# Standard deviations of the lean: sideways, and forwards or back, rad, and the mean lean forwards
+# of the trunk. The pelvis has that of the trunk less the mean bend of the spine.
+TRUNK_ASIDE, TRUNK_FORWARDS, TRUNK_LEAN = np.radians(6.0), np.radians(10.0), np.radians(3.0)
+PELVIS_ASIDE, PELVIS_FORWARDS = np.radians(10.0), np.radians(20.0)
 # Depth below the floor that costs 1/2, with an exact plane, m.
 FLOOR_SIGMA = 0.02
 # Distance from the support that costs nothing, and the deviation beyond it of somebody at rest, m.
@@ -187,13 +190,13 @@ class GroundTerm:
     def _constants(self) -> Constants:
         body, plane = self.body, self.plane
         skeleton, feet, mass = body.skeleton, soles(body), masses(body)
-        upright, axes = upright_axes(body)
+        upright = upright_segments(body)
         weights = self.settings.weights
-        weights[0] *= len(upright) > 0
+        weights[0] *= len(upright.segments) > 0
         weights[1:] *= len(feet) > 0
         weights[1] *= plane.height is not None
         weights[2] *= mass.known
-        lean = np.hypot([ASIDE, FORWARDS, FORWARDS], plane.up_sigma)
+        lean = np.hypot(upright.sigma, plane.up_sigma)
         floor = float(np.hypot(FLOOR_SIGMA, plane.height_sigma))
         rest_height = float(np.hypot(REST_HEIGHT_SIGMA, plane.height_sigma))
         return Constants(
@@ -204,8 +207,8 @@ class GroundTerm:
             weights,
             np.asarray(plane.up, dtype=np.float64).copy(),
             0.0 if plane.height is None else float(plane.height),
-            upright.astype(np.int64),
-            axes,
+            upright.segments.astype(np.int64),
+            upright.axes,
             lean,
             feet.segments.astype(np.int64),
             feet.local,
@@ -220,31 +223,48 @@ class GroundTerm:
         )
 
 
-@lru_cache(maxsize=32)
-def upright_axes(body: Body) -> tuple[NDArray[np.intp], Array]:
-    """Segments (U,) that are upright in somebody who stands, and their axes (U, 3, 3).
+class Upright(NamedTuple):
+    """Segments that are upright in somebody who stands.
 
-    They are pelvis and trunk of a body whose root has a prior of its lean; none of another. The
-    rows of the axes, in the frame of the segment, point to the side, ahead and up.
+    Attributes:
+        segments: (U,).
+        axes: (U, 3, 3) in the frame of each; the rows point to the side, ahead and up when the
+            person stands as usual.
+        sigma: (U, 3) deviations of the vertical along these, rad.
     """
-    lean = root_lean_dofs(body)
-    if not len(lean) or 'neck' not in body.joint_names:
-        return np.zeros(0, dtype=np.intp), np.zeros((0, 3, 3))
+
+    segments: NDArray[np.intp]
+    axes: Array
+    sigma: Array
+
+
+@lru_cache(maxsize=32)
+def upright_segments(body: Body) -> Upright:
+    """Pelvis and trunk of a body whose root has a prior of its lean; nothing of another."""
+    if not len(root_lean_dofs(body)) or 'neck' not in body.joint_names:
+        return Upright(np.zeros(0, dtype=np.intp), np.zeros((0, 3, 3)), np.zeros((0, 3)))
     skeleton = body.skeleton
-    trunk = skeleton.parents[skeleton.joint_segments[skeleton.joint_index(('neck',))[0]]]
-    frames = forward(skeleton, np.zeros((1, body.dimension)))
+    neck = skeleton.joint_index(('neck',))[0]
+    trunk = skeleton.parents[skeleton.joint_segments[neck]]
+    # Somebody whose trunk is vertical with the mean angles of the spine.
+    pose = body.prior_mean.copy()
+    pose[list(skeleton.segment_dofs[0])] = 0.0
+    frames = forward(skeleton, pose[None])
     columns = frames.columns[..., 0]
-    neck = frames.joints()[skeleton.joint_index(('neck',))[0], :, 0]
-    segments, axes = [0], [np.eye(3)]
-    if trunk > 0:
-        up = columns[trunk] @ (neck - frames.origins[trunk, :, 0])
-        up /= np.linalg.norm(up)
-        ahead = columns[trunk] @ columns[0, 1]
-        ahead -= up * float(up @ ahead)
-        ahead /= np.linalg.norm(ahead)
-        segments.append(trunk)
-        axes.append(np.array([np.cross(ahead, up), ahead, up]))
-    return np.array(segments, dtype=np.intp), np.array(axes)
+    up = frames.joints()[neck, :, 0] - frames.origins[max(trunk, 0), :, 0]
+    up /= np.linalg.norm(up)
+    ahead = columns[0, 1] - up * float(up @ columns[0, 1])
+    ahead /= np.linalg.norm(ahead)
+    cos, sin = np.cos(TRUNK_LEAN), np.sin(TRUNK_LEAN)
+    up, ahead = cos * up - sin * ahead, cos * ahead + sin * up
+    axes = np.array([np.cross(ahead, up), ahead, up])
+    segments = np.array([0, trunk] if trunk > 0 else [0], dtype=np.intp)
+    sigma = [
+        [PELVIS_ASIDE, PELVIS_FORWARDS, PELVIS_FORWARDS],
+        [TRUNK_ASIDE, TRUNK_FORWARDS, TRUNK_FORWARDS],
+    ]
+    local = np.array([axes @ columns[s].T for s in segments])
+    return Upright(segments, local, np.array(sigma[: len(segments)]))
 
 
 def root_lean_dofs(body: Body) -> Index:

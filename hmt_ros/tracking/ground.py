@@ -111,10 +111,10 @@ class GroundEstimator:
     """Estimates the ground from what is known of it and from a track.
 
     The height of the floor follows the lowest sole: a person stands on the floor for most of the
-    time, and jumps at times, so it is a high quantile of the last seconds. The vertical is near the
-    image's, and near the mean axis of the body of somebody who stands, from the middle of the feet to
-    the centre of mass. Errors of that axis last, so its images count as one per `AXIS_TIME`, and
-    the deviation never goes below `LEAST_UP_SIGMA`.
+    time, and jumps at times, so it is a high quantile of the last seconds. The vertical is near
+    that of the image, and near the axis of a body that stands, from the middle of the feet to the
+    centre of mass. Errors of that axis last, so its images count as one per `AXIS_TIME`, and the
+    deviation never goes below `LEAST_UP_SIGMA`.
 
     Args:
         known: what is known; None: nothing.
