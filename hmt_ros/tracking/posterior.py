@@ -90,6 +90,7 @@ class Posterior:
         ground: GroundEstimator | None = None,
     ) -> None:
         self.ground = ground if settings.ground.on else None
+        self._person = body
         if self.ground is not None and settings.ground.upright_weight > 0:
             body = without_root_lean(body)
         self.body, self.camera, self.settings, self.extra = body, camera, settings, extra
@@ -136,7 +137,7 @@ class Posterior:
             return None
         plane = self.ground.plane
         if self._ground_term is None or self._ground_term.plane is not plane:
-            self._ground_term = GroundTerm(self.body, self.settings.ground, plane)
+            self._ground_term = GroundTerm(self._person, self.settings.ground, plane)
         return self._ground_term
 
     def _of_image(

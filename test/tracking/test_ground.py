@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -13,7 +15,7 @@ from hmt_ros.body.soles import soles
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.motion.procedural_motion import procedural_motion
-from hmt_ros.tracking import KnownGround, Tracker, TrackerSettings
+from hmt_ros.tracking import KnownGround, Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.contact import FootContacts
 from hmt_ros.tracking.ground import LEAST_UP_SIGMA, UP_SIGMA, GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
@@ -122,12 +124,14 @@ def test_the_vertical_is_found_slowly_and_never_surely(body, reaching):
         errors.append(degrees_between(estimator.estimate.up, truth))
     assert errors[0] == pytest.approx(20.0, abs=0.1)
     assert errors[-1] < 10.0
-    assert all(a > b - 0.5 for a, b in zip(errors, errors[1:], strict=False))
+    assert all(a > b - 0.5 for a, b in pairwise(errors))
     assert estimator.estimate.up_sigma >= LEAST_UP_SIGMA * 0.99
     # Where the person is, the floor is under the soles all the same.
     feet, plane = soles(body), estimator.plane
     points = forward(body.skeleton, reaching[-1:]).points(feet.segments, feet.local)[..., 0]
-    assert (points @ plane.up + plane.height).min() == pytest.approx(0.0, abs=2 * plane.height_sigma)
+    assert (points @ plane.up + plane.height).min() == pytest.approx(
+        0.0, abs=2 * plane.height_sigma
+    )
 
 
 def test_a_vertical_far_from_that_of_the_image_is_not_believed(body, reaching):
@@ -151,13 +155,19 @@ def test_newer_directions_replace_the_known_one():
 
 def test_contacts_are_those_of_a_walker(body, walking):
     """Points of the soles that rest in the motion rest, and those that swing do not."""
-    estimator, contacts, found = GroundEstimator(KnownGround(up_of(PITCHED), 1.4)), FootContacts(), []
+    estimator, contacts, found = (
+        GroundEstimator(KnownGround(up_of(PITCHED), 1.4)),
+        FootContacts(),
+        [],
+    )
     for t, pose in enumerate(walking):
         velocity = RATE * (pose - walking[max(t - 1, 0)])
         contacts.update(body, estimator.plane, single(pose, velocity), 1.0 / RATE, still=True)
         found.append([contacts.by_foot()[f'{side}_foot'] for side in ('left', 'right')])
     rests = np.array(found)[5:] > 0.5
-    ankles = body.joint_positions(walking)[:, body.skeleton.joint_index(('left_ankle', 'right_ankle'))]
+    ankles = body.joint_positions(walking)[
+        :, body.skeleton.joint_index(('left_ankle', 'right_ankle'))
+    ]
     toes = body.joint_positions(walking)[:, body.skeleton.joint_index(('left_toe', 'right_toe'))]
     speed = RATE * np.minimum(
         *(np.linalg.norm(np.diff(x, axis=0), axis=2)[4:] for x in (ankles, toes))
@@ -217,6 +227,26 @@ def test_weights_of_zero_leave_the_terms_out(body, camera, reaching):
     assert len(on.known) == 1
 
 
+def test_the_lean_is_measured_against_gravity_and_not_against_the_camera(body, camera, reaching):
+    """Turned with the vertical, a pose costs what it did."""
+    settings = TrackerSettings(likelihood=LikelihoodSettings(self_intersection_sigma=np.inf))
+    level = procedural_motion('reach', body, 0.1, RATE, 1, viewpoint=Viewpoint(3.5, 1.4))
+    pitched = procedural_motion('reach', body, 0.1, RATE, 1, viewpoint=PITCHED)
+    costs, leaning = [], []
+    for view, poses in ((Viewpoint(3.5, 1.4), level), (PITCHED, pitched)):
+        known = KnownGround(up_of(view), 1.4)
+        term = Posterior(body, camera, settings, ground=GroundEstimator(known)).of_image(
+            Observation()
+        )
+        costs.append(term.energy(poses[:1], np.arange(1)).value)
+        tipped = poses[:1].copy()
+        tipped[:, body.skeleton.dof_index(('root_x',))] -= np.radians(30)
+        leaning.append(term.energy(tipped, np.arange(1)).value)
+    assert costs[0] == pytest.approx(costs[1], rel=0.02)
+    assert leaning[0] > costs[0] + 1.0
+    assert leaning[1] > costs[1] + 1.0
+
+
 @pytest.mark.parametrize('ground', [GroundSettings(), OFF])
 def test_a_tracker_knows_its_ground(ground, human32, camera, motion, keypoints_of):
     """A body that reaches for things before a level camera 1.2 m above the floor."""
@@ -227,8 +257,6 @@ def test_a_tracker_knows_its_ground(ground, human32, camera, motion, keypoints_o
     )  # fmt: skip
     up = np.array([0.0, -1.0, 0.0])
     black = np.zeros((camera.height, camera.width, 3), np.uint8)
-    from hmt_ros.tracking import Subject
-
     subject = Subject(0, keypoints_of(human32, motion[0]), dict(human32.segment_lengths))
     errors = []
     for known in (None, KnownGround(up, 1.2)):
@@ -238,7 +266,9 @@ def test_a_tracker_knows_its_ground(ground, human32, camera, motion, keypoints_o
             tracker.step(black, t * 100_000_000, keypoints_of(human32, motion[t], 1.0, t))
         assert tracker.contacts == {}  # no background: the camera may move
         found = human32.joint_positions(tracker.point_estimate[None])[0]
-        errors.append(np.linalg.norm(found - human32.joint_positions(motion[3:4])[0], axis=1).mean())
+        errors.append(
+            np.linalg.norm(found - human32.joint_positions(motion[3:4])[0], axis=1).mean()
+        )
         assert tracker.ground.up == pytest.approx(up, abs=0.15)
         if known is not None:
             assert tracker.ground.plane == pytest.approx([*up, 1.2])
