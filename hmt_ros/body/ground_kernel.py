@@ -40,7 +40,7 @@ class Constants(NamedTuple):
         vertical: what the uncertain vertical adds to the deviation of the balance, m.
         per_rest, per_rest_height: 1 / deviation of a resting point from its anchor and from the
             height of the floor, 1/m; 0: unknown.
-        tails: degrees of freedom of the robust costs.
+        lean_tails, tails: degrees of freedom of the robust costs, of the lean and of the others.
     """
 
     parents: NDArray[np.int64]
@@ -62,6 +62,7 @@ class Constants(NamedTuple):
     vertical: float
     per_rest: float
     per_rest_height: float
+    lean_tails: float
     tails: float
 
 
@@ -167,7 +168,7 @@ def _upright(c, columns, axes, row, n, wanted, gradient, hessian):  # type: igno
                 along += axis[i, k] * c.up[k]
             residual[i] = (along - (1.0 if i == 2 else 0.0)) / c.lean[u, i]
             square += residual[i] * residual[i]
-        value, factor = _student(square, c.tails, 2.0)
+        value, factor = _student(square, c.lean_tails, 2.0)
         total += c.weights[0] * value
         if not wanted:
             continue

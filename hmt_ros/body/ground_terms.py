@@ -29,10 +29,11 @@ from hmt_ros.body.soles import soles
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
 
-# Standard deviations of the lean: sideways, and forwards or back, rad, and the mean lean forwards
-# of the trunk. The pelvis has that of the trunk less the mean bend of the spine.
-TRUNK_ASIDE, TRUNK_FORWARDS, TRUNK_LEAN = np.radians(6.0), np.radians(10.0), np.radians(3.0)
-PELVIS_ASIDE, PELVIS_FORWARDS = np.radians(10.0), np.radians(20.0)
+# Mean lean forwards of trunk and pelvis, and the deviations sideways and forwards or back, rad: the
+# trunk is nearly vertical, the hips lie before the joint of pelvis and spine. Means are those of
+# motion capture, deviations those of people who stand or walk; the tails are for those who bend.
+TRUNK_LEAN, TRUNK_SIGMA = np.radians(3.0), (np.radians(5.0), np.radians(7.0))
+PELVIS_LEAN, PELVIS_SIGMA = np.radians(-20.0), (np.radians(8.0), np.radians(12.0))
 # Depth below the floor that costs 1/2, with an exact plane, m.
 FLOOR_SIGMA = 0.02
 # Distance from the support that costs nothing, and the deviation beyond it of somebody at rest, m.
@@ -42,8 +43,8 @@ SUPPORT_MARGIN, BALANCE_SIGMA = 0.05, 0.06
 MASS_HEIGHT = 1.0
 # How far a point of the sole that rests moves in an image, and how high over the floor it is, m.
 REST_SIGMA, REST_HEIGHT_SIGMA = 0.015, 0.03
-# Degrees of freedom nu of the heavy tails.
-TAILS = 4.0
+# Degrees of freedom nu of the heavy tails, of the lean and of the other terms.
+LEAN_TAILS, TAILS = 2.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -219,6 +220,7 @@ class GroundTerm:
             plane.up_sigma * MASS_HEIGHT * body.scale,
             1.0 / REST_SIGMA,
             0.0 if plane.height is None else 1.0 / rest_height,
+            LEAN_TAILS,
             TAILS,
         )
 
@@ -246,25 +248,34 @@ def upright_segments(body: Body) -> Upright:
     skeleton = body.skeleton
     neck = skeleton.joint_index(('neck',))[0]
     trunk = skeleton.parents[skeleton.joint_segments[neck]]
-    # Somebody whose trunk is vertical with the mean angles of the spine.
-    pose = body.prior_mean.copy()
-    pose[list(skeleton.segment_dofs[0])] = 0.0
-    frames = forward(skeleton, pose[None])
+    frames = forward(skeleton, np.zeros((1, body.dimension)))
     columns = frames.columns[..., 0]
-    up = frames.joints()[neck, :, 0] - frames.origins[max(trunk, 0), :, 0]
-    up /= np.linalg.norm(up)
+    spine = frames.joints()[neck, :, 0] - frames.origins[max(trunk, 0), :, 0]
+    known = [(trunk, spine, TRUNK_LEAN, TRUNK_SIGMA)]
+    if skeleton.segment_dofs[trunk]:
+        known.append((0, columns[0, 2], PELVIS_LEAN, PELVIS_SIGMA))
+    return Upright(
+        np.array([segment for segment, *_ in known], dtype=np.intp),
+        np.array([_axes(columns, segment, up, lean) for segment, up, lean, _ in known]),
+        np.array([[aside, ahead, ahead] for *_, (aside, ahead) in known]),
+    )
+
+
+def _axes(columns: Array, segment: int, along: Array, lean: float) -> Array:
+    """Axes (3, 3) in the frame of a segment: to the side, ahead and up.
+
+    Args:
+        columns: (S, 3, 3) frames at rest.
+        segment: whose axes.
+        along: (3,) its long axis upwards, as the columns.
+        lean: how far the long axis leans forwards where the person stands as usual, rad.
+    """
+    up = along / np.linalg.norm(along)
     ahead = columns[0, 1] - up * float(up @ columns[0, 1])
     ahead /= np.linalg.norm(ahead)
-    cos, sin = np.cos(TRUNK_LEAN), np.sin(TRUNK_LEAN)
-    up, ahead = cos * up - sin * ahead, cos * ahead + sin * up
-    axes = np.array([np.cross(ahead, up), ahead, up])
-    segments = np.array([0, trunk] if trunk > 0 else [0], dtype=np.intp)
-    sigma = [
-        [PELVIS_ASIDE, PELVIS_FORWARDS, PELVIS_FORWARDS],
-        [TRUNK_ASIDE, TRUNK_FORWARDS, TRUNK_FORWARDS],
-    ]
-    local = np.array([axes @ columns[s].T for s in segments])
-    return Upright(segments, local, np.array(sigma[: len(segments)]))
+    up, ahead = np.cos(lean) * up - np.sin(lean) * ahead, np.cos(lean) * ahead + np.sin(lean) * up
+    result: Array = np.array([np.cross(ahead, up), ahead, up]) @ columns[segment].T
+    return result
 
 
 def root_lean_dofs(body: Body) -> Index:

@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation
 from hmt_ros.body import load_body
 from hmt_ros.body.ground_terms import (
     BALANCE_SIGMA,
-    PELVIS_FORWARDS,
+    LEAN_TAILS,
+    PELVIS_SIGMA,
     SUPPORT_MARGIN,
     TAILS,
-    TRUNK_FORWARDS,
     TRUNK_LEAN,
+    TRUNK_SIGMA,
     FloorPlane,
     GroundSettings,
     GroundTerm,
@@ -71,10 +72,6 @@ def standing(body) -> np.ndarray:
     pose = np.zeros((1, body.dimension))
     pose[0, 2] = 3.0
     return pose
-
-
-def skeleton_dof(body, name: str) -> int:
-    return int(body.skeleton.dof_index((name,))[0])
 
 
 def level_plane(body, pose: np.ndarray) -> FloorPlane:
@@ -135,36 +132,37 @@ def test_who_stands_on_both_feet_costs_nothing_but_the_lean(body, standing):
 
 
 @pytest.mark.parametrize('name', ['human32', 'human34', 'human37'])
-def test_the_usual_lean_of_the_trunk_costs_nothing(name):
+def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
     body = load_body(name)
-    skeleton, bent = body.skeleton, skeleton_dof(body, 'root_x')
-    poses = np.tile(body.prior_mean, (1201, 1))
-    poses[:, list(skeleton.segment_dofs[0])] = 0.0
-    poses[:, 2] = 3.0
-    poses[:, bent] = np.radians(np.linspace(-60, 60, len(poses)))
-    frames, rows = forward(skeleton, poses), np.zeros(len(poses), dtype=np.intp)
-    cost = GroundTerm(body, only('upright'), FloorPlane(LEVEL, 0.0, None, np.inf)).energy(
-        frames, rows
-    )
-    best = int(np.argmin(cost.value))
-    assert cost.value[best] == pytest.approx(0.0, abs=1e-4)
-    neck = frames.joints()[skeleton.joint_index(('neck',))[0], :, best]
-    trunk = skeleton.parents[skeleton.joint_segments[skeleton.joint_index(('neck',))[0]]]
-    axis = neck - frames.origins[trunk, :, best]
-    # The person at rest faces the camera: forwards is -z.
-    assert np.arctan2(-axis[2], -axis[1]) == pytest.approx(TRUNK_LEAN, abs=2e-3)
-    # Heavy tails: people bend.
-    over = np.radians(20)
-    turned = poses[[best]].copy()
-    turned[0, bent] -= over
-    small = turned.copy()
-    small[0, bent] = poses[best, bent] - 0.01
-    costs = GroundTerm(body, only('upright'), FloorPlane(LEVEL, 0.0, None, np.inf)).energy(
-        forward(skeleton, np.concatenate([small, turned])), np.zeros(2, dtype=np.intp)
-    )
-    square = 0.01**2 * (PELVIS_FORWARDS**-2 + (trunk > 0) * TRUNK_FORWARDS**-2)
-    assert costs.value[0] == pytest.approx(0.5 * (TAILS + 2) / TAILS * square, rel=0.02)
-    assert costs.value[1] < 6.0
+    skeleton = body.skeleton
+    neck = skeleton.joint_index(('neck',))[0]
+    trunk = skeleton.parents[skeleton.joint_segments[neck]]
+    term = GroundTerm(body, only('upright'), FloorPlane(LEVEL, 0.0, None, np.inf))
+    bends = bool(skeleton.segment_dofs[trunk])
+
+    def leaning(pelvis: np.ndarray, spine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cost and lean of the trunk (N,), of leans of the pelvis and angles of the spine."""
+        poses = np.zeros((len(pelvis), body.dimension))
+        poses[:, 2] = 3.0
+        poses[:, skeleton.dof_index(('root_x',))[0]] = pelvis
+        if bends:
+            poses[:, skeleton.dof_index(('trunk_x',))[0]] = spine
+        frames = forward(skeleton, poses)
+        axis = frames.joints()[neck] - frames.origins[trunk]
+        # The person at rest faces the camera: forwards is -z.
+        cost = term.energy(frames, np.zeros(len(poses), dtype=np.intp)).value
+        return cost, np.arctan2(-axis[2], -axis[1])
+
+    angles = np.radians(np.linspace(-90, 30, 481))
+    grid = np.stack(np.meshgrid(angles, angles if bends else [0.0]), axis=-1).reshape(-1, 2)
+    cost, lean = leaning(*grid.T)
+    best = int(np.argmin(cost))
+    assert cost[best] == pytest.approx(0.0, abs=1e-4)
+    assert lean[best] == pytest.approx(TRUNK_LEAN, abs=2e-3)
+    small, turned = leaning(grid[best, 0] + np.array([-0.01, -np.pi / 3]), grid[best, 1])[0]
+    square = 0.01**2 * (TRUNK_SIGMA[1] ** -2 + bends * PELVIS_SIGMA[1] ** -2)
+    assert small == pytest.approx(0.5 * (LEAN_TAILS + 2) / LEAN_TAILS * square, rel=0.03)
+    assert turned < 16.0
 
 
 def test_feet_below_the_floor_cost_and_feet_above_it_do_not(body, standing):
