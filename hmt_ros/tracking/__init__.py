@@ -1,11 +1,15 @@
 """The filter: proposals and mixture density propagation over images (KJS)."""
 
+from hmt_ros.tracking.ground import Ground, GroundSettings, KnownGround
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.subject import Subject, SubjectError, read_subject
 from hmt_ros.tracking.tracker import Status, Tracker
 
 __all__ = [
+    'Ground',
+    'GroundSettings',
+    'KnownGround',
     'PosePrediction',
     'Status',
     'Subject',

@@ -25,6 +25,7 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.filter import MixtureFilter
+from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
@@ -43,6 +44,7 @@ class Track:
         settings: how.
         seed: of all randomness.
         extra: further energy terms.
+        ground: gravity and floor; None: nothing is made of them.
     """
 
     def __init__(
@@ -52,9 +54,10 @@ class Track:
         settings: TrackerSettings,
         seed: int,
         extra: tuple[FrameTerm, ...] = (),
+        ground: GroundEstimator | None = None,
     ) -> None:
         self.settings = settings
-        self._filters = [MixtureFilter(body, camera, settings, seed, extra)]
+        self._filters = [MixtureFilter(body, camera, settings, seed, extra, ground)]
         self._undecided_until = 0
 
     @property
@@ -81,6 +84,11 @@ class Track:
     def misfit(self) -> float:
         """Share of the last image that no mode explains."""
         return self._first.misfit
+
+    @property
+    def contacts(self) -> dict[str, float]:
+        """Probability that the heaviest mode rests on a foot, by foot; empty: unknown."""
+        return self._first.contacts.by_foot()
 
     @property
     def evaluations(self) -> int:

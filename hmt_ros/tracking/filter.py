@@ -23,7 +23,9 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, resting
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.ambiguities import ambiguity_classes
+from hmt_ros.tracking.contact import FootContacts
 from hmt_ros.tracking.facing_odds import FacingOdds
+from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses, relative_joints
 from hmt_ros.tracking.loss import unexplained_share
 from hmt_ros.tracking.motion_states import PredictedStates, fused
@@ -76,8 +78,10 @@ class MixtureFilter:
         settings: how.
         seed: of all randomness.
         extra: further energy terms.
+        ground: gravity and floor; None: nothing is made of them.
 
     Attributes:
+        contacts: of the feet of the modes.
         body: with the lengths and the flesh that have been estimated.
         shape: the estimate of them.
         misfit: share of the last image that no mode explains.
@@ -93,6 +97,7 @@ class MixtureFilter:
         settings: TrackerSettings,
         seed: int,
         extra: tuple[FrameTerm, ...] = (),
+        ground: GroundEstimator | None = None,
     ) -> None:
         self.body = body
         self.camera = camera
@@ -111,7 +116,8 @@ class MixtureFilter:
         self._images = 0
         self._shape_age = 0.0
         self._facing = FacingOdds()
-        self._posterior = Posterior(body, camera, settings, extra)
+        self._posterior = Posterior(body, camera, settings, extra, ground)
+        self.contacts = FootContacts()
         self._proposal = PROPOSALS[settings.proposals](self._posterior)
 
     @property
@@ -196,13 +202,15 @@ class MixtureFilter:
     def hold(self, solved: Minimum, log_weights: Array, observation: Observation) -> None:
         """Makes modes at rest from minima and their log prior weights (N,)."""
         optimised = Optimised(new_hypotheses(solved.x, log_weights), solved)
+        self._posterior.stance = None
         least = self._weigh_and_select(optimised, None, observation)
+        self._stand(None)
         self.log_evidence = -self.beta * least
 
     def twin(self) -> MixtureFilter:
         """Another filter of the same person, without modes, with random numbers of its own."""
-        extra = self._posterior.extra
-        other = MixtureFilter(self.body, self.camera, self.settings, self._seed + 1, extra)
+        extra, ground = self._posterior.extra, self._posterior.ground
+        other = MixtureFilter(self.body, self.camera, self.settings, self._seed + 1, extra, ground)
         other.shape = deepcopy(self.shape)
         return other
 
@@ -210,6 +218,7 @@ class MixtureFilter:
         """Takes over modes; their textures are taken from the image anew."""
         textures = self._posterior.textures(modes.poses, observation)
         self._modes = replace(modes, textures=textures, texture_rows=np.arange(len(modes)))
+        self._stand(None)
 
     # One image after another.
 
@@ -264,6 +273,7 @@ class MixtureFilter:
         # Of the error of an energy only what is new counts.
         self.log_evidence -= beta * (least - s.error_correlation * float(modes.energies.min()))
         posterior.trust.update(least)
+        self._stand(dt)
         self._shape_age += dt
         if self._images < s.shape_images or (
             s.shape_interval > 0 and self._images % s.shape_interval == 0
@@ -470,6 +480,18 @@ class MixtureFilter:
         odds.follow(self.body, poses, log_weights, back)
         return log_weights
 
+    def _stand(self, dt: float | None) -> None:
+        """Takes in how the modes stand, dt after their ancestors, s; None: they have none."""
+        ground = self._posterior.ground
+        if ground is None:
+            return
+        body, modes, plane = self._posterior.body, self.modes, ground.plane
+        if dt is None:
+            self.contacts.begin(body, plane, modes)
+        else:
+            self.contacts.update(body, plane, modes, dt, still=ground.still)
+        self._posterior.stance = self.contacts.stance
+
     # What is learned.
 
     def _learn_usual_energy(self, energy: float) -> None:
@@ -517,8 +539,9 @@ class MixtureFilter:
     def _use_body(self, body: Body) -> None:
         """Goes on with a body of the same degrees of freedom."""
         self.body = body
-        evaluations, trust = self._posterior.evaluations, self._posterior.trust
-        self._posterior = Posterior(body, self.camera, self.settings, self._posterior.extra)
-        self._posterior.evaluations = evaluations
-        self._posterior.trust = trust
+        before = self._posterior
+        self._posterior = Posterior(body, self.camera, self.settings, before.extra, before.ground)
+        self._posterior.evaluations = before.evaluations
+        self._posterior.trust = before.trust
+        self._posterior.stance = before.stance
         self._proposal = PROPOSALS[self.settings.proposals](self._posterior)

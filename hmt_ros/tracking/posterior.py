@@ -1,9 +1,11 @@
 """The energy of a pose given one image and where it was expected (KJS 2).
 
-    E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_motion(x) + E_extra(x)
+    E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_motion(x)
+           + E_ground(x) + E_extra(x)
 
 E_motion is a Student prior around the expected pose: a Gaussian motion prior with heavy tails.
-E_extra are terms that the user of a tracker adds.
+E_ground is what is known of gravity, floor and feet (`body.ground_terms`), E_extra are terms that
+the user of a tracker adds.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.ground_terms import GroundTerm, Stance, without_root_lean
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.pose_terms import FrameTerm, Posed
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
@@ -36,6 +39,7 @@ from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.trust import Trust
 
 if TYPE_CHECKING:
+    from hmt_ros.tracking.ground import GroundEstimator
     from hmt_ros.tracking.settings import TrackerSettings
 
 
@@ -68,9 +72,11 @@ class Posterior:
     Args:
         body, camera: who is seen by what.
         settings: of the tracker.
-        extra: further terms, such as what is known of the floor.
+        extra: further terms.
+        ground: gravity and floor; None: nothing is made of them.
 
     Attributes:
+        stance: how the modes of the image before stood; None: unknown.
         evaluations: of the likelihood, so far.
         trust: how far images are believed.
     """
@@ -81,8 +87,15 @@ class Posterior:
         camera: Camera,
         settings: TrackerSettings,
         extra: tuple[FrameTerm, ...] = (),
+        ground: GroundEstimator | None = None,
     ) -> None:
+        self.ground = ground if settings.ground.on else None
+        self._person = body
+        if self.ground is not None and settings.ground.upright_weight > 0:
+            body = without_root_lean(body)
         self.body, self.camera, self.settings, self.extra = body, camera, settings, extra
+        self.stance: Stance | None = None
+        self._ground_term: GroundTerm | None = None
         self.trust = Trust(settings.trust, settings.error_correlation)
         self.evaluations = 0
         self._step_scale = np.where(body.skeleton.dof_is_rotation, 0.3, 0.2)
@@ -106,8 +119,36 @@ class Posterior:
         texture_rows: Index | None = None,
     ) -> EnergyTerm:
         """The energy without what was expected; its evaluations are counted."""
+        return self._of_image(observation, textures, texture_rows, self.known)
+
+    @property
+    def known(self) -> tuple[FrameTerm, ...]:
+        """What is known besides image and body: terms that were added, gravity and floor."""
+        ground = self._ground
+        if ground is None:
+            return self.extra
+        stance = None if self.stance is None else self.stance.of_first
+        return (*self.extra, ground.following(stance))
+
+    @property
+    def _ground(self) -> GroundTerm | None:
+        """The term of the present plane, without a stance."""
+        if self.ground is None:
+            return None
+        plane = self.ground.plane
+        if self._ground_term is None or self._ground_term.plane is not plane:
+            self._ground_term = GroundTerm(self._person, self.settings.ground, plane)
+        return self._ground_term
+
+    def _of_image(
+        self,
+        observation: Observation,
+        textures: Textures | None,
+        texture_rows: Index | None,
+        known: tuple[FrameTerm, ...],
+    ) -> EnergyTerm:
         terms = self.likelihood.given(observation, textures, texture_rows).terms
-        return _Counted(Posed(self.body.skeleton, (*terms, *self.extra)), self)
+        return _Counted(Posed(self.body.skeleton, (*terms, *known)), self)
 
     def around(self, observation: Observation, centres: Array, precisions: Array) -> EnergyTerm:
         """With a Gaussian prior of precisions (N, d, d) around centres (N, d)."""
@@ -118,7 +159,10 @@ class Posterior:
     ) -> EnergyTerm:
         """With the motion prior of hypotheses, whose ancestors have precisions (K, d, d)."""
         h = hypotheses
-        image = self.of_image(observation, h.textures, h.texture_rows)
+        known, ground = self.known, self._ground
+        if ground is not None and self.stance is not None:
+            known = (*self.extra, ground.following(self.stance[h.ancestors]))
+        image = self._of_image(observation, h.textures, h.texture_rows, known)
         return Sum((image, self._motion_prior(h, precisions)))
 
     def values(
@@ -164,7 +208,7 @@ class Posterior:
                 *(term.energy(frames, rows) for term in keypoints),
             ]
         )
-        known = (*self.likelihood.priors, *self.extra)
+        known = (*self.likelihood.priors, *self.known)
         priors = [term.energy(frames, rows) for term in known]
         fit = ImageFit(add_energies([seen, *priors]), seen.value, image.hessian, image.costs)
         self._last_fit = (poses, observation, fit)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from hmt_ros.image.likelihood import LikelihoodSettings
+from hmt_ros.tracking.ground import GroundSettings
 from hmt_ros.tracking.proposals import PROPOSALS
 from hmt_ros.tracking.proposals.chain_votes import VOTES
 from hmt_ros.tracking.weighting import REWEIGHTINGS
@@ -82,6 +83,7 @@ class TrackerSettings:
             measured by the stamps of the images.
         likelihood: settings of the likelihood.
         search: settings of the search of limbs.
+        ground: settings of what is known of gravity and floor.
     """
 
     max_hypotheses: int = 8
@@ -117,6 +119,7 @@ class TrackerSettings:
     absence_time: float = 0.5
     likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
     search: LimbSearchSettings = field(default_factory=LimbSearchSettings)
+    ground: GroundSettings = field(default_factory=GroundSettings)
 
     def __post_init__(self) -> None:
         if self.proposals not in PROPOSALS:

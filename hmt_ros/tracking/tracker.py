@@ -14,6 +14,7 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
@@ -25,6 +26,7 @@ from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.facing import Track
+from hmt_ros.tracking.ground import Ground, GroundEstimator, KnownGround
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.initialisation import (
     poses_from_keypoints,
@@ -54,6 +56,8 @@ ARRIVAL, ARRIVAL_AT_BORDER = 0.2, 0.6
 LIKELY = 4.0
 # Margin around all joints of all modes, as a fraction of their extent: where the silhouette may be.
 REGION_MARGIN = 0.3
+# Share of the time for which somebody stands on both feet, where contact is unknown.
+RESTING = 0.3
 
 
 class Status(Enum):
@@ -91,7 +95,8 @@ class Tracker:
         background: the empty scene; None, or a model that has learned nothing: learned from images
             before the track starts, and if there are none the silhouette is not used.
         seed: of all randomness. The same images, settings and seed give the same numbers.
-        extra: further energy terms of the posterior, such as what is known of the floor.
+        extra: further energy terms of the posterior.
+        known_ground: gravity and floor, as far as they are known; the rest is estimated.
 
     Attributes:
         silhouettes: where those of the images come from.
@@ -107,6 +112,7 @@ class Tracker:
         background: BackgroundModel | None = None,
         seed: int = 0,
         extra: Sequence[FrameTerm] = (),
+        known_ground: KnownGround | None = None,
     ) -> None:
         self.settings = settings or TrackerSettings()
         self.model = body
@@ -117,6 +123,7 @@ class Tracker:
         self._seed = seed
         self._start: Subject | GaussianMixture | None = None
         self._extra = tuple(extra)
+        self._ground = GroundEstimator(known_ground)
         self._track = self._new_track(body)
         self._point = PointEstimate()
         self._presence = Presence(self.settings.absence_time)
@@ -187,6 +194,8 @@ class Tracker:
         if self._last_stamp is not None and stamp <= self._last_stamp:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
         self.evaluations = 0
+        known = self.background.frames > 0 and not self.silhouettes.doubted
+        self._ground.still = known and not self._ground.turning
         view = self._view(image, keypoints, mask, nobody_predicted)
         found = self._take(view, stamp, prediction, masked=mask is not None)
         self._last_stamp = stamp
@@ -210,6 +219,31 @@ class Tracker:
     def body(self) -> Body:
         """The person, with what has been estimated of lengths and widths."""
         return self._track.body
+
+    @property
+    def ground(self) -> Ground:
+        """Gravity and floor, as far as they are known or estimated."""
+        return self._ground.estimate
+
+    def set_gravity(self, up: ArrayLike) -> None:
+        """Takes a newer direction against gravity, before the image that it belongs to.
+
+        Args:
+            up: (3,) unit vector in the camera frame.
+
+        Raises:
+            ValueError: it is no unit vector.
+        """
+        self._ground.set_gravity(up)
+
+    @property
+    def contacts(self) -> dict[str, float]:
+        """Probability by foot, 'left_foot' and 'right_foot', that the heaviest mode rests on it.
+
+        Empty while it is unknown: there is no track, the body has no feet, the terms of the ground
+        are off, or the camera moves. It stands still where there is a background image.
+        """
+        return self._track.contacts if self._ground.still else {}
 
     @property
     def misfit(self) -> float:
@@ -242,12 +276,13 @@ class Tracker:
         return self.modes.mixture(1.0 - self.settings.error_correlation)
 
     def _new_track(self, body: Body) -> Track:
-        return Track(body, self.camera, self.settings, self._seed, self._extra)
+        return Track(body, self.camera, self.settings, self._seed, self._extra, self._ground)
 
     def _drop_track(self) -> None:
         """Keeps nothing but the body."""
         self._track = self._new_track(self.body)
         self._point = PointEstimate()
+        self._ground.reset()
         self._arrived = None
         self._last_image, self._followed = None, None
 
@@ -275,6 +310,9 @@ class Tracker:
             poses = self.modes.poses[likely]
             self.silhouettes.complete(view.image, self.body, self.camera, poses)
         dt = 0.0 if self._followed is None else (stamp - self._followed) * 1e-9
+        if self.settings.ground.on:
+            resting = min(self.contacts.values(), default=RESTING)
+            self._ground.update(self.body, self.modes, resting, dt)
         self._point.update(self.body, self.modes.poses, np.exp(self.modes.log_weights), dt)
         self._last_image, self._followed = view.image, stamp
         self.evaluations = self._track.evaluations

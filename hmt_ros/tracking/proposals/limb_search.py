@@ -82,7 +82,7 @@ class LimbSearch:
         )
         rows = np.full(len(samples), row)
         seen = self._own.seen(observation, textures, rows, explained=others.costs)
-        seen = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.extra)
+        seen = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
         term = Sum(
             (
                 Restricted(Posed(body.skeleton, seen), pose, own),

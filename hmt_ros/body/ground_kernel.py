@@ -1,0 +1,336 @@
+"""The compiled energy of `ground_terms`, one pose at a time.
+
+Every residual r with the derivative J over the pose adds `g J` to the gradient and `k J J^T` to the
+Hessian, g the derivative and k the curvature of its robust cost as in iteratively reweighted least
+squares; only the degrees of freedom that move its points have a part in J.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from hmt_ros.inference.arrays import Array
+
+# A point of the soles supports the body up to this height over the lowest one, m.
+SUPPORT_HEIGHT = 0.10
+
+
+class Constants(NamedTuple):
+    """What does not depend on the pose.
+
+    Attributes:
+        parents: (S,) segment above; -1: none.
+        dof_segments, dof_is_rotation: (d,).
+        moves: (S, d) whether a degree of freedom moves a segment.
+        weights: (4,) of the terms: upright, floor, balance, contact; 0: off.
+        up: (3,) against gravity.
+        height: of the camera over the floor, m.
+        upright: (U,) segments that are upright.
+        axes: (U, 3, 3) their axes: to the side, ahead, up.
+        lean: (U, 3) deviations of gravity along these, rad.
+        soles: (P,) segments of the points of the soles.
+        local: (P, 3) their places there, m.
+        per_floor: 1 / deviation of the height of the floor, 1/m.
+        shares, centres: (S,), (S, 3) masses of the segments and their places, m.
+        margin: distance from the support that costs nothing, m.
+        vertical: what the uncertain vertical adds to the deviation of the balance, m.
+        per_rest, per_rest_height: 1 / deviation of a resting point from its anchor and from the
+            height of the floor, 1/m; 0: unknown.
+        lean_tails, tails: degrees of freedom of the robust costs, of the lean and of the others.
+    """
+
+    parents: NDArray[np.int64]
+    dof_segments: NDArray[np.int64]
+    dof_is_rotation: NDArray[np.bool_]
+    moves: NDArray[np.bool_]
+    weights: Array
+    up: Array
+    height: float
+    upright: NDArray[np.int64]
+    axes: Array
+    lean: Array
+    soles: NDArray[np.int64]
+    local: Array
+    per_floor: float
+    shares: Array
+    centres: Array
+    margin: float
+    vertical: float
+    per_rest: float
+    per_rest_height: float
+    lean_tails: float
+    tails: float
+
+
+@njit(cache=True, nogil=True)
+def add_ground_energies(  # type: ignore[no-untyped-def]
+    c, contact, anchors, balance_sigma, grounded, columns, origins, axes, dof_origins,
+    terms, gradient, hessian,
+):  # fmt: skip
+    """Adds the terms of N poses.
+
+    Args:
+        c: the constants.
+        contact, anchors, balance_sigma, grounded: of each pose, as in `Stance`.
+        columns, origins: (N, S, 3, 3), (N, S, 3) frames of the segments.
+        axes, dof_origins: (N, d, 3) of the degrees of freedom.
+        terms: (N, 4) is added to.
+        gradient, hessian: (N, d), (N, d, d) are added to; of no length: not wanted.
+    """
+    count, d, points = len(columns), axes.shape[1], len(c.soles)
+    wanted = len(gradient) > 0
+    place = np.zeros((points, 3))
+    moved = np.zeros((points, 3, d))
+    row = np.zeros(d)
+    mass, moment = np.zeros(len(c.parents)), np.zeros((len(c.parents), 3))
+    for n in range(count):
+        if c.weights[0] > 0:
+            terms[n, 0] += _upright(c, columns[n], axes[n], row, n, wanted, gradient, hessian)
+        if c.weights[1] + c.weights[2] + c.weights[3] == 0:
+            continue
+        for p in range(points):
+            s = c.soles[p]
+            for k in range(3):
+                place[p, k] = origins[n, s, k]
+                for i in range(3):
+                    place[p, k] += c.local[p, i] * columns[n, s, i, k]
+            if wanted:
+                _move(c.moves[s], c.dof_is_rotation, axes[n], dof_origins[n], place[p], moved[p])
+        if c.weights[1] > 0:
+            terms[n, 1] += _floor(c, place, moved, row, n, wanted, gradient, hessian)
+        if c.weights[2] > 0:
+            terms[n, 2] += _balance(
+                c, columns[n], origins[n], axes[n], dof_origins[n], place, moved, mass, moment,
+                balance_sigma[n], grounded[n], row, n, wanted, gradient, hessian,
+            )  # fmt: skip
+        if c.weights[3] > 0:
+            for p in range(points):
+                if contact[n, p] > 0:
+                    high = _height(c.up, c.height, place[p]) * c.per_rest_height
+                    terms[n, 3] += _contact(
+                        c.weights[3], c.up, c.per_rest, c.per_rest_height, contact[n, p],
+                        anchors[n, p], high, place[p], moved[p], row, n, wanted, gradient, hessian,
+                    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _move(moves, is_rotation, axes, origins, point, result):  # type: ignore[no-untyped-def]
+    """Derivative (3, d) of a point by the degrees of freedom that move it."""
+    for j in range(len(moves)):
+        if not moves[j]:
+            for k in range(3):
+                result[k, j] = 0.0
+        elif is_rotation[j]:
+            x, y, z = point[0] - origins[j, 0], point[1] - origins[j, 1], point[2] - origins[j, 2]
+            result[0, j] = axes[j, 1] * z - axes[j, 2] * y
+            result[1, j] = axes[j, 2] * x - axes[j, 0] * z
+            result[2, j] = axes[j, 0] * y - axes[j, 1] * x
+        else:
+            for k in range(3):
+                result[k, j] = axes[j, k]
+
+
+@njit(cache=True, nogil=True)
+def _add(row, pull, curvature, gradient, hessian):  # type: ignore[no-untyped-def]
+    """Adds g J and k J J^T for the derivative J (d,) of a residual."""
+    d = len(row)
+    for i in range(d):
+        if row[i] != 0.0:
+            gradient[i] += pull * row[i]
+            scaled = curvature * row[i]
+            for j in range(d):
+                hessian[i, j] += scaled * row[j]
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _student(square, tails, dimension):  # type: ignore[no-untyped-def]
+    """Value at r^2, and the factor s so that s r is the derivative and s the curvature."""
+    value = 0.5 * (tails + dimension) * np.log1p(square / tails)
+    return value, (tails + dimension) / (tails + square)
+
+
+@njit(cache=True, nogil=True)
+def _upright(c, columns, axes, row, n, wanted, gradient, hessian):  # type: ignore[no-untyped-def]
+    total = 0.0
+    axis, residual = np.empty((3, 3)), np.empty(3)
+    for u in range(len(c.upright)):
+        s, square = c.upright[u], 0.0
+        for i in range(3):
+            along = 0.0
+            for k in range(3):
+                axis[i, k] = 0.0
+                for m in range(3):
+                    axis[i, k] += c.axes[u, i, m] * columns[s, m, k]
+                along += axis[i, k] * c.up[k]
+            residual[i] = (along - (1.0 if i == 2 else 0.0)) / c.lean[u, i]
+            square += residual[i] * residual[i]
+        value, factor = _student(square, c.lean_tails, 2.0)
+        total += c.weights[0] * value
+        if not wanted:
+            continue
+        for i in range(3):
+            # An axis e that turns by w moves e . up by w . (e x up).
+            x = axis[i, 1] * c.up[2] - axis[i, 2] * c.up[1]
+            y = axis[i, 2] * c.up[0] - axis[i, 0] * c.up[2]
+            z = axis[i, 0] * c.up[1] - axis[i, 1] * c.up[0]
+            for j in range(len(row)):
+                row[j] = 0.0
+                if c.moves[s, j] and c.dof_is_rotation[j]:
+                    row[j] = (axes[j, 0] * x + axes[j, 1] * y + axes[j, 2] * z) / c.lean[u, i]
+            k = c.weights[0] * factor
+            _add(row, k * residual[i], k, gradient[n], hessian[n])
+    return total
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _height(up, height, point):  # type: ignore[no-untyped-def]
+    return up[0] * point[0] + up[1] * point[1] + up[2] * point[2] + height
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _project(direction, moved, factor, row):  # type: ignore[no-untyped-def]
+    """Derivative of a point along a direction, times a factor."""
+    for j in range(len(row)):
+        row[j] = factor * (
+            direction[0] * moved[0, j] + direction[1] * moved[1, j] + direction[2] * moved[2, j]
+        )
+
+
+@njit(cache=True, nogil=True)
+def _floor(c, place, moved, row, n, wanted, gradient, hessian):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for p in range(len(place)):
+        r = _height(c.up, c.height, place[p]) * c.per_floor
+        if r >= 0.0:
+            continue
+        value, factor = _student(r * r, c.tails, 1.0)
+        total += c.weights[1] * value
+        if wanted:
+            _project(c.up, moved[p], c.per_floor, row)
+            k = c.weights[1] * factor
+            _add(row, k * r, k, gradient[n], hessian[n])
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _contact(  # type: ignore[no-untyped-def]
+    weight, up, per, per_height, probability, anchor, high, place, moved, row, n, wanted, gradient,
+    hessian,
+):  # fmt: skip
+    """Minus the logarithm of a mixture: the point rests, or it does not."""
+    square = high * high
+    for k in range(3):
+        square += ((place[k] - anchor[k]) * per) ** 2
+    rests, free = probability * np.exp(-0.5 * square), 1.0 - probability
+    if wanted:
+        k = weight * rests / (rests + free)
+        for i in range(3):
+            for j in range(len(row)):
+                row[j] = moved[i, j] * per
+            _add(row, k * (place[i] - anchor[i]) * per, k, gradient[n], hessian[n])
+        if per_height > 0:
+            _project(up, moved, per_height, row)
+            _add(row, k * high, k, gradient[n], hessian[n])
+    return -weight * np.log(rests + free)
+
+
+@njit(cache=True, nogil=True)
+def _balance(  # type: ignore[no-untyped-def]
+    c, columns, origins, axes, dof_origins, place, moved, mass, moment, allowed, grounded,
+    row, n, wanted, gradient, hessian,
+):  # fmt: skip
+    weight = c.weights[2] * grounded
+    if weight == 0.0:
+        return 0.0
+    # Masses and first moments of all that hangs on each segment.
+    mass[:] = 0.0
+    moment[:] = 0.0
+    for s in range(len(c.parents) - 1, -1, -1):
+        for k in range(3):
+            at = origins[s, k]
+            for i in range(3):
+                at += c.centres[s, i] * columns[s, i, k]
+            moment[s, k] += c.shares[s] * at
+        mass[s] += c.shares[s]
+        if c.parents[s] >= 0:
+            mass[c.parents[s]] += mass[s]
+            for k in range(3):
+                moment[c.parents[s], k] += moment[s, k]
+    a, b, share, distance, away = _nearest_support(c.up, place, moment[0])
+    e = distance - c.margin
+    if e <= 0.0:
+        return 0.0
+    per = 1.0 / np.sqrt(allowed * allowed + c.vertical * c.vertical)
+    r = e * per
+    value, factor = _student(r * r, c.tails, 1.0)
+    if wanted:
+        for j in range(len(row)):
+            s = c.dof_segments[j]
+            if c.dof_is_rotation[j]:
+                x = moment[s, 0] - mass[s] * dof_origins[j, 0]
+                y = moment[s, 1] - mass[s] * dof_origins[j, 1]
+                z = moment[s, 2] - mass[s] * dof_origins[j, 2]
+                total = away[0] * (axes[j, 1] * z - axes[j, 2] * y)
+                total += away[1] * (axes[j, 2] * x - axes[j, 0] * z)
+                total += away[2] * (axes[j, 0] * y - axes[j, 1] * x)
+            else:
+                total = 0.0
+                for k in range(3):
+                    total += mass[s] * away[k] * axes[j, k]
+            for k in range(3):
+                total -= away[k] * ((1.0 - share) * moved[a, k, j] + share * moved[b, k, j])
+            row[j] = total * per
+        k = weight * factor
+        _add(row, k * r, k, gradient[n], hessian[n])
+    return weight * value
+
+
+@njit(cache=True, nogil=True)
+def _nearest_support(up, place, centre):  # type: ignore[no-untyped-def]
+    """Where the support is nearest to the centre of mass, seen from above.
+
+    The support is made of the lines between any two points of the soles that are near the floor:
+    with their diagonals they come near every point of the hull.
+
+    Returns:
+        The two points and the share of the way between them; the distance and its direction (3,).
+    """
+    lowest = np.inf
+    for p in range(len(place)):
+        lowest = min(lowest, _height(up, 0.0, place[p]))
+    first, second, share, least = 0, 0, 0.0, np.inf
+    away, to, line = np.zeros(3), np.empty(3), np.empty(3)
+    for a in range(len(place)):
+        if _height(up, 0.0, place[a]) > lowest + SUPPORT_HEIGHT:
+            continue
+        for b in range(a, len(place)):
+            if _height(up, 0.0, place[b]) > lowest + SUPPORT_HEIGHT:
+                continue
+            for k in range(3):
+                to[k], line[k] = centre[k] - place[a, k], place[b, k] - place[a, k]
+            high, rise = 0.0, 0.0
+            for k in range(3):
+                high += to[k] * up[k]
+                rise += line[k] * up[k]
+            along, length = 0.0, 0.0
+            for k in range(3):
+                to[k] -= high * up[k]
+                line[k] -= rise * up[k]
+                along += to[k] * line[k]
+                length += line[k] * line[k]
+            t = 0.0 if length < 1e-12 else min(max(along / length, 0.0), 1.0)
+            square = 0.0
+            for k in range(3):
+                square += (to[k] - t * line[k]) ** 2
+            if square < least:
+                first, second, share, least = a, b, t, square
+                for k in range(3):
+                    away[k] = to[k] - t * line[k]
+    distance = np.sqrt(least)
+    if distance > 0.0:
+        away /= distance
+    return first, second, share, distance, away

@@ -1,0 +1,236 @@
+"""The ground: which way is up, and how far the floor lies below the camera.
+
+    h(p) = n . p + d        height of a point p over the floor, camera frame, m
+
+with n the unit vector against gravity and d the height of the camera. What is not known is
+estimated from the track; see `GroundEstimator`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.ground_terms import FloorPlane, GroundSettings
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.mass import masses
+from hmt_ros.body.soles import soles
+from hmt_ros.inference.arrays import Array
+from hmt_ros.tracking.hypotheses import Modes
+
+__all__ = ['Ground', 'GroundEstimator', 'GroundSettings', 'KnownGround']
+
+# Standard deviations of a direction and of a height that are given: of an inertial sensor and its
+# mounting, rad, and of a measured height, m.
+GIVEN_UP_SIGMA, GIVEN_HEIGHT_SIGMA = 0.01, 0.02
+# The y axis of an image points down; how far the direction of gravity is from it, and at most, rad.
+IMAGE_UP = np.array([0.0, -1.0, 0.0])
+UP_SIGMA, MOST_TILT = np.radians(15.0), np.radians(35.0)
+# Deviation of the axis of a standing body from the vertical, across and along the line of sight,
+# rad, and the time for which its error lasts, s.
+AXIS_SIGMA, AXIS_DEPTH_SIGMA, AXIS_TIME = np.radians(4.0), np.radians(9.0), 1.0
+# Deviation of the vertical that is never undercut, rad, and how fast it is forgotten, rad/sqrt(s).
+LEAST_UP_SIGMA, UP_DRIFT = np.radians(4.0), np.radians(1.0)
+# Time over which the lowest sole is followed, s; its quantile that is the floor; deviations of the
+# floor from it, and of the first image, m.
+LEVEL_TIME, LEVEL_QUANTILE = 2.0, 0.75
+LEVEL_SIGMA, FIRST_LEVEL_SIGMA = 0.04, 0.10
+# Change of the direction of gravity from image to image above which the camera turns, rad.
+TURNED = 0.003
+# Distance of a person before the first image, m.
+USUAL_DISTANCE = 3.0
+
+
+@dataclass(frozen=True)
+class KnownGround:
+    """What is known of the ground besides the images.
+
+    Attributes:
+        up: (3,) unit vector against gravity in the camera frame; None: unknown.
+        camera_height: height of the camera above the floor, m; None: unknown.
+
+    Raises:
+        ValueError: a direction that is no unit vector, or a height that is not positive.
+    """
+
+    up: Array | None = None
+    camera_height: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.up is not None:
+            object.__setattr__(self, 'up', unit_vector(self.up))
+        height = self.camera_height
+        if height is not None and not (np.isfinite(height) and height > 0):
+            raise ValueError(f'camera_height must be a positive number of metres, saw {height}')
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The present estimate of the ground.
+
+    Attributes:
+        up: (3,) unit vector against gravity in the camera frame.
+        up_sigma: standard deviation of its angle about each horizontal axis, rad.
+        height: height of the camera above the floor, m; None: unknown.
+        height_sigma: its standard deviation, m; inf where it is unknown.
+    """
+
+    up: Array
+    up_sigma: float
+    height: float | None
+    height_sigma: float
+
+    @property
+    def plane(self) -> Array | None:
+        """(4,) n and d with n . x + d = 0 on the floor; None: the height is unknown."""
+        return None if self.height is None else np.append(self.up, self.height)
+
+
+def unit_vector(up: ArrayLike) -> Array:
+    """A direction (3,) of unit length.
+
+    Raises:
+        ValueError: another shape, or a length that is not 1 within 1 %.
+    """
+    vector = np.array(up, dtype=np.float64)
+    length = float(np.linalg.norm(vector)) if vector.shape == (3,) else np.nan
+    if not abs(length - 1.0) < 0.01:
+        raise ValueError(
+            f'up must be a unit vector (3,) against gravity in the camera frame, saw {vector}'
+        )
+    unit: Array = vector / length
+    unit.setflags(write=False)
+    return unit
+
+
+class GroundEstimator:
+    """Estimates the ground from what is known of it and from a track.
+
+    The height of the floor follows the lowest sole: a person stands on the floor for most of the
+    time, and jumps at times, so it is a high quantile of the last seconds. The vertical is near
+    that of the image, and near the axis of a body that stands, from the middle of the feet to the
+    centre of mass. Errors of that axis last, so its images count as one per `AXIS_TIME`, and the
+    deviation never goes below `LEAST_UP_SIGMA`.
+
+    Args:
+        known: what is known; None: nothing.
+
+    Attributes:
+        known: what is known.
+        estimate: the present one.
+        still: whether the camera stands still, so that what rests has a place in its frame; set by
+            who knows.
+        turning: whether a newer direction of gravity has told that the camera turns.
+    """
+
+    def __init__(self, known: KnownGround | None = None) -> None:
+        self.known = known or KnownGround()
+        self.still = False
+        self.turning = False
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets what was estimated from a track."""
+        self._mean, self._covariance = IMAGE_UP, np.eye(3) * UP_SIGMA**2
+        self._levels: deque[tuple[float, float]] = deque()
+        self._time = 0.0
+        self._distance = USUAL_DISTANCE
+        self._conclude()
+
+    def set_gravity(self, up: ArrayLike) -> None:
+        """Takes a newer direction (3,) against gravity, camera frame."""
+        before, unit = self.known.up, unit_vector(up)
+        self.turning = before is not None and float(np.linalg.norm(unit - before)) > TURNED
+        self.known = KnownGround(unit, self.known.camera_height)
+        self._conclude()
+
+    @property
+    def plane(self) -> FloorPlane:
+        """Gravity and floor where the person is, for the energy of poses."""
+        return self._plane
+
+    def update(self, body: Body, modes: Modes, resting: float, dt: float) -> None:
+        """Takes in the modes of an image.
+
+        Args:
+            body: of the modes.
+            modes: of the posterior.
+            resting: probability that both feet rest.
+            dt: since the image before, s.
+        """
+        feet, mass = soles(body), masses(body)
+        if not len(feet):
+            return
+        frames = forward(body.skeleton, modes.poses)
+        weights = np.exp(modes.log_weights)
+        weights = weights / weights.sum()
+        points = frames.points(feet.segments, feet.local)
+        self._time += dt
+        if self.known.up is None and mass.known:
+            axes = mass.centre_of_mass(frames) - points.mean(0)
+            axes = axes / np.linalg.norm(axes, axis=0)
+            place = frames.origins[0] @ weights
+            self._follow_axis(axes @ weights, place, resting, dt)
+            self._conclude()
+        up = self.estimate.up
+        level = float(-np.einsum('pin,i->pn', points, up).min(0) @ weights)
+        self._levels.append((self._time, level))
+        while self._levels[0][0] < self._time - LEVEL_TIME:
+            self._levels.popleft()
+        place = frames.origins[0] @ weights
+        self._distance = float(np.linalg.norm(place - up * (up @ place)))
+        self._conclude()
+
+    def _follow_axis(self, axis: Array, place: Array, resting: float, dt: float) -> None:
+        """Moves the vertical by the mean axis (3,) of the body at a place (3,)."""
+        length = np.linalg.norm(axis)
+        if dt <= 0 or resting <= 0 or length == 0:
+            return
+        ray = place / np.linalg.norm(place)
+        along = np.outer(ray, ray)
+        error = AXIS_SIGMA**2 * (np.eye(3) - along) + AXIS_DEPTH_SIGMA**2 * along
+        error = error * max(AXIS_TIME / (resting * dt), 1.0)
+        covariance = self._covariance + UP_DRIFT**2 * dt * np.eye(3)
+        gain = covariance @ np.linalg.inv(covariance + error)
+        mean = self._mean + gain @ (axis / length - self._mean)
+        mean = mean / np.linalg.norm(mean)
+        angle = float(np.arccos(np.clip(mean @ IMAGE_UP, -1.0, 1.0)))
+        if angle > MOST_TILT:
+            aside = mean - IMAGE_UP * (mean @ IMAGE_UP)
+            aside = aside / np.linalg.norm(aside)
+            mean = np.cos(MOST_TILT) * IMAGE_UP + np.sin(MOST_TILT) * aside
+        self._mean = mean
+        values, vectors = np.linalg.eigh(covariance - gain @ covariance)
+        values = np.clip(values, LEAST_UP_SIGMA**2, UP_SIGMA**2)
+        self._covariance = (vectors * values) @ vectors.T
+
+    def _conclude(self) -> None:
+        known = self.known
+        if known.up is not None:
+            up, up_sigma = known.up, GIVEN_UP_SIGMA
+        else:
+            up, up_sigma = self._mean, float(np.sqrt(self._covariance.trace() / 3.0))
+        tracked, tracked_sigma = self._tracked_level()
+        height, sigma = tracked, tracked_sigma
+        if known.camera_height is not None:
+            height, sigma = known.camera_height, GIVEN_HEIGHT_SIGMA
+        self.estimate = Ground(up, up_sigma, height, sigma)
+        # An error of the vertical lifts the floor where the person is.
+        if known.camera_height is not None:
+            sigma = float(np.hypot(sigma, up_sigma * self._distance))
+        if sigma > tracked_sigma:
+            height, sigma = tracked, tracked_sigma
+        self._plane = FloorPlane(up, up_sigma, height, sigma)
+
+    def _tracked_level(self) -> tuple[float | None, float]:
+        """Height of the camera over the lowest soles of the last seconds, and its deviation, m."""
+        if not self._levels:
+            return None, np.inf
+        levels = np.array([level for _, level in self._levels])
+        low, high = np.quantile(levels, [0.5, LEVEL_QUANTILE])
+        few = FIRST_LEVEL_SIGMA / np.sqrt(len(levels))
+        return float(high), float(np.sqrt(LEVEL_SIGMA**2 + (high - low) ** 2 + few**2))

@@ -1,0 +1,264 @@
+"""Gravity, floor, balance and contact as energies of poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hmt_ros.body import load_body
+from hmt_ros.body.ground_terms import (
+    BALANCE_SIGMA,
+    LEAN_TAILS,
+    PELVIS_SIGMA,
+    SUPPORT_MARGIN,
+    TAILS,
+    TRUNK_LEAN,
+    TRUNK_SIGMA,
+    FloorPlane,
+    GroundSettings,
+    GroundTerm,
+    Stance,
+    root_lean_dofs,
+    without_root_lean,
+)
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.mass import SHARES, masses
+from hmt_ros.body.mirror import root_angles, root_rotations
+from hmt_ros.body.soles import soles
+from hmt_ros.inference.energy import Derivatives
+
+TERMS = ('upright', 'floor', 'balance', 'contact')
+UP = np.array([0.1, -0.95, -0.25]) / np.linalg.norm([0.1, -0.95, -0.25])
+PLANE = FloorPlane(UP, 0.01, 0.8, 0.02)
+LEVEL = np.array([0.0, -1.0, 0.0])
+
+
+def only(name: str) -> GroundSettings:
+    off = {f'{term}_weight': 0.0 for term in TERMS}
+    return GroundSettings(**{**off, f'{name}_weight': 1.0})
+
+
+@pytest.fixture(scope='module')
+def body():
+    return load_body('human37')
+
+
+@pytest.fixture(scope='module')
+def poses(body) -> np.ndarray:
+    """(12, d) some that lean, stand badly, and have feet below the floor."""
+    rng = np.random.default_rng(0)
+    sigma = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 0.0)
+    x = body.prior_mean + sigma * rng.normal(size=(12, body.dimension))
+    x[:, :3] = [0.0, 0.0, 3.0] + 0.2 * rng.normal(size=(12, 3))
+    x[:, body.skeleton.dof_index(('root_z',))] = rng.uniform(-3, 3, (12, 1))
+    return np.clip(x, body.lower, body.upper)
+
+
+@pytest.fixture(scope='module')
+def stance(body, poses) -> Stance:
+    rng = np.random.default_rng(1)
+    feet, n = soles(body), len(poses)
+    points = forward(body.skeleton, poses).points(feet.segments, feet.local).transpose(2, 0, 1)
+    anchors = points + 0.01 * rng.normal(size=points.shape)
+    return Stance(rng.uniform(0, 0.9, points.shape[:2]), anchors, np.full(n, 0.1), np.ones(n))
+
+
+@pytest.fixture(scope='module')
+def standing(body) -> np.ndarray:
+    """(1, d) upright, both feet on the floor below a level camera."""
+    pose = np.zeros((1, body.dimension))
+    pose[0, 2] = 3.0
+    return pose
+
+
+def level_plane(body, pose: np.ndarray) -> FloorPlane:
+    """The floor under the soles of a pose (1, d), before a level camera."""
+    feet = soles(body)
+    points = forward(body.skeleton, pose).points(feet.segments, feet.local)[..., 0]
+    return FloorPlane(LEVEL, 0.0, float(-(points @ LEVEL).min()), 0.0)
+
+
+@pytest.mark.parametrize('name', TERMS)
+def test_derivatives_are_those_of_finite_differences(name, body, poses, stance):
+    term, rows = GroundTerm(body, only(name), PLANE, stance), np.arange(len(poses))
+
+    def value(x: np.ndarray) -> np.ndarray:
+        found = term.energy(forward(body.skeleton, x), rows, derivatives=Derivatives.NONE)
+        assert found.gradient is None
+        return found.value
+
+    energy = term.energy(forward(body.skeleton, poses), rows)
+    assert energy.value == pytest.approx(value(poses))
+    assert (energy.value > 0.1).sum() >= len(poses) // 2
+    step, numeric = 1e-6, np.empty_like(poses)
+    for j, unit in enumerate(step * np.eye(body.dimension)):
+        numeric[:, j] = (value(poses + unit) - value(poses - unit)) / (2.0 * step)
+    gradient, hessian = energy.derivatives()
+    assert gradient == pytest.approx(numeric, abs=1e-5)
+    assert hessian == pytest.approx(hessian.transpose(0, 2, 1))
+    assert np.linalg.eigvalsh(hessian).min() > -1e-8
+
+
+@pytest.mark.parametrize('name', TERMS)
+def test_a_camera_that_turns_with_the_vertical_changes_nothing(name, body, poses, stance):
+    turn = Rotation.from_rotvec([0.2, -0.1, 0.15]).as_matrix()
+    turned = poses.copy()
+    turned[:, :3] = poses[:, :3] @ turn.T
+    which = body.skeleton.dof_index(('root_z', 'root_y', 'root_x'))
+    turned[:, which] = root_angles(body, turn @ root_rotations(body, poses))
+    rows = np.arange(len(poses))
+    before = GroundTerm(body, only(name), PLANE, stance)
+    after = GroundTerm(
+        body,
+        only(name),
+        replace(PLANE, up=turn @ UP),
+        replace(stance, anchors=stance.anchors @ turn.T),
+    )
+    assert after.energy(forward(body.skeleton, turned), rows).value == pytest.approx(
+        before.energy(forward(body.skeleton, poses), rows).value
+    )
+
+
+def test_who_stands_on_both_feet_costs_nothing_but_the_lean(body, standing):
+    term = GroundTerm(body, GroundSettings(), level_plane(body, standing))
+    parts = term.parts(forward(body.skeleton, standing), np.zeros(1, dtype=np.intp))
+    assert list(parts) == list(TERMS)
+    assert parts['upright'] > 0
+    for name in TERMS[1:]:
+        assert parts[name] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize('name', ['human32', 'human34', 'human37'])
+def test_the_usual_lean_costs_nothing_and_heavy_tails_let_people_bend(name):
+    body = load_body(name)
+    skeleton = body.skeleton
+    neck = skeleton.joint_index(('neck',))[0]
+    trunk = skeleton.parents[skeleton.joint_segments[neck]]
+    term = GroundTerm(body, only('upright'), FloorPlane(LEVEL, 0.0, None, np.inf))
+    bends = bool(skeleton.segment_dofs[trunk])
+
+    def leaning(pelvis: np.ndarray, spine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cost and lean of the trunk (N,), of leans of the pelvis and angles of the spine."""
+        poses = np.zeros((len(pelvis), body.dimension))
+        poses[:, 2] = 3.0
+        poses[:, skeleton.dof_index(('root_x',))[0]] = pelvis
+        if bends:
+            poses[:, skeleton.dof_index(('trunk_x',))[0]] = spine
+        frames = forward(skeleton, poses)
+        axis = frames.joints()[neck] - frames.origins[trunk]
+        # The person at rest faces the camera: forwards is -z.
+        cost = term.energy(frames, np.zeros(len(poses), dtype=np.intp)).value
+        return cost, np.arctan2(-axis[2], -axis[1])
+
+    angles = np.radians(np.linspace(-90, 30, 481))
+    grid = np.stack(np.meshgrid(angles, angles if bends else [0.0]), axis=-1).reshape(-1, 2)
+    cost, lean = leaning(*grid.T)
+    best = int(np.argmin(cost))
+    assert cost[best] == pytest.approx(0.0, abs=1e-4)
+    assert lean[best] == pytest.approx(TRUNK_LEAN, abs=2e-3)
+    small, turned = leaning(grid[best, 0] + np.array([-0.01, -np.pi / 3]), grid[best, 1])[0]
+    square = 0.01**2 * (TRUNK_SIGMA[1] ** -2 + bends * PELVIS_SIGMA[1] ** -2)
+    assert small == pytest.approx(0.5 * (LEAN_TAILS + 2) / LEAN_TAILS * square, rel=0.03)
+    assert turned < 16.0
+
+
+def test_feet_below_the_floor_cost_and_feet_above_it_do_not(body, standing):
+    plane, rows = level_plane(body, standing), np.zeros(1, dtype=np.intp)
+    frames = forward(body.skeleton, standing)
+    costs = [
+        GroundTerm(body, only('floor'), replace(plane, height=plane.height - sunk))
+        .energy(frames, rows)
+        .value[0]
+        for sunk in (-0.5, 0.0, 0.02, 0.04, 0.4)
+    ]
+    assert costs[0] == 0.0
+    assert costs[1] == pytest.approx(0.0, abs=1e-6)
+    assert 0.0 < costs[2] < costs[3] < costs[4] < 60.0
+    # Without a known floor nothing is below it.
+    unknown = GroundTerm(body, only('floor'), replace(plane, height=None))
+    assert unknown.energy(frames, rows).value[0] == 0.0
+
+
+def test_balance_is_the_distance_of_the_centre_of_mass_from_the_feet(body, standing):
+    rows, skeleton = np.zeros(1, dtype=np.intp), body.skeleton
+    plane = level_plane(body, standing)
+    term = GroundTerm(body, only('balance'), plane)
+    x = standing.copy()
+    x[0, skeleton.dof_index(('root_x',))] = 0.4
+    frames, feet = forward(skeleton, x), soles(body)
+    centre = masses(body).centre_of_mass(frames)[:, 0]
+    points = frames.points(feet.segments, feet.local)[..., 0]
+    # Seen from above, the dense hull of the soles.
+    shares = np.random.default_rng(0).dirichlet(np.full(4, 0.3), 20000)
+    flat = np.array([1.0, 0.0, 1.0])
+    distance = np.linalg.norm((shares @ points - centre) * flat, axis=1).min()
+    excess = (distance - SUPPORT_MARGIN) / BALANCE_SIGMA
+    assert excess > 1
+    expected = 0.5 * (TAILS + 1) * np.log1p(excess**2 / TAILS)
+    cost = term.energy(frames, rows).value[0]
+    assert cost == pytest.approx(expected, rel=0.02)
+    # Who moves fast may be farther away; in the air nothing is out of balance.
+    one = Stance(np.zeros((1, 4)), np.zeros((1, 4, 3)), np.array([0.3]), np.ones(1))
+    assert term.following(one).energy(frames, rows).value[0] < 0.4 * cost
+    aloft = replace(one, grounded=np.zeros(1))
+    assert term.following(aloft).energy(frames, rows).value[0] == 0.0
+
+
+def test_a_wrong_contact_costs_little(body, standing):
+    feet, rows = soles(body), np.zeros(1, dtype=np.intp)
+    frames = forward(body.skeleton, standing)
+    points = frames.points(feet.segments, feet.local).transpose(2, 0, 1)
+    probability = np.array([[0.6, 0.6, 0.0, 0.0]])
+    costs = []
+    for shift in (0.0, 0.01, 0.5):
+        stance = Stance(probability, points + shift, np.full(1, 0.1), np.ones(1))
+        term = GroundTerm(body, only('contact'), level_plane(body, standing), stance)
+        costs.append(term.energy(frames, rows).value[0])
+    assert costs[0] == pytest.approx(0.0, abs=0.05)
+    assert costs[0] < costs[1] < costs[2]
+    assert costs[2] == pytest.approx(-2 * np.log(0.4))
+
+
+def test_masses_are_those_of_the_table(body):
+    mass = masses(body)
+    assert mass.shares.sum() == pytest.approx(1.0)
+    share = dict(zip(body.skeleton.segment_names, mass.shares, strict=True))
+    assert share['left_thigh'] == pytest.approx(SHARES['thigh'][0], rel=0.01)
+    # Of somebody who stands it is a little above the hips [Winter: 0.55 to 0.58 of the stature].
+    upright = np.zeros((1, body.dimension))
+    upright[0, 2] = 3.0
+    frames, feet = forward(body.skeleton, upright), soles(body)
+    high = mass.centre_of_mass(frames)[1, 0]
+    floor = frames.points(feet.segments, feet.local)[:, 1, 0].max()
+    assert 0.52 < (floor - high) / body.stature < 0.62
+
+
+def test_soles_are_the_lowest_points_of_the_feet(body):
+    feet, names = soles(body), body.skeleton.segment_names
+    assert [names[s] for s in feet.segments] == 2 * ['left_foot'] + 2 * ['right_foot']
+    mesh = body.flesh.mesh()
+    foot = mesh.vertices[mesh.segments == feet.segments[0]]
+    assert feet.local[:2, 1] == pytest.approx(foot[:, 1].min(), abs=0.01)  # y up, flat foot
+    heel, toe = feet.local[:2, 2]
+    assert heel > 0 > toe  # along -z from ankle to toe
+    wide = body.with_widths([2.0] * len(body.shapes))
+    assert (soles(wide).local[:, 1] < feet.local[:, 1] - 0.02).all()
+
+
+def test_a_body_without_a_prior_of_its_root_keeps_its_angles(body):
+    free = without_root_lean(body)
+    lean = root_lean_dofs(body)
+    assert [body.dof_names[i] for i in lean] == ['root_y', 'root_x']
+    assert np.isinf(free.prior_sigma[lean]).all()
+    others = np.setdiff1d(np.arange(body.dimension), lean)
+    assert np.array_equal(free.prior_sigma[others], body.prior_sigma[others])
+    assert without_root_lean(free) is free
+
+
+@pytest.mark.parametrize('value', [-1.0, np.nan, np.inf])
+def test_weights_that_are_refused(value):
+    with pytest.raises(ValueError, match=r'ground\.floor_weight must be a number of at least 0'):
+        GroundSettings(floor_weight=value)

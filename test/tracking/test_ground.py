@@ -1,0 +1,279 @@
+"""The ground: what is known of it, and what a track says of it."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import load_body
+from hmt_ros.body.camera import Viewpoint
+from hmt_ros.body.ground_terms import GroundSettings
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.soles import soles
+from hmt_ros.image.likelihood import LikelihoodSettings
+from hmt_ros.image.observation import Observation
+from hmt_ros.motion.procedural_motion import procedural_motion
+from hmt_ros.tracking import KnownGround, Subject, Tracker, TrackerSettings
+from hmt_ros.tracking.contact import FootContacts
+from hmt_ros.tracking.ground import LEAST_UP_SIGMA, UP_SIGMA, GroundEstimator
+from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
+from hmt_ros.tracking.posterior import Posterior
+
+RATE = 30.0
+PITCHED = Viewpoint(distance=3.5, height=1.4, pitch=np.radians(20.0))
+OFF = GroundSettings(0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope='module')
+def body():
+    return load_body('human37')
+
+
+@pytest.fixture(scope='module')
+def reaching(body) -> np.ndarray:
+    """(90, d) somebody who stands on both feet and reaches for things."""
+    return procedural_motion('reach', body, 3.0, RATE, 1, viewpoint=PITCHED)
+
+
+@pytest.fixture(scope='module')
+def walking(body) -> np.ndarray:
+    return procedural_motion('walk', body, 3.0, RATE, 1, viewpoint=PITCHED)
+
+
+def up_of(view: Viewpoint) -> np.ndarray:
+    return view.rotation @ np.array([0.0, 0.0, 1.0])
+
+
+def single(pose: np.ndarray, velocity: np.ndarray | None = None) -> Modes:
+    """One mode, its own ancestor."""
+    start, d = new_hypotheses(pose[None], np.zeros(1)), len(pose)
+    velocities = np.zeros((1, d)) if velocity is None else velocity[None]
+    one = np.eye(d)[None]
+    return Modes(
+        **vars(start), velocities=velocities, covariances=one, filtered=one,
+        log_likelihoods=np.zeros(1), energies=np.zeros(1),
+    )  # fmt: skip
+
+
+def after(estimator: GroundEstimator, body, poses: np.ndarray) -> GroundEstimator:
+    for pose in poses:
+        estimator.update(body, single(pose), 1.0, 1.0 / RATE)
+    return estimator
+
+
+def degrees_between(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1.0, 1.0))))
+
+
+@pytest.mark.parametrize(
+    ('values', 'said'),
+    [
+        ({'up': np.array([0.0, -9.81, 0.0])}, 'up must be a unit vector'),
+        ({'up': np.array([0.0, -1.0])}, 'up must be a unit vector'),
+        ({'up': np.array([0.0, np.nan, 1.0])}, 'up must be a unit vector'),
+        ({'camera_height': 0.0}, 'camera_height must be a positive number of metres, saw 0.0'),
+        ({'camera_height': np.nan}, 'camera_height must be a positive number'),
+    ],
+)
+def test_what_is_no_ground_is_refused(values, said):
+    with pytest.raises(ValueError, match=said):
+        KnownGround(**values)
+
+
+def test_what_is_known_is_the_estimate():
+    up = up_of(PITCHED)
+    ground = GroundEstimator(KnownGround(up, 1.4)).estimate
+    assert ground.up == pytest.approx(up)
+    assert ground.height == 1.4
+    assert ground.plane == pytest.approx([*up, 1.4])
+    # The floor under the world's origin.
+    assert ground.plane @ [*PITCHED.translation, 1.0] == pytest.approx(0.0)
+
+
+def test_nothing_known_before_the_first_image():
+    ground = GroundEstimator().estimate
+    assert ground.up == pytest.approx([0.0, -1.0, 0.0])
+    assert ground.up_sigma == UP_SIGMA
+    assert ground.height is None
+    assert ground.plane is None
+
+
+@pytest.mark.parametrize('name', ['reaching', 'walking'])
+def test_the_height_of_the_camera_is_found(name, body, request):
+    poses = request.getfixturevalue(name)
+    found = after(GroundEstimator(KnownGround(up_of(PITCHED))), body, poses).estimate
+    assert found.height == pytest.approx(1.4, abs=0.04)
+    assert 0.03 < found.height_sigma < 0.08
+
+
+def test_a_jump_does_not_lift_the_floor(body, reaching):
+    poses = reaching.copy()
+    poses[60:75, :3] += 0.3 * up_of(PITCHED)
+    found = after(GroundEstimator(KnownGround(up_of(PITCHED))), body, poses[:75]).estimate
+    assert found.height == pytest.approx(1.4, abs=0.05)
+
+
+def test_the_vertical_is_found_slowly_and_never_surely(body, reaching):
+    estimator = GroundEstimator()
+    truth = up_of(PITCHED)
+    errors = [degrees_between(estimator.estimate.up, truth)]
+    for _ in range(3):
+        after(estimator, body, reaching)
+        errors.append(degrees_between(estimator.estimate.up, truth))
+    assert errors[0] == pytest.approx(20.0, abs=0.1)
+    assert errors[-1] < 10.0
+    assert all(a > b - 0.5 for a, b in pairwise(errors))
+    assert estimator.estimate.up_sigma >= LEAST_UP_SIGMA * 0.99
+    # Where the person is, the floor is under the soles all the same.
+    feet, plane = soles(body), estimator.plane
+    points = forward(body.skeleton, reaching[-1:]).points(feet.segments, feet.local)[..., 0]
+    assert (points @ plane.up + plane.height).min() == pytest.approx(
+        0.0, abs=2 * plane.height_sigma
+    )
+
+
+def test_a_vertical_far_from_that_of_the_image_is_not_believed(body, reaching):
+    tilted = Viewpoint(distance=3.5, height=1.4, pitch=np.radians(60.0))
+    poses = procedural_motion('reach', body, 3.0, RATE, 1, viewpoint=tilted)
+    found = after(GroundEstimator(), body, np.tile(poses, (5, 1))).estimate
+    assert degrees_between(found.up, np.array([0.0, -1.0, 0.0])) <= 35.0 + 1e-6
+
+
+def test_newer_directions_replace_the_known_one():
+    estimator = GroundEstimator(KnownGround(up_of(PITCHED), 1.4))
+    assert not estimator.turning
+    other = up_of(Viewpoint(pitch=np.radians(25.0)))
+    estimator.set_gravity(other)
+    assert estimator.estimate.up == pytest.approx(other)
+    assert estimator.estimate.height == 1.4
+    assert estimator.turning
+    with pytest.raises(ValueError, match='up must be a unit vector'):
+        estimator.set_gravity([0.0, 0.0, 0.0])
+
+
+def test_contacts_are_those_of_a_walker(body, walking):
+    """Points of the soles that rest in the motion rest, and those that swing do not."""
+    estimator, contacts, found = (
+        GroundEstimator(KnownGround(up_of(PITCHED), 1.4)),
+        FootContacts(),
+        [],
+    )
+    for t, pose in enumerate(walking):
+        velocity = RATE * (pose - walking[max(t - 1, 0)])
+        contacts.update(body, estimator.plane, single(pose, velocity), 1.0 / RATE, still=True)
+        found.append([contacts.by_foot()[f'{side}_foot'] for side in ('left', 'right')])
+    rests = np.array(found)[5:] > 0.5
+    ankles = body.joint_positions(walking)[
+        :, body.skeleton.joint_index(('left_ankle', 'right_ankle'))
+    ]
+    toes = body.joint_positions(walking)[:, body.skeleton.joint_index(('left_toe', 'right_toe'))]
+    speed = RATE * np.minimum(
+        *(np.linalg.norm(np.diff(x, axis=0), axis=2)[4:] for x in (ankles, toes))
+    )
+    stands, swings = speed < 0.05, speed > 0.8
+    assert stands.sum() > 40
+    assert swings.sum() > 30
+    assert rests[stands].mean() > 0.9
+    assert rests[swings].mean() < 0.1
+
+
+def test_anchors_rest_with_the_foot(body, reaching):
+    """Noise of the pose is averaged in the anchors of a foot that stands."""
+    estimator, contacts = GroundEstimator(KnownGround(up_of(PITCHED), 1.4)), FootContacts()
+    rng, feet = np.random.default_rng(0), soles(body)
+    moved = []
+    for pose in reaching[:45]:
+        noisy = pose.copy()
+        noisy[:3] += 0.008 * rng.normal(size=3)
+        contacts.update(body, estimator.plane, single(noisy), 1.0 / RATE, still=True)
+        points = forward(body.skeleton, pose[None]).points(feet.segments, feet.local)
+        moved.append(contacts.stance.anchors[0] - points[..., 0])
+    spread = np.std(np.array(moved)[20:], axis=0)
+    assert spread.max() < 0.005
+
+
+def test_nothing_rests_before_a_camera_that_moves(body, reaching):
+    estimator, contacts = GroundEstimator(), FootContacts()
+    for pose in reaching[:5]:
+        contacts.update(body, estimator.plane, single(pose), 1.0 / RATE, still=False)
+    assert (contacts.stance.contact[0] == 0.0).all()
+
+
+def test_who_is_in_the_air_is_not_out_of_balance(body, reaching):
+    estimator, contacts = GroundEstimator(KnownGround(up_of(PITCHED), 1.4)), FootContacts()
+    contacts.begin(body, estimator.plane, single(reaching[0]))
+    assert contacts.stance.grounded[0] > 0.95
+    aloft = reaching[0].copy()
+    aloft[:3] += 0.4 * up_of(PITCHED)
+    contacts.begin(body, estimator.plane, single(aloft))
+    assert contacts.stance.grounded[0] < 0.01
+
+
+def test_weights_of_zero_leave_the_terms_out(body, camera, reaching):
+    estimator = GroundEstimator(KnownGround(up_of(PITCHED), 1.4))
+    settings = TrackerSettings(ground=OFF)
+    without = Posterior(body, camera, settings)
+    with_it = Posterior(body, camera, settings, ground=estimator)
+    assert with_it.body is body
+    assert with_it.known == ()
+    energies = [
+        x.of_image(Observation()).energy(reaching[:4], np.arange(4)) for x in (without, with_it)
+    ]
+    for a, b in zip(*energies, strict=True):
+        assert np.array_equal(a, b)
+    on = Posterior(body, camera, TrackerSettings(), ground=estimator)
+    assert len(on.known) == 1
+
+
+def test_the_lean_is_measured_against_gravity_and_not_against_the_camera(body, camera, reaching):
+    """Turned with the vertical, a pose costs what it did."""
+    settings = TrackerSettings(likelihood=LikelihoodSettings(self_intersection_sigma=np.inf))
+    level = procedural_motion('reach', body, 0.1, RATE, 1, viewpoint=Viewpoint(3.5, 1.4))
+    pitched = procedural_motion('reach', body, 0.1, RATE, 1, viewpoint=PITCHED)
+    costs, leaning = [], []
+    for view, poses in ((Viewpoint(3.5, 1.4), level), (PITCHED, pitched)):
+        known = KnownGround(up_of(view), 1.4)
+        term = Posterior(body, camera, settings, ground=GroundEstimator(known)).of_image(
+            Observation()
+        )
+        costs.append(term.energy(poses[:1], np.arange(1)).value)
+        tipped = poses[:1].copy()
+        tipped[:, body.skeleton.dof_index(('root_x',))] -= np.radians(30)
+        leaning.append(term.energy(tipped, np.arange(1)).value)
+    assert costs[0] == pytest.approx(costs[1], rel=0.02)
+    assert leaning[0] > costs[0] + 1.0
+    assert leaning[1] > costs[1] + 1.0
+
+
+@pytest.mark.parametrize('ground', [GroundSettings(), OFF])
+def test_a_tracker_knows_its_ground(ground, human32, camera, motion, keypoints_of):
+    """A body that reaches for things before a level camera 1.2 m above the floor."""
+    likelihood = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
+    settings = TrackerSettings(
+        candidates=8, max_hypotheses=4, likelihood=likelihood, flesh_images=0, facing_trial=0.0,
+        ground=ground,
+    )  # fmt: skip
+    up = np.array([0.0, -1.0, 0.0])
+    black = np.zeros((camera.height, camera.width, 3), np.uint8)
+    subject = Subject(0, keypoints_of(human32, motion[0]), dict(human32.segment_lengths))
+    errors = []
+    for known in (None, KnownGround(up, 1.2)):
+        tracker = Tracker(human32, camera, settings, known_ground=known)
+        tracker.reset(subject)
+        for t in range(4):
+            tracker.step(black, t * 100_000_000, keypoints_of(human32, motion[t], 1.0, t))
+        assert tracker.contacts == {}  # no background: the camera may move
+        found = human32.joint_positions(tracker.point_estimate[None])[0]
+        errors.append(
+            np.linalg.norm(found - human32.joint_positions(motion[3:4])[0], axis=1).mean()
+        )
+        assert tracker.ground.up == pytest.approx(up, abs=0.15)
+        if known is not None:
+            assert tracker.ground.plane == pytest.approx([*up, 1.2])
+        elif ground.on:
+            assert tracker.ground.height == pytest.approx(1.2, abs=0.2)
+    assert max(errors) < 0.12
+    tracker.set_gravity(up_of(PITCHED))
+    assert tracker.ground.up == pytest.approx(up_of(PITCHED))
