@@ -26,6 +26,7 @@ from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.facing import Track
+from hmt_ros.tracking.ground import Ground, KnownGround
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.initialisation import (
     poses_from_keypoints,
@@ -93,9 +94,12 @@ class Tracker:
             before the track starts, and if there are none the silhouette is not used.
         seed: of all randomness. The same images, settings and seed give the same numbers.
         extra: further energy terms of the posterior, such as what is known of the floor.
+        known_ground: what is known of gravity and of the floor.
 
     Attributes:
         silhouettes: where those of the images come from.
+        ground: the present estimate of gravity and of the floor.
+        contacts: probabilities that the feet stand on the floor, by name.
         evaluations: of the likelihood in the last image.
         track_id: number of the present track, or of the last one; 0 before the first.
     """
@@ -108,7 +112,15 @@ class Tracker:
         background: BackgroundModel | None = None,
         seed: int = 0,
         extra: Sequence[FrameTerm] = (),
+        known_ground: KnownGround | None = None,
     ) -> None:
+        known = known_ground or KnownGround()
+        self.ground = Ground(height=known.camera_height)
+        if known.camera_height is not None:
+            self.ground = replace(self.ground, height_sigma=0.0)
+        if known.up is not None:
+            self.set_gravity(known.up)
+        self.contacts: dict[str, float] = {}
         self.settings = settings or TrackerSettings()
         self.model = body
         self.camera = camera
@@ -125,6 +137,10 @@ class Tracker:
         self._last_image: Image | None = None
         self._last_stamp: int | None = None
         self._followed: int | None = None
+
+    def set_gravity(self, up: Array) -> None:
+        """Takes the direction up (3,) against gravity at the next image, camera frame."""
+        self.ground = replace(self.ground, up=up, up_sigma=0.0)
 
     def reset(self, start: Subject | GaussianMixture | None = None) -> None:
         """Drops the track; the next image starts a new one.
