@@ -88,7 +88,7 @@ def parameter_table(node: str) -> str:
     for parameter in declared_parameters(settings[node]):
         value = parameter.default
         text = str(value).lower() if isinstance(value, bool) else str(value)
-        default = f'`{text}`' if text else 'empty'
+        default = f'`{text}`' if value != () and text else 'empty'
         bounds = ''
         if parameter.limits is not None:
             low, high = (_number(limit) for limit in parameter.limits)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping
 from typing import Any
 
@@ -30,7 +31,7 @@ def changed_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> No
         elif not why or '\n' in why:
             outcome.fault(f'{chosen.name} = {value!r} is refused with {why!r}')
         (found,) = watched.get([chosen.name])
-        if found != known[chosen.name]:
+        if _plain(found) != _plain(known[chosen.name]):
             outcome.lost += 1
             outcome.fault(f'{chosen.name} is {found!r}, was set to {known[chosen.name]!r}')
         if number % 4 == 0:
@@ -44,13 +45,18 @@ def changed_parameters(watched: Watched, amount: Amount, outcome: Outcome) -> No
 def _set_back(
     watched: Watched, usual: Mapping[str, Any], known: dict[str, Any], outcome: Outcome
 ) -> None:
-    changed = {name: usual[name] for name in usual if known[name] != usual[name]}
+    changed = {name: usual[name] for name in usual if _plain(known[name]) != _plain(usual[name])}
     if not changed:
         return
     done, why = watched.set(**changed)
     if not done:
         outcome.fault(f'the usual values are refused: {why}')
     known.update(usual)
+
+
+def _plain(value: Any) -> Any:
+    """A value as it is compared: ROS gives lists back as arrays."""
+    return list(value) if isinstance(value, list | array | tuple) else value
 
 
 def _any_value(parameter: DeclaredParameter, rng: np.random.Generator) -> Any:
@@ -61,6 +67,9 @@ def _any_value(parameter: DeclaredParameter, rng: np.random.Generator) -> Any:
         return wrong[int(rng.integers(0, len(wrong)))]
     if isinstance(default, bool):
         return bool(rng.random() < 0.5)
+    if isinstance(default, tuple):
+        lists: tuple[Any, ...] = ([], [0.0, 1.0, 0.0], [0, 1, 0], [0.0, 0.0, 0.0], [1.0], ['down'])
+        return lists[int(rng.integers(0, len(lists)))]
     if isinstance(default, str):
         return ('', default, 'nowhere', default * 2, '/dev/null', '\n')[int(rng.integers(0, 6))]
     low, high = parameter.limits or (-1e9, 1e9)

@@ -12,6 +12,7 @@ import numpy as np
 from benchmarks.clips import COMPRESSED, ROOT, index_back_and_forth, read_messages
 from benchmarks.publisher import STEP_NS
 from hmt_ros.body import load_body
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import BmeSession
@@ -21,11 +22,13 @@ from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
 from hmt_ros.sessions.session import Session
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
+from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
 from hmt_ros.tracking import TrackerSettings
 from msg_tools import RosbagsMessages
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.images import decode_image, image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.states import transforms_message
 
 CLIP = ROOT / 'bags' / 'reach'
 _SMALL = TrackerSettings(max_hypotheses=2, candidates=4)
@@ -80,7 +83,9 @@ class Scene:
 
 
 def stamped(message: Any, stamp_ns: int) -> Any:
-    """The same message with another stamp."""
+    """The same message with another stamp; transforms have one each, and keep it."""
+    if not hasattr(message, 'header'):
+        return message
     header = header_message(RosbagsMessages(), stamp_ns, str(message.header.frame_id))
     return replace(message, header=header)
 
@@ -106,13 +111,15 @@ _CAMERA_TOPICS = ('/image/compressed', '/camera_info')
 
 def _filter() -> Scene:
     info, images = _clip()
-    start = time_ns(images[0].header.stamp)
+    start, frame = time_ns(images[0].header.stamp), str(images[0].header.frame_id)
     return Scene(
         'filter_node',
         FilterParameters(
             subject_file=str(CLIP / 'subject.yaml'),
             background_file=str(CLIP / 'background.png'),
             image_transport='compressed',
+            gravity_frame='world',
+            floor_in_gravity_frame=True,
             tracker=_SMALL,
         ),
         FilterSession,
@@ -120,14 +127,18 @@ def _filter() -> Scene:
             **_CAMERA,
             KEYPOINTS: ('keypoints', 'hmt_msgs/msg/Keypoints2D'),
             PREDICTION: ('pose_prediction', 'hmt_msgs/msg/PoseMixture'),
+            **{source: (f'/{source}', TRANSFORMS_TYPE) for source in TRANSFORMS},
         },
         (*_CAMERA_TOPICS, '/keypoints'),
-        ((CAMERA_INFO, info),),
+        # A static transform keeps no image waiting.
+        ((CAMERA_INFO, info), (TF_STATIC, _transform('world', frame, 0))),
         images,
         {
             CAMERA_INFO: info,
             KEYPOINTS: _keypoints(start),
             PREDICTION: _mixture(0, MixtureKind.PREDICTION),
+            TF_STATIC: _transform('world', frame, 0),
+            TF: _transform('world', 'robot', start),
         },
         start,
         (
@@ -136,6 +147,7 @@ def _filter() -> Scene:
             {'subject_file': '', 'use_keypoints': True, 'reset_on_time_jump': True},
             {'subject_file': '', 'background_file': '', 'reset_on_time_jump': True},
             {'subject_file': '', 'use_predictions': True, 'prediction_timeout': 0.0},
+            {'subject_file': '', 'gravity_frame': 'robot', 'transform_timeout': 0.0},
         ),
     )
 
@@ -187,6 +199,14 @@ def _mixture(index: int, kind: MixtureKind) -> Any:
     mixture = GaussianMixture(np.array([0.6, 0.4]), means, covariances)
     content = PoseMixture.of_body(body, mixture, kind, 10**18, 'lens')
     return pose_mixture_message(RosbagsMessages(), content)
+
+
+def _transform(parent: str, child: str, stamp_ns: int) -> Any:
+    """A frame 1.2 m above another, with the z axis level."""
+    rotation = Viewpoint(height=1.2).rotation.T
+    return transforms_message(
+        RosbagsMessages(), [parent], [child], rotation[None], [[0.0, 0.0, 1.2]], stamp_ns
+    )
 
 
 def _keypoints(stamp_ns: int) -> Any:

@@ -26,6 +26,10 @@ Coverage is the fraction of frames in which the truth lies in the smallest regio
 90 percent of the probability of the mixture, for all joints together and for each joint alone: the
 regions of a calibrated mixture cover 50 and 90 percent of the frames.
 
+Where the truth has gravity and camera_height, the feet of the heaviest component are compared with
+the floor: how deep ankles and toes lie below it, and how fast the ankles of feet that truly stand
+(contact) slide over it.
+
 examples:
   evaluate out --truth truth.npz             print a table
   evaluate out                               use the ground truth in the bag itself
@@ -104,6 +108,7 @@ def as_json(
                 'without_truth': topic.without_truth,
                 'note': topic.note,
                 **topic.scores.summary(),
+                **({} if topic.ground is None else {'feet': topic.ground.summary()}),
             }
             for name, topic in found.items()
         },
@@ -149,6 +154,8 @@ def as_text(found: dict[str, TrackScores], truth: Truth, *, by_joint: bool = Tru
             cells = [summary['by_joint'][joint]['best_mm'] for summary in summaries.values()]
             joints.append((joint, *(f'{cell:.0f}' for cell in cells)))
         lines += ['', *table(joints)]
+    feet = [f'{name}: {topic.ground}' for name, topic in found.items() if topic.ground is not None]
+    lines += ['', *feet] if feet else []
     lines += [f'{name}: {topic.note}' for name, topic in found.items() if topic.note]
     return '\n'.join(lines)
 

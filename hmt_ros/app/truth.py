@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from hmt_ros.evaluation.ground_scores import TrueGround
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.inference.arrays import Array
+from hmt_ros.sessions.transform_buffer import rotation_matrix
 from msg_tools import BagReader, MessageError
 from msg_tools.files.array_file import read_archive
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, MixtureKind, pose_mixture_of
 
 FIELDS = ('stamps', 'joint_names', 'joints')
+_FLOOR = ('gravity', 'camera_height')
 
 
 def read_truth(path: Path) -> Truth:
     """Truth from a file of arrays (.npz) or from a bag.
 
     The file has `stamps` (T,) ns, `joint_names` (J,) and `joints` (T, J, 3) m in the camera optical
-    frame.
+    frame. It may have the true floor: `gravity` (T, 3) and `camera_height` (T,) m, and with them
+    `contact` (T, 2) of the left and right foot, and the pose of a camera that moves in the world:
+    `camera_position` (T, 3) m and `camera_quaternion` (T, 4) x y z w.
 
     Raises:
         ValueError: another file, arrays that are missing or do not fit each other.
@@ -64,7 +70,39 @@ def _from_arrays(path: Path) -> Truth:
     if len(stamps) != len(joints):
         raise ValueError(f'{path}: {len(stamps)} stamps for {len(joints)} frames of joints')
     frames = {int(t): x.astype(np.float64) for t, x in zip(stamps, joints, strict=True)}
-    return Truth(str(path), tuple(str(name) for name in np.ravel(names)), frames)
+    ground = _ground(path, content, stamps)
+    return Truth(str(path), tuple(str(name) for name in np.ravel(names)), frames, ground=ground)
+
+
+def _ground(path: Path, content: Mapping[str, Array], stamps: Array) -> dict[int, TrueGround]:
+    """The true floor in a file; nothing where gravity or height of the camera are missing."""
+    if not set(_FLOOR) <= content.keys():
+        return {}
+    shapes = {'gravity': (3,), 'camera_height': (), 'contact': (2,)}
+    shapes |= {'camera_position': (3,), 'camera_quaternion': (4,)}
+    known = {}
+    for name, shape in shapes.items():
+        if name in content:
+            known[name] = np.asarray(content[name], dtype=np.float64)
+            if known[name].shape != (len(stamps), *shape):
+                raise ValueError(
+                    f'{path}: {name} has shape {known[name].shape}, wanted {(len(stamps), *shape)}'
+                )
+    lengths = np.linalg.norm(known['gravity'], axis=1)
+    if not ((lengths > 0) & np.isfinite(lengths) & np.isfinite(known['camera_height'])).all():
+        raise ValueError(f'{path}: gravity or camera_height is zero or not finite somewhere')
+    # Without the pose of the camera it rests.
+    moves = {'camera_position', 'camera_quaternion'} <= known.keys()
+    return {
+        int(stamp): TrueGround(
+            up=-known['gravity'][i] / lengths[i],
+            height=float(known['camera_height'][i]),
+            standing=known['contact'][i] > 0 if 'contact' in known else None,
+            camera_rotation=rotation_matrix(known['camera_quaternion'][i]) if moves else np.eye(3),
+            camera_position=known['camera_position'][i] if moves else np.zeros(3),
+        )
+        for i, stamp in enumerate(stamps)
+    }
 
 
 def _truth_topic(bag: BagReader) -> str | None:

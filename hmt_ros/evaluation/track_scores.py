@@ -7,11 +7,12 @@ Estimate and truth belong together where their stamps are equal.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from hmt_ros.body.body import Body
+from hmt_ros.evaluation.ground_scores import GroundScores, TrueGround, ground_scores
 from hmt_ros.evaluation.pose_scores import (
     BATCH,
     EVALUATED_JOINTS,
@@ -41,6 +42,7 @@ class Truth:
         joint_names: (J,).
         joints: stamp in ns -> (J, 3) m, camera optical frame.
         frame_id: frame of the positions; '' if unknown.
+        ground: what is true of the floor, by stamp; empty: unknown.
 
     Raises:
         ValueError: no frames, or positions that do not fit the names or are not finite.
@@ -50,6 +52,7 @@ class Truth:
     joint_names: tuple[str, ...]
     joints: dict[int, Array]
     frame_id: str = ''
+    ground: Mapping[int, TrueGround] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.joints:
@@ -114,6 +117,7 @@ class TrackScores:
         missing: number of true frames without an estimate.
         without_truth: number of estimates without a truth.
         note: why there are no densities; '' where there are.
+        ground: of the feet of the heaviest mode against the true floor; None: it is not known.
     """
 
     kind: str
@@ -121,6 +125,7 @@ class TrackScores:
     missing: int
     without_truth: int
     note: str
+    ground: GroundScores | None = None
 
 
 class TrackScorer:
@@ -151,6 +156,8 @@ class TrackScorer:
         self._waiting: list[Estimate] = []
         self._window: dict[int, Estimate] = {}
         self._parts: list[Scores] = []
+        self._heaviest: dict[int, Array] = {}
+        self._names: tuple[str, ...] = ()
 
     def take(self, estimate: Estimate) -> None:
         """Takes an estimate that will not be revised; of several with one stamp the first counts.
@@ -164,6 +171,8 @@ class TrackScorer:
             self._without_truth += 1
             return
         self._seen.add(estimate.stamp_ns)
+        if estimate.stamp_ns in self.truth.ground:
+            self._keep_heaviest(estimate)
         if self._waiting and self._waiting[-1].body is not estimate.body:
             self._score_waiting()
         self._waiting.append(estimate)
@@ -197,8 +206,24 @@ class TrackScorer:
             )
         missing = len(self.truth.joints) - len(self._seen)
         return TrackScores(
-            self.kind, Scores.concatenate(self._parts), missing, self._without_truth, self._note
+            self.kind,
+            Scores.concatenate(self._parts),
+            missing,
+            self._without_truth,
+            self._note,
+            ground_scores(self._heaviest, self._names, self.truth.ground),
         )
+
+    def _keep_heaviest(self, estimate: Estimate) -> None:
+        """Joint positions of the heaviest mode, for the scores of its feet."""
+        rank = int(np.argmax(estimate.weights))
+        if estimate.positions is not None:
+            self._names = tuple(estimate.joint_names)
+            self._heaviest[estimate.stamp_ns] = estimate.positions[rank]
+        elif estimate.body is not None and estimate.mixture is not None:
+            self._names = estimate.body.joint_names
+            means = estimate.mixture.means[[rank]]
+            self._heaviest[estimate.stamp_ns] = estimate.body.joint_positions(means)[0]
 
     def _score_waiting(self) -> None:
         """Scores the estimates that wait; they have the same body."""

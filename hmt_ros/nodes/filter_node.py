@@ -14,6 +14,7 @@ from hmt_ros.nodes.subscribed_topic import (
     CAMERA_INFO_TOPIC,
     MASK_TOPICS,
     RELIABLE,
+    TRANSFORM_TOPICS,
     SubscribedTopic,
     image_topic,
 )
@@ -39,6 +40,8 @@ class FilterNode(SessionNode[FilterSession, FilterParameters]):
         yield SubscribedTopic(KEYPOINTS, 'keypoints', 'hmt_msgs/msg/Keypoints2D')
         yield SubscribedTopic(PREDICTION, 'pose_prediction', 'hmt_msgs/msg/PoseMixture', RELIABLE)
         yield from MASK_TOPICS
+        if self._session is not None and self._session.gravity_frame is not None:
+            yield from TRANSFORM_TOPICS
         yield image_topic(self._settings.image_transport)
 
     def _on_reset(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:

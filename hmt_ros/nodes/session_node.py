@@ -44,10 +44,12 @@ from hmt_ros.sessions.declared_parameters import (
     EFFECTS,
     DeclaredParameter,
     NodeParameters,
+    Value,
     declared_parameters,
     with_values,
 )
 from hmt_ros.sessions.handled import HANDLED, Handled, Output, handled_message
+from hmt_ros.sessions.own_messages import OwnMessages
 from hmt_ros.sessions.session import SUBSCRIBERS, Session, SessionState
 from msg_tools import RosbagsMessages
 from msg_tools.files.error_line import error_line
@@ -82,7 +84,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     def __init__(self, **options: Any) -> None:
         super().__init__(self.NAME, **options)
         declared = declared_parameters(self.DEFAULTS)
-        self.declare_parameters('', [(p.name, p.default, _descriptor(p)) for p in declared])
+        self.declare_parameters(
+            '', [(p.name, _as_in_ros(p.default), _descriptor(p)) for p in declared]
+        )
         values = {p.name: self.get_parameter(p.name).value for p in declared}
         self._settings: Parameters = with_values(self.DEFAULTS, values)
         self._names = values.keys()
@@ -94,6 +98,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._handled: Any = None
         self._offered: list[Any] = []
         self._inputs: list[Any] = []
+        # Topics that the node both publishes and subscribes to, and what it published there.
+        self._heard: set[str] = set()
+        self._own = OwnMessages()
         self._failure = ''
         self._inner_faults = InnerFaults()
         self._last_arrival: float | None = None
@@ -191,6 +198,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             inner_faults=self._inner_faults,
             log_error=self.get_logger().error,
         )
+        self._heard = {one.topic for one in inputs} & self._outputs.keys()
         for one in inputs:
             self._subscribe(one)
         topic = self._inputs[-1].topic_name
@@ -226,6 +234,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         assert thread is not None
 
         def receive(data: bytes) -> None:
+            if wanted.topic in self._heard and self._own.is_own(data):
+                return
             now = time.monotonic()
             if wanted.source == self.SESSION.COUNTED:
                 self._last_arrival = now
@@ -321,6 +331,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             self._handled.publish(serialise(handled_message(RosbagsMessages(), handled)))
 
     def _publish(self, output: Output) -> None:
+        if output.topic in self._heard:
+            self._own.sent(output.data)
         self._outputs[output.topic].publish(output.data)
 
     def _is_wanted(self, topic: str) -> bool:
@@ -411,11 +423,18 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._diagnostics.publish(message)
 
 
+def _as_in_ros(value: Value) -> Any:
+    """A value of a parameter as ROS takes it."""
+    return list(value) if isinstance(value, tuple) else value
+
+
 def _descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
     """How a parameter is declared to ROS: description, limits, whether it can change."""
     descriptor = ParameterDescriptor(
         description=f'{parameter.description} {EFFECTS[parameter.effect]}',
         read_only=parameter.effect == AT_LAUNCH,
+        # ROS gives an empty list, and one of whole numbers, another type than one of numbers.
+        dynamic_typing=isinstance(parameter.default, tuple),
     )
     if parameter.limits is not None:
         low, high = parameter.limits

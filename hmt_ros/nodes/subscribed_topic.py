@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK
+from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS_TYPE
 from msg_tools.messages.images import MAX_PIXELS
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
@@ -24,8 +25,8 @@ LATCHED = QoSProfile(
 LARGEST_MESSAGE = 2**24
 LARGEST_IMAGE = 8 * MAX_PIXELS + 2**16
 LARGEST_MASK = MAX_PIXELS + 2**16
-# Messages that wait while an estimate is made: small ones, and masks.
-SMALL_QUEUE, MASK_QUEUE = 100, 20
+# Messages that wait while an estimate is made: small ones, masks, and transforms of a whole robot.
+SMALL_QUEUE, MASK_QUEUE, TF_QUEUE = 100, 20, 2000
 
 
 class SubscribedTopic(NamedTuple):
@@ -59,6 +60,17 @@ MASK_TOPICS = (
         largest=LARGEST_MASK,
         waiting=MASK_QUEUE,
     ),
+)
+# As the listener of tf2 has them.
+_TF_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+_TF_STATIC_QOS = QoSProfile(
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+TRANSFORM_TOPICS = (
+    SubscribedTopic(TF_STATIC, '/tf_static', TRANSFORMS_TYPE, _TF_STATIC_QOS, waiting=TF_QUEUE),
+    SubscribedTopic(TF, '/tf', TRANSFORMS_TYPE, _TF_QOS, waiting=TF_QUEUE),
 )
 CAMERA_INFO_TOPIC = SubscribedTopic(CAMERA_INFO, 'camera_info', 'sensor_msgs/msg/CameraInfo')
 

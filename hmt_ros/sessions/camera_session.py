@@ -88,8 +88,8 @@ class CameraSession(Session[CameraParameters, State]):
         """What an image is waiting for, besides a camera_info."""
         return Fault.NO_MASK
 
-    def _forget_inputs(self) -> None:
-        """Drops what belongs to the images before a jump in time."""
+    def _forget_inputs(self, stamp: int) -> None:
+        """Drops what belongs to the images before time jumped back to a stamp."""
         self._masks.clear()
 
     def _has_mask(self, stamp: int) -> bool:
@@ -135,7 +135,7 @@ class CameraSession(Session[CameraParameters, State]):
             self._log.counts['dropped'] += len(self._waiting)
             self._waiting.clear()
             self._newest = None
-            self._forget_inputs()
+            self._forget_inputs(stamp)
             self._start_anew()
         try:
             image = decode_image(message)
@@ -215,11 +215,15 @@ class CameraSession(Session[CameraParameters, State]):
         except ValueError as error:
             self._log.skip(Fault.IMAGE_SIZE, str(error))
             return
-        frame = waiting.frame_id or self._frame or FRAME_ID
+        frame = self._frame_of(waiting)
         mask = None
         if self.parameters.use_mask:
             mask = self._mask_of(waiting.image, waiting.stamp_ns)
         self._estimate(waiting._replace(frame_id=frame, mask=mask), camera)
+
+    def _frame_of(self, waiting: WaitingImage) -> str:
+        """Optical frame of the camera, as the image names it, or else the camera_info."""
+        return waiting.frame_id or self._frame or FRAME_ID
 
     def _status_and_wants(self) -> tuple[str, str]:
         if self._camera is None:

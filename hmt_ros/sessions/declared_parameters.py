@@ -15,11 +15,13 @@ import inspect
 import math
 import re
 import textwrap
+from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
-Value = bool | int | float | str
+# A tuple is a list of numbers.
+Value = bool | int | float | str | tuple[float, ...]
 Limits = tuple[float, float] | None
 Settings = TypeVar('Settings')
 
@@ -146,6 +148,8 @@ class DeclaredParameter:
             ParameterError: another type, or beyond the limits.
         """
         wanted: Any = type(self.default)
+        if wanted is tuple:
+            return self._numbers(value)
         if wanted is float and type(value) is int:
             value = float(value)
         if type(value) is not wanted:
@@ -157,6 +161,16 @@ class DeclaredParameter:
             )
         result: Value = wanted(value)
         return result
+
+    def _numbers(self, value: Any) -> tuple[float, ...]:
+        """A list of numbers; to ROS an empty list is no value at all."""
+        numbers = () if value is None else value
+        # ROS has bytes, whole numbers and texts in lists, too.
+        if not isinstance(numbers, list | tuple | array):
+            raise ParameterError(f'{self.name} must be a list of numbers, saw {value!r}')
+        if not all(type(number) in (int, float) for number in numbers):
+            raise ParameterError(f'{self.name} must be a list of numbers, saw {list(numbers)!r}')
+        return tuple(map(float, numbers))
 
 
 _NAMES = {bool: 'truth value', int: 'whole number', float: 'number', str: 'text'}
@@ -183,9 +197,12 @@ def declared_parameters(settings: Any) -> list[DeclaredParameter]:
     ]
 
 
-def values_of(settings: Any) -> dict[str, Value]:
-    """Values of all parameters, by name."""
-    return {parameter.name: parameter.default for parameter in declared_parameters(settings)}
+def values_of(settings: Any) -> dict[str, Any]:
+    """Values of all parameters, by name, as a parameter file has them: tuples as lists."""
+    return {
+        p.name: list(p.default) if isinstance(p.default, tuple) else p.default
+        for p in declared_parameters(settings)
+    }
 
 
 def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:

@@ -15,14 +15,17 @@ from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     FRACTION,
+    NEXT_CONFIGURE,
     NEXT_TRACK,
     NOT_NEGATIVE,
     CameraNodeParameters,
     nested_parameters,
     parameter_field,
 )
+from hmt_ros.sessions.gravity_frame import unit_vector
 from hmt_ros.sessions.parameter_file import parameter_file_text
 from hmt_ros.tracking import TrackerSettings
+from hmt_ros.tracking.ground import KnownGround
 
 # Settings that are parameters, with their limits.
 _TRACKER = {
@@ -74,6 +77,16 @@ class FilterParameters(CameraNodeParameters):
             prediction of its stamp.
         prediction_timeout: Maximum time that an image waits for its prediction, measured by the
             stamps of later images, s; a prediction of a later stamp ends the wait at once.
+        gravity: Direction of gravity in the camera optical frame, three numbers of any length;
+            empty if unknown. A still camera that looks to the horizon has [0.0, 1.0, 0.0].
+        camera_height: Height of the camera above the floor, m; 0 if unknown.
+        gravity_frame: Name of a frame with z up, such as odom or map; /tf and /tf_static then tell
+            the direction of gravity at every image, before gravity does; empty switches it off.
+        floor_in_gravity_frame: If true, the floor is the plane z = 0 of gravity_frame, and /tf and
+            /tf_static tell the height of the camera, before camera_height does.
+        transform_timeout: Maximum time that an image waits for the transforms of its stamp,
+            measured by the stamps of later images and transforms, s; then it goes on with the
+            direction that was known.
         overlay_modes: Maximum number of modes drawn on the image, the heaviest; 0 switches the
             overlay off.
         overlay_quality: JPEG quality of the overlay.
@@ -93,6 +106,11 @@ class FilterParameters(CameraNodeParameters):
     keypoints_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
     use_predictions: bool = parameter_field(False, AT_ONCE)
     prediction_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
+    gravity: tuple[float, ...] = parameter_field((), NEXT_TRACK)
+    camera_height: float = parameter_field(0.0, NEXT_TRACK, (0.0, 100.0))
+    gravity_frame: str = parameter_field('', NEXT_CONFIGURE)
+    floor_in_gravity_frame: bool = parameter_field(False, NEXT_CONFIGURE)
+    transform_timeout: float = parameter_field(0.1, AT_ONCE, (0.0, 60.0))
     overlay_modes: int = parameter_field(3, AT_ONCE, (0, 64))
     overlay_quality: int = parameter_field(85, AT_ONCE, (1, 100))
     publish_tf: bool = parameter_field(True, AT_ONCE)
@@ -109,6 +127,18 @@ class FilterParameters(CameraNodeParameters):
         super().__post_init__()
         if not self.body_model:
             raise ValueError("body_model must be a name or a file, saw ''")
+        if self.gravity:
+            unit_vector(self.gravity, 'gravity')
+        if self.floor_in_gravity_frame and not self.gravity_frame:
+            raise ValueError(
+                'floor_in_gravity_frame needs the name of gravity_frame, which is empty'
+            )
+
+    @property
+    def known_ground(self) -> KnownGround:
+        """What the parameters tell of gravity and of the floor, without transforms."""
+        up = -unit_vector(self.gravity, 'gravity') if self.gravity else None
+        return KnownGround(up, self.camera_height or None)
 
 
 if __name__ == '__main__':

@@ -9,6 +9,9 @@ order give the same bytes. The rules, besides those of `CameraSession`:
   stamp, or for an image that is `keypoints_timeout` younger; with `use_predictions` and
   `prediction_timeout` for a pose_prediction in the same way. Of several of one stamp the last
   counts; keypoints without names, and mixtures without components, say that nobody was seen.
+- With `gravity_frame` an image waits for the transforms of its stamp, or for an image or a
+  transform that is `transform_timeout` younger, and never so long that it would be dropped. What
+  was known of gravity before holds where they do not come.
 - When the person is no longer in view one mixture without components of either kind goes out, with
   markers that remove those before, and then nothing until a new track starts.
 - A camera_info with another calibration, and ~/reset, start the track anew.
@@ -37,6 +40,7 @@ from hmt_ros.sessions.camera_session import (
     WaitingImage,
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.gravity_frame import GravityFrame
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.session import SessionState, everything
 from hmt_ros.sessions.track_messages import (
@@ -47,11 +51,13 @@ from hmt_ros.sessions.track_messages import (
     track_messages,
 )
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
+from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
 from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker
+from hmt_ros.tracking.ground import KnownGround
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
-from msg_tools.messages.headers import SECOND_NS
+from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.keypoints import keypoints_of
 from msg_tools.messages.pose_mixtures import pose_mixture_of
 
@@ -126,6 +132,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
 
     Attributes:
         start: what the present track started from.
+        gravity_frame: where transforms tell gravity from; None: there is no such frame.
     """
 
     TOPICS = TOPICS
@@ -141,6 +148,11 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     ) -> None:
         super().__init__(parameters, publish, wanted)
         self.start = prepare_start(parameters)
+        self.gravity_frame: GravityFrame | None = None
+        if parameters.gravity_frame:
+            self.gravity_frame = GravityFrame(
+                parameters.gravity_frame, floor=parameters.floor_in_gravity_frame
+            )
         self._tracker: Tracker | None = None
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
@@ -169,6 +181,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         elif source == PREDICTION:
             self._predictions.put(stamp, self._prediction_in(message))
             self._estimate_what_is_ready()
+        elif source in TRANSFORMS:
+            self._take_transforms(message, static=source == TF_STATIC)
         else:
             super()._take(source, message, stamp)
 
@@ -176,10 +190,24 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._tracker = None
         self._shown_body = None
 
-    def _forget_inputs(self) -> None:
-        super()._forget_inputs()
+    def _forget_inputs(self, stamp: int) -> None:
+        super()._forget_inputs(stamp)
         self._keypoints.clear()
         self._predictions.clear()
+        if self.gravity_frame is not None:
+            self.gravity_frame.forget_after(stamp)
+
+    def _stamp_of(self, source: str, message: Any) -> int:
+        if source not in TRANSFORMS:
+            return super()._stamp_of(source, message)
+        return max((time_ns(each.header.stamp) for each in message.transforms), default=0)
+
+    def _take_transforms(self, message: Any, *, static: bool) -> None:
+        if self.gravity_frame is None:
+            return
+        for text in self.gravity_frame.take(message, static=static):
+            self._log.note(Fault.TRANSFORM, text)
+        self._estimate_what_is_ready()
 
     def _start_anew(self) -> None:
         try:
@@ -221,7 +249,21 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
 
     def _is_ready(self, stamp: int) -> bool:
         return (
-            super()._is_ready(stamp) and self._has_keypoints(stamp) and self._has_prediction(stamp)
+            super()._is_ready(stamp)
+            and self._has_keypoints(stamp)
+            and self._has_prediction(stamp)
+            and self._has_transforms()
+        )
+
+    def _has_transforms(self) -> bool:
+        """Whether the oldest image need not wait for transforms."""
+        frame, p, oldest = self.gravity_frame, self.parameters, self._waiting[0]
+        if frame is None or len(self._waiting) > p.queue_size:
+            return True
+        timeout = p.transform_timeout * SECOND_NS
+        assert self._newest is not None
+        return self._newest - oldest.stamp_ns > timeout or frame.is_settled(
+            self._frame_of(oldest), oldest.stamp_ns, timeout
         )
 
     def _has_keypoints(self, stamp: int) -> bool:
@@ -245,8 +287,11 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         prediction = self._predictions.take(stamp) if self.parameters.use_predictions else None
         starts = self._tracker is None or self._tracker.status is Status.WAITING
         try:
+            known = self._known_ground(waiting)
             if self._tracker is None:
-                self._tracker = self.start.tracker(camera)
+                self._tracker = self.start.tracker(camera, known)
+            elif self.gravity_frame is not None and known.up is not None:
+                self._tracker.set_gravity(known.up)
             trusted = not self._tracker.silhouettes.doubted
             posterior, likelihood = self._tracker.step(
                 waiting.image,
@@ -272,6 +317,15 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             # The next image would fail as this one did, after as long a time.
             self._log.skip(Fault.START, f'no track starts at the image of {stamp} ns: {text}')
             self.restart(replace(self.start, background=None, initial=None))
+
+    def _known_ground(self, waiting: WaitingImage) -> KnownGround:
+        """What parameters and transforms tell of gravity and of the floor at an image."""
+        known, frame = self.start.parameters.known_ground, self.gravity_frame
+        if frame is None:
+            return known
+        for kind, text in frame.look(waiting.frame_id, waiting.stamp_ns):
+            self._log.note(kind, text)
+        return frame.known_ground(known)
 
     def _report_background(self, share: float, stamp_ns: int) -> None:
         self._log.note(
@@ -311,6 +365,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             likelihood=likelihood,
             log_likelihoods=tracker.modes.log_likelihoods,
             point=tracker.point_estimate,
+            ground=tracker.ground,
+            contacts=tracker.contacts,
             starts=starts,
         )
         presentation = Presentation(

@@ -73,6 +73,8 @@ def yaml_scalar(value: Value) -> str:
     """A value as YAML that the parser of ROS reads as the same type."""
     if isinstance(value, str):
         return "'" + value.replace("'", "''") + "'"
+    if isinstance(value, list | tuple):
+        return f'[{", ".join(yaml_scalar(each) for each in value)}]'
     text: str = yaml.safe_dump(value)
     return text.removesuffix('\n...\n').strip()
 

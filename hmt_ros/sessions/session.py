@@ -141,7 +141,7 @@ class Session(ABC, Generic[Parameters, State]):
             message: of the type of the source, from `rosbags` or ROS.
         """
         self._log.begin()
-        stamp = time_ns(message.header.stamp)
+        stamp = self._stamp_of(source, message)
         self._log.counts['received'] += source == self.COUNTED
         self._take(source, message, stamp)
         return self._handled(source, stamp)
@@ -182,6 +182,10 @@ class Session(ABC, Generic[Parameters, State]):
     @abstractmethod
     def _present_state(self) -> State:
         """The state now."""
+
+    def _stamp_of(self, source: str, message: Any) -> int:
+        """Stamp of a message, ns."""
+        return time_ns(message.header.stamp)
 
     def _start_again(self) -> None:
         """Starts the estimate anew as the last time."""

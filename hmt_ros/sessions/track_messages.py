@@ -6,7 +6,8 @@ the track and the image alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,8 +20,11 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.session import PublishedTopic
+from hmt_ros.tracking.ground import Ground
 from msg_tools import MessageFactory
 from msg_tools.messages.bodies import description_message, message_of_body
+from msg_tools.messages.ground import GROUND, GroundState, ground_message
+from msg_tools.messages.ground_markers import ground_markers, removed_ground
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.markers import skeleton_markers
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
@@ -34,6 +38,7 @@ TOPICS = {
     'human_description': PublishedTopic('std_msgs/msg/String', latched=True),
     'pose_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
     'likelihood_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
+    'ground': PublishedTopic(GROUND),
     'joint_states': PublishedTopic('sensor_msgs/msg/JointState'),
     '/tf': PublishedTopic('tf2_msgs/msg/TFMessage'),
     'markers': PublishedTopic('visualization_msgs/msg/MarkerArray'),
@@ -52,6 +57,8 @@ class TrackedImage:
         posterior, likelihood: mixtures over poses, heaviest first.
         log_likelihoods: (K,) of the image at the means of the posterior.
         point: (d,) the point estimate, for those who want one pose.
+        ground: gravity and the floor, as far as they are known.
+        contacts: probabilities that the feet stand on the floor, by name.
         starts: whether the body is a new one, with other lengths than the image before.
     """
 
@@ -64,6 +71,8 @@ class TrackedImage:
     likelihood: GaussianMixture
     log_likelihoods: Array
     point: Array
+    ground: Ground
+    contacts: Mapping[str, float]
     starts: bool
 
 
@@ -123,6 +132,7 @@ def track_messages(
     likelihood = PoseMixture.of_body(
         track.body, track.likelihood, MixtureKind.LIKELIHOOD, stamp, frame
     )
+    ground = _ground_state(track)
     if track.starts:
         publish('body', message_of_body(messages, track.body, stamp, frame))
     if presentation.describe:
@@ -132,6 +142,8 @@ def track_messages(
         publish('pose_mixture', pose_mixture_message(messages, posterior))
     if wanted('likelihood_mixture'):
         publish('likelihood_mixture', pose_mixture_message(messages, likelihood))
+    if wanted('ground'):
+        publish('ground', ground_message(messages, ground))
     if wanted('joint_states'):
         names = posterior.dof_names
         publish('joint_states', joint_state_message(messages, names, track.point, stamp, frame))
@@ -139,19 +151,19 @@ def track_messages(
         publish('/tf', _link_transforms(messages, track, presentation.frame_prefix))
     if wanted('markers'):
         names = track.body.joint_names
-        publish(
-            'markers',
-            skeleton_markers(
-                messages,
-                joints,
-                names,
-                [(names[a], names[b]) for a, b in skeleton.bones],
-                track.posterior.weights,
-                stamp,
-                frame,
-                ranks=max(presentation.max_hypotheses, len(track.posterior)),
-            ),
+        array = skeleton_markers(
+            messages,
+            joints,
+            names,
+            [(names[a], names[b]) for a, b in skeleton.bones],
+            track.posterior.weights,
+            stamp,
+            frame,
+            ranks=max(presentation.max_hypotheses, len(track.posterior)),
         )
+        shown = forward(skeleton, track.point[None]).joints()[..., 0]
+        array.markers += ground_markers(messages, ground, shown, names)
+        publish('markers', array)
     if presentation.overlay_modes and wanted('overlay/compressed'):
         drawn = draw_modes(
             track.image,
@@ -200,10 +212,25 @@ def nobody_messages(
         markers = skeleton_markers(
             messages, nothing, names, [], np.empty(0), stamp_ns, frame_id, ranks=ranks
         )
+        markers.markers += removed_ground(messages, stamp_ns, frame_id)
         publish('markers', markers)
     if image is not None and wanted('overlay/compressed'):
         picture = compressed_image_message(messages, image, stamp_ns, frame_id, quality)
         publish('overlay/compressed', picture)
+
+
+def _ground_state(track: TrackedImage) -> GroundState:
+    """What is known of gravity and of the floor, as a message holds it."""
+    ground = track.ground
+    return GroundState(
+        track.stamp_ns,
+        track.frame_id,
+        ground.up,
+        ground.up_sigma,
+        ground.height,
+        math.nan if ground.height is None else ground.height_sigma,
+        track.contacts,
+    )
 
 
 def _link_transforms(messages: MessageFactory, track: TrackedImage, prefix: str) -> Any:

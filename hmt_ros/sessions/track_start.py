@@ -14,6 +14,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_session import read_picture
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.tracking import Subject, Tracker, read_subject
+from hmt_ros.tracking.ground import KnownGround
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.pose_mixtures import pose_mixture_of
@@ -35,8 +36,12 @@ class TrackStart:
     background: NDArray[np.uint8] | None
     initial: Subject | GaussianMixture | None
 
-    def tracker(self, camera: Camera) -> Tracker:
+    def tracker(self, camera: Camera, ground: KnownGround | None = None) -> Tracker:
         """A tracker that waits for its first image.
+
+        Args:
+            camera: calibrated.
+            ground: what is known of gravity and of the floor; None: what the parameters tell.
 
         Raises:
             ValueError: the background was taken by another camera.
@@ -51,7 +56,10 @@ class TrackStart:
                     f'{camera.width}x{camera.height}'
                 )
             background = BackgroundModel.from_image(self.background, p.background)
-        tracker = Tracker(self.body, camera, p.tracker, background, p.random_seed)
+        known = p.known_ground if ground is None else ground
+        tracker = Tracker(
+            self.body, camera, p.tracker, background, p.random_seed, known_ground=known
+        )
         tracker.reset(self.initial)
         return tracker
 

@@ -100,6 +100,8 @@ class Tracker:
 
     Attributes:
         silhouettes: where those of the images come from.
+        ground: the present estimate of gravity and of the floor.
+        contacts: probabilities that the feet stand on the floor, by name.
         evaluations: of the likelihood in the last image.
         track_id: number of the present track, or of the last one; 0 before the first.
     """

@@ -66,7 +66,9 @@ class World:
         self.executor.add_node(self.other)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.publishers = {
-            topic: self.other.create_publisher(message, topic, latched if topic == 'body' else 100)
+            topic: self.other.create_publisher(
+                message, topic, latched if topic in ('body', 'tf_static') else 100
+            )
             for topic, message in inputs.items()
         }
         self.handled, self.diagnostics = [], []

@@ -118,7 +118,9 @@ def test_parameters_are_those_of_the_file(running):
     assert sorted(names) == sorted(parameters)
     for name, declared in parameters.items():
         if name != 'subject_file':
-            assert running.node.get_parameter(name).value == declared.default
+            wanted = declared.default
+            wanted = list(wanted) if isinstance(wanted, tuple) else wanted
+            assert running.node.get_parameter(name).value == wanted
         descriptor = running.node.describe_parameter(name)
         ranges = [*descriptor.integer_range, *descriptor.floating_point_range]
         assert [(r.from_value, r.to_value) for r in ranges] == (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,6 +14,7 @@ from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions import bme_session, track_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
+from hmt_ros.tracking.ground import Ground
 from msg_tools import RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.headers import header_message
@@ -32,13 +33,18 @@ class StubTracker:
     empty: set[int] = set()  # noqa: RUF012  # stamps of images without a person
     fault: Exception | None = None
 
-    def __init__(self, body, camera, settings=None, background=None, seed=0):
+    def __init__(self, body, camera, settings=None, background=None, seed=0, known_ground=None):
         self.body, self.camera, self.seed = body, camera, seed
         self.settings = settings or TrackerSettings()
         self.background = background
         self.silhouettes = SimpleNamespace(doubted=False, share=0.9, known='known')
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.track_id = 0
+        self.known_ground = known_ground
+        up = np.array([0.0, -1.0, 0.0]) if known_ground.up is None else known_ground.up
+        self.ground = Ground(up, 0.1, known_ground.camera_height, 0.02)
+        self.contacts = {'left_foot': 0.75, 'right_foot': 0.0}
+        self.gravities: list[Any] = []
         self.seen: list[tuple[int, Any]] = []
         self.predictions: list[PosePrediction | None] = []
         self.masks: list[Any] = []
@@ -48,6 +54,10 @@ class StubTracker:
 
     def reset(self, start=None):
         self._start = start
+
+    def set_gravity(self, up):
+        self.gravities.append(up)
+        self.ground = replace(self.ground, up=up)
 
     @property
     def modes(self):

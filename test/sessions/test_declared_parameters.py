@@ -1,6 +1,8 @@
 import math
+from array import array
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import pytest
 
 from hmt_ros.sessions.bme_parameters import BmeParameters
@@ -200,7 +202,9 @@ def test_descriptions_are_sentences_that_stand_alone(settings):
 def test_defaults_lie_between_limits(settings):
     for parameter in declared_parameters(settings):
         assert parameter.effect in EFFECTS
-        assert (parameter.limits is None) == (type(parameter.default) in (bool, str)), parameter
+        assert (parameter.limits is None) == (type(parameter.default) in (bool, str, tuple)), (
+            parameter
+        )
         assert parameter.checked(parameter.default) == parameter.default
 
 
@@ -222,3 +226,54 @@ def test_defaults_lie_between_limits(settings):
 def test_wrong_parameters_of_the_node(values, message):
     with pytest.raises(ValueError, match=message):
         with_values(FilterParameters(), values)
+
+
+@pytest.mark.parametrize(
+    ('given', 'kept'),
+    [
+        ([0.0, 2.0, 0.5], (0.0, 2.0, 0.5)),
+        ([0, 1, 0], (0.0, 1.0, 0.0)),
+        ((), ()),
+        # What ROS makes of an empty list in a file, and of lists that a node is given.
+        (None, ()),
+        (array('d', [0.0, 0.0, 9.81]), (0.0, 0.0, 9.81)),
+    ],
+)
+def test_a_parameter_may_be_a_list_of_numbers(given, kept):
+    parameters = with_values(FilterParameters(), {'gravity': given})
+    assert parameters.gravity == kept
+    assert values_of(parameters)['gravity'] == list(kept)
+
+
+@pytest.mark.parametrize('given', ['down', 9.81, [b'x'], ['down'], [True, False, True], {'y': 1}])
+def test_what_is_no_list_of_numbers(given):
+    with pytest.raises(ParameterError, match='gravity must be a list of numbers, saw'):
+        with_values(FilterParameters(), {'gravity': given})
+
+
+@pytest.mark.parametrize(
+    ('values', 'message'),
+    [
+        ({'gravity': [0.0, 0.0, 0.0]}, 'gravity must be three finite numbers, not all zero, saw'),
+        ({'gravity': [0.0, 1.0]}, r'not all zero, saw \[0.0, 1.0\]'),
+        ({'gravity': [math.nan, 1.0, 0.0]}, r'saw \[nan, 1.0, 0.0\]'),
+        ({'gravity': [0.0, math.inf, 0.0]}, r'saw \[0.0, inf, 0.0\]'),
+        ({'camera_height': -1.0}, 'camera_height must lie between 0 and 100, saw -1.0'),
+        ({'camera_height': math.nan}, 'camera_height must lie between 0 and 100, saw nan'),
+        ({'floor_in_gravity_frame': True}, 'needs the name of gravity_frame, which is empty'),
+        ({'transform_timeout': -0.1}, 'transform_timeout must lie between 0 and 60'),
+    ],
+)
+def test_what_is_no_ground(values, message):
+    with pytest.raises(ValueError, match=message):
+        with_values(FilterParameters(), values)
+
+
+def test_ground_that_parameters_tell():
+    assert FilterParameters().known_ground.up is None
+    assert FilterParameters().known_ground.camera_height is None
+    known = with_values(
+        FilterParameters(), {'gravity': [0, 3, 4], 'camera_height': 1.25}
+    ).known_ground
+    np.testing.assert_allclose(known.up, [0, -0.6, -0.8])
+    assert known.camera_height == 1.25

@@ -20,7 +20,7 @@ from test.sessions.conftest import JOINTS, Likelihoods
 
 MIXTURES = ['pose_mixture', 'likelihood_mixture']
 STARTS = ['body', 'human_description']
-ONE_IMAGE = [*MIXTURES, 'joint_states', '/tf', 'markers', 'overlay/compressed']
+ONE_IMAGE = [*MIXTURES, 'ground', 'joint_states', '/tf', 'markers', 'overlay/compressed']
 
 
 @pytest.fixture
@@ -260,7 +260,8 @@ def test_nobody_in_view_is_told_once(session, outputs, small_camera, stub_tracke
         content = pose_mixture_of(messages[topic])
         assert (len(content.weights), content.kind, content.frame_id) == (0, kind, 'lens')
     removed = {(marker.ns, marker.id): marker.action for marker in messages['markers'].markers}
-    assert removed == {(f'mode_{rank}', key): 2 for rank in range(3) for key in (0, 1)}
+    modes = {(f'mode_{rank}', key): 2 for rank in range(3) for key in (0, 1)}
+    assert removed == {**modes, ('floor', 0): 2, ('contacts', 0): 2}
     state = one.state
     assert (state.status, state.trouble(), state.wants) == ('nobody', 'nobody in view', '')
     assert (state.modes, state.track_id, state.counts['tracked']) == (0, 1, 1)
@@ -774,7 +775,7 @@ def test_switches_of_the_outputs(session, small_camera, outputs):
     one = session(overlay_modes=0, publish_tf=False)
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
-    assert [o.topic for o in outputs] == [*STARTS, *MIXTURES, 'joint_states', 'markers']
+    assert [o.topic for o in outputs] == [*STARTS, *MIXTURES, 'ground', 'joint_states', 'markers']
 
 
 def test_urdf_comes_again_with_other_frames(session, small_camera, outputs):

@@ -11,8 +11,10 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.track_messages import TOPICS, Presentation, TrackedImage, track_messages
+from hmt_ros.tracking.ground import Ground
 from msg_tools import MessageError, RosbagsMessages
 from msg_tools.messages.cdr import serialise
+from msg_tools.messages.ground import ground_of
 from msg_tools.messages.images import decode_image
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 
@@ -44,6 +46,8 @@ def track(body):
         likelihood=GaussianMixture(np.array([0.6, 0.4]), poses[:2], covariances[:2]),
         log_likelihoods=np.array([-3.0, -2.0, -1.0]),
         point=poses[1],
+        ground=Ground(np.array([0.0, -0.8, -0.6]), 0.05, 1.5, 0.1),
+        contacts={'left_foot': 0.75, 'right_foot': 0.25},
         starts=True,
     )
 
@@ -189,11 +193,37 @@ def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
 
 def test_markers_speak_about_all_ranks(track):
     markers = made(track)['markers'].markers
-    assert [m.ns for m in markers] == [f'mode_{k // 2}' for k in range(16)]
-    assert [m.action for m in markers] == [0] * 6 + [2] * 10
+    assert [m.ns for m in markers] == [*(f'mode_{k // 2}' for k in range(16)), 'floor', 'contacts']
+    assert [m.action for m in markers] == [0] * 6 + [2] * 10 + [0, 0]
     shares = [m.color.a for m in markers[:6:2]]
     assert shares == sorted(shares, reverse=True)
     assert np.isclose(shares[0], 1.0)
+
+
+def test_ground(track, body):
+    found = made(track)
+    content = ground_of(found['ground'])
+    assert (content.stamp_ns, content.frame_id) == (STAMP, 'lens')
+    np.testing.assert_allclose(content.plane, [0.0, -0.8, -0.6, 1.5])
+    assert (content.up_sigma, content.height_sigma) == (0.05, 0.1)
+    assert content.contacts == track.contacts
+    # The feet are those of the point estimate.
+    feet = found['markers'].markers[-1]
+    joints = dict(zip(body.joint_names, body.joint_positions(track.point[None])[0], strict=True))
+    for point, name in zip(
+        feet.points, ('left_ankle', 'left_toe', 'right_ankle', 'right_toe'), strict=True
+    ):
+        np.testing.assert_allclose([point.x, point.y, point.z], joints[name])
+
+
+def test_ground_whose_height_is_unknown(track):
+    unknown = replace(track, ground=Ground(track.ground.up, 0.3, None, np.inf), contacts={})
+    found = made(unknown)
+    content = ground_of(found['ground'])
+    assert content.plane is None
+    assert np.isnan(content.height_sigma)
+    assert np.isnan(found['ground'].plane).all()
+    assert [marker.action for marker in found['markers'].markers[-2:]] == [2, 2]
 
 
 def test_body_comes_with_its_first_image_only(track):

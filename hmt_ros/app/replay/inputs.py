@@ -1,12 +1,13 @@
-"""The input of the filter in a bag: images, their calibration, masks, keypoints."""
+"""The input of the filter in a bag: images, their calibration, masks, keypoints, transforms."""
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
 from hmt_ros.sessions.filter_session import KEYPOINTS
+from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools import BagError, BagMessage, BagReader, Topic
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
@@ -29,6 +30,8 @@ class RecordedInput:
         mask: topic of masks of the person; None if the bag has none.
         keypoints: topic of 2D keypoints; None if the bag has none.
         ground_truth: topic of the ground truth; None if the bag has none.
+        transforms: topics of transforms by source, those that the bag has of `TRANSFORMS`; None if
+            transforms are not used.
     """
 
     image: Topic
@@ -36,6 +39,7 @@ class RecordedInput:
     mask: Topic | None
     keypoints: Topic | None
     ground_truth: Topic | None
+    transforms: Mapping[str, Topic] | None = None
 
     @property
     def transport(self) -> str:
@@ -56,6 +60,7 @@ class RecordedInput:
             sources[self.keypoints.name] = KEYPOINTS
         if self.ground_truth is not None:
             sources[self.ground_truth.name] = GROUND_TRUTH
+        sources |= {topic.name: source for source, topic in (self.transforms or {}).items()}
         for stored in bag.messages(sources):
             yield sources[stored.topic], stored
 
@@ -67,7 +72,7 @@ def recorded_input(
 
     Images come from `image/compressed`, else from `image`, else from the only topic of images.
     Calibration comes from `camera_info` beside the images, else from the only topic of its type.
-    Masks come from `mask`, else from `mask/compressed`.
+    Masks come from `mask`, else from `mask/compressed`, transforms from `/tf` and `/tf_static`.
 
     Args:
         bag: an open bag.
@@ -77,12 +82,14 @@ def recorded_input(
         BagError: there are no images, no camera_info, or several topics to choose from.
     """
     image = _image_topic(bag, image_topic)
+    found = {source: _named(bag, source, (TRANSFORMS_TYPE,)) for source in TRANSFORMS}
     return RecordedInput(
         image,
         _camera_info_topic(bag, image, camera_info_topic),
         _named(bag, MASK, (RAW,)) or _named(bag, COMPRESSED_MASK, (COMPRESSED,)),
         _named(bag, 'keypoints', (_KEYPOINTS,)),
         _named(bag, GROUND_TRUTH, (POSE_MIXTURE,)),
+        {source: topic for source, topic in found.items() if topic is not None},
     )
 
 

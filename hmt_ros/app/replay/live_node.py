@@ -23,14 +23,18 @@ import hmt_ros
 from hmt_ros.app.replay.player import LiveNodeError, Player, environment
 from hmt_ros.sessions.declared_parameters import values_of
 from hmt_ros.sessions.handled import HANDLED, Handled, handled_of
+from hmt_ros.sessions.own_messages import OwnMessages
 from hmt_ros.sessions.parameter_file import yaml_scalar
 from hmt_ros.sessions.session import SUBSCRIBERS, PublishedTopic
+from hmt_ros.sessions.transform_buffer import TF_STATIC
 from msg_tools.messages.cdr import canonical, deserialise, serialise
 
 # Long limits, which end a replay that hangs. The end of a node is noticed at once.
 START_SECONDS = 120.0
 MESSAGE_SECONDS = 600.0  # the first image may have to wait until kernels are compiled
 STOP_SECONDS = 20.0
+# Sources whose messages late subscribers get, too.
+LATCHED_SOURCES = (TF_STATIC,)
 
 
 class LiveNode:
@@ -84,6 +88,8 @@ class LiveNode:
 
     def publish_bytes(self, source: str, data: bytes) -> None:
         """Hands over bytes, which need not be a message."""
+        if source in self._shared:
+            self._own.sent(data)
         self._publishers[source].publish(data)
 
     @property
@@ -168,9 +174,13 @@ class LiveNode:
             future = self._state.call_async(self._state_request)
             self._wait(future.done, START_SECONDS, 'the state of the node')
             label = future.result().current_state.label
-        publishers = self._publishers.values()
+        # To a shared topic this side subscribes, too.
+        publishers = self._publishers.items()
         self._wait(
-            lambda: all(publisher.get_subscription_count() for publisher in publishers),
+            lambda: all(
+                publisher.get_subscription_count() > (source in self._shared)
+                for source, publisher in publishers
+            ),
             START_SECONDS,
             'the subscriptions of the node',
         )
@@ -279,15 +289,19 @@ class LiveNode:
             source: node.create_publisher(
                 player.classes[msgtype],
                 self._topic(topic),
-                player.reliable,
+                player.latched if source in LATCHED_SOURCES else player.reliable,
             )
             for source, (topic, msgtype) in inputs.items()
         }
+        # Sources whose topic the node publishes on, too, and what was published there by this side.
+        self._shared = {source for source, (topic, _) in inputs.items() if topic in self._topics}
+        self._own = OwnMessages()
+        shared = {inputs[source][0] for source in self._shared}
         for topic, published in self._topics.items():
             node.create_subscription(
                 player.classes[published.msgtype],
                 self._topic(topic),
-                _into(self._arrived[topic]),
+                _into(self._arrived[topic], self._own if topic in shared else None),
                 player.latched if published.latched else player.reliable,
                 raw=True,
             )
@@ -328,10 +342,11 @@ class LiveNode:
         return lines[-1] if lines else 'it has written nothing'
 
 
-def _into(queue: deque[bytes]) -> Callable[[bytes], None]:
-    """A callback that appends to a queue; rclpy inspects its signature."""
+def _into(queue: deque[bytes], own: OwnMessages | None = None) -> Callable[[bytes], None]:
+    """A callback that appends to a queue what others have sent; rclpy inspects its signature."""
 
     def receive(data: bytes) -> None:
-        queue.append(data)
+        if own is None or not own.is_own(data):
+            queue.append(data)
 
     return receive

@@ -20,12 +20,17 @@ from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, MASK
 from hmt_ros.sessions.filter_session import KEYPOINTS
 from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
 from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
-from msg_tools.messages.headers import header_message, time_ns
+from msg_tools.messages.headers import SECOND_NS, header_message, time_ns
 from msg_tools.messages.images import ImageError, decode_image, image_message
+from msg_tools.messages.states import transforms_message
 
 Tell = Callable[[str], None]
+
+# Of the parameter transform_timeout, s.
+LONGEST_TIMEOUT = 60
 
 
 @dataclass
@@ -80,6 +85,8 @@ def replay_bag(source: Path, target: Path, options: ReplayOptions, tell: Tell) -
                 topics.update(bme_session.TOPICS)
             for topic, published in topics.items():
                 out.add_topic(topic, published.msgtype, latched=published.latched)
+            if recorded.transforms and TF_STATIC in recorded.transforms:
+                out.add_topic(recorded.transforms[TF_STATIC].name, TRANSFORMS_TYPE, latched=True)
             way = LiveTrack if options.live else OfflineTrack
             # Bytes are compressed and images decoded while the next image is tracked.
             with WriteBehind() as behind:
@@ -111,6 +118,8 @@ def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
         recorded = replace(recorded, mask=None)
     if not parameters.filter.use_keypoints:
         recorded = replace(recorded, keypoints=None)
+    if not parameters.filter.gravity_frame:
+        recorded = replace(recorded, transforms=None)
     return recorded
 
 
@@ -120,7 +129,10 @@ def _play(
 ) -> Replayed:  # fmt: skip
     """Hands the messages of the bag to the nodes, and copies those that the new bag keeps."""
     result = Replayed()
-    copied = {GROUND_TRUTH, IMAGE, CAMERA_INFO} if options.with_images else {GROUND_TRUTH}
+    # Transforms are copied so that a replay of the new bag sees the same gravity.
+    copied = {GROUND_TRUTH, *TRANSFORMS}
+    if options.with_images:
+        copied |= {IMAGE, CAMERA_INFO}
 
     def check(handled: Handled) -> None:
         behind.check()
@@ -152,6 +164,8 @@ def _play(
             check(track.take(KEYPOINTS, _nobody(result.last_stamp)))
         if recorded.mask is not None:
             check(track.take(MASK, _mask_after(result.last_stamp)))
+        if recorded.transforms is not None:
+            check(track.take(TF, _transform_after(result.last_stamp)))
         check(track.finish())
     return result
 
@@ -209,6 +223,14 @@ def _nobody(stamp_ns: int) -> Any:
 def _mask_after(stamp_ns: int) -> Any:
     """sensor_msgs/Image with a mask of an image after the last: no mask of an earlier one comes."""
     return image_message(RosbagsMessages(), np.zeros((1, 1), np.uint8), stamp_ns + 1, '')
+
+
+def _transform_after(stamp_ns: int) -> Any:
+    """tf2_msgs/TFMessage after the last image, which no transform of that image can follow."""
+    after = stamp_ns + LONGEST_TIMEOUT * SECOND_NS + 1
+    return transforms_message(
+        RosbagsMessages(), ['hmt_ros'], ['hmt_ros/end'], np.eye(3)[None], np.zeros((1, 3)), after
+    )
 
 
 def _why_nothing(result: Replayed, subject: object) -> str:

@@ -31,7 +31,14 @@ class Player:
         try:
             import rclpy
             from diagnostic_msgs.msg import DiagnosticArray
-            from hmt_msgs.msg import Body, Handled, Keypoints2D, PoseMixture, TrajectoryMixture
+            from hmt_msgs.msg import (
+                Body,
+                Ground,
+                Handled,
+                Keypoints2D,
+                PoseMixture,
+                TrajectoryMixture,
+            )
             from rclpy.executors import SingleThreadedExecutor
             from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
             from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
@@ -43,7 +50,7 @@ class Player:
                 f'--live needs a sourced ROS 2 workspace ({error}): source install/setup.bash'
             ) from error
         kinds = (
-            Body, CameraInfo, CompressedImage, Handled, Image, JointState, Keypoints2D,
+            Body, CameraInfo, CompressedImage, Ground, Handled, Image, JointState, Keypoints2D,
             MarkerArray, PoseMixture, String, TFMessage, TrajectoryMixture,
         )  # fmt: skip
         self.classes: dict[str, Any] = {

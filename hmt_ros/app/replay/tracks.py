@@ -21,6 +21,7 @@ from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE,
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
 from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
+from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools.messages.cdr import deserialise
 
 # Topics of the filter that the smoother takes, as sources of the same names.
@@ -128,6 +129,8 @@ class LiveTrack(PlayedTrack):
                 COMPRESSED_MASK: ('mask/compressed', 'sensor_msgs/msg/CompressedImage'),
                 IMAGE: (topic, f'sensor_msgs/msg/{kind}'),
             }
+            if self._parameters.filter.gravity_frame:
+                inputs |= {each: (f'/{each}', TRANSFORMS_TYPE) for each in TRANSFORMS}
             live = partial(LiveNode, player, opened, write=self._write)
             sensors = (f'/{topic}', '/camera_info', *(f'/{each}' for each in MASKS))
             if self._parameters.bme is not None:

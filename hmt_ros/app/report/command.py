@@ -7,14 +7,16 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from hmt_ros.app.bag_scores import chosen_topics, score_bag
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
 from hmt_ros.app.recorded_bodies import body_topics
+from hmt_ros.app.report.grounds import read_grounds
 from hmt_ros.app.report.images import FilmStrip, ImageSource, film_strip, image_source
-from hmt_ros.app.report.mixtures import RecordedMixtures, read_mixtures
+from hmt_ros.app.report.mixtures import Layer, RecordedMixtures, read_mixtures
 from hmt_ros.app.report.page import Content, data_size, page_html
 from hmt_ros.app.report.pictures import PICTURES, draw_pictures, shown_in_pictures
 from hmt_ros.app.truth import read_truth, recorded_truth
@@ -181,7 +183,9 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: tqdm) -> C
         if len(images.jpegs) < len(stamps):
             notes.append(f'{len(stamps) - len(images.jpegs)} times are shown without an image')
     title = f'{options.bag.resolve().name}: mixtures over poses'
-    return Content(title, stamps, mixtures, images, truth, scores, notes)
+    shown: list[Layer[Any]] = [*mixtures.layers, *mixtures.trajectories]
+    grounds = read_grounds(options.bag, shown[0].topic, shown[0].frame_id)
+    return Content(title, stamps, mixtures, images, truth, scores, notes, grounds)
 
 
 def _with_truth(mixtures: RecordedMixtures, truth: Truth) -> list[str]:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import base64
 import html
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
 import numpy as np
 
 from hmt_ros.app.evaluate import as_json
+from hmt_ros.app.report.grounds import ground_data
 from hmt_ros.app.report.images import FilmStrip
 from hmt_ros.app.report.mixtures import Layer, Moment, RecordedMixtures, Window
 from hmt_ros.app.report.pictures import PROBABILITIES
@@ -24,6 +25,7 @@ from hmt_ros.evaluation.pose_scores import LOST, ORIGIN, origin_joints
 from hmt_ros.evaluation.track_scores import TrackScores, Truth, mode_errors
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.calibration import coverage
+from msg_tools.messages.ground import GroundState
 
 # Least step of positions, m, and step of pixels as a fraction of the width of the image.
 FINEST = 5e-4
@@ -46,6 +48,7 @@ class Content:
         truth: true joint positions; None if unknown.
         scores: by topic; empty without truth.
         notes: what the page does not show, and why.
+        grounds: what is known of the floor and of contacts, by stamp; empty: nothing.
     """
 
     title: str
@@ -55,6 +58,7 @@ class Content:
     truth: Truth | None
     scores: dict[str, TrackScores]
     notes: list[str]
+    grounds: dict[int, GroundState] = field(default_factory=dict)
 
 
 def data_size(mixtures: RecordedMixtures) -> int:
@@ -115,6 +119,7 @@ def page_data(content: Content) -> dict[str, Any]:
             _trajectories(topic, start, grid) for topic in content.mixtures.trajectories
         ],
         'truth': None if truth is None else _truth(truth, content, grid),
+        'ground': ground_data(content.grounds, stamps),
         'images': _images(content),
         'scores': _scores(content),
     }

@@ -17,6 +17,7 @@ from hmt_ros.sessions import track_start
 from hmt_ros.sessions.smoothed_messages import TOPICS as SMOOTHED_TOPICS
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.tracking import Status
+from hmt_ros.tracking.ground import Ground
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.headers import header_message, time_ns
@@ -71,11 +72,12 @@ class StandingStill:
 
     made = []  # noqa: RUF012
 
-    def __init__(self, body, camera, settings, background, seed):
+    def __init__(self, body, camera, settings, background, seed, known_ground=None):
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
         self.track_id = 1
         self.keypoints, self.predictions, self.masks = [], [], []
+        self.ground, self.contacts = Ground(np.array([0.0, -1.0, 0.0]), 0.3, None, np.inf), {}
         self.silhouettes = SimpleNamespace(doubted=False, known='known')
         StandingStill.made.append(self)
 

@@ -18,6 +18,7 @@ from hmt_ros.app.truth import read_truth
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader, BagWriter
 from msg_tools.messages.bodies import message_of_body
+from msg_tools.messages.ground import GroundState, ground_message
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
@@ -428,3 +429,57 @@ def test_it_tells_what_came_out(made, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith(f'{tmp_path / "report" / "report.html"}: {FRAMES} times, ')
     assert any('weights.png' in line for line in lines)
+
+
+# The floor.
+
+UP = np.array([0.0, -0.8, -0.6])
+
+
+def with_ground(path, body, poses, *, frame=FRAME_ID, height=1.5, topics=('ground',), spoil=None):
+    """A bag of mixtures with messages about the floor, of which the first image has none."""
+
+    def message(stamp):
+        contacts = {'left_foot': 0.9, 'right_foot': 0.1}
+        made = ground_message(MESSAGES, GroundState(stamp, frame, UP, 0.1, height, 0.1, contacts))
+        if spoil is not None:
+            spoil(made)
+        return made
+
+    with BagReader(write_out(path / 'source', body, poses)) as source, BagWriter(path / 'b') as bag:
+        for stored in source.messages():
+            bag.write(stored.topic, stored.log_time_ns, stored.message)
+        for topic in topics:
+            for stamp in STAMPS[1:]:
+                bag.write(topic, stamp, message(stamp))
+    return path / 'b'
+
+
+def test_floor_is_that_of_the_bag(body, poses, tmp_path):
+    bag = with_ground(tmp_path, body, poses)
+    ground = data_of(make(bag, tmp_path / 'report', '--topic', 'pose_mixture'))['ground']
+    assert ground['planes'] == [None, *[[0.0, -0.8, -0.6, 1.5]] * (FRAMES - 1)]
+    assert ground['contacts'] == [{}, *[{'left': 0.9, 'right': 0.1}] * (FRAMES - 1)]
+
+
+@pytest.mark.parametrize(
+    'options',
+    [{'frame': 'elsewhere'}, {'topics': ('a/ground', 'b/ground')}, {'topics': ()}],
+    ids=['another frame', 'of other persons', 'none'],
+)
+def test_floor_that_is_not_known(body, poses, tmp_path, options):
+    bag = with_ground(tmp_path, body, poses, **options)
+    assert data_of(make(bag, tmp_path / 'report', '--topic', 'pose_mixture'))['ground'] is None
+
+
+def test_contacts_without_a_floor(body, poses, tmp_path):
+    bag = with_ground(tmp_path, body, poses, height=None)
+    ground = data_of(make(bag, tmp_path / 'report', '--topic', 'pose_mixture'))['ground']
+    assert ground['planes'] == [None] * FRAMES
+    assert ground['contacts'][1] == {'left': 0.9, 'right': 0.1}
+
+
+def test_floor_that_contradicts_itself(body, poses, tmp_path, capsys):
+    bag = with_ground(tmp_path, body, poses, spoil=lambda m: setattr(m, 'height', 7.0))
+    assert report.main([str(bag), '-o', str(tmp_path / 'report'), '--quiet']) == 1
+    assert f'ground at {STAMPS[1]} ns: ground: plane is' in capsys.readouterr().err

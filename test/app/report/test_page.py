@@ -9,7 +9,8 @@ import subprocess
 
 import pytest
 
-from test.app.conftest import FRAMES, TRAJECTORIES, make
+from test.app.conftest import FRAMES, TRAJECTORIES, make, write_out
+from test.app.report.test_command import with_ground
 
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable', 'chrome')
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
@@ -226,3 +227,17 @@ def test_the_address_tells_what_is_shown(page, tmp_path):
     assert given['clock'] == f'0.40 s, 5 of {FRAMES}'
     assert (plain['second'], given['second']) == (False, True)
     assert given['space'] != plain['space']
+
+
+@in_a_browser
+def test_floor_and_contacts_are_drawn(body, poses, tmp_path):
+    guessed = make(write_out(tmp_path / 'plain', body, poses), tmp_path / 'one', '--times', '3')
+    known = make(with_ground(tmp_path, body, poses), tmp_path / 'two', '--times', '3')
+    steps = "look('space'); seen.caption = get('space-caption').textContent;"
+    steps += 'seen.floor = space.floorAt(1, -2);'
+    seen = [visit(page, steps, tmp_path, '#frame=2') for page in (guessed, known)]
+    assert 'does not tell the floor' in seen[0]['caption']
+    assert 'The grid is the floor' in seen[1]['caption']
+    assert seen[0]['space'] != seen[1]['space']
+    # -0.8 y - 0.6 z + 1.5 = 0 at x = 1 and z = 2; the page turns y and z round.
+    assert abs(seen[1]['floor'] + (1.5 - 0.6 * 2) / 0.8) < 1e-6

@@ -83,6 +83,19 @@ trajectories.forEach((topic) => {
   });
 });
 
+/** The floor at each time: {across, along, height} with y = height - across x - along z, or null. */
+const floors = TIMES.map((_, t) => {
+  const plane = report.ground && report.ground.planes[t];
+  if (!plane) return null;
+  // As the positions: y up, z towards the camera.
+  const [a, b, c, d] = [plane[0], -plane[1], -plane[2], plane[3]];
+  // A floor that stands upright in the view can not carry its grid.
+  return b > 0.3 ? { across: a / b, along: c / b, height: -d / b } : null;
+});
+
+/** Probability that a foot stands on the floor, by its side. */
+const contactsAt = (t) => (report.ground ? report.ground.contacts[t] : {});
+
 /** The time nearest to a number of seconds, as an index. */
 function nearest(seconds) {
   let best = 0;

@@ -193,6 +193,9 @@ function tell() {
     element('image-figure').hidden = true;
     element('stage').classList.add('without-image');
   }
+  element('space-caption').textContent += floors.some(Boolean)
+    ? ' The grid is the floor, as the bag has it; rings mark feet that stand on it.'
+    : ' The grid lies under the lowest joints: the bag does not tell the floor.';
   element('notes-section').hidden = !report.notes.length;
   element('notes').append(...report.notes.map((note) => made('li', note)));
 }

@@ -228,6 +228,7 @@ class Space {
         points.forEach((point) => segments.push({ from: point, to: point, depth: point[2], mode, side: 'trunk' }));
       }
     });
+    this.drawContacts(context, project, root);
     segments.sort((a, b) => b.depth - a.depth);
     segments.forEach(({ from, to, mode, side }) => {
       context.globalAlpha = mode.strength;
@@ -243,6 +244,39 @@ class Space {
     context.setLineDash([]);
   }
 
+  /** The height of the floor at a place: that of the bag, or else that of the lowest joints. */
+  floorAt(x, z) {
+    let floor = floors[shown.time];
+    for (let t = shown.time; t >= 0 && !floor; t -= 1) floor = floors[t];
+    floor = floor || floors.find(Boolean);
+    return floor ? floor.height - floor.across * x - floor.along * z : this.floor;
+  }
+
+  onFloor(project, x, z) {
+    return project(x, this.floorAt(x, z), z);
+  }
+
+  /** A ring around each foot of the heaviest mode, the stronger the more probably it stands. */
+  drawContacts(context, project, root) {
+    const [layer] = layers;
+    if (!layer || !shown.layers.has(0) || !layer.weights[shown.time].length) return;
+    const offset = layer.starts[shown.time];
+    const own = this.origin(layer, offset);
+    context.strokeStyle = colour('contact');
+    context.lineWidth = 2;
+    Object.entries(contactsAt(shown.time)).forEach(([side, probability]) => {
+      const joint = ['toe', 'ankle'].map((name) => layer.joints.indexOf(`${side}_${name}`)).find((i) => i >= 0);
+      if (joint === undefined || probability < 0.05) return;
+      const point = this.joint(layer, offset, joint).map((x, axis) => (this.together ? x + root[axis] - own[axis] : x));
+      const [u, v] = project(...point);
+      context.globalAlpha = probability;
+      context.beginPath();
+      context.arc(u, v, 7, 0, 2 * Math.PI);
+      context.stroke();
+    });
+    context.globalAlpha = 1;
+  }
+
   /** A grid of half metres under the feet, and an arrow to the camera. */
   drawFloor(context, project, width, height) {
     const root = this.follow ? this.lastRoot() || this.centre : this.centre;
@@ -254,7 +288,7 @@ class Space {
     for (let i = -reach; i <= reach + 1e-6; i += 0.5) {
       [[[i, -reach], [i, reach]], [[-reach, i], [reach, i]]].forEach((ends) => {
         ends.forEach(([x, z], end) => {
-          const [u, v] = project(middle[0] + x, this.floor, middle[1] + z);
+          const [u, v] = this.onFloor(project, middle[0] + x, middle[1] + z);
           if (end) context.lineTo(u, v); else context.moveTo(u, v);
         });
       });
@@ -265,8 +299,8 @@ class Space {
     if (away < 1e-3) return;
     const [tail, head] = [0.4 * this.radius, 0.7 * this.radius];
     const [dx, dz] = [-root[0] / away, -root[2] / away];
-    const place = (along, aside) => project(
-      root[0] + along * dx - aside * dz, this.floor, root[2] + along * dz + aside * dx,
+    const place = (along, aside) => this.onFloor(
+      project, root[0] + along * dx - aside * dz, root[2] + along * dz + aside * dx,
     );
     const tip = place(head, 0);
     context.strokeStyle = colour('axis');

@@ -1,0 +1,131 @@
+"""Feet against the true floor: whether those that stand slide, and whether they sink in.
+
+The sliding of a foot is the speed of its ankle in the world between two frames in which the foot
+truly stands. Depths are those of ankles and toes below the true plane of the floor; the sole lies
+some centimetres below the ankle, so a pose that does not sink in has a depth of 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from hmt_ros.inference.arrays import Array
+
+ANKLES = ('left_ankle', 'right_ankle')
+FEET = (*ANKLES, 'left_toe', 'right_toe')
+# A joint that is deeper counts as sunk in, m.
+SUNK = 0.02
+# Frames further apart than this many times the usual interval are no neighbours.
+_GAP = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class TrueGround:
+    """What is truly so of the floor at one time.
+
+    Attributes:
+        up: (3,) unit vector against gravity, camera frame.
+        height: of the camera above the floor, m.
+        standing: (2,) whether the left and the right foot stand; None: unknown.
+        camera_rotation: (3, 3) from the camera to a world that rests, and
+        camera_position: (3,) in it, m.
+    """
+
+    up: Array
+    height: float
+    standing: Array | None
+    camera_rotation: Array
+    camera_position: Array
+
+
+@dataclass(frozen=True)
+class GroundScores:
+    """Feet of the heaviest mode.
+
+    Attributes:
+        sliding: mean speed of standing ankles, m/s; None: no foot is known to stand.
+        depth: mean depth of ankles and toes below the floor, m; 0 for those above.
+        sunk: fraction of the frames in which one is deeper than `SUNK`.
+        frames: number of frames.
+    """
+
+    sliding: float | None
+    depth: float
+    sunk: float
+    frames: int
+
+    def summary(self) -> dict[str, float | int | None]:
+        """The numbers by name, lengths in mm."""
+        return {
+            'sliding_m_per_s': self.sliding,
+            'below_floor_mm': 1e3 * self.depth,
+            'fraction_below_floor': self.sunk,
+            'frames': self.frames,
+        }
+
+    def __str__(self) -> str:
+        sliding = '' if self.sliding is None else f'standing ankles slide {self.sliding:.3f} m/s; '
+        return (
+            f'{sliding}ankles and toes lie {1e3 * self.depth:.1f} mm below the floor on average, '
+            f'one more than {1e3 * SUNK:.0f} mm in {self.sunk:.0%} of the frames'
+        )
+
+
+def ground_scores(
+    joints: Mapping[int, Array], names: Sequence[str], truth: Mapping[int, TrueGround]
+) -> GroundScores | None:
+    """Scores of feet; None: no frame has a truth, or there are no joints of feet.
+
+    Args:
+        joints: stamp in ns -> (J, 3) of one pose, m, camera frame.
+        names: (J,) of the joints.
+        truth: by stamp in ns.
+    """
+    stamps = sorted(joints.keys() & truth.keys())
+    feet = [names.index(name) for name in FEET if name in names]
+    if not stamps or not feet:
+        return None
+    depths = np.array(
+        [np.maximum(-(joints[t][feet] @ truth[t].up + truth[t].height), 0.0) for t in stamps]
+    )
+    return GroundScores(
+        sliding=_sliding(stamps, joints, names, truth),
+        depth=float(depths.mean()),
+        sunk=float((depths.max(1) > SUNK).mean()),
+        frames=len(stamps),
+    )
+
+
+def _sliding(
+    stamps: Sequence[int],
+    joints: Mapping[int, Array],
+    names: Sequence[str],
+    truth: Mapping[int, TrueGround],
+) -> float | None:
+    """Mean speed of the standing ankles, m/s; None: there are none."""
+    if len(stamps) < 2:
+        return None
+    usual = _GAP * float(np.median(np.diff(stamps)))
+    speeds = []
+    for side, ankle in enumerate(ANKLES):
+        if ankle not in names:
+            continue
+        at = names.index(ankle)
+        for before, now in pairwise(stamps):
+            one, other = truth[before], truth[now]
+            if now - before > usual or one.standing is None or other.standing is None:
+                continue
+            if one.standing[side] and other.standing[side]:
+                moved = _placed(joints[now][at], other) - _placed(joints[before][at], one)
+                speeds.append(float(np.linalg.norm(moved)) / (1e-9 * (now - before)))
+    return float(np.mean(speeds)) if speeds else None
+
+
+def _placed(point: Array, truth: TrueGround) -> Array:
+    """A point (3,) of the camera frame in the world."""
+    result: Array = truth.camera_rotation @ point + truth.camera_position
+    return result

@@ -1,0 +1,275 @@
+"""Transforms between frames over time, from the messages on /tf and /tf_static, without ROS.
+
+The rules are those of tf2: a frame has one parent; between two stamps rotations are interpolated on
+the shortest arc and positions along a line; nothing is extrapolated; a transform on /tf_static
+holds at all times. The same messages in the same order give the same transforms.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hmt_ros.inference.arrays import Array
+from msg_tools.files.error_line import one_line
+from msg_tools.messages.headers import SECOND_NS, time_ns
+
+# Sources of transforms.
+TF, TF_STATIC = TRANSFORMS = ('tf', 'tf_static')
+TRANSFORMS_TYPE = 'tf2_msgs/msg/TFMessage'
+
+# Time that a moving frame is remembered, as in tf2, s, and bounds that a flood of messages meets.
+REMEMBERED = 10.0
+MOST_FRAMES, MOST_STAMPS = 1000, 10_000
+# Most that the length of a quaternion differs from 1; tf2 takes half of it.
+_NOT_UNIT = 1e-2
+# Cosine of half the angle between two rotations that a line joins as well as an arc.
+_CLOSE = 0.9995
+# Names of frames in a message for people.
+_LISTED = 12
+
+
+class TransformError(ValueError):
+    """There is no transform between two frames at a time: one line that says why."""
+
+
+class Transform(NamedTuple):
+    """p_parent = R p_child + t.
+
+    Attributes:
+        rotation: R (3, 3).
+        translation: t (3,), m.
+    """
+
+    rotation: Array
+    translation: Array
+
+    def after(self, inner: Transform) -> Transform:
+        """The transform that applies this one to the results of another."""
+        return Transform(
+            self.rotation @ inner.rotation,
+            self.rotation @ inner.translation + self.translation,
+        )
+
+    def inverse(self) -> Transform:
+        """The transform back."""
+        back = self.rotation.T
+        return Transform(back, -back @ self.translation)
+
+
+class _Sample(NamedTuple):
+    """Place of a frame in its parent: position (3,) m, unit quaternion (4,) x y z w."""
+
+    parent: str
+    position: Array
+    quaternion: Array
+
+    def transform(self) -> Transform:
+        return Transform(rotation_matrix(self.quaternion), self.position)
+
+
+@dataclass
+class _Moving:
+    """Places of a frame by stamp in ns, increasing."""
+
+    stamps: list[int] = field(default_factory=list)
+    samples: list[_Sample] = field(default_factory=list)
+
+    def put(self, stamp: int, sample: _Sample) -> None:
+        if self.stamps and stamp < self.stamps[-1] - REMEMBERED * SECOND_NS:
+            # Time has jumped back.
+            self.stamps.clear()
+            self.samples.clear()
+        place = bisect_left(self.stamps, stamp)
+        if self.stamps[place : place + 1] == [stamp]:
+            self.samples[place] = sample
+        else:
+            self.stamps.insert(place, stamp)
+            self.samples.insert(place, sample)
+        old = bisect_left(self.stamps, self.stamps[-1] - round(REMEMBERED * SECOND_NS))
+        old = max(old, len(self.stamps) - MOST_STAMPS)
+        if old > 0:
+            del self.stamps[:old], self.samples[:old]
+
+    def forget_after(self, stamp: int) -> None:
+        kept = bisect_right(self.stamps, stamp)
+        del self.stamps[kept:], self.samples[kept:]
+
+    def at(self, stamp: int) -> _Sample | None:
+        """The place at a time; None: it lies outside of the known ones."""
+        after = bisect_left(self.stamps, stamp)
+        if after == len(self.stamps):
+            return None
+        if self.stamps[after] == stamp:
+            return self.samples[after]
+        if after == 0:
+            return None
+        one, other = self.samples[after - 1 : after + 1]
+        if one.parent != other.parent:
+            return one
+        start, end = self.stamps[after - 1 : after + 1]
+        share = (stamp - start) / (end - start)
+        return _Sample(
+            one.parent,
+            one.position + share * (other.position - one.position),
+            slerp(one.quaternion, other.quaternion, share),
+        )
+
+
+class TransformBuffer:
+    """Remembers transforms and joins them along the tree of frames.
+
+    Attributes:
+        newest_ns: newest stamp on /tf; None before the first.
+    """
+
+    def __init__(self) -> None:
+        self._moving: dict[str, _Moving] = {}
+        self._static: dict[str, _Sample] = {}
+        self.newest_ns: int | None = None
+
+    def put(self, message: Any, *, static: bool) -> list[str]:
+        """Takes a tf2_msgs/TFMessage.
+
+        Args:
+            message: of `rosbags` or of ROS.
+            static: whether it comes from /tf_static.
+
+        Returns:
+            Why transforms in it were not taken, a line for each.
+        """
+        faults = []
+        for stamped in message.transforms:
+            parent, child = _name(stamped.header.frame_id), _name(stamped.child_frame_id)
+            try:
+                self._put(parent, child, stamped, static=static)
+            except ValueError as error:
+                faults.append(f'transform from {child!r} to {parent!r}: {error}')
+        return faults
+
+    def forget_after(self, stamp_ns: int) -> None:
+        """Forgets places of moving frames after a time, to which time has jumped back."""
+        for child, moving in list(self._moving.items()):
+            moving.forget_after(stamp_ns)
+            if not moving.stamps:
+                del self._moving[child]
+        self.newest_ns = max((x.stamps[-1] for x in self._moving.values()), default=None)
+
+    def frames(self) -> list[str]:
+        """Names of all frames, sorted."""
+        parents = {sample.parent for sample in self._static.values()}
+        parents.update(moving.samples[-1].parent for moving in self._moving.values())
+        return sorted(parents | self._static.keys() | self._moving.keys())
+
+    def lookup(self, target: str, source: str, stamp_ns: int) -> Transform:
+        """The transform p_target = R p_source + t at a time.
+
+        Raises:
+            TransformError: a frame is not known, the frames are not connected or form a loop, or
+                there is no transform of that time.
+        """
+        target, source = _name(target), _name(source)
+        from_target, why = self._to_root(target, stamp_ns)
+        from_source, also = self._to_root(source, stamp_ns)
+        for name, inner in from_source.items():
+            if name in from_target:
+                return from_target[name].inverse().after(inner)
+        known = self.frames()
+        for name in (source, target):
+            if name not in known:
+                raise TransformError(f'there is no frame {name!r}; there are: {_listed(known)}')
+        raise TransformError(
+            why
+            or also
+            or f'{source!r} and {target!r} are not connected; there are: {_listed(known)}'
+        )
+
+    def _put(self, parent: str, child: str, stamped: Any, *, static: bool) -> None:
+        if not parent or not child:
+            raise ValueError('a frame has no name')
+        if parent == child:
+            raise ValueError('a frame can not be its own parent')
+        t, r = stamped.transform.translation, stamped.transform.rotation
+        position, quaternion = np.array([t.x, t.y, t.z]), np.array([r.x, r.y, r.z, r.w])
+        if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):
+            raise ValueError('its numbers are not finite')
+        length = math.hypot(*quaternion)
+        if abs(length - 1.0) > _NOT_UNIT:
+            raise ValueError(f'its quaternion has length {length:.3g}, wanted 1')
+        known = child in self._static or child in self._moving
+        if not known and len(self._static) + len(self._moving) >= MOST_FRAMES:
+            raise ValueError(f'there are {MOST_FRAMES} frames already')
+        sample = _Sample(parent, position, quaternion / length)
+        if static:
+            self._moving.pop(child, None)
+            self._static[child] = sample
+            return
+        stamp = time_ns(stamped.header.stamp)
+        self._static.pop(child, None)
+        self._moving.setdefault(child, _Moving()).put(stamp, sample)
+        if self.newest_ns is None or stamp > self.newest_ns:
+            self.newest_ns = stamp
+
+    def _to_root(self, frame: str, stamp_ns: int) -> tuple[dict[str, Transform], str]:
+        """Transforms from a frame to each frame above it; why there are no more, '' at the root."""
+        reached = {frame: Transform(np.eye(3), np.zeros(3))}
+        here, total = frame, reached[frame]
+        while True:
+            sample = self._static.get(here)
+            if sample is None:
+                moving = self._moving.get(here)
+                if moving is None:
+                    return reached, ''
+                sample = moving.at(stamp_ns)
+                if sample is None:
+                    first, last = moving.stamps[0], moving.stamps[-1]
+                    return reached, (
+                        f'{here!r} has transforms of {first} to {last} ns, wanted {stamp_ns} ns'
+                    )
+            if sample.parent in reached:
+                return reached, f'the frames {_listed([*reached, sample.parent])} form a loop'
+            total = sample.transform().after(total)
+            here = sample.parent
+            reached[here] = total
+
+
+def rotation_matrix(quaternion: Array) -> Array:
+    """Rotation (3, 3) of a unit quaternion (4,) x y z w."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def slerp(start: Array, end: Array, share: float) -> Array:
+    """Unit quaternion (4,) on the shortest arc from one to another (Shoemake 1985)."""
+    cosine = float(start @ end)
+    if cosine < 0:
+        end, cosine = -end, -cosine
+    if cosine > _CLOSE:
+        between = start + share * (end - start)
+    else:
+        angle = np.arccos(cosine)
+        between = np.sin((1 - share) * angle) * start + np.sin(share * angle) * end
+    result: Array = between / np.linalg.norm(between)
+    return result
+
+
+def _name(frame: Any) -> str:
+    """Name of a frame as tf2 has it, without the slash of old."""
+    return str(frame).removeprefix('/')
+
+
+def _listed(names: Iterable[str]) -> str:
+    every = [one_line(name) for name in names]
+    more = f' and {len(every) - _LISTED} more' if len(every) > _LISTED else ''
+    return (', '.join(every[:_LISTED]) or 'none') + more

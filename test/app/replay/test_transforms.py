@@ -1,0 +1,160 @@
+"""replay of bags with /tf: gravity and the height of the camera from the bag itself."""
+
+import numpy as np
+import pytest
+
+from hmt_ros.app.replay.command import main
+from hmt_ros.body.camera import Viewpoint
+from msg_tools import RosbagsMessages
+from msg_tools.messages.ground import ground_of
+from msg_tools.messages.headers import time_ns
+from msg_tools.messages.states import transforms_message
+from test.app.replay.test_command import PERSON, content, read, recorded, write
+
+VIEW = Viewpoint(distance=4.0, height=1.25, pitch=0.15)
+FRAME = ['--set', 'gravity_frame=world', '--set', 'floor_in_gravity_frame=true']
+ESTIMATES = ('pose_mixture', 'likelihood_mixture', 'joint_states', 'ground')
+SMALL = ['--set', 'max_hypotheses=2', '--set', 'candidates=3', '--set', 'facing_trial=0.0']
+
+
+def camera_place(stamp, parent, child):
+    return transforms_message(
+        RosbagsMessages(),
+        [parent],
+        [child],
+        VIEW.rotation.T[None],
+        VIEW.to_world(np.zeros(3))[None],
+        stamp,
+    )
+
+
+def with_transforms(entries):
+    """The entries with a robot that stands at the origin, a bit before and after the images."""
+    images = [x for x in entries if x[0] == 'image/compressed']
+    frame = str(images[0][2].header.frame_id)
+    times = [images[0][1], *(time + 1_000_000 for _, time, _ in images)]
+    robot = [
+        transforms_message(
+            RosbagsMessages(), ['world'], ['robot'], np.eye(3)[None], np.zeros((1, 3)), stamp
+        )
+        for stamp in times
+    ]
+    extra = [('/tf_static', times[0], camera_place(0, 'robot', frame))]
+    extra += [('/tf', time, message) for time, message in zip(times, robot, strict=True)]
+    return sorted([*entries, *extra], key=lambda entry: entry[1])
+
+
+@pytest.fixture(scope='module')
+def entries():
+    return recorded()
+
+
+@pytest.fixture(scope='module')
+def moving(tmp_path_factory, entries):
+    return write(tmp_path_factory.mktemp('moving') / 'bag', with_transforms(entries))
+
+
+@pytest.fixture(scope='module')
+def replayed(moving, tmp_path_factory):
+    out = tmp_path_factory.mktemp('replayed') / 'out'
+    arguments = [str(moving), '-o', str(out), *PERSON, *SMALL, *FRAME, '--with-images']
+    assert main([*arguments, '--no-smoother', '--quiet']) == 0
+    return out
+
+
+def data(folder, topic):
+    return [(stored.log_time_ns, bytes(stored.data)) for stored in read(folder)[topic]]
+
+
+def test_ground_is_that_of_the_frame(replayed):
+    found = read(replayed)
+    grounds = [ground_of(stored.message) for stored in found['ground']]
+    assert [x.stamp_ns for x in grounds] == [
+        time_ns(stored.message.header.stamp) for stored in found['pose_mixture']
+    ]
+    for ground in grounds:
+        np.testing.assert_allclose(ground.up, VIEW.rotation[:, 2], atol=1e-9)
+        assert ground.height == pytest.approx(1.25, abs=0.05)
+
+
+def test_same_numbers_as_with_parameters_of_the_same_gravity(replayed, moving, tmp_path):
+    down = [float(x) for x in -VIEW.rotation[:, 2]]
+    settings = ['--set', f'gravity={down}', '--set', 'camera_height=1.25']
+    arguments = [str(moving), '-o', str(tmp_path / 'out'), *PERSON, *SMALL, *settings]
+    assert main([*arguments, '--no-smoother', '--quiet']) == 0
+    other, one = read(tmp_path / 'out'), read(replayed)
+    # The transforms are not used, and not copied.
+    assert '/tf_static' not in other
+    for first, second in zip(one['pose_mixture'], other['pose_mixture'], strict=True):
+        pairs = zip(first.message.components, second.message.components, strict=True)
+        for a, b in pairs:
+            np.testing.assert_allclose(a.mean, b.mean, atol=1e-5)
+            assert a.weight == pytest.approx(b.weight, abs=1e-4)
+    for first, second in zip(one['ground'], other['ground'], strict=True):
+        np.testing.assert_allclose(first.message.plane, second.message.plane, atol=1e-6)
+
+
+def test_new_bag_has_what_was_used(replayed, moving, tmp_path):
+    """A replay of the new bag gives the same bytes."""
+    found, given = read(replayed), read(moving)
+    assert data(replayed, '/tf_static') == data(moving, '/tf_static')
+    links = {message for _, message in data(replayed, '/tf')}
+    assert {message for _, message in data(moving, '/tf')} < links
+    assert len(found['/tf']) == len(given['/tf']) + len(found['ground'])
+    out = tmp_path / 'again'
+    arguments = [str(replayed), '-o', str(out), *PERSON, *SMALL, *FRAME, '--no-smoother']
+    assert main([*arguments, '--quiet']) == 0
+    for topic in ESTIMATES:
+        assert data(out, topic) == data(replayed, topic)
+
+
+def test_bag_without_transforms(entries, tmp_path, capsys):
+    bag = write(tmp_path / 'bag', entries)
+    out = tmp_path / 'out'
+    assert main([str(bag), '-o', str(out), *PERSON, *SMALL, *FRAME, '--no-smoother']) == 0
+    streams = capsys.readouterr()
+    assert '2 of 2 images tracked' in streams.out
+    lines = [line for line in streams.err.splitlines() if 'gravity_frame' in line]
+    assert len(lines) == 1
+    assert "no transform from gravity_frame 'world' to" in lines[0]
+    assert "there is no frame 'world'; there are: " in lines[0]
+    (first, _) = read(out)['ground']
+    assert ground_of(first.message).up.tolist() == [0.0, -1.0, 0.0]
+
+
+def test_damaged_transforms_are_told_and_left_out(entries, tmp_path, capsys):
+    spoilt = with_transforms(entries)
+    for topic, _, message in spoilt:
+        if topic == '/tf':
+            rotation = message.transforms[0].transform.rotation
+            rotation.x = rotation.y = rotation.z = rotation.w = 0.0
+    bag = write(tmp_path / 'bag', spoilt)
+    out = tmp_path / 'out'
+    assert main([str(bag), '-o', str(out), *PERSON, *SMALL, *FRAME, '--no-smoother']) == 0
+    streams = capsys.readouterr()
+    assert "transform from 'robot' to 'world': its quaternion has length 0, wanted 1" in streams.err
+    assert "there is no frame 'world'" in streams.err
+    assert len(read(out)['ground']) == 2
+
+
+@pytest.mark.parametrize(
+    ('setting', 'line'),
+    [
+        ('gravity=[0, 0, 0]', 'gravity must be three finite numbers, not all zero'),
+        ('gravity=down', "gravity must be a list of numbers, saw 'down'"),
+        ('floor_in_gravity_frame=true', 'floor_in_gravity_frame needs the name of gravity_frame'),
+    ],
+)
+def test_bad_settings(moving, tmp_path, capsys, setting, line):
+    arguments = [str(moving), '-o', str(tmp_path / 'out'), *PERSON, '--set', setting]
+    assert main(arguments) == 1
+    assert line in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.ros
+def test_live_nodes_give_the_same_bytes(replayed, moving, tmp_path):
+    out = tmp_path / 'out'
+    arguments = [str(moving), '-o', str(out), *PERSON, *SMALL, *FRAME, '--with-images']
+    assert main([*arguments, '--no-smoother', '--quiet', '--live']) == 0
+    assert content(out) == content(replayed)

@@ -1,0 +1,116 @@
+"""Gravity over DDS: the filter node hears /tf and /tf_static, on which it publishes itself."""
+
+import numpy as np
+import pytest
+
+from msg_tools import RosbagsMessages
+from msg_tools.messages.ground import ground_of
+from msg_tools.messages.states import transforms_message
+
+pytestmark = pytest.mark.ros
+
+# A camera 1.2 m above the floor that looks down by the angle whose cosine is 0.8.
+ROTATION = np.array([[-1.0, 0.0, 0.0], [0.0, 0.6, -0.8], [0.0, -0.8, -0.6]])
+
+
+def camera_place(stamp, parent='map', child='lens'):
+    return transforms_message(
+        RosbagsMessages(), [parent], [child], ROTATION.T[None], [[0.0, 0.0, 1.2]], stamp
+    )
+
+
+@pytest.fixture
+def world(stub_tracker, subject_file, world_of):
+    from sensor_msgs.msg import CameraInfo, Image
+    from tf2_msgs.msg import TFMessage
+
+    from hmt_ros.nodes.filter_node import FilterNode
+
+    inputs = {'image': Image, 'camera_info': CameraInfo, 'tf': TFMessage, 'tf_static': TFMessage}
+
+    def make(**values):
+        values = {'subject_file': str(subject_file), **values}
+        used = inputs if values.get('gravity_frame') else dict(list(inputs.items())[:2])
+        return world_of(FilterNode, 'filter_node', used, **values)
+
+    return make
+
+
+def test_gravity_of_a_frame(world, small_camera, stub_tracker):
+    from hmt_msgs.msg import Ground
+    from tf2_msgs.msg import TFMessage
+
+    one = world(gravity_frame='map', floor_in_gravity_frame=True)
+    found, transforms = [], []
+    one.listen(Ground, 'ground', found)
+    one.listen(TFMessage, '/tf', transforms)
+    one.start()
+    one.spin_until(lambda: one.node._outputs['ground'].get_subscription_count() == 1)
+    one.send('camera_info', small_camera.info())
+    # A static mount, sent once and kept for those who come late, and a robot that stands.
+    one.send('tf_static', camera_place(0, 'robot'))
+    for index in range(3):
+        place = transforms_message(
+            RosbagsMessages(), ['map'], ['robot'], np.eye(3)[None], [[index, 0.0, 0.5]],
+            small_camera.stamp(index),
+        )  # fmt: skip
+        one.send('tf', place)
+        handled = one.send('image', small_camera.image(index))
+        assert (handled.faults, handled.warnings) == ((), ())
+    one.spin_until(lambda: len(found) == 3 and len(transforms) == 6)
+    for message in found:
+        content = ground_of(message)
+        np.testing.assert_allclose(content.up, [0.0, -0.8, -0.6], atol=1e-12)
+        assert content.frame_id == 'lens'
+        assert np.isclose(content.height, 1.7)
+        assert content.contacts == {'left_foot': 0.75, 'right_foot': 0.0}
+    (tracker,) = stub_tracker.made
+    assert np.isclose(tracker.known_ground.camera_height, 1.7)
+    assert len(tracker.gravities) == 2
+    # What the node itself publishes on /tf is no input.
+    sources = [handled.source for handled in one.handled]
+    assert sources == ['camera_info', 'tf_static', *['tf', 'image'] * 3]
+    assert one.node._session.state.faults == {}
+
+
+def test_without_the_frame_nobody_listens(world, small_camera):
+    one = world(gravity=[0, 1, 0]).start()
+    assert one.node.count_subscribers('/tf') == one.node.count_subscribers('/tf_static') == 0
+    one.send('camera_info', small_camera.info())
+    assert one.send('image', small_camera.image(0)).warnings == ()
+    # Takes effect when the node is configured the next time.
+    assert one.set(gravity_frame='map') == (True, '')
+    assert one.node.count_subscribers('/tf') == 0
+
+
+def test_parameters_of_the_ground(world, stub_tracker, small_camera):
+    one = world(gravity=[0.0, 0.0, 9.81], camera_height=2.0).start()
+    one.assert_refused(
+        ({'gravity': [0.0, 0.0, 0.0]}, 'gravity must be three finite numbers, not all zero'),
+        ({'gravity': [1.0, 2.0]}, 'saw [1.0, 2.0]'),
+        ({'gravity': 'down'}, "gravity must be a list of numbers, saw 'down'"),
+        ({'gravity': ['down']}, "must be a list of numbers, saw ['down']"),
+        ({'camera_height': -1.0}, 'camera_height'),
+        ({'floor_in_gravity_frame': True}, 'needs the name of gravity_frame'),
+    )
+    one.send('camera_info', small_camera.info())
+    one.send('image', small_camera.image(0))
+    assert stub_tracker.made[0].known_ground.camera_height == 2.0
+    np.testing.assert_array_equal(stub_tracker.made[0].known_ground.up, [0.0, 0.0, -1.0])
+    for value, up in (([0, 2, 0], [0.0, -1.0, 0.0]), ([], None)):
+        assert one.set(gravity=value) == (True, '')
+        assert one.node._session.parameters.known_ground.up is None or up is not None
+        assert list(one.node._settings.gravity) == [float(x) for x in value]
+
+
+def test_missing_frames_are_told_once(world, small_camera):
+    one = world(gravity_frame='map', transform_timeout=0.0, status_interval=0).start()
+    one.send('camera_info', small_camera.info())
+    one.send('tf_static', camera_place(0, 'world'))
+    for index in range(3):
+        one.send('image', small_camera.image(index))
+    one.spin_until(lambda: len(one.warnings()) == 1)
+    (warning,) = one.warnings()
+    assert "no transform from gravity_frame 'map' to 'lens'" in warning
+    assert "there is no frame 'map'; there are: lens, world" in warning
+    assert one.node._session.state.faults == {'no transform': 2}

@@ -1,0 +1,219 @@
+"""Gravity from parameters and transforms, as the tracker gets it."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hmt_ros.body.camera import Viewpoint
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.filter_session import CAMERA_INFO, IMAGE, KEYPOINTS, FilterSession
+from hmt_ros.sessions.track_messages import TOPICS
+from hmt_ros.sessions.transform_buffer import TF, TF_STATIC
+from msg_tools import RosbagsMessages
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.ground import ground_of
+from msg_tools.messages.states import transforms_message
+
+
+@pytest.fixture
+def session(stub_tracker, subject_file, outputs):
+    def make(**values):
+        values = {'subject_file': str(subject_file), 'gravity_frame': 'world', **values}
+        return FilterSession(with_values(FilterParameters(), values), outputs.append)
+
+    return make
+
+
+def view(index, *, height=1.2, pitch=0.1):
+    """A camera over a floor that looks down by `pitch` more at each image."""
+    return Viewpoint(distance=4.0, height=height, pitch=pitch * index)
+
+
+def transforms(stamp, *, seen=None, frames=('world', 'lens'), **options):
+    """The camera in the world."""
+    seen = view(0) if seen is None else seen
+    place = seen.to_world(np.zeros(3))
+    return transforms_message(
+        RosbagsMessages(), [frames[0]], [frames[1]], seen.rotation.T[None], place[None], stamp
+    )
+
+
+def at(small_camera, index, **options):
+    return transforms(small_camera.stamp(index), seen=view(index, **options))
+
+
+def up_of(index, pitch=0.1):
+    return [0.0, -np.cos(pitch * index), -np.sin(pitch * index)]
+
+
+def grounds(outputs):
+    return [
+        ground_of(deserialise(output.data, TOPICS['ground'].msgtype))
+        for output in outputs
+        if output.topic == 'ground'
+    ]
+
+
+def test_gravity_of_the_parameters(session, stub_tracker, small_camera, outputs):
+    one = session(gravity_frame='', gravity=[0.0, 1.6, 1.2], camera_height=1.3)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in range(2):
+        # Nobody listens to transforms.
+        one.take(TF, at(small_camera, index))
+        one.take(IMAGE, small_camera.image(index))
+    (tracker,) = stub_tracker.made
+    np.testing.assert_allclose(tracker.known_ground.up, [0.0, -0.8, -0.6])
+    assert tracker.known_ground.camera_height == 1.3
+    assert tracker.gravities == []
+    assert len(grounds(outputs)) == 2
+    np.testing.assert_allclose(grounds(outputs)[0].plane, [0.0, -0.8, -0.6, 1.3])
+
+
+@pytest.mark.parametrize('first', [TF, IMAGE])
+def test_gravity_at_every_image(session, stub_tracker, small_camera, outputs, first):
+    one = session(floor_in_gravity_frame=True, camera_height=3.0)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in range(3):
+        pair = [(TF, at(small_camera, index)), (IMAGE, small_camera.image(index))]
+        for source, message in pair if first == TF else reversed(pair):
+            handled = one.take(source, message)
+        assert 'pose_mixture' in [topic for topic, _ in handled.published]
+        assert handled.warnings == ()
+    (tracker,) = stub_tracker.made
+    np.testing.assert_allclose(tracker.known_ground.up, up_of(0), atol=1e-12)
+    assert np.isclose(tracker.known_ground.camera_height, 1.2)
+    np.testing.assert_allclose(tracker.gravities, [up_of(1), up_of(2)], atol=1e-12)
+    found = [g.up for g in grounds(outputs)]
+    np.testing.assert_allclose(found, [up_of(k) for k in range(3)], atol=1e-12)
+    assert one.state.faults == {}
+
+
+def test_transforms_of_other_times_and_frames_are_joined(session, stub_tracker, small_camera):
+    """world - robot, which moves, - mast - lens, of a static transform."""
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(TF_STATIC, transforms(0, seen=view(0), frames=('mast', 'lens')))
+    one.take(IMAGE, small_camera.image(1))
+    for index in (0.0, 2.0):
+        turned = Rotation.from_euler('x', 0.2 * index).as_matrix()[None]
+        message = transforms_message(
+            RosbagsMessages(),
+            ['world', 'robot'],
+            ['robot', 'mast'],
+            np.concatenate([turned, np.eye(3)[None]]),
+            np.zeros((2, 3)),
+            small_camera.stamp(index),
+        )
+        assert stub_tracker.made == []
+        one.take(TF, message)
+    (tracker,) = stub_tracker.made
+    wanted = view(0).rotation @ Rotation.from_euler('x', -0.2).as_matrix() @ [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(tracker.known_ground.up, wanted, atol=1e-12)
+    # The floor was not asked for.
+    assert tracker.known_ground.camera_height is None
+
+
+def test_missing_transforms_do_not_stop_the_track(session, stub_tracker, small_camera, outputs):
+    one = session(gravity=[0.0, 1.0, 0.0], transform_timeout=0.15)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(TF_STATIC, transforms(0, frames=('map', 'base')))
+    warnings = []
+    for index in range(8):
+        warnings += one.take(IMAGE, small_camera.image(index)).warnings
+    # Each waits for one that is 0.15 s younger.
+    assert len(grounds(outputs)) == 6
+    assert warnings == [
+        f"no transform from gravity_frame 'world' to 'lens' at the image of "
+        f"{small_camera.stamp(0)} ns: there is no frame 'world'; there are: base, map; the track "
+        'goes on with what was known of gravity'
+    ]
+    assert one.state.faults == {'no transform': 6}
+    (tracker,) = stub_tracker.made
+    np.testing.assert_allclose(tracker.known_ground.up, [0.0, -1.0, 0.0])
+    # What waits is not tracked later than it must be.
+    one.take(TF, at(small_camera, 6))
+    assert len(grounds(outputs)) == 7
+    np.testing.assert_allclose(tracker.gravities[-1], up_of(6), atol=1e-12)
+    # A transform of a later time: none of this one comes any more.
+    one.take(TF, transforms(small_camera.stamp(9), frames=('map', 'base')))
+    assert len(grounds(outputs)) == 8
+    np.testing.assert_allclose(tracker.gravities[-1], up_of(6), atol=1e-12)
+
+
+def test_no_image_is_dropped_for_want_of_transforms(session, stub_tracker, small_camera, outputs):
+    one = session(queue_size=2, transform_timeout=60.0)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in range(6):
+        one.take(IMAGE, small_camera.image(index))
+    assert len(grounds(outputs)) == 4
+    assert one.state.counts == {'received': 6, 'tracked': 4}
+
+
+def test_transforms_and_keypoints_are_waited_for_together(session, stub_tracker, small_camera):
+    one = session(use_keypoints=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.take(TF, at(small_camera, 0))
+    assert stub_tracker.made == []
+    one.take(KEYPOINTS, small_camera.keypoints(0))
+    assert len(stub_tracker.made) == 1
+
+
+def test_a_camera_below_the_floor_has_no_height(session, stub_tracker, small_camera):
+    one = session(floor_in_gravity_frame=True, camera_height=1.1)
+    one.take(CAMERA_INFO, small_camera.info())
+    message = at(small_camera, 0)
+    message.transforms[0].transform.translation.z = -0.25
+    one.take(TF, message)
+    handled = one.take(IMAGE, small_camera.image(0))
+    assert handled.faults == ()
+    assert handled.warnings == (
+        "the camera lies 0.25 m below z = 0 of gravity_frame 'world', which can not be the floor",
+    )
+    assert stub_tracker.made[0].known_ground.camera_height == 1.1
+
+
+@pytest.mark.parametrize(
+    ('spoil', 'why'),
+    [
+        (lambda t: setattr(t.transform.translation, 'x', np.nan), 'its numbers are not finite'),
+        (lambda t: setattr(t.transform.rotation, 'w', 7.0), 'its quaternion has length 7'),
+        (lambda t: setattr(t, 'child_frame_id', ''), 'a frame has no name'),
+    ],
+)
+def test_bad_transforms_are_counted(session, small_camera, outputs, spoil, why):
+    one = session(transform_timeout=0.0)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in range(2):
+        bad = at(small_camera, index)
+        rotation = bad.transforms[0].transform.rotation
+        rotation.x, rotation.y, rotation.z, rotation.w = 0.0, 0.0, 0.0, 1.0
+        spoil(bad.transforms[0])
+        handled = one.take(TF, bad)
+        assert handled.faults == ()
+        assert len(handled.warnings) == (index == 0)
+        assert why in one.state.last_fault
+        one.take(IMAGE, small_camera.image(index))
+    one.take(IMAGE, small_camera.image(2))
+    assert len(grounds(outputs)) == 2
+    assert one.state.faults == {'transform': 2, 'no transform': 2}
+
+
+def test_an_empty_message(session, small_camera):
+    message = RosbagsMessages().create('tf2_msgs/msg/TFMessage')
+    for source in (TF, TF_STATIC):
+        handled = session().take(source, message)
+        assert (handled.faults, handled.warnings, handled.stamp_ns) == ((), (), 0)
+
+
+def test_time_that_jumps_back_gives_the_same_again(session, stub_tracker, small_camera, outputs):
+    one = session(reset_on_time_jump=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    for _ in range(2):
+        for index in range(4):
+            one.take(IMAGE, small_camera.image(index))
+            one.take(TF, at(small_camera, index))
+    assert len(stub_tracker.made) == 2
+    half = len(outputs) // 2
+    assert outputs[:half] == outputs[half:]
