@@ -14,7 +14,6 @@ from hmt_ros.body.flesh import Flesh, Superquadric
 from hmt_ros.body.skeleton import Skeleton, sided_pairs
 from hmt_ros.inference.arrays import Array
 
-
 # How a part of the flesh differs from that of the model, column by column: logarithms of factors on
 # the x and y radii, distances by which it exceeds the start and the end of its segment more than
 # the model's, and its shift along the y axis, m.

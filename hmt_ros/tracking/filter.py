@@ -47,6 +47,8 @@ USUAL_GAIN = 0.1
 REVERSED_EVERY = 3
 # How often the shape is fitted to the first image.
 FIRST_FITS = 3
+# Number of the heaviest modes that the shape is estimated from.
+SHAPED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,10 +324,9 @@ class MixtureFilter:
     ) -> Optimised:
         # Each has a precision of its own, where it jumped a lower one.
         own = states.precisions_of(hypotheses.ancestors, hypotheses.jumped, precisions)
-        each = replace(hypotheses, ancestors=np.arange(len(hypotheses)))
-        term = self._posterior.given(observation, each, own)
+        term = self._posterior.given(observation, hypotheses, own)
         solved = self._posterior.minimise(term, hypotheses.poses, self.settings.iterations)
-        hessian = self._posterior.gaussian_hessians(solved, each, own)
+        hessian = self._posterior.gaussian_hessians(solved, hypotheses, own)
         return Optimised(hypotheses, replace(solved, hessian=hessian))
 
     def _search_again(
@@ -437,7 +438,7 @@ class MixtureFilter:
         if observation.evidence:
             alone = self._posterior.covariances(fit, solved.free[rows])
             covariances = alone + self.shape.considered(
-                self._posterior.likelihood, self._believed(observation), poses,
+                self._posterior.likelihood, observation, poses,
                 self._posterior.given_way(poses, observation)[1],
             )  # fmt: skip
         h = optimised.hypotheses[rows]
@@ -524,15 +525,15 @@ class MixtureFilter:
             return False
         if observation.outline is None and observation.keypoints is None:
             return False
-        observation = self._believed(observation)
-        poses, weights = self.modes.poses[:4], np.exp(self.modes.log_weights[:4])
+        best = slice(SHAPED)
+        poses, weights = self.modes.poses, np.exp(self.modes.log_weights[best])
         gradients, covariances = self._posterior.given_way(poses, observation)
         body = self.shape.update(
-            self._posterior.likelihood, observation, poses, weights / weights.sum(),
-            gradients, covariances, trust=trust, dt=self._shape_age,
+            self._posterior.likelihood, observation, poses[best], weights / weights.sum(),
+            gradients[best], covariances[best], trust=trust, dt=self._shape_age,
         )  # fmt: skip
         self._shape_age = 0.0
-        self._posterior.evaluations += len(poses)
+        self._posterior.evaluations += len(weights)
         self._use_body(body)
         return True
 

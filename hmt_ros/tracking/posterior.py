@@ -157,7 +157,7 @@ class Posterior:
     def given(
         self, observation: Observation, hypotheses: Hypotheses, precisions: Array
     ) -> EnergyTerm:
-        """With the motion prior of hypotheses, whose ancestors have precisions (K, d, d)."""
+        """With the motion prior of N hypotheses, of precisions (N, d, d)."""
         h = hypotheses
         known, ground = self.known, self._ground
         if ground is not None and self.stance is not None:
@@ -186,12 +186,11 @@ class Posterior:
 
         A Student density is sharper at its centre than its covariance says.
         """
-        own = precisions[hypotheses.ancestors]
         offset = solved.x - hypotheses.expected
-        distance = np.einsum('ni,nij,nj->n', offset, own, offset)
+        distance = np.einsum('ni,nij,nj->n', offset, precisions, offset)
         prior = self._motion_prior(hypotheses, precisions)
         shrinkage = prior.shrinkage(distance, self.body.dimension)
-        return np.asarray(solved.hessian - (shrinkage - 1.0)[:, None, None] * own)
+        return np.asarray(solved.hessian - (shrinkage - 1.0)[:, None, None] * precisions)
 
     def fit(self, poses: Array, observation: Observation) -> ImageFit:
         """How poses (K, d) explain an image."""
@@ -246,8 +245,7 @@ class Posterior:
         return capture_textures(self.body, self.camera, frames, observation.intensity)
 
     def _motion_prior(self, hypotheses: Hypotheses, precisions: Array) -> Student:
-        own = precisions[hypotheses.ancestors]
-        return Student(hypotheses.expected, own, self.settings.tails)
+        return Student(hypotheses.expected, precisions, self.settings.tails)
 
 
 @dataclass(frozen=True, eq=False)
