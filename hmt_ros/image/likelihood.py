@@ -54,7 +54,7 @@ class LikelihoodSettings(_ImageTerms):  # type: ignore[misc]
     """The terms of the likelihood and of the prior."""
 
     keypoints: TermSettings = KEYPOINTS
-    prior_weight: float = 1.0
+    prior_weight: float = 0.5
     pose_prior: str = LEARNED
     self_intersection_sigma: float = 0.03
 
