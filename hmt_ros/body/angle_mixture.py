@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property, lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -164,7 +164,7 @@ def shipped_prior(body: Body) -> AngleMixture | None:
     )
 
 
-@cache
+@lru_cache(maxsize=16)
 def _shipped(name: str) -> AngleMixture | None:
     file = resources.files('hmt_ros.body') / 'models' / f'{name}_prior.npz'
     if name not in model_names() or not file.is_file():
@@ -198,6 +198,7 @@ def read_pose_prior(path: str | Path, body: Body) -> AngleMixture:
     if (
         name != body.name
         or mounts.shape != skeleton.mounts.shape
+        or mounts.dtype.kind != 'f'
         or not np.allclose(mounts, skeleton.mounts, atol=SAME)
     ):
         raise ValueError(
@@ -206,7 +207,7 @@ def read_pose_prior(path: str | Path, body: Body) -> AngleMixture:
         )
     try:
         return _mixture_of(arrays, skeleton)
-    except (ValueError, TypeError, IndexError) as fault:
+    except (ValueError, TypeError, IndexError, RecursionError) as fault:
         raise ValueError(f'{path}: a damaged pose prior ({fault}); learn it again') from fault
 
 
