@@ -33,7 +33,7 @@ VERSION = 1
 LARGEST_FILE = 10_000_000  # bytes of all arrays; the file that ships has some tens of kB
 MOST_COMPONENTS = 1000
 # Steps of the climb to the highest density, and the step at which it ends, rad.
-CLIMB, ARRIVED = 1000, 1e-9
+CLIMB, ARRIVED = 1000, 1e-7
 SAME = 1e-4  # difference of two rotations at rest that single precision explains
 
 _ARRAYS = ('format', 'version', 'body', 'dofs', 'mounts', 'weights', 'means', 'factors', 'card')
