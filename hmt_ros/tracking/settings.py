@@ -72,8 +72,8 @@ class TrackerSettings:
             values below 1 allow for correlated errors of neighbouring measurements.
         error_correlation: Correlation of the errors of an image, such as a shape that the model
             lacks, with those of the image before.
-        motion: Motion prior: 'learned', where the body ships with one, or 'random_walk' at the rates
-            of the body.
+        motion: Motion prior: 'learned', where the body ships with one, or 'random_walk' at the
+            rates of the body.
         tails: Degrees of freedom of the Student motion prior; small numbers give heavy tails.
         least_log_weight: Smallest log weight of a mode that is kept, nats.
         flesh_images: Number of images from which the widths of the body parts are estimated; 0
