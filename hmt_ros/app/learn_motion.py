@@ -8,7 +8,6 @@ file, in `hmt_ros/body/models`, as BODY_motion.npz.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,7 +62,7 @@ def main(argv: list[str] | None = None) -> int:
     )
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> CommandParser:
     parser = CommandParser(
         prog='learn-motion', description='Learns how the poses of a body move, from motions.'
     )

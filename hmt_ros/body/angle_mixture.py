@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property, lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ VERSION = 1
 LARGEST_FILE = 10_000_000  # bytes of all arrays; the file that ships has some tens of kB
 MOST_COMPONENTS = 1000
 # Steps of the climb to the highest density, and the step at which it ends, rad.
-CLIMB, ARRIVED = 1000, 1e-9
+CLIMB, ARRIVED = 1000, 1e-7
 SAME = 1e-4  # difference of two rotations at rest that single precision explains
 
 _ARRAYS = ('format', 'version', 'body', 'dofs', 'mounts', 'weights', 'means', 'factors', 'card')
@@ -164,7 +164,7 @@ def shipped_prior(body: Body) -> AngleMixture | None:
     )
 
 
-@cache
+@lru_cache(maxsize=16)
 def _shipped(name: str) -> AngleMixture | None:
     file = resources.files('hmt_ros.body') / 'models' / f'{name}_prior.npz'
     if name not in model_names() or not file.is_file():
@@ -198,6 +198,7 @@ def read_pose_prior(path: str | Path, body: Body) -> AngleMixture:
     if (
         name != body.name
         or mounts.shape != skeleton.mounts.shape
+        or mounts.dtype.kind != 'f'
         or not np.allclose(mounts, skeleton.mounts, atol=SAME)
     ):
         raise ValueError(
@@ -206,7 +207,7 @@ def read_pose_prior(path: str | Path, body: Body) -> AngleMixture:
         )
     try:
         return _mixture_of(arrays, skeleton)
-    except (ValueError, TypeError, IndexError) as fault:
+    except (ValueError, TypeError, IndexError, RecursionError) as fault:
         raise ValueError(f'{path}: a damaged pose prior ({fault}); learn it again') from fault
 
 

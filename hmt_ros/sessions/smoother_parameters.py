@@ -35,12 +35,12 @@ class SmootherDynamics:
         model: Motion model: 'random_walk' with the rates of the body, 'constant_velocity', whose
             state has velocities besides the pose and costs several times as much, or 'learned',
             that of the filter: damped velocities that are coupled, where the body ships with them,
-            else the random walk.
+            else the random walk. It costs twice as much as the random walk.
         velocity_time: Time for which a velocity lasts at constant velocity, s; velocities then gain
             so much that after it poses have moved as far as the random walk.
     """
 
-    model: str = 'random_walk'
+    model: str = 'learned'
     velocity_time: float = 0.3
 
     def __post_init__(self) -> None:
@@ -101,7 +101,7 @@ class SmootherParameters(NodeParameters):
     max_trajectories: int = parameter_field(16, NEXT_WINDOW, (1, 1024))
     max_hypotheses: int = parameter_field(8, AT_ONCE, (1, 1024))
     merge_distance: float = parameter_field(1.75, NEXT_WINDOW, (0.0, 100.0))
-    error_correlation: float = parameter_field(0.05, NEXT_WINDOW, (0.0, 100.0))
+    error_correlation: float = parameter_field(0.2, NEXT_WINDOW, (0.0, 100.0))
     random_seed: int = parameter_field(0, NEXT_WINDOW, (0, 2**31 - 1))
     longest_interval: float = parameter_field(0.25, AT_ONCE, (0.0, 3600.0))
     publish_covariances: bool = parameter_field(False, AT_ONCE)

@@ -16,11 +16,11 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, resting
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.ambiguities import ambiguity_classes
 from hmt_ros.tracking.contact import FootContacts
@@ -30,7 +30,7 @@ from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses, relat
 from hmt_ros.tracking.loss import unexplained_share
 from hmt_ros.tracking.motion_states import PredictedStates, fused
 from hmt_ros.tracking.posterior import Posterior, free_covariances
-from hmt_ros.tracking.prediction import follow_flow, predict
+from hmt_ros.tracking.prediction import dynamics_of, follow_flow, predict
 from hmt_ros.tracking.proposals import PROPOSALS, PredictedPoses, Proposal
 from hmt_ros.tracking.proposals.headings import Headings
 from hmt_ros.tracking.proposals.reversals import Reversals
@@ -148,6 +148,11 @@ class MixtureFilter:
         return self._posterior.trust.inverse_temperature
 
     @property
+    def dynamics(self) -> LinearGaussianDynamics:
+        """How modes move by themselves."""
+        return dynamics_of(self.body, self.settings.motion)
+
+    @property
     def begun(self) -> bool:
         """Whether there are modes."""
         return self._modes is not None
@@ -236,7 +241,7 @@ class MixtureFilter:
         """
         s, modes, posterior = self.settings, self.modes, self._posterior
         observation = self._believed(observation)
-        predicted, states = predict(modes, self.body, dt)
+        predicted, states = predict(modes, self.body, self.dynamics, dt)
         covariances, searched = states.pose_covariances, states.searched
         precisions = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
         beta = self.beta
@@ -444,7 +449,7 @@ class MixtureFilter:
         h = optimised.hypotheses[rows]
         if states is None:
             velocities = np.zeros_like(poses)
-            state_covariances = motion_prior(self.body).states(filtered)
+            state_covariances = self.dynamics.states(filtered)
         else:
             found = filtered
             if states.wandered.any() and observation.evidence:

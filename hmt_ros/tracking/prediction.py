@@ -2,7 +2,7 @@
 
     (x, v)_{t+1} ~ N(A (x, v)_t, A S_t A' + Q)
 
-v is the velocity of the mode; A and Q are those of the motion prior of the body (`motion_prior`).
+v is the velocity of the mode; A and Q are those of the motion prior (`motion_prior`).
 The optical flow then corrects the means, before shapes are compared.
 """
 
@@ -19,6 +19,7 @@ from hmt_ros.image.likelihood import ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.energy import Quadratic, Sum
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses
 from hmt_ros.tracking.motion_states import PredictedStates
 from hmt_ros.tracking.posterior import Posterior
@@ -27,15 +28,25 @@ from hmt_ros.tracking.posterior import Posterior
 FLOW_ITERATIONS = 5
 
 
-def predict(modes: Modes, body: Body, dt: float) -> tuple[Hypotheses, PredictedStates]:
+def dynamics_of(body: Body, motion: str) -> LinearGaussianDynamics:
+    """The dynamics of the poses of a body, by the setting `motion`."""
+    if motion == 'learned':
+        return motion_prior(body)
+    return LinearGaussianDynamics.random_walk(body.rates)
+
+
+def predict(
+    modes: Modes, body: Body, dynamics: LinearGaussianDynamics, dt: float
+) -> tuple[Hypotheses, PredictedStates]:
     """Hypotheses that the modes predict, within the limits, and their states.
 
     Args:
         modes: that were selected in the last image.
-        body: with the motion prior and the limits.
+        body: with the limits, and with the rates by which jumps may miss.
+        dynamics: of the modes.
         dt: time since the last image, s.
     """
-    states = predicted_states(modes, modes.state_covariances, body, dt)
+    states = predicted_states(modes, modes.state_covariances, body, dynamics, dt)
     moved = np.clip(states.poses, body.lower, body.upper)
     predicted = replace(
         new_hypotheses(moved, modes.log_weights),
@@ -45,9 +56,10 @@ def predict(modes: Modes, body: Body, dt: float) -> tuple[Hypotheses, PredictedS
     return predicted, states
 
 
-def predicted_states(modes: Modes, covariances: Array, body: Body, dt: float) -> PredictedStates:
+def predicted_states(
+    modes: Modes, covariances: Array, body: Body, dynamics: LinearGaussianDynamics, dt: float
+) -> PredictedStates:
     """States of modes with covariances (K, n, n) after dt seconds."""
-    dynamics = motion_prior(body)
     known = np.concatenate([modes.poses, modes.velocities], axis=1)
     means = known[:, : dynamics.state_dimension]
     has_velocities = dynamics.state_dimension > dynamics.dimension

@@ -10,6 +10,8 @@ from hmt_ros.tracking.proposals import PROPOSALS
 from hmt_ros.tracking.proposals.chain_votes import VOTES
 from hmt_ros.tracking.weighting import REWEIGHTINGS
 
+MOTIONS = ('learned', 'random_walk')
+
 
 @dataclass(frozen=True)
 class LimbSearchSettings:
@@ -71,6 +73,8 @@ class TrackerSettings:
             values below 1 allow for correlated errors of neighbouring measurements.
         error_correlation: Correlation of the errors of an image, such as a shape that the model
             lacks, with those of the image before.
+        motion: Motion prior: 'learned', where the body ships with one, or 'random_walk' at the
+            rates of the body.
         tails: Degrees of freedom of the Student motion prior; small numbers give heavy tails.
         least_log_weight: Smallest log weight of a mode that is kept, nats.
         shape_images: Number of images at the start of a track that are all used to estimate the
@@ -110,6 +114,7 @@ class TrackerSettings:
     iterations: int = 6
     trust: float = 0.35
     error_correlation: float = 0.8
+    motion: str = 'learned'
     tails: float = 8.0
     least_log_weight: float = -14.0
     shape_images: int = 15
@@ -126,6 +131,8 @@ class TrackerSettings:
             raise ValueError(f'proposals must be one of {tuple(PROPOSALS)}, saw {self.proposals!r}')
         if self.reweighting not in REWEIGHTINGS:
             raise ValueError(f'reweighting must be one of {REWEIGHTINGS}, saw {self.reweighting!r}')
+        if self.motion not in MOTIONS:
+            raise ValueError(f'motion must be one of {MOTIONS}, saw {self.motion!r}')
         if self.vote not in VOTES:
             raise ValueError(f'vote must be one of {VOTES}, saw {self.vote!r}')
         if self.max_hypotheses < 1 or self.candidates < self.max_hypotheses:

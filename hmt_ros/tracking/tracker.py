@@ -34,7 +34,7 @@ from hmt_ros.tracking.initialisation import (
     start_from_keypoints,
 )
 from hmt_ros.tracking.point_estimate import PointEstimate
-from hmt_ros.tracking.prediction import predicted_states
+from hmt_ros.tracking.prediction import dynamics_of, predicted_states
 from hmt_ros.tracking.presence import (
     FEWEST_KEYPOINTS,
     MOST_CHANGED,
@@ -360,7 +360,8 @@ class Tracker:
         # What is published of the poses is less certain than what is propagated.
         known[:, :d, :] = known[:, :, :d] = 0.0
         known[:, :d, :d] = modes.covariances
-        states = predicted_states(modes, known, body, dt)
+        dynamics = dynamics_of(body, self.settings.motion)
+        states = predicted_states(modes, known, body, dynamics, dt)
         means = np.clip(states.poses, body.lower, body.upper)
         return GaussianMixture(self.posterior.weights, means, states.pose_covariances)
 

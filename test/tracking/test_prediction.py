@@ -9,7 +9,7 @@ import numpy as np
 from hmt_ros.body import Body
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.tracking.hypotheses import Modes
-from hmt_ros.tracking.prediction import predict
+from hmt_ros.tracking.prediction import dynamics_of, predict
 
 K = 3
 
@@ -42,7 +42,7 @@ def modes_of(body: Body) -> Modes:
 
 def test_modes_move_as_the_motion_prior_of_their_body_says(human37):
     modes = modes_of(human37)
-    predicted, states = predict(modes, human37, 0.04)
+    predicted, states = predict(modes, human37, motion_prior(human37), 0.04)
     dynamics = motion_prior(human37)
     a, q = dynamics.transition(0.04)
     d = human37.dimension
@@ -57,7 +57,7 @@ def test_modes_move_as_the_motion_prior_of_their_body_says(human37):
 
 def test_a_body_of_which_nothing_was_learned_walks_randomly(human32):
     modes = modes_of(human32)
-    predicted, states = predict(modes, human32, 0.04)
+    predicted, states = predict(modes, human32, motion_prior(human32), 0.04)
     np.testing.assert_array_equal(predicted.poses, modes.poses)
     np.testing.assert_allclose(
         states.pose_covariances - modes.filtered,
@@ -68,7 +68,7 @@ def test_a_body_of_which_nothing_was_learned_walks_randomly(human32):
 
 def test_a_prediction_is_its_own_ancestor_and_has_not_jumped(human37):
     modes = modes_of(human37)
-    predicted, _ = predict(modes, human37, 0.1)
+    predicted, _ = predict(modes, human37, motion_prior(human37), 0.1)
     assert predicted.ancestors.tolist() == [0, 1, 2]
     assert not predicted.jumped.any()
     assert predicted.expected is predicted.poses
@@ -78,7 +78,7 @@ def test_a_prediction_is_its_own_ancestor_and_has_not_jumped(human37):
 
 def test_two_predictions_are_one_over_the_sum_of_times(human37):
     modes = modes_of(human37)
-    _, halfway = predict(modes, human37, 0.1)
+    _, halfway = predict(modes, human37, motion_prior(human37), 0.1)
     d = human37.dimension
     there = replace(
         modes,
@@ -86,8 +86,8 @@ def test_two_predictions_are_one_over_the_sum_of_times(human37):
         velocities=halfway.means[:, d:],
         state_covariances=halfway.covariances,
     )
-    _, twice = predict(there, human37, 0.3)
-    _, once = predict(modes, human37, 0.4)
+    _, twice = predict(there, human37, motion_prior(human37), 0.3)
+    _, once = predict(modes, human37, motion_prior(human37), 0.4)
     np.testing.assert_allclose(twice.means, once.means, atol=1e-11)
     np.testing.assert_allclose(twice.covariances, once.covariances, atol=1e-11)
 
@@ -95,5 +95,11 @@ def test_two_predictions_are_one_over_the_sum_of_times(human37):
 def test_predictions_stay_within_the_limits(human37):
     modes = modes_of(human37)
     fast = replace(modes, velocities=np.full_like(modes.poses, 1e9))
-    predicted, _ = predict(fast, human37, 1.0)
+    predicted, _ = predict(fast, human37, motion_prior(human37), 1.0)
     assert np.array_equal(predicted.poses, np.tile(human37.upper, (K, 1)))
+
+
+def test_the_setting_chooses_the_dynamics(human37):
+    assert dynamics_of(human37, 'learned') is motion_prior(human37)
+    walk = dynamics_of(human37, 'random_walk')
+    np.testing.assert_array_equal(walk.diffusion, np.diag(human37.rates))
