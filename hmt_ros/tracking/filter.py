@@ -502,7 +502,8 @@ class MixtureFilter:
             self._posterior.likelihood, observation, poses, weights / weights.sum()
         )
         self._posterior.evaluations += len(poses) * (2 * len(self._flesh.widths) + 1)
-        self._use_body(body)
+        # The likelihood's body lacks the prior that gravity replaces.
+        self._use_body(self.body.with_widths(body.widths))
         return True
 
     def _use_body(self, body: Body) -> None:
