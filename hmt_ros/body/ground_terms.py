@@ -242,8 +242,8 @@ class Upright(NamedTuple):
 
 @lru_cache(maxsize=32)
 def upright_segments(body: Body) -> Upright:
-    """Pelvis and trunk of a body whose root has a prior of its lean; nothing of another."""
-    if not len(root_lean_dofs(body)) or 'neck' not in body.joint_names:
+    """Pelvis and trunk of a body whose root turns about z, y and x; nothing of another."""
+    if not len(_root_turns(body)) or 'neck' not in body.joint_names:
         return Upright(np.zeros(0, dtype=np.intp), np.zeros((0, 3, 3)), np.zeros((0, 3)))
     skeleton = body.skeleton
     neck = skeleton.joint_index(('neck',))[0]
@@ -280,13 +280,17 @@ def _axes(columns: Array, segment: int, along: Array, lean: float) -> Array:
 
 def root_lean_dofs(body: Body) -> Index:
     """The rotations of the root with a prior (L,): how far it leans, against the camera."""
+    turns = _root_turns(body)
+    return np.asarray(turns[np.isfinite(body.prior_sigma[turns])], dtype=np.intp)
+
+
+def _root_turns(body: Body) -> Index:
+    """The rotations of the root if they are those about z, y and x (3,); else none."""
     skeleton = body.skeleton
     root = np.array(skeleton.segment_dofs[0], dtype=np.intp)
     turns = root[skeleton.dof_is_rotation[root]]
     names = [skeleton.dof_names[i] for i in turns]
-    if names != ['root_z', 'root_y', 'root_x']:
-        return np.zeros(0, dtype=np.intp)
-    return np.asarray(turns[np.isfinite(body.prior_sigma[turns])], dtype=np.intp)
+    return turns if names == ['root_z', 'root_y', 'root_x'] else turns[:0]
 
 
 def without_root_lean(body: Body) -> Body:

@@ -225,6 +225,12 @@ def test_weights_of_zero_leave_the_terms_out(body, camera, reaching):
         assert np.array_equal(a, b)
     on = Posterior(body, camera, TrackerSettings(), ground=estimator)
     assert len(on.known) == 1
+    # Also of a body that has lost the prior of its root before.
+    again = Posterior(on.body, camera, TrackerSettings(), ground=estimator)
+    costs = [
+        x.of_image(Observation()).energy(reaching[:1], np.arange(1)).value for x in (on, again)
+    ]
+    assert costs[0] == costs[1]
 
 
 def test_the_lean_is_measured_against_gravity_and_not_against_the_camera(body, camera, reaching):
