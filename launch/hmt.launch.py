@@ -50,6 +50,11 @@ ARGUMENTS = (
     ('image_transport', 'raw', "'raw', or 'compressed' for images on <image>/compressed"),
     ('keypoints', '', 'topic of the keypoints of a 2D detector; empty: none'),
     ('mask', '', 'topic of the masks of a segmenter, without /compressed; empty: none'),
+    (
+        'gravity_frame',
+        '',
+        'frame with z up, such as odom, from which /tf leads to the camera; empty: none',
+    ),
     ('subject_file', '', 'file with the joints in one image; empty: a prediction starts the track'),
     ('background_file', '', 'image of the empty scene; empty: learned from the first images'),
     ('model_file', '', 'model written by train; empty: the one that comes with the package'),
@@ -128,6 +133,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
         'filter_node': {
             **camera,
             **_named(given, 'subject_file'),
+            **_named(given, 'gravity_frame'),
             'use_predictions': 'bme_node' in names,
             'use_keypoints': bool(given['keypoints']),
             'frame_prefix': f'{_frame(namespace)}/',
@@ -209,7 +215,7 @@ def _namespace(given: Mapping[str, str]) -> str:
 
 
 def _named(given: Mapping[str, str], name: str) -> dict[str, str]:
-    """The file that an argument names, as a parameter; empty without a name."""
+    """The file or frame that an argument names, as a parameter; empty without a name."""
     return {name: given[name]} if given[name] else {}
 
 

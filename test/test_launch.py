@@ -630,8 +630,9 @@ def test_policy_allows_what_the_nodes_do_and_nothing_else(started, name):
     allowed = policy()[name]
     found = started.graph(name)
     assert found.keys() == allowed.keys()
-    # Time is subscribed to when it is simulated, and images in one form or the other.
-    optional = {'/clock', '/camera/image_raw'}
+    # Time is subscribed to when it is simulated, images in one form or the other, and transforms
+    # with gravity_frame.
+    optional = {'/clock', '/camera/image_raw', '/tf', '/tf_static'}
     assert allowed['subscribe'] - optional == set(found['subscribe'])
     assert allowed['publish'] == set(found['publish'])
     assert allowed['reply'] == set(found['reply'])

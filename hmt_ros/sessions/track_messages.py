@@ -229,7 +229,8 @@ def _ground_state(track: TrackedImage) -> GroundState:
         ground.up_sigma,
         ground.height,
         math.nan if ground.height is None else ground.height_sigma,
-        track.contacts,
+        # Rounding may take a probability a little out of its range.
+        {foot: min(max(float(p), 0.0), 1.0) for foot, p in track.contacts.items()},
     )
 
 

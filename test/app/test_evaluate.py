@@ -461,3 +461,26 @@ def test_bags_that_can_not_be_used(capsys, tmp_path, bag, body, mixtures, truth_
         assert (code, out, len(errors)) == (1, '', 1), (wanted, errors)
         assert errors[0].startswith('evaluate: ')
         assert wanted in errors[0], errors[0]
+
+
+def test_feet_against_the_floor(tmp_path, body, mixtures, truth_file, capsys):
+    with np.load(truth_file) as known:
+        content = dict(known)
+    content['gravity'] = np.tile([0.0, 1.0, 0.0], (FRAMES, 1))
+    # A floor that is higher than every foot.
+    feet = [i for i, name in enumerate(body.joint_names) if name.endswith(('ankle', 'toe'))]
+    content['camera_height'] = np.full(FRAMES, content['joints'][:, feet, 1].min() - 0.5)
+    content['contact'] = np.ones((FRAMES, 2))
+    truth = tmp_path / 'truth.npz'
+    np.savez(truth, **content)
+    bag = write(tmp_path / 'bag', body, mixtures)
+    assert main([str(bag), '--truth', str(truth), '--quiet', '--json']) == 0
+    found = json.loads(capsys.readouterr().out)['topics']['pose_mixture']['feet']
+    assert found['fraction_below_floor'] == 1.0
+    assert found['below_floor_mm'] > 300.0
+    assert found['sliding_m_per_s'] > 0.0
+    assert found['frames'] == FRAMES
+    assert main([str(bag), '--truth', str(truth), '--quiet']) == 0
+    assert 'pose_mixture: standing ankles slide' in capsys.readouterr().out
+    assert main([str(bag), '--truth', str(truth_file), '--quiet', '--json']) == 0
+    assert 'feet' not in json.loads(capsys.readouterr().out)['topics']['pose_mixture']
