@@ -39,7 +39,13 @@ from hmt_ros.tracking.reliability import SilhouetteRecall
 from hmt_ros.tracking.selection import choose_hypotheses, heads_of_classes
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
-from hmt_ros.tracking.weighting import at_least, inherited_log_weights, normalised, weigh
+from hmt_ros.tracking.weighting import (
+    at_least,
+    cost_of_room,
+    inherited_log_weights,
+    normalised,
+    weigh,
+)
 
 # How far the usual energy follows that of the last image.
 USUAL_GAIN = 0.1
@@ -332,7 +338,8 @@ class MixtureFilter:
         term = self._posterior.given(observation, hypotheses, own)
         solved = self._posterior.minimise(term, hypotheses.poses, self.settings.iterations)
         hessian = self._posterior.gaussian_hessians(solved, hypotheses, own)
-        return Optimised(hypotheses, replace(solved, hessian=hessian))
+        room = cost_of_room(hessian, own, precisions[hypotheses.ancestors], hypotheses.jumped)
+        return Optimised(hypotheses, replace(solved, value=solved.value + room, hessian=hessian))
 
     def _search_again(
         self,

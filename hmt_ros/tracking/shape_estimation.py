@@ -183,5 +183,3 @@ class ShapeEstimate:
         by_shape = np.zeros((len(joints), self._space.size))
         by_shape[:, : self._space.lengths] = np.einsum('mk,mkl->ml', directions, lengths)
         return pull, curvature, by_pose, by_shape
-
-

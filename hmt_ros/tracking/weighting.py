@@ -24,7 +24,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.mixture import GaussianMixture, bhattacharyya_distances
 
 REWEIGHTINGS = ('ancestry', 'bhattacharyya')
@@ -39,6 +39,28 @@ def weigh(log_priors: Array, energies: Array, beta: float) -> Array:
         beta: inverse temperature.
     """
     return log_priors - beta * energies
+
+
+def cost_of_room(hessians: Array, own: Array, usual: Array, jumped: Mask) -> Array:
+    """What the wider motion prior of jumps costs (N,), nats: Occam's factor.
+
+        1/2 log |I + H S_own| - 1/2 log |I + H S_usual|
+
+    H is the curvature of all but the motion prior. What the image does not fix costs nothing.
+
+    Args:
+        hessians: (N, d, d) at the optimum, motion prior included.
+        own: (N, d, d) precisions S_own^-1 of the motion prior of each hypothesis.
+        usual: (N, d, d) of those that have not jumped.
+        jumped: (N, d) what has jumped.
+    """
+    result = np.zeros(len(hessians))
+    rows = np.flatnonzero(jumped.any(1))
+    if len(rows):
+        h, a, b = hessians[rows], own[rows], usual[rows]
+        logs = [np.linalg.slogdet(x)[1] for x in (h, a, h - a + b, b)]
+        result[rows] = np.maximum(0.5 * (logs[0] - logs[1] - logs[2] + logs[3]), 0.0)
+    return result
 
 
 def normalised(log_weights: Array) -> Array:
