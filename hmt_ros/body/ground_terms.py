@@ -30,8 +30,9 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
 
 # Mean lean forwards of trunk and pelvis, and the deviations sideways and forwards or back, rad: the
-# trunk is nearly vertical, the hips lie before the joint of pelvis and spine. Means are those of
-# motion capture, deviations those of people who stand or walk; the tails are for those who bend.
+# trunk is nearly vertical, the hips lie before the joint of pelvis and spine. Means follow medians
+# of the truth of 13 rendered clips, deviations are chosen for people who stand or walk; tails are
+# for those who bend.
 TRUNK_LEAN, TRUNK_SIGMA = np.radians(3.0), (np.radians(5.0), np.radians(7.0))
 PELVIS_LEAN, PELVIS_SIGMA = np.radians(-20.0), (np.radians(8.0), np.radians(12.0))
 # Depth below the floor that costs 1/2, with an exact plane, m.

@@ -15,9 +15,17 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy
-from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker, TrackerSettings
+from hmt_ros.tracking import (
+    GroundSettings,
+    PosePrediction,
+    Status,
+    Subject,
+    Tracker,
+    TrackerSettings,
+)
 
 ONLY_KEYPOINTS = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
+OFF = GroundSettings(0.0, 0.0, 0.0, 0.0)
 FRAME = 100_000_000  # ns
 
 
@@ -144,8 +152,8 @@ def test_heaviest_modes_explain_the_joints(follow, camera, human32, motion, keyp
 def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     follow, camera, human32, motion, keypoints_of
 ):
-    """exp(-beta * energy) at the modes of the posterior, normalised."""
-    tracker, mixtures, _ = follow(frames=4, trust=0.4)
+    """exp(-beta * energy) at the modes of the posterior, normalised, with the ground off."""
+    tracker, mixtures, _ = follow(frames=4, trust=0.4, ground=OFF)
     posterior, likelihood = mixtures[-1]
     seen = Observation(keypoints=keypoints_of(human32, motion[3], 1.0, 3))
     likelihood_of = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).given(seen)
@@ -243,7 +251,7 @@ def test_components_without_weight_start_too(human32, camera, black, motion, key
 def test_modes_move_on_where_nothing_is_seen(human37, camera, black, motion, keypoints_of):
     """Keypoints of 10^5 px say nothing: modes go where their velocities take them."""
     free = replace(ONLY_KEYPOINTS, prior_weight=0.0, self_intersection_sigma=np.inf)
-    settings = keypoint_settings(likelihood=free, max_hypotheses=1)
+    settings = keypoint_settings(likelihood=free, max_hypotheses=1, ground=OFF)
     tracker = Tracker(human37, camera, settings)
     pose = human37.prior_mean.copy()
     pose[:6] = motion[0, :6]
