@@ -14,8 +14,11 @@ from numpy.typing import ArrayLike
 from hmt_ros.body.body import Body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.skeleton import Skeleton, other_side
-from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.arrays import Array, Index, Mask
 
+# A person whose front is turned away from the image plane by less than this is seen from the side,
+# as sine of the angle.
+SIDEWAYS = 0.12
 # Axes of the root's rotations, in the order in which they act.
 ROOT_AXES = 'zyx'
 
@@ -111,3 +114,23 @@ def left_directions(body: Body, poses: Array) -> Array:
     left = joints[:, ends[0]].sum(1) - joints[:, ends[1]].sum(1)
     result: Array = left / np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-12)
     return result
+
+
+def faces_back(body: Body, poses: Array, reference: Array) -> Mask:
+    """Which of poses (N, d) face another way than a reference pose (d,), as silhouettes may have it.
+
+    They face away from it, or one faces the camera where the other turns its back: a turn, seen
+    from the side, may go either way on.
+
+    Raises:
+        ValueError: a body without shoulders and hips.
+    """
+    both = np.concatenate([reference[None], poses])
+    left = left_directions(body, both)
+    joints = body.joint_positions(both)
+    up = joints[:, body.skeleton.joint_index(['neck'])[0]] - joints[:, 0]
+    up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-12)
+    ray = joints[:, 0] / np.linalg.norm(joints[:, 0], axis=1, keepdims=True)
+    away = (np.cross(left, up) * ray).sum(1)
+    apart = (away[1:] * away[0] < 0) & (np.abs(away[1:] - away[0]) > 2 * SIDEWAYS)
+    return np.asarray((left[1:] @ left[0] < 0) | apart, dtype=np.bool_)

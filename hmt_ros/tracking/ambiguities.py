@@ -1,6 +1,6 @@
 """Which large ambiguities tell hypotheses apart: heading, lean of the trunk, legs.
 
-    class = [faces away from the reference] + 2 [trunk leans the other way in depth]
+    class = [faces another way than the reference] + 2 [trunk leans the other way in depth]
             + 4 [legs are exchanged in the image]
 
 A camera hardly tells these apart, and a wrong one does not come right by small steps: each class
@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.mirror import faces_back
 from hmt_ros.inference.arrays import Array, Index
 
 # A trunk that leans less than this out of the image plane leans neither way, as sine of the angle.
@@ -27,8 +28,7 @@ def ambiguity_classes(body: Body, poses: Array, reference: Array) -> Index:
     def at(name: str) -> Array:
         return joints[:, body.skeleton.joint_index([name])[0]]
 
-    left = at('left_shoulder') + at('left_hip') - at('right_shoulder') - at('right_hip')
-    result: Index = (left[1:] @ left[0] < 0).astype(np.intp)
+    result: Index = faces_back(body, poses, reference).astype(np.intp)
     ray = joints[:, 0] / np.linalg.norm(joints[:, 0], axis=1, keepdims=True)
     trunk = at('neck') - joints[:, 0]
     lean = (trunk * ray).sum(1) / np.linalg.norm(trunk, axis=1)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.mirror import left_directions
+from hmt_ros.body.mirror import faces_back, left_directions
 from hmt_ros.inference.arrays import Array, Mask
 
 # Log odds up to which the way is known when the person is seen from the side, and how much better
@@ -34,13 +34,14 @@ class FacingOdds:
 
     def __init__(self) -> None:
         self.log_odds = NEW
-        self._left: Array | None = None
+        self._lead: Array | None = None
+        self._left = np.zeros(3)
 
     def back(self, body: Body, poses: Array) -> Mask:
         """Which of poses (N, d) face the other way than the track did in the last image."""
-        if self._left is None:
+        if self._lead is None:
             return np.zeros(len(poses), dtype=np.bool_)
-        return np.asarray(left_directions(body, poses) @ self._left < 0, dtype=np.bool_)
+        return faces_back(body, poses, self._lead)
 
     def update(self, back: Mask, energies: Array, known: Mask, pose: Array, gamma: float) -> None:
         """Takes in the hypotheses of an image.
@@ -52,7 +53,7 @@ class FacingOdds:
             pose: (3,) line of sight to the person.
             gamma: factor on differences of energies.
         """
-        if self._left is None:
+        if self._lead is None:
             return
         ray = pose / np.linalg.norm(pose)
         most = LEAST + RANGE * (1.0 - float(self._left @ ray) ** 2)
@@ -77,4 +78,5 @@ class FacingOdds:
         lead = int(np.argmax(np.where(back == turned, log_weights, -np.inf)))
         if turned:
             self.log_odds = abs(self.log_odds)
+        self._lead = poses[lead]
         self._left = left_directions(body, poses[lead][None])[0]
