@@ -8,8 +8,9 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm
-from hmt_ros.body.mirror import root_angles, root_rotations
+from hmt_ros.body.mirror import root_angles, root_rotation_dofs, root_rotations
 from hmt_ros.inference.arrays import Array
+from hmt_ros.tracking.ground import IMAGE_UP
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,22 +32,22 @@ class Gravity:
 
     def turned(self, body: Body, poses: Array) -> Array:
         """Poses (N, d) upright in the image, turned the shortest way to be upright in space."""
-        turn = shortest_turn(np.array([0.0, -1.0, 0.0]), self.plane.up)
+        turn = shortest_turn(IMAGE_UP, self.plane.up)
         result = poses.copy()
-        angles = body.dof_names.index('root_z')
-        result[:, angles : angles + 3] = root_angles(body, turn @ root_rotations(body, poses))
+        angles = root_rotation_dofs(body.skeleton)
+        result[:, angles] = root_angles(body, turn @ root_rotations(body, poses))
         return np.clip(result, body.lower, body.upper)
 
 
 def shortest_turn(start: Array, end: Array) -> Array:
     """The rotation (3, 3) by the least angle that takes a unit vector to another.
 
-    Raises:
-        ValueError: they are opposite, so that no rotation is the shortest.
+    Of opposite ones, where no rotation is the shortest, that about the optical axis, as when the
+    camera hangs upside down; they lie in the plane of the image.
     """
     cosine = float(start @ end)
     if cosine <= -1.0 + 1e-9:
-        raise ValueError('gravity points up in the image: is the camera upside down?')
+        return np.diag([-1.0, -1.0, 1.0])
     x, y, z = np.cross(start, end)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     result: Array = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
