@@ -280,9 +280,9 @@ class Tracker:
 
     @property
     def _gravity(self) -> Gravity | None:
-        """What a start knows of gravity."""
-        weight = self.settings.ground.upright_weight
-        return Gravity(self._ground.plane, weight) if weight > 0 else None
+        """What a start knows of gravity; None: nothing, or nothing is made of it."""
+        weight, known = self.settings.ground.upright_weight, self._ground.known.up is not None
+        return Gravity(self._ground.plane, weight) if known and weight > 0 else None
 
     def _new_track(self, body: Body) -> Track:
         return Track(body, self.camera, self.settings, self._seed, self._extra, self._ground)

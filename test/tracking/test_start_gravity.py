@@ -7,12 +7,13 @@ import pytest
 
 from hmt_ros.body import load_body
 from hmt_ros.body.camera import Viewpoint
-from hmt_ros.body.ground_terms import FloorPlane
+from hmt_ros.body.ground_terms import FloorPlane, GroundSettings
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_rotations
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.motion.procedural_motion import procedural_motion
+from hmt_ros.tracking import KnownGround, Tracker, TrackerSettings
 from hmt_ros.tracking.gravity import Gravity, shortest_turn
-from hmt_ros.tracking.ground import UP_SIGMA
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from hmt_ros.tracking.subject import Subject
 
@@ -74,22 +75,40 @@ def test_only_the_lean_costs_at_the_start(body, standing):
     assert all(parts[name] == 0 for name in ('floor', 'balance', 'contact'))
 
 
-def test_a_start_is_upright_where_gravity_is_known(body, camera, keypoints_of, standing):
-    """Stature and lengths are unknown, so that the lean decides among depths of the joints."""
+def test_a_start_is_upright_against_gravity(body, camera, keypoints_of, standing):
+    """Clicks are poor and the size is unknown, so that the lean decides the depths of the joints."""
     keypoints = keypoints_of(body, standing, 3.0)
     subject = Subject(0, keypoints, {}, None)
-    found = {
-        name: start_from_keypoints(body, camera, subject, upright=upright)
-        for name, upright in {
-            'known': Gravity(plane(UP, 0.01)),
-            'unknown': Gravity(plane(np.array([0.0, -1.0, 0.0]), UP_SIGMA)),
-            'camera': None,
-        }.items()
-    }
-    error = {name: lean(body, start.poses[0], standing) for name, start in found.items()}
-    assert error['known'] < 10.0
-    assert error['known'] < error['camera']
-    assert error['unknown'] < error['camera']
-    for start in found.values():
-        assert (np.diff(start.energies) >= 0).all()
-        assert np.linalg.eigvalsh(start.hessians).min() > 0
+    known, camera_axes = (
+        start_from_keypoints(body, camera, subject, upright=upright)
+        for upright in (Gravity(plane(UP, 0.01)), None)
+    )
+    error = lean(body, known.poses[0], standing)
+    assert error < 6.0
+    assert error < lean(body, camera_axes.poses[0], standing)
+    assert (np.diff(known.energies) >= 0).all()
+    assert np.linalg.eigvalsh(known.hessians).min() > 0
+
+
+def test_a_tracker_passes_gravity_to_a_start_only_where_it_is_known(body, camera, monkeypatch):
+    seen = []
+
+    def start(*_, upright, **__):
+        seen.append(upright)
+        raise ValueError('enough')
+
+    monkeypatch.setattr('hmt_ros.tracking.tracker.start_from_keypoints', start)
+    keypoints = Keypoints(('neck',), np.zeros((1, 2)), np.eye(2)[None], np.ones(1))
+    image = np.zeros((camera.height, camera.width, 3), np.uint8)
+    off = TrackerSettings(ground=GroundSettings(upright_weight=0.0))
+    for settings, ground in (
+        (TrackerSettings(), None),
+        (TrackerSettings(), KnownGround(UP)),
+        (off, KnownGround(UP)),
+    ):
+        tracker = Tracker(body, camera, settings, known_ground=ground)
+        tracker.reset(Subject(0, keypoints, {}, None))
+        with pytest.raises(ValueError, match='enough'):
+            tracker.step(image, 1)
+    assert [upright is not None for upright in seen] == [False, True, False]
+    assert np.allclose(seen[1].plane.up, UP)
