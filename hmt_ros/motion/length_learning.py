@@ -100,7 +100,7 @@ def own_skeletons(
     alike = np.abs(rigid[:, None] - rigid[None]).max(2) < ALIKE
     own: dict[str, list[Array]] = {}
     for name, row, copies in zip(people, relative, alike, strict=True):
-        if {people[i] for i in np.flatnonzero(copies)} == {name}:
+        if {people[i] for i in np.flatnonzero(copies).tolist()} == {name}:
             own.setdefault(name, []).append(row)
     names = tuple(sorted(own))
     rows = [np.mean(own[name], axis=0) for name in names]

@@ -76,7 +76,7 @@ def test_only_the_lean_costs_at_the_start(body, standing):
 
 
 def test_a_start_is_upright_against_gravity(body, camera, keypoints_of, standing):
-    """Clicks are poor and the size is unknown, so that the lean decides the depths of the joints."""
+    """Clicks are poor and the size is unknown, so that the lean decides the depths of joints."""
     keypoints = keypoints_of(body, standing, 3.0)
     subject = Subject(0, keypoints, {}, None)
     known, camera_axes = (
