@@ -73,6 +73,7 @@ setup(
             'train = hmt_ros.app.train:main',
             'learn-prior = hmt_ros.app.learn_prior:main',
             'learn-motion = hmt_ros.app.learn_motion:main',
+            'learn-lengths = hmt_ros.app.learn_lengths:main',
             'report = hmt_ros.app.report.command:main',
             'evaluate = hmt_ros.app.evaluate:main',
         ],

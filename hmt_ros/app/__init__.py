@@ -28,6 +28,10 @@ COMMANDS = {
         'hmt_ros.app.learn_motion',
         'learn how poses move, from recorded motions',
     ),
+    'learn-lengths': (
+        'hmt_ros.app.learn_lengths',
+        'learn how lengths vary over people, from the skeletons of motion files',
+    ),
     'report': (
         'hmt_ros.app.report.command',
         'show the mixtures in a bag: pictures, and a page with a 3D view',

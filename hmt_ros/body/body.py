@@ -87,7 +87,8 @@ class Body:
         prior_mean, prior_sigma: (d,) Gaussian prior of each degree of freedom; sigma is inf where
             there is none.
         rates: (d,) variance that each degree of freedom gains per second by itself, m^2 or rad^2.
-        length_sigma: (L,) standard deviation of the lengths over people, m.
+        length_covariance: (L, L) of the lengths over people, or of what is known of this person's,
+            m^2.
         stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra (m,
             at the default lengths; it scales with them).
         default_lengths: (L,) lengths of the model file, m.
@@ -100,7 +101,7 @@ class Body:
     prior_mean: Array
     prior_sigma: Array
     rates: Array
-    length_sigma: Array
+    length_covariance: Array
     stature_lengths: tuple[str, ...]
     stature_extra: float
     default_lengths: Array
@@ -119,6 +120,12 @@ class Body:
         if self.rates.shape != (self.dimension,) or not (self.rates > 0).all():
             raise ValueError(
                 f'{self.name}: rates must be {self.dimension} positive numbers, saw {self.rates}'
+            )
+        count, covariance = len(self.skeleton.lengths), self.length_covariance
+        if covariance.shape != (count, count) or not np.allclose(covariance, covariance.T):
+            raise ValueError(
+                f'{self.name}: length_covariance must be symmetric, {(count, count)}, saw '
+                f'{covariance.shape}'
             )
 
     @property
@@ -177,6 +184,18 @@ class Body:
         return dict(zip(self.skeleton.length_names, map(float, self.skeleton.lengths), strict=True))
 
     @property
+    def length_sigma(self) -> Array:
+        """Standard deviations of the lengths (L,), m."""
+        return np.sqrt(np.diagonal(self.length_covariance))
+
+    @property
+    def stature_rates(self) -> Array:
+        """Derivatives (L,) of the stature with respect to the lengths."""
+        names = self.skeleton.length_names
+        rate = 1.0 + self.stature_extra / self._sum_of(self.default_lengths)
+        return np.array([rate if name in self.stature_lengths else 0.0 for name in names])
+
+    @property
     def stature(self) -> float:
         """Height of the person standing upright, m."""
         return self._sum_of(self.skeleton.lengths) + self.stature_extra * self.scale
@@ -230,7 +249,7 @@ class Body:
         return replace(self, skeleton=self.skeleton.with_lengths(lengths))
 
     def with_stature(self, stature: float) -> Body:
-        """The same body, all lengths scaled so that the person is this tall, m.
+        """The same body, all lengths and their spread scaled so that the person is this tall, m.
 
         Raises:
             ValueError: the stature is not a positive number.
@@ -239,7 +258,8 @@ class Body:
             raise ValueError(f'stature must be a positive number of metres, saw {stature}')
         factor = stature / self.stature
         skeleton = replace(self.skeleton, lengths=self.skeleton.lengths * factor)
-        return replace(self, skeleton=skeleton)
+        covariance = self.length_covariance * factor**2
+        return replace(self, skeleton=skeleton, length_covariance=covariance)
 
     def with_growth(self, growth: ArrayLike) -> Body:
         """The same body with parts that differ otherwise from the model's, (B, 5); see `GROWTH`.

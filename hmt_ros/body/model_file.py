@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body.body import Body, PartShape
+from hmt_ros.body.length_prior import STATURE_SPREAD, length_covariance
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference.arrays import Array
 from msg_tools.files.plain_yaml import load_plain_yaml, read_plain_yaml
@@ -119,8 +120,8 @@ def _mount(entry: dict[str, Any]) -> Array:
 
 
 KEYS = {
-    'name', 'lengths', 'stature', 'stature_extra', 'segments', 'joints', 'keypoint_aliases',
-    'chains', 'fixed',
+    'name', 'lengths', 'stature_spread', 'stature', 'stature_extra', 'segments', 'joints',
+    'keypoint_aliases', 'chains', 'fixed',
 }  # fmt: skip
 SEGMENT_KEYS = {
     'name', 'parent', 'offset', 'points', 'x_axis', 'length', 'diffusion', 'dofs', 'flesh',
@@ -147,6 +148,7 @@ def _build(content: dict[str, Any]) -> Body:
     relative = np.array([float(v[1]) for v in content['lengths'].values()])
     if not (np.isfinite(lengths).all() and np.isfinite(relative).all()):
         raise ValueError(f'lengths must be finite, saw {content["lengths"]}')
+    stature_spread = float(content.get('stature_spread', STATURE_SPREAD))
     for name in content['stature']:
         _named(name, length_names, 'stature:')
     fixed_dofs = {name for entry in content.get('fixed', []) for name, _ in _sides(entry)}
@@ -246,7 +248,7 @@ def _build(content: dict[str, Any]) -> Body:
         prior_mean=np.array(columns[6]),
         prior_sigma=np.array(columns[7]),
         rates=np.array(rates),
-        length_sigma=relative * lengths,
+        length_covariance=length_covariance(lengths, relative, stature_spread),
         stature_lengths=tuple(content['stature']),
         stature_extra=float(content['stature_extra']),
         default_lengths=lengths,

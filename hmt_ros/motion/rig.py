@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.length_prior import length_covariance
 from hmt_ros.body.model_file import read_body
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference.arrays import Array
@@ -213,7 +214,7 @@ def rig_body(rig: Rig, name: str, unit_to_m: float) -> Body:
         prior_mean=np.zeros(len(channels)),
         prior_sigma=np.full(len(channels), np.inf),
         rates=_rates(rig, names),
-        length_sigma=0.05 * values,
+        length_covariance=length_covariance(values, np.full(len(values), 0.05)),
         stature_lengths=tuple(upright),
         stature_extra=SKULL_AND_HEEL * sum(lengths[k] for k in upright),
         default_lengths=values,

@@ -4,7 +4,8 @@
 
 u_j projects joint j of the pose x with the lengths l, which was seen at p_j; the norm is that of
 the keypoint's covariance. From several headings the pose is fitted together with the lengths, each
-length held by what was measured or by its spread over people. The lengths are then fixed, the flips
+length held by what was measured or by its spread over people, and upright against gravity as far
+as that is known. The lengths are then fixed, the flips
 of all limbs that the image and the limits allow are enumerated and fitted again, and the best are
 the first mixture.
 """
@@ -14,11 +15,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.ground_terms import without_root_lean
 from hmt_ros.body.kinematics import forward, joint_length_jacobians, point_jacobians
+from hmt_ros.body.length_prior import held
+from hmt_ros.body.pose_terms import Posed
 from hmt_ros.flips.best_combinations import distinct_poses
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
@@ -29,12 +32,12 @@ from hmt_ros.image.terms.silhouette import Outline
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import Derivatives, EnergyFunction, EnergyTerm, Quadratic
+from hmt_ros.tracking.gravity import Gravity
 from hmt_ros.tracking.subject import Subject
 
-# Standard deviation of a length that was measured on the person, m.
-MEASURED = 0.01
-# Relative standard deviation of all lengths together when the stature is unknown.
-STATURE_SPREAD = 0.06
+# Standard deviation of a length that was measured on the person, and of the stature, which also has
+# a skull and a heel that are not the model's, m.
+MEASURED, STATURE_MEASURED = 0.01, 0.02
 HEADINGS = 8
 
 
@@ -56,17 +59,28 @@ class Start:
 
 
 def start_from_keypoints(
-    body: Body, camera: Camera, subject: Subject, *, prior_weight: float = 1.0
+    body: Body,
+    camera: Camera,
+    subject: Subject,
+    *,
+    prior_weight: float = 1.0,
+    upright: Gravity | None = None,
 ) -> Start:
     """All poses that explain the joints of a subject, and the body with the subject's lengths.
+
+    Args:
+        body: model of the person.
+        camera: that the joints were seen by.
+        subject: joints, and what was measured of the person.
+        prior_weight: factor on the soft prior of the body.
+        upright: what is known of gravity; None: the root leans little against the camera's axes.
 
     Raises:
         ValueError: joints from which no pose can be fitted.
     """
     body = _sized(body, subject)
     keypoints = subject.keypoints
-    measured = np.array([x in subject.segment_lengths for x in body.skeleton.length_names])
-    fits = _fit_with_lengths(body, camera, keypoints, measured, subject.stature is not None)
+    fits = _fit_with_lengths(body, camera, keypoints, upright)
     best = np.argsort(fits.value, kind='stable')[:3]
     if not np.isfinite(fits.value[best[0]]):
         raise ValueError('no pose of the body explains the keypoints: are they in the image?')
@@ -75,11 +89,13 @@ def start_from_keypoints(
     lengths = (weights / weights.sum()) @ fits.x[best, d:]
     body = body.with_segment_lengths(dict(zip(body.skeleton.length_names, lengths, strict=True)))
     spread = np.linalg.inv(fits.hessian[best[0]])[d:, d:]
-    body = replace(body, length_sigma=np.sqrt(np.diagonal(spread)))
+    body = replace(body, length_covariance=0.5 * (spread + spread.T))
 
     least_squares = LikelihoodSettings.of_terms(keypoints=TermSettings(1.0, 1.0, np.inf))
     settings = replace(least_squares, prior_weight=prior_weight)
-    energy = ImageLikelihood(body, camera, settings).given(Observation(keypoints=keypoints))
+    leaning = body if upright is None else without_root_lean(body)
+    image = ImageLikelihood(leaning, camera, settings).given(Observation(keypoints=keypoints))
+    energy = image if upright is None else Posed(body.skeleton, (*image.terms, upright.term(body)))
 
     heads = _distinct(_solve(energy, fits.x[:, :d], body), body, 4)
     trees = [enumerate_flips(body, heads.x, c)[0] for c in (*body.chains, *body.chain_pairs)]
@@ -91,10 +107,12 @@ def start_from_keypoints(
     return Start(body, solved.x[order], solved.value[order], solved.hessian[order])
 
 
-def poses_from_keypoints(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
+def poses_from_keypoints(
+    body: Body, camera: Camera, keypoints: Keypoints, upright: Gravity | None = None
+) -> Array:
     """Poses (M, d) of a body of known lengths that explain the joints of an image."""
     subject = Subject(0, keypoints, dict(body.segment_lengths))
-    return start_from_keypoints(body, camera, subject).poses
+    return start_from_keypoints(body, camera, subject, upright=upright).poses
 
 
 def poses_from_outline(body: Body, camera: Camera, outline: Outline) -> Array:
@@ -115,20 +133,27 @@ def poses_from_outline(body: Body, camera: Camera, outline: Outline) -> Array:
 
 
 def _sized(body: Body, subject: Subject) -> Body:
+    """The body with what was measured on the person, and how well its lengths are known by that."""
     if subject.stature is not None:
         body = body.with_stature(subject.stature)
     known = subject.segment_lengths
-    if not known:
-        return body
-    # What was not measured scales with what was.
     names = body.skeleton.length_names
-    factor = sum(known.values()) / sum(body.segment_lengths[x] for x in known)
-    scaled = {x: body.segment_lengths[x] * factor for x in names if x not in known}
-    return body.with_segment_lengths({**scaled, **known})
+    if known:
+        # What was not measured scales with what was.
+        factor = sum(known.values()) / sum(body.segment_lengths[x] for x in known)
+        scaled = {x: body.segment_lengths[x] * factor for x in names if x not in known}
+        body = body.with_segment_lengths({**scaled, **known})
+    rows = [np.eye(len(names))[[name in known for name in names]]]
+    sigma = [MEASURED] * len(known)
+    if subject.stature is not None:
+        rows.append(body.stature_rates[None])
+        sigma.append(STATURE_MEASURED)
+    covariance = held(body.length_covariance, np.concatenate(rows), sigma)
+    return replace(body, length_covariance=covariance)
 
 
 def _fit_with_lengths(
-    body: Body, camera: Camera, keypoints: Keypoints, measured: NDArray[np.bool_], sized: bool
+    body: Body, camera: Camera, keypoints: Keypoints, upright: Gravity | None
 ) -> Minimum:
     """Fits (pose, lengths) to the joints from several headings; x is (HEADINGS, d + L)."""
     skeleton = body.skeleton
@@ -137,14 +162,12 @@ def _fit_with_lengths(
     seen = np.asarray(np.isfinite(keypoints.pixels).all(1), dtype=np.bool_)
     precision = np.linalg.inv(keypoints.covariances) * seen[:, None, None]
     target = np.where(seen[:, None], keypoints.pixels, 0.0)
-    sigma = np.where(measured, MEASURED, body.length_sigma)
-    length_precision = np.diag(sigma**-2.0)
-    if not sized and not measured.any():
-        # People differ in size first and in proportions second.
-        common = STATURE_SPREAD * skeleton.lengths
-        covariance = np.diag(sigma**2) + np.outer(common, common)
-        length_precision = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-    prior_precision = np.where(np.isfinite(body.prior_sigma), body.prior_sigma, np.inf) ** -2.0
+    sigma = body.length_sigma
+    length_precision = np.asarray(np.linalg.inv(body.length_covariance), dtype=np.float64)
+    leaning, lean = body, None
+    if upright is not None:
+        leaning, lean = without_root_lean(body), upright.term(body)
+    prior_precision = leaning.prior_sigma**-2.0
     default = skeleton.lengths
 
     of_angles = Quadratic(body.prior_mean, prior_precision)
@@ -176,6 +199,12 @@ def _fit_with_lengths(
             value[i] = 0.5 * np.einsum('ja,jab,jb->', error, precision, error)
             gradient[i] = np.einsum('jad,ja->d', weighted, error)
             hessian[i] = np.einsum('jad,jae->de', weighted, jacobian)
+            if lean is not None:
+                of_lean = lean.energy(frames, rows[i : i + 1])
+                slope, curvature = of_lean.derivatives()
+                value[i] += of_lean.value[0]
+                gradient[i, :d] += slope[0]
+                hessian[i, :d, :d] += curvature[0]
         angles = of_angles.energy(poses, rows)
         slope, curvature = angles.derivatives()
         change = lengths - default
@@ -188,7 +217,7 @@ def _fit_with_lengths(
         return value, gradient, hessian
 
     starts = np.concatenate(
-        [_first_guesses(body, camera, keypoints), np.tile(default, (HEADINGS, 1))], axis=1
+        [_first_guesses(body, camera, keypoints, upright), np.tile(default, (HEADINGS, 1))], axis=1
     )
     lower = np.concatenate([body.lower, np.minimum(default - 5 * sigma, 0.5 * default)])
     upper = np.concatenate([body.upper, np.maximum(default + 5 * sigma, 2.0 * default)])
@@ -207,7 +236,9 @@ def _fit_with_lengths(
     )  # fmt: skip
 
 
-def _first_guesses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
+def _first_guesses(
+    body: Body, camera: Camera, keypoints: Keypoints, upright: Gravity | None
+) -> Array:
     """Mean poses at several headings, where the joints are and as far as their spread says."""
     seen = np.asarray(np.isfinite(keypoints.pixels).all(1), dtype=np.bool_)
     pixels = keypoints.pixels[seen]
@@ -227,6 +258,8 @@ def _first_guesses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
     result = np.tile(pose, (HEADINGS, 1))
     turn = body.dof_names.index('root_z')
     result[:, turn] = np.linspace(-np.pi, np.pi, HEADINGS, endpoint=False)
+    if upright is not None:
+        result = upright.turned(body, result)
     turned = body.joint_positions(result)[:, body.skeleton.joint_index(names)]
     result[:, :3] = middle - turned.mean(1)
     return result

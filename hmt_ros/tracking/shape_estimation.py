@@ -56,8 +56,8 @@ class ShapeEstimate:
     """Estimates the shape of one person.
 
     Args:
-        body: that the estimate starts from; its `length_sigma` tells how well its lengths are
-            known.
+        body: that the estimate starts from; its `length_covariance` tells how well its lengths
+            are known.
 
     Attributes:
         covariance: (P, P) of the shape.
@@ -68,9 +68,12 @@ class ShapeEstimate:
         self._space = ShapeSpace(body)
         count = len(self._space.groups)
         lengths = np.maximum(body.length_sigma, LEAST_LENGTH_SIGMA)
+        unknown = lengths**2 - np.diagonal(body.length_covariance)
         grown = np.tile(np.array(list(SPREAD.values())), count)
         self._spread = np.concatenate([lengths, grown])
         self.covariance = np.diag(self._spread**2)
+        own = slice(0, self._space.lengths)
+        self.covariance[own, own] = body.length_covariance + np.diag(unknown)
         self._offset = np.zeros(self._space.size)
         self.images = 0
 

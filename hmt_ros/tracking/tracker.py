@@ -26,6 +26,7 @@ from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.facing import Track
+from hmt_ros.tracking.gravity import Gravity
 from hmt_ros.tracking.ground import Ground, GroundEstimator, KnownGround
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.initialisation import (
@@ -277,6 +278,12 @@ class Tracker:
         """The present posterior."""
         return self.modes.mixture(1.0 - self.settings.error_correlation)
 
+    @property
+    def _gravity(self) -> Gravity | None:
+        """What a start knows of gravity; None: nothing, or nothing is made of it."""
+        weight, known = self.settings.ground.upright_weight, self._ground.known.up is not None
+        return Gravity(self._ground.plane, weight) if known and weight > 0 else None
+
     def _new_track(self, body: Body) -> Track:
         return Track(body, self.camera, self.settings, self._seed, self._extra, self._ground)
 
@@ -413,7 +420,7 @@ class Tracker:
     ) -> _Beginning:
         """The body and the poses that a track begins with."""
         if isinstance(start, Subject):
-            begun = start_from_keypoints(self.model, self.camera, start)
+            begun = start_from_keypoints(self.model, self.camera, start, upright=self._gravity)
             return _Beginning(begun.body, begun.poses, both_ways=False, clicked=start.keypoints)
         if isinstance(start, PosePrediction):
             poses = start.both_ways(start.body)
@@ -449,7 +456,7 @@ class Tracker:
         found = []
         keypoints = observation.keypoints
         if keypoints is not None and np.isfinite(keypoints.pixels).all(1).sum() >= FEWEST_KEYPOINTS:
-            found.append(poses_from_keypoints(self.body, self.camera, keypoints))
+            found.append(poses_from_keypoints(self.body, self.camera, keypoints, self._gravity))
         elif observation.outline is not None:
             found.append(poses_from_outline(self.body, self.camera, observation.outline))
         if prediction is not None:

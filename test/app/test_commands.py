@@ -34,11 +34,12 @@ def test_unknown_commands_are_one_line(arguments, message, capsys):
     assert main(arguments) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
-    assert 'replay, recover, make-bag, train, learn-motion, report, evaluate' in line
+    assert 'train, learn-prior, learn-motion, learn-lengths, report, evaluate' in line
 
 
 @pytest.mark.parametrize(
-    'command', ['replay', 'recover', 'make-bag', 'learn-motion', 'report', 'evaluate']
+    'command',
+    ['replay', 'recover', 'make-bag', 'learn-motion', 'learn-lengths', 'report', 'evaluate'],
 )
 def test_commands_explain_themselves(command, capsys):
     with pytest.raises(SystemExit) as caught:
