@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import sys
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,21 +51,26 @@ EVERY = 12  # images
 QUICK = 2  # clips
 # Of the true silhouettes, to which the flesh is fitted.
 TERM = TermSettings(30.0, 3.0, 8.0)
-MOST_STEPS, LARGEST_STEP, CONVERGED = 15, 0.5, 0.02  # the last two in deviations over people
+SETTINGS = LikelihoodSettings.of_terms(containment=TERM, coverage=TERM)
+MOST_STEPS = 8
+# Of a step, and of a central difference, in deviations over people.
+LARGEST_STEP, DIFFERENCE = 0.8, 0.3
+CONVERGED = 0.02  # share of the energy
 AHEAD = 0.7  # |sine| of the angle around a ring from which a point is in front or behind
 MARGIN = 2  # px from the border of an image
 RINGS_APART = (1, 2, 3)
 FURTHEST = 0.05  # m, of a distance in a correlation
-HEADER = """\
-# How far the contour of a person lies from that of the model at the true pose, as standard deviations
-# in m: at the sides of a part, along the x axis of its segment, and in front and behind, along y.
-#
-# Learned by `python -m benchmarks contour_noise` from {clips} rendered clips of another body than the
-# model's (MuJoCo's humanoid, moved by motion capture of CMU, mocap.cs.cmu.edu): robust deviations of
-# the subtracted silhouettes' outlines from the model's contours, the flesh fitted once to all clips.
-# Neighbouring points err together: the correlation is {first:.2f} from one ring of a part to the next,
-# {second:.2f} and {third:.2f} over two and three, so that {points:.0f} points on the outline are worth {worth:.0f}.
-"""
+HEADER = (
+    'How far the contour of a person lies from that of the model at the true pose, as standard '
+    'deviations in m: at the sides of a part, along the x axis of its segment, and in front and '
+    'behind, along y.',
+    'Learned by `python -m benchmarks contour_noise` from {clips} rendered clips of another body '
+    "than the model's (MuJoCo's humanoid, moved by motion capture of CMU, mocap.cs.cmu.edu): "
+    "robust deviations of the subtracted silhouettes' outlines from the model's contours, the "
+    'flesh fitted once to all clips. Neighbouring points err together: the correlation is '
+    '{first:.2f} from one ring of a part to the next, {second:.2f} and {third:.2f} over two and '
+    'three, so that {points:.0f} points on the outline are worth {worth:.0f}.',
+)
 
 
 class Distances(NamedTuple):
@@ -125,28 +131,57 @@ def posed(folder: Path, every: int = EVERY) -> Posed:
 def fitted_growth(clips: Sequence[Posed]) -> Array:
     """How the groups of parts grow (G, 5) to fit the true silhouettes; poses are held.
 
-    Gauss-Newton, with a Gaussian prior of the deviations `SPREAD`.
+    Levenberg-Marquardt, with a Gaussian prior of the deviations `SPREAD`. The gradient is that of
+    differences: derivatives do not see which points of the contour come to light or are covered.
     """
-    settings = LikelihoodSettings.of_terms(containment=TERM, coverage=TERM)
     groups = len(ShapeSpace(clips[0].body).groups)
     spread = np.tile(np.array([*SPREAD.values()]), groups)
-    growth = np.zeros(len(spread))
+    growth, damping = np.zeros(len(spread)), 0.1
+    least, (gradient, curvature) = energy_of(clips, growth), derivatives_of(clips, growth)
     for _ in range(MOST_STEPS):
-        gradient, curvature = growth / spread**2, np.diag(spread**-2.0)
-        for clip in clips:
-            body = grown(clip.body, growth)
-            grows = slice(ShapeSpace(body).lengths, None)
-            likelihood, estimate = ImageLikelihood(body, clip.camera, settings), ShapeEstimate(body)
-            for pose, observation in zip(clip.poses, clip.observations, strict=True):
-                found = estimate.linearised(likelihood, observation, pose)
-                gradient += found.by_shape[grows]
-                curvature += found.curvature[grows, grows]
-        step = -np.linalg.solve(curvature, gradient)
+        damped = curvature + damping * np.diag(np.diagonal(curvature))
+        step = -np.linalg.solve(damped, gradient)
         furthest = float(np.abs(step / spread).max())
-        growth += step * min(1.0, LARGEST_STEP / max(furthest, 1e-12))
-        if furthest < CONVERGED:
-            break
+        step *= min(1.0, LARGEST_STEP / max(furthest, 1e-12))
+        energy = energy_of(clips, growth + step)
+        if energy < least:
+            growth, damping = growth + step, 0.3 * damping
+            if least - energy < CONVERGED * least:
+                break
+            least, (gradient, curvature) = energy, derivatives_of(clips, growth)
+        else:
+            damping *= 5.0
     return growth.reshape(groups, -1)
+
+
+def energy_of(clips: Sequence[Posed], growth: Array) -> float:
+    """Energy of growth (G * 5,): of the true silhouettes of all clips, and of the prior."""
+    spread = np.tile(np.array([*SPREAD.values()]), len(growth) // len(SPREAD))
+    result = 0.5 * float(((growth / spread) ** 2).sum())
+    for clip in clips:
+        body = grown(clip.body, growth)
+        likelihood = ImageLikelihood(body, clip.camera, SETTINGS)
+        for pose, observation in zip(clip.poses, clip.observations, strict=True):
+            frames = forward(body.skeleton, pose[None])
+            result += float(likelihood.energies(frames, observation, derivatives=False).value[0])
+    return result
+
+
+def derivatives_of(clips: Sequence[Posed], growth: Array) -> tuple[Array, Array]:
+    """Gradient (G * 5,), by central differences, and Gauss-Newton Hessian of the energy."""
+    spread = np.tile(np.array([*SPREAD.values()]), len(growth) // len(SPREAD))
+    gradient, curvature = np.empty(len(growth)), np.diag(spread**-2.0)
+    for i, step in enumerate(DIFFERENCE * np.diag(spread)):
+        rise = energy_of(clips, growth + step) - energy_of(clips, growth - step)
+        gradient[i] = rise / (2.0 * step[i])
+    for clip in clips:
+        body = grown(clip.body, growth)
+        grows = slice(ShapeSpace(body).lengths, None)
+        likelihood, estimate = ImageLikelihood(body, clip.camera, SETTINGS), ShapeEstimate(body)
+        for pose, observation in zip(clip.poses, clip.observations, strict=True):
+            found = estimate.linearised(likelihood, observation, pose)
+            curvature += found.curvature[grows, grows]
+    return gradient, curvature
 
 
 def grown(body: Body, growth: Array) -> Body:
@@ -155,9 +190,7 @@ def grown(body: Body, growth: Array) -> Body:
     return space.moved(np.concatenate([np.zeros(space.lengths), np.ravel(growth)]))
 
 
-def contour_distances(
-    body: Body, camera: Camera, poses: Array, masks: Sequence[Mask]
-) -> Distances:
+def contour_distances(body: Body, camera: Camera, poses: Array, masks: Sequence[Mask]) -> Distances:
     """Of the contour points that no part covers to the outlines of silhouettes, pose by pose."""
     frames = forward(body.skeleton, poses)
     surface, contour = project_surface(body, camera, frames), occluding_contour(body.flesh, frames)
@@ -278,16 +311,20 @@ def as_yaml(result: dict[str, Any]) -> str:
     whole = np.array([*rows.values()], dtype=np.float64)
     rows['other'] = np.nanmedian(whole, axis=0).tolist()
     first, second, third = result['correlations']
-    head = HEADER.format(
-        clips=len(result['clips']), first=first, second=second, third=third,
-        points=result['points'], worth=result['independent_points'],
-    )  # fmt: skip
+    numbers = {
+        'clips': len(result['clips']), 'first': first, 'second': second, 'third': third,
+        'points': result['points'], 'worth': result['independent_points'],
+    }  # fmt: skip
+    head = '\n#\n'.join(
+        textwrap.fill(text.format(**numbers), 100, initial_indent='# ', subsequent_indent='# ')
+        for text in HEADER
+    )
     # A side that was never seen has the other's deviation.
     lines = [
         f'{name}: [{side or ahead:.3f}, {ahead or side:.3f}]'
         for name, (side, ahead) in rows.items()
     ]
-    return head + '\n'.join(lines) + '\n'
+    return '\n'.join([head, *lines, ''])
 
 
 def as_text(result: dict[str, Any]) -> str:

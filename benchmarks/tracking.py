@@ -345,8 +345,7 @@ def errors_by_size(
     errors = np.array([scores_of(record)[HEAVIEST.key] for record in run_all(runs, processes)])
     means = errors.reshape(len(SIZES), -1).mean(1)
     rows = [
-        {'size': size, HEAVIEST.key: float(error)}
-        for size, error in zip(SIZES, means, strict=True)
+        {'size': size, HEAVIEST.key: float(error)} for size, error in zip(SIZES, means, strict=True)
     ]
     largest = float(np.abs(means / means[SIZES.index(1.0)] - 1.0).max())
     return {'clip': folder.name, 'rows': rows, 'largest_difference': largest}

@@ -207,9 +207,7 @@ def test_correlation_along_a_contour():
         assert contour_noise.correlation(found, apart) == pytest.approx(0.6**apart, abs=0.06)
     # Other parts and other images do not count as neighbours.
     split = found._replace(parts=found.rings % 2)
-    assert contour_noise.correlation(split, 2) == pytest.approx(
-        contour_noise.correlation(found, 2)
-    )
+    assert contour_noise.correlation(split, 2) == pytest.approx(contour_noise.correlation(found, 2))
     both = contour_noise.joined([found, found])
     assert len(np.unique(both.images)) == 160
     assert contour_noise.correlation(both, 1) == pytest.approx(contour_noise.correlation(found, 1))

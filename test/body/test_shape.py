@@ -128,7 +128,8 @@ def test_growth_of_a_part(human37):
     before, after = human37.flesh.parts[part], human37.with_growth(growth).flesh.parts[part]
     rx, ry, rz = before.radii
     assert after.radii == pytest.approx((rx * np.exp(0.1), ry * np.exp(-0.2), rz + 0.02))
-    assert after.centre == pytest.approx(np.array(before.centre) + [0, 0.004, 0.01])
+    moved = np.subtract(after.centre, before.centre)
+    assert moved == pytest.approx(np.array([0.0, 0.004, 0.01]))
     # The start (z up) moves by 0.03 and the end by 0.01, each outwards.
     tops = [x.centre[2] + x.radii[2] for x in (before, after)]
     bottoms = [x.centre[2] - x.radii[2] for x in (before, after)]

@@ -39,7 +39,7 @@ def precisions_of(seed, count, d=5):
 
 
 def test_room_costs_what_the_evidence_loses():
-    """Of a measurement where it was expected: -log N(y; m, S_own + R) + log N(y; m, S_usual + R)."""
+    """Of a measurement y at its mean: log N(y; m, S_usual + R) - log N(y; m, S_own + R)."""
     measured, usual = precisions_of(0, 4), precisions_of(1, 4)
     own = usual.copy()
     own[:, :2] *= 0.01
