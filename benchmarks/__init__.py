@@ -9,6 +9,7 @@ from types import ModuleType
 # Benchmark, which is the module of that name: what it measures.
 BENCHMARKS = {
     'bags': 'reading, memory, and what replay adds to the estimate',
+    'contour_noise': 'how far contours of people lie from those of the model',
     'experts': 'conditional densities: a toy, motions of people apart, clips, speed',
     'flips': 'time per leaf of the interpretation trees',
     'kernels': 'the compiled likelihood against vectorised numpy',

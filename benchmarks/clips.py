@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ class Clip:
         truth: where the joints were.
         pixels: stamp -> (J, 2) true image positions of the joints of `truth`.
         background: the empty scene; None: the camera moves.
+        size: against that of the images in the bag.
     """
 
     folder: Path
@@ -56,6 +57,7 @@ class Clip:
     truth: Truth
     pixels: dict[int, NDArray[np.float64]]
     background: NDArray[np.uint8] | None
+    size: float = 1.0
 
     @property
     def name(self) -> str:
@@ -72,6 +74,44 @@ class Clip:
         step = self.stamps[1] - self.stamps[0]
         for i in range(frames):
             yield self.stamps[0] + i * step, self.images[index_back_and_forth(i, len(self.images))]
+
+
+def resized(clip: Clip, size: float) -> Clip:
+    """A clip with images of another size: as a camera with so many times the pixels had seen it.
+
+    Args:
+        clip: with its images as they are in its bag.
+        size: factor on width and height.
+    """
+    c = clip.camera
+    width, height = round(size * c.width), round(size * c.height)
+    across, down = width / c.width, height / c.height
+    centre = at_size(np.array([c.cx, c.cy]), (across, down))
+    camera = replace(
+        c, fx=across * c.fx, fy=down * c.fy, cx=float(centre[0]), cy=float(centre[1]),
+        width=width, height=height,
+    )  # fmt: skip
+
+    def scaled(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        result = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        return np.asarray(result, dtype=np.uint8)
+
+    return replace(
+        clip,
+        camera=camera,
+        images=[scaled(image) for image in clip.images],
+        pixels={stamp: at_size(x, (across, down)) for stamp, x in clip.pixels.items()},
+        background=None if clip.background is None else scaled(clip.background),
+        size=size,
+    )
+
+
+def at_size(pixels: NDArray[np.float64], factors: tuple[float, float]) -> NDArray[np.float64]:
+    """Pixels (..., 2) in an image whose width and height were multiplied by factors.
+
+    The centre of the first pixel is at (0, 0), its corner at (-1/2, -1/2).
+    """
+    return np.asarray((pixels + 0.5) * np.array(factors) - 0.5, dtype=np.float64)
 
 
 def index_back_and_forth(number: int, count: int) -> int:

@@ -259,9 +259,7 @@ def containment(
     )  # fmt: skip
 
 
-def coverage(
-    surface: Surface, outline: Outline, term: TermSettings, sigma: Array
-) -> Residuals:
+def coverage(surface: Surface, outline: Outline, term: TermSettings, sigma: Array) -> Residuals:
     """Points on the outline pay their distance to the nearest contour of the model."""
     match = nearest_contour_points(surface, outline)  # (M, N)
     batch = np.arange(match.shape[1])
@@ -317,9 +315,7 @@ def nearest_contour_points(surface: Surface, outline: Outline) -> Index:
     return np.ascontiguousarray((samples @ features).argmin(2).T)
 
 
-def edges(
-    surface: Surface, image_map: ImageMap, term: TermSettings, sigma: Array
-) -> Residuals:
+def edges(surface: Surface, image_map: ImageMap, term: TermSettings, sigma: Array) -> Residuals:
     """Visible contour points pay their distance to the nearest edge of their direction."""
     bins = image_map.values.shape[0]
     angle = np.arctan2(surface.normals[1], surface.normals[0])

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from benchmarks.clips import ROOT, Clip, read_clip, read_detections
+from benchmarks.clips import ROOT, Clip, at_size, read_clip, read_detections, resized
 from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import (
     EVALUATED_JOINTS,
@@ -42,7 +42,7 @@ from hmt_ros.image.likelihood import OFF
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings, read_subject
+from hmt_ros.tracking import PosePrediction, Subject, Tracker, TrackerSettings, read_subject
 
 Item = TypeVar('Item')
 Result = TypeVar('Result')
@@ -65,6 +65,7 @@ class Run:
         seed: of the tracker.
         changes: settings of the tracker, by their path, that differ from the defaults.
         limit: number of images; None: all.
+        size: of the images against those in the bag; other sizes go with images alone.
     """
 
     folder: Path
@@ -72,6 +73,7 @@ class Run:
     seed: int
     changes: tuple[tuple[str, Any], ...] = ()
     limit: int | None = None
+    size: float = 1.0
 
     @property
     def clip(self) -> str:
@@ -171,8 +173,19 @@ def new_tracker(clip: Clip, body: Body, settings: TrackerSettings, seed: int) ->
     """A tracker that starts with the subject of a clip."""
     background = None if clip.background is None else BackgroundModel.from_image(clip.background)
     tracker = Tracker(body, clip.camera, settings, background, seed)
-    tracker.reset(read_subject(clip.subject, body))
+    tracker.reset(subject_of(clip, body))
     return tracker
+
+
+def subject_of(clip: Clip, body: Body) -> Subject:
+    """The subject of a clip, with its keypoints where they are in images of the clip's size."""
+    subject = read_subject(clip.subject, body)
+    if clip.size == 1.0:
+        return subject
+    known = subject.keypoints
+    pixels = at_size(known.pixels, (clip.size, clip.size))
+    moved = replace(known, pixels=pixels, covariances=clip.size**2 * known.covariances)
+    return replace(subject, keypoints=moved)
 
 
 def run(one: Run) -> Record:
@@ -182,6 +195,10 @@ def run(one: Run) -> Record:
         ValueError: the clip can not be read, or lacks what the run needs.
     """
     clip, body = read_clip(one.folder, one.limit), load_body('human37')
+    if one.size != 1.0:
+        if one.inputs != IMAGES:
+            raise ValueError(f'keypoints are for images of size 1, saw {one.size}')
+        clip = resized(clip, one.size)
     settings = changed(one.changes)
     keypoints = None if one.inputs == IMAGES else read_detections(one.folder).keypoints
     if one.inputs == KEYPOINTS:

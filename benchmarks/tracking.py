@@ -30,7 +30,7 @@ from hmt_ros.tracking import TrackerSettings
 
 Array = NDArray[np.float64]
 
-PARTS = ('accuracy', 'ablations', 'oracle', 'speed')
+PARTS = ('accuracy', 'ablations', 'sizes', 'oracle', 'speed')
 SEEDS = (0, 1, 2)
 # Clips that settings of the tracker were chosen on.
 CHOSEN = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'follow')
@@ -42,6 +42,8 @@ ABLATIONS: tuple[tuple[str, Any], ...] = (
     ('reweighting', 'bhattacharyya'),
 )
 TIMED = 'walk'  # if it is there
+SIZED = 'signals'  # if it is there
+SIZES = (0.25, 0.5, 1.0)  # of the images
 QUICK = 20  # images a clip
 
 
@@ -193,6 +195,9 @@ def measure(
         result['against'] = comparison(runs, against, processes)
     if 'ablations' in parts:
         result['ablations'] = ablations(folders, limit, processes)
+    if 'sizes' in parts:
+        sized = next((folder for folder in folders if folder.name == SIZED), folders[0])
+        result['sizes'] = errors_by_size(sized, seeds, limit, processes)
     if 'oracle' in parts:
         result['oracle'] = oracle(folders, limit, processes)
     still = [folder for folder in folders if (folder / 'background.png').is_file()]
@@ -332,6 +337,20 @@ def ablations(folders: Sequence[Path], limit: int | None, processes: int = 0) ->
     return {'clips': [folder.name for folder in folders], 'rows': rows}
 
 
+def errors_by_size(
+    folder: Path, seeds: Sequence[int], limit: int | None, processes: int = 0
+) -> dict[str, Any]:
+    """Errors on a clip with smaller images, images alone; differences are relative to the whole."""
+    runs = [Run(folder, IMAGES, seed, limit=limit, size=size) for size in SIZES for seed in seeds]
+    errors = np.array([scores_of(record)[HEAVIEST.key] for record in run_all(runs, processes)])
+    means = errors.reshape(len(SIZES), -1).mean(1)
+    rows = [
+        {'size': size, HEAVIEST.key: float(error)} for size, error in zip(SIZES, means, strict=True)
+    ]
+    largest = float(np.abs(means / means[SIZES.index(1.0)] - 1.0).max())
+    return {'clip': folder.name, 'rows': rows, 'largest_difference': largest}
+
+
 # What is printed.
 
 
@@ -361,6 +380,16 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         found = result['ablations']
         parts.append(f'Images alone, seed 0; mean over {", ".join(found["clips"])}.')
         parts.append(_table_of_ablations(found['rows'], markdown))
+    if 'sizes' in result:
+        found = result['sizes']
+        rows = [['size of the images', 'heaviest, mm']]
+        rows += [[f'{x["size"]:g}', HEAVIEST.cell(x[HEAVIEST.key])] for x in found['rows']]
+        difference = 100.0 * found['largest_difference']
+        parts.append(
+            f'{found["clip"]} with smaller images, images alone: '
+            f'the error differs by {difference:.0f} % at most.'
+        )
+        parts.append(table(rows, markdown=markdown))
     if 'oracle' in result:
         parts.append(oracle_as_text(result['oracle'], markdown=markdown))
     if 'speed' in result:

@@ -8,14 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import bags, flips, kernels, kjs, nodes, votes
+from benchmarks import bags, contour_noise, flips, kernels, kjs, nodes, votes
 from benchmarks.__main__ import main
 from benchmarks.clips import find_clips, read_clip, table
 from benchmarks.command import run_stages
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.stages import StageClock
-from hmt_ros.body import load_body
+from hmt_ros.body import Camera, load_body
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.flips.interpretation_tree import enumerate_flips
+from hmt_ros.rendering.renderer import render_frames
+from hmt_ros.rendering.scene import Scene
+from msg_tools.files.plain_yaml import read_plain_yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -176,6 +180,84 @@ def test_votes():
     assert summary == {'best_mm': 2.0, 'best_mm_error': 1.0}
 
 
+def test_robust_deviations_are_those_of_most_values():
+    rng = np.random.default_rng(0)
+    values = 0.01 * rng.normal(size=4000)
+    values[:200] += 1.0
+    assert contour_noise.robust_deviation(values) == pytest.approx(0.01, rel=0.1)
+
+
+def drawn_distances(rho, images=80, rings=40):
+    """Distances along one part whose neighbours correlate by rho, over two that are apart."""
+    rng = np.random.default_rng(1)
+    values = np.empty((images, rings))
+    values[:, 0] = rng.normal(size=images)
+    for r in range(1, rings):
+        values[:, r] = rho * values[:, r - 1] + np.sqrt(1 - rho**2) * rng.normal(size=images)
+    index = np.arange(images * rings)
+    return contour_noise.Distances(
+        0.005 * values.ravel(), np.zeros(len(index), dtype=int),
+        np.zeros(len(index), dtype=bool), index % rings, index // rings,
+    )  # fmt: skip
+
+
+def test_correlation_along_a_contour():
+    found = drawn_distances(0.6)
+    for apart in (1, 2, 3):
+        assert contour_noise.correlation(found, apart) == pytest.approx(0.6**apart, abs=0.06)
+    # Other parts and other images do not count as neighbours.
+    split = found._replace(parts=found.rings % 2)
+    assert contour_noise.correlation(split, 2) == pytest.approx(contour_noise.correlation(found, 2))
+    both = contour_noise.joined([found, found])
+    assert len(np.unique(both.images)) == 160
+    assert contour_noise.correlation(both, 1) == pytest.approx(contour_noise.correlation(found, 1))
+    assert contour_noise.independent_points(80, [0.59, 0.39, 0.3]) == pytest.approx(22.5, abs=0.1)
+
+
+def test_distances_of_contours_to_outlines(body):
+    """Of silhouettes that are moved to the left by 2 px, at the sides of a person who stands."""
+    camera = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
+    poses = np.zeros((1, body.dimension))
+    poses[0, 2] = 3.5
+    scene = Scene(viewpoint=Viewpoint(distance=3.5), seed=2)
+    (frame,) = render_frames(body, poses, camera, scene)
+    found = contour_noise.contour_distances(body, camera, poses, [frame.mask])
+    assert len(found.values) > 30
+    assert abs(np.median(found.values)) < 1.0 / camera.magnification(3.5)
+    moved = np.roll(frame.mask, -2, axis=1)
+    other = contour_noise.contour_distances(body, camera, poses, [moved])
+    assert np.array_equal(other.rings, found.rings)
+    change = camera.magnification(3.5) * (other.values - found.values)
+    assert change.max() > 1.5
+    assert change.min() < -1.5
+    assert np.abs(change).max() < 3.0
+
+
+def test_the_file_of_contour_noise_is_that_which_is_read(body, tmp_path):
+    found = drawn_distances(0.6)
+    found = found._replace(
+        parts=found.images % len(body.shapes), ahead=found.images // len(body.shapes) % 2 == 1
+    )
+    groups = len(dict.fromkeys(contour_noise.groups_of(body)))
+    numbers = contour_noise.summary(found, body, np.zeros((groups, 5)))
+    result = {'clips': ['walk', 'kick'], **numbers}
+    path = tmp_path / 'noise.yaml'
+    path.write_text(contour_noise.as_yaml(result))
+    content = read_plain_yaml(path, 10_000)
+    assert list(content) == [*numbers['groups'], 'other']
+    shipped = ROOT / 'hmt_ros' / 'image' / 'contour_noise.yaml'
+    assert sorted(content) == sorted(read_plain_yaml(shipped, 10_000))
+    for sides in content.values():
+        assert sides == pytest.approx([0.005, 0.005], abs=0.0015)
+    assert 'walk, kick' in contour_noise.as_text(result)
+
+
+def test_without_the_clips_contour_noise_is_skipped(tmp_path, capsys):
+    assert contour_noise.main(['--clips', str(tmp_path)]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f'contour_noise: skipped, {tmp_path} lacks walk, charleston')
+
+
 def test_tables():
     rows = [['name', 'a'], ['long name', '1'], ['b', '22']]
     assert table(rows).splitlines() == ['name        a', 'long name   1', 'b          22']
@@ -189,8 +271,8 @@ def test_command_line(capsys, tmp_path):
     assert 'tracking' in capsys.readouterr().out
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
-        "benchmarks: no 'flops', wanted one of bags, experts, flips, kernels, kjs, "
-        'motion_prior, nodes, smoothing, soak, tracking, votes'
+        "benchmarks: no 'flops', wanted one of bags, contour_noise, experts, flips, "
+        'kernels, kjs, motion_prior, nodes, smoothing, soak, tracking, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks import tracking, tracking_oracle, tracking_speed
-from benchmarks.clips import LANDMARK_NAMES, read_clip, rounded
+from benchmarks.clips import LANDMARK_NAMES, read_clip, resized, rounded
 from benchmarks.runs import (
     BOTH,
     IMAGES,
@@ -25,7 +25,9 @@ from benchmarks.runs import (
     new_tracker,
     read_record,
     run_all,
+    subject_of,
 )
+from benchmarks.runs import run as run_one
 from benchmarks.stages import STAGES
 from benchmarks.tracking_scores import (
     acceleration_ratio,
@@ -458,6 +460,40 @@ def test_ablations_share_the_usual_runs(quick_runs, monkeypatch):
         {'clips': 'here', 'seeds': [0], 'without_keypoints': [], 'ablations': found}, markdown=True
     )
     assert sum(line.startswith('| max_hypotheses |') for line in text.splitlines()) == 2
+
+
+def test_smaller_images_are_those_of_a_camera_with_fewer_pixels(clip, body):
+    small = resized(clip, 0.5)
+    assert small.camera.width == clip.camera.width // 2
+    assert small.images[0].shape == (small.camera.height, small.camera.width, 3)
+    assert small.background.shape == small.images[0].shape
+    stamp = clip.stamps[0]
+    points = clip.truth.joints[stamp]
+    before, after = (x.camera.project(points) - x.pixels[stamp] for x in (clip, small))
+    assert np.allclose(after, 0.5 * before, atol=1e-9)
+    whole, half = (subject_of(x, body).keypoints for x in (clip, small))
+    assert np.allclose(half.pixels + 0.5, 0.5 * (whole.pixels + 0.5))
+    assert np.allclose(half.covariances, 0.25 * whole.covariances)
+    run = Run(REACH, IMAGES, 0, limit=2)
+    assert name_of(run) != name_of(replace(run, size=0.5))
+    with pytest.raises(ValueError, match=r'size 1, saw 0\.5'):
+        run_one(replace(run, inputs=KEYPOINTS, size=0.5))
+
+
+def test_errors_by_size(monkeypatch):
+    errors = {0.25: (150.0, 130.0), 0.5: (90.0, 110.0), 1.0: (100.0, 100.0)}
+    monkeypatch.setattr(tracking, 'run_all', lambda runs, _processes=0: runs)
+    monkeypatch.setattr(
+        tracking, 'scores_of', lambda one: {'heaviest_mm': errors[one.size][one.seed]}
+    )
+    found = tracking.errors_by_size(REACH, (0, 1), 2)
+    assert [row['heaviest_mm'] for row in found['rows']] == [140.0, 100.0, 100.0]
+    assert found['largest_difference'] == pytest.approx(0.4)
+    text = tracking.as_text(
+        {'clips': 'here', 'seeds': [0, 1], 'without_keypoints': [], 'sizes': found}
+    )
+    assert 'reach with smaller images' in text
+    assert '40 % at most' in text
 
 
 def test_the_oracle_starts_at_the_truth():

@@ -1,7 +1,7 @@
 """The soles: where the flesh of the feet meets a floor, and where it rests.
 
 The points of a foot are those of its flesh that lie farthest down when the foot is flat and pitched
-by `PITCH` up (heel) or down (toe). They move with the flesh when its widths and lengths change.
+by `PITCH` up (heel) or down (toe). They move with the flesh when the shape changes.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, make_dataclass, replace
+from dataclasses import dataclass, field, make_dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
@@ -24,7 +24,7 @@ from hmt_ros.body.kinematics import Frames
 from hmt_ros.body.pose_prior import LEARNED, check_kind, pose_prior
 from hmt_ros.body.pose_terms import FrameTerm, Posed, SelfIntersection
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.surface import flesh_table_of, grown, lens_of
+from hmt_ros.image.surface import flesh_table_of, lens_of
 from hmt_ros.image.terms.image_term import Request, TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import KEYPOINTS, KeypointTerm
 from hmt_ros.image.terms.registry import (
@@ -234,16 +234,6 @@ class ImageLikelihood:
                 np.zeros(len(TERMS)), result,
             )  # fmt: skip
         return result[1 : 1 + int(result[0, 0])]
-
-    def with_growth(self, growth: Array) -> ImageLikelihood:
-        """The likelihood of a body whose parts have grown by (B, 5) more; see `body.GROWTH`.
-
-        Made from what is compiled for this one: much cheaper than from a body with other flesh,
-        which `body` does not become.
-        """
-        result = replace(self)
-        result.__dict__['_model'] = self._model._replace(flesh=grown(self._model.flesh, growth))
-        return result
 
     def _inputs(
         self, observation: Observation, poses: int, explained: Array | None, *, textured: bool

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hmt_ros.body.body import LEAST_HEIGHT, Body
+from hmt_ros.body.body import Body
 from hmt_ros.body.camera import NEAR, Camera
 from hmt_ros.inference.arrays import Array, Mask
 from msg_tools.files.plain_yaml import load_plain_yaml
@@ -120,33 +120,6 @@ def _contour_noise(body: Body) -> Array:
     known, names = _noise_of_parts(), body.skeleton.segment_names
     plain = [names[p.segment].removeprefix('left_').removeprefix('right_') for p in body.shapes]
     return np.array([known.get(name, known['other']) for name in plain]).reshape(-1, 2)
-
-
-def grown(flesh: FleshTable, growth: Array) -> FleshTable:
-    """The flesh with parts that have grown by (B, 5) more; see `body.GROWTH`.
-
-    The same as of a body with more growth, at a fraction of the time.
-    """
-    of_ring = flesh.ring_parts
-    factors = np.exp(growth[:, :2])
-    radii, centres = flesh.part_radii.copy(), flesh.part_centres.copy()
-    radii[:, :2] *= factors
-    radii[:, 2] = np.maximum(radii[:, 2] + 0.5 * (growth[:, 2] + growth[:, 3]), LEAST_HEIGHT)
-    centres[:, 1] += growth[:, 4]
-    centres[:, 2] += 0.5 * (growth[:, 2] - growth[:, 3])
-    stretch = (radii[:, 2] / flesh.part_radii[:, 2])[of_ring]
-    rings = flesh.ring_centres.copy()
-    rings[:, 1] += growth[of_ring, 4]
-    along = flesh.ring_centres[:, 2] - flesh.part_centres[of_ring, 2]
-    rings[:, 2] = centres[of_ring, 2] + along * stretch
-    return flesh._replace(
-        part_centres=centres,
-        part_radii=radii,
-        ring_centres=rings,
-        ring_radii=flesh.ring_radii * factors[of_ring],
-        ring_slopes=flesh.ring_slopes / stretch[:, None],
-        ring_leans=flesh.ring_leans / stretch[:, None],
-    )
 
 
 @njit(cache=True, nogil=True)

@@ -67,7 +67,7 @@ class Track:
 
     @property
     def body(self) -> Body:
-        """The person, with what has been estimated of lengths and widths."""
+        """The person, with what has been estimated of lengths and flesh."""
         return self._first.body
 
     @property

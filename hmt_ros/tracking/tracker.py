@@ -220,7 +220,7 @@ class Tracker:
 
     @property
     def body(self) -> Body:
-        """The person, with what has been estimated of lengths and widths."""
+        """The person, with what has been estimated of lengths and flesh."""
         return self._track.body
 
     @property
@@ -450,7 +450,7 @@ class Tracker:
     ) -> Array | None:
         """Poses (N, d) that a lost track starts anew from, by an image alone; None: it shows none.
 
-        The body keeps its lengths and widths. From keypoints come all poses that explain them, from
+        The body keeps its lengths and flesh. From keypoints come all poses that explain them, from
         a silhouette mean poses of several headings at its place, and what was predicted.
         """
         found = []

@@ -128,3 +128,18 @@ def test_equidistant_with_zero_coefficients_is_still_a_fisheye():
         points[:, None], np.zeros((3, 1)), np.zeros((3, 1)), camera.matrix, np.zeros(4)
     )
     np.testing.assert_allclose(camera.project(points), expected[:, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize('depth', [0.5, 2.0, 7.0])
+def test_magnification_is_pixels_for_a_metre(depth):
+    camera = Camera(600.0, 600.0, 320.0, 240.0, 640, 480)
+    a, b = camera.project([[0.0, 0.1, depth], [0.01, 0.1, depth]])
+    assert camera.magnification(depth) == pytest.approx((b - a)[0] / 0.01)
+    wide = Camera(600.0, 150.0, 320.0, 240.0, 640, 480)
+    # The area of a square metre is right where the pixels are not square.
+    assert wide.magnification(depth) ** 2 == pytest.approx(600.0 * 150.0 / depth**2)
+
+
+@pytest.mark.parametrize('depth', [0.0, -1.0])
+def test_magnification_behind_the_camera_is_finite(depth):
+    assert 0 < Camera(600.0, 600.0, 320.0, 240.0, 640, 480).magnification(depth) < np.inf

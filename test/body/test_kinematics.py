@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.kinematics import (
     assemble,
+    directed_derivatives,
     forward,
     joint_length_jacobians,
+    origin_length_jacobians,
     point_jacobians,
     segment_sums,
 )
@@ -130,6 +132,18 @@ def test_length_jacobians_equal_central_differences(body, random_poses):
         np.testing.assert_allclose(jacobians[..., k], difference / (2 * STEP), atol=1e-8)
 
 
+def test_origins_of_segments_move_with_the_lengths(body, random_poses):
+    poses = random_poses(body, 3, 6)
+    jacobians = origin_length_jacobians(body.skeleton, forward(body.skeleton, poses))
+    assert jacobians.shape == (len(body.skeleton.parents), 3, len(body.segment_lengths), 3)
+    for k, (name, length) in enumerate(body.segment_lengths.items()):
+        ahead, behind = (
+            forward(body.with_segment_lengths({name: length + x}).skeleton, poses).origins
+            for x in (STEP, -STEP)
+        )
+        np.testing.assert_allclose(jacobians[:, :, k], (ahead - behind) / (2 * STEP), atol=1e-8)
+
+
 def random_points(body: Body, poses: np.ndarray, per_segment: int, seed: int):
     rng = np.random.default_rng(seed)
     segments = np.repeat(np.arange(len(body.skeleton.parents)), per_segment)
@@ -170,6 +184,14 @@ def test_point_jacobians_equal_central_differences(body, random_poses):
             forward(body.skeleton, poses + x).points(segments, local) for x in (step, -step)
         )
         np.testing.assert_allclose(jacobian[:, k], (ahead - behind) / (2 * STEP), atol=1e-8)
+
+
+def test_directed_derivatives_equal_the_jacobians(body, random_poses):
+    rng, segments, frames, points = random_points(body, random_poses(body, 1, 11), 3, 12)
+    directions = rng.normal(size=(len(segments), 3))
+    found = directed_derivatives(frames, segments, points[..., 0], directions)
+    jacobian = point_jacobians(frames, segments, points)[..., 0]
+    np.testing.assert_allclose(found, np.einsum('mdi,mi->md', jacobian, directions), atol=1e-12)
 
 
 @given(seed=st.integers(0, 2**32 - 1), name=st.sampled_from(sorted(BODIES)))

@@ -118,6 +118,32 @@ def test_a_segment_without_a_diffusion_has_that_of_its_parent(tmp_path):
     assert {name: rates[name] for name in wanted} == pytest.approx(wanted)
 
 
+def of_segment(content, name):
+    return next(x for x in content['segments'] if x['name'] == name)
+
+
+def test_flesh_grows_with_the_length_that_its_size_names(tmp_path):
+    def change(content):
+        of_segment(content, 'trunk')['flesh']['size'] = 'hip_width'
+        of_segment(content, '{side}_thigh')['flesh'].pop('size', None)
+
+    body = load_body(write(tmp_path / 'own.yaml', change))
+    names = body.skeleton.length_names
+    of = {body.skeleton.segment_names[x.segment]: x for x in body.shapes}
+    assert names[of['trunk'].size] == 'hip_width'
+    # Without an entry a part grows with the length of its segment.
+    assert names[of['left_thigh'].size] == names[of['right_thigh'].size] == 'thigh'
+
+
+def test_flesh_of_an_unknown_size_is_refused(tmp_path):
+    path = write(
+        tmp_path / 'wrong.yaml',
+        lambda c: of_segment(c, 'pelvis')['flesh'].update(size='girth'),
+    )
+    with pytest.raises(ValueError, match=r'wrong\.yaml.*girth'):
+        load_body(path)
+
+
 def test_a_misspelt_entry_of_a_segment_is_refused(tmp_path):
     """`dof` instead of `dofs` would silently give a stiff joint."""
 

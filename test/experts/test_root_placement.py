@@ -144,7 +144,7 @@ def test_samples_of_the_placed_gaussian_have_the_box(body: Body, poses: np.ndarr
 def test_a_body_without_flesh_is_refused(body: Body, poses: np.ndarray) -> None:
     from dataclasses import replace
 
-    bare = replace(body, shapes=(), widths=())
+    bare = replace(body, shapes=(), growth=())
     encoding = PoseEncoding(bare)
     place = seen(body, poses[:1])[0]
     with pytest.raises(ValueError, match='no flesh'):

@@ -249,5 +249,5 @@ def test_what_does_not_go_together_is_refused(body, pose):
 
 def test_bodies_without_flesh_or_torso(pose):
     body = load_body('human34')
-    bare = replace(body, shapes=(), widths=())
+    bare = replace(body, shapes=(), growth=())
     assert full_body_flips(bare, pose).size == full_body_flips(body, pose, most_overlap=np.inf).size

@@ -9,15 +9,16 @@ import pytest
 from benchmarks import numpy_likelihood as oracle
 from benchmarks.numpy_contour import occluding_contour
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.kinematics import forward
+from hmt_ros.body.kinematics import directed_derivatives, forward
 from hmt_ros.body.pose_terms import AnglePrior
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.image import likelihood as likelihood_module
 from hmt_ros.image.likelihood import OFF, ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
-from hmt_ros.image.surface import COVER, HIDDEN
-from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
+from hmt_ros.image.terms.image_term import TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
+from hmt_ros.image.terms.residuals import contour_sigma
 from hmt_ros.image.texture import capture_textures
 from hmt_ros.inference.energy import Derivatives
 
@@ -288,6 +289,96 @@ def test_self_intersection_falls_against_its_gradient(shot):
     step = 1e-4 * gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
     after = energy(poses - step)[0]
     assert (after < value).all()
+
+
+# Lists of residuals.
+
+
+def summed(frames, segments, points, directions, pull, curvature):
+    """Gradient (d,) and Hessian (d, d) over the pose of residuals at points of the skin."""
+    by_pose = directed_derivatives(frames, segments, points, directions)
+    return by_pose.T @ pull, (by_pose * curvature[:, None]).T @ by_pose
+
+
+@pytest.mark.parametrize('names', [*((name,) for name in CONTOUR_TERMS), CONTOUR_TERMS])
+def test_listed_residuals_sum_to_gradient_and_hessian(shot, observation, names):
+    likelihood = only(ImageLikelihood(shot.body, shot.camera), *names)
+    for pose in shot.near(4, 22, spread=0.3):
+        frames = forward(shot.body.skeleton, pose[None])
+        listed = likelihood.residuals(frames, observation)
+        assert len(listed) > 10
+        gradient, hessian = summed(
+            frames, listed[:, 0].astype(int), listed[:, 1:4], listed[:, 4:7],
+            listed[:, 7], listed[:, 8],
+        )  # fmt: skip
+        wanted = likelihood.energies(frames, observation)
+        assert np.allclose(gradient, wanted.gradient[0], rtol=1e-9, atol=1e-9)
+        assert np.allclose(hessian, wanted.hessian[0], rtol=1e-9, atol=1e-9)
+
+
+def test_without_evidence_no_residuals_are_listed(shot, observation):
+    frames = forward(shot.body.skeleton, shot.poses[:1])
+    likelihood = ImageLikelihood(shot.body, shot.camera)
+    assert likelihood.residuals(frames, Observation()).shape == (0, 9)
+    switched_off = replace(likelihood, settings=LikelihoodSettings.of_terms())
+    assert switched_off.residuals(frames, observation).shape == (0, 9)
+
+
+def test_listed_residuals_of_keypoints_sum_to_gradient_and_hessian(shot):
+    keypoints = keypoints_of(shot)
+    pixels, confidences = keypoints.pixels.copy(), keypoints.confidences.copy()
+    pixels[3], confidences[5], confidences[7] = np.nan, 0.0, 0.4
+    keypoints = replace(keypoints, pixels=pixels, confidences=confidences)
+    poses = shot.near(3, 23)
+    poses[2, 2] = 0.1  # some joints are behind the camera
+    term = KeypointTerm(shot.body.skeleton, shot.camera, keypoints, TermSettings(2.0, 1.5, 5.0))
+    for pose in poses:
+        frames = forward(shot.body.skeleton, pose[None])
+        joints, *residuals = term.residuals(frames)
+        assert not {3, 5} & set(joints)
+        segments = shot.body.skeleton.joint_segments[joints]
+        gradient, hessian = summed(frames, segments, *residuals)
+        wanted = term.energy(frames, np.arange(1))
+        assert np.allclose(gradient, wanted.gradient[0], rtol=1e-9, atol=1e-7)
+        assert np.allclose(hessian, wanted.hessian[0], rtol=1e-9, atol=1e-7)
+
+
+# Noise of contours.
+
+
+def test_noise_of_contours_in_pixels_grows_with_the_magnification():
+    near, far = (Weighting(30.0, 2.0, 3.0, pixels) for pixels in (400.0, 100.0))
+    assert contour_sigma(near, 0.015) == pytest.approx(np.hypot(2.0, 6.0))
+    assert contour_sigma(far, 0.015) == pytest.approx(np.hypot(2.0, 1.5))
+    assert contour_sigma(far._replace(magnification=0.0), 0.015) == 2.0
+
+
+def test_every_part_has_a_noise_of_its_contour(shot):
+    table = flesh_table_of(shot.body)
+    assert table.ring_noise.shape == (len(table.ring_parts), 2)
+    assert (table.ring_noise > 0.002).all()
+    assert (table.ring_noise < 0.05).all()
+    names = [shot.body.skeleton.segment_names[s] for s in table.part_segments]
+    left, right = (
+        table.ring_noise[table.ring_parts == names.index(f'{side}_thigh')]
+        for side in ('left', 'right')
+    )
+    assert np.array_equal(left, right)
+
+
+@pytest.mark.parametrize('name', CONTOUR_TERMS)
+def test_the_nearer_a_person_the_less_a_pixel_says(shot, observation, name):
+    """In pixels; a centimetre says the same at any distance where the noise is that of the body."""
+    likelihood = only(ImageLikelihood(shot.body, shot.camera), name)
+    frames = forward(shot.body.skeleton, shot.near(1, 24))
+    curvatures = [
+        likelihood.residuals(frames, replace(observation, magnification=pixels))[:, 4:]
+        for pixels in (0.0, 100.0, 400.0)
+    ]
+    sharpness = [
+        np.mean(np.linalg.norm(rows[:, :3], axis=1) ** 2 * rows[:, 4]) for rows in curvatures
+    ]
+    assert sharpness[0] > sharpness[1] > sharpness[2]
 
 
 # Visibility.

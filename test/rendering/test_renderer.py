@@ -165,7 +165,7 @@ def test_no_pixel_is_left_out(body):
     """A part alone is convex: its silhouette is one piece without holes, and each row one run."""
     view = camera()
     for shape in body.shapes:
-        alone = replace(body, shapes=(shape,), widths=())
+        alone = replace(body, shapes=(shape,), growth=())
         mask = render_silhouettes(alone, standing(body, root_y=0.4, root_z=0.7)[None], view)[0]
         assert mask.sum() > 50
         padded = np.pad(mask, 1).astype(int)
@@ -237,7 +237,7 @@ def test_clothes_stay_on_the_surface(body):
 
 
 def test_body_without_flesh(body):
-    bare = replace(body, shapes=(), widths=())
+    bare = replace(body, shapes=(), growth=())
     with pytest.raises(ValueError, match='no flesh'):
         render(bare, np.zeros(bare.dimension), camera(), BARE)
     with pytest.raises(ValueError, match='no flesh'):

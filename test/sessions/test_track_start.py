@@ -75,7 +75,7 @@ def test_bodies_that_are_none(tmp_path, monkeypatch, body):
     broken.write_text('a: [')
     with pytest.raises(ValueError, match=r'broken.yaml: not a body model'):
         prepare_start(parameters(body_model=broken))
-    monkeypatch.setattr(track_start, 'load_body', lambda model: replace(body, shapes=(), widths=()))
+    monkeypatch.setattr(track_start, 'load_body', lambda model: replace(body, shapes=(), growth=()))
     with pytest.raises(ValueError, match=r'bones has no flesh: wanted one such as human37'):
         prepare_start(parameters(body_model='bones'))
 

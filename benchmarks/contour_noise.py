@@ -1,0 +1,368 @@
+"""contour_noise: how far contours of people lie from the model's, in metres.
+
+The poses of the body, with the true lengths, that come nearest to the true joints of rendered clips
+of another body; its flesh fitted once to the true silhouettes of all clips, a Gaussian prior on its
+growth; then the signed distances, positive inside out, of contour points that no other part covers
+to the outline of the subtracted silhouettes. Robust deviations by part, at the sides and in front
+and behind, and correlations along the contour. `-o` writes `hmt_ros/image/contour_noise.yaml`.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.clips import ROOT, read_clip, table
+from benchmarks.command import benchmark_parser, show, told
+from benchmarks.numpy_contour import occluding_contour
+from benchmarks.numpy_likelihood import project_surface
+from benchmarks.tracking_oracle import (
+    STARTS,
+    SUBTRACTED,
+    TRUE,
+    best_poses,
+    silhouettes_of,
+    with_true_lengths,
+)
+from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.shape import ShapeSpace
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.terms.image_term import ImageWindow, TermSettings
+from hmt_ros.tracking import read_subject
+from hmt_ros.tracking.initialisation import start_from_keypoints
+from hmt_ros.tracking.shape_estimation import SPREAD, ShapeEstimate
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+CLIPS = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'exercise')
+EVERY = 12  # images
+QUICK = 2  # clips
+# Of the true silhouettes, to which the flesh is fitted.
+TERM = TermSettings(30.0, 3.0, 8.0)
+SETTINGS = LikelihoodSettings.of_terms(containment=TERM, coverage=TERM)
+MOST_STEPS = 8
+# Of a step, and of a central difference, in deviations over people.
+LARGEST_STEP, DIFFERENCE = 0.8, 0.3
+CONVERGED = 0.02  # share of the energy
+AHEAD = 0.7  # |sine| of the angle around a ring from which a point is in front or behind
+MARGIN = 2  # px from the border of an image
+RINGS_APART = (1, 2, 3)
+FURTHEST = 0.05  # m, of a distance in a correlation
+HEADER = (
+    'How far the contour of a person lies from that of the model at the true pose, as standard '
+    'deviations in m: at the sides of a part, along the x axis of its segment, and in front and '
+    'behind, along y.',
+    'Learned by `python -m benchmarks contour_noise` from {clips} rendered clips of another body '
+    "than the model's (MuJoCo's humanoid, moved by motion capture of CMU, mocap.cs.cmu.edu): "
+    "robust deviations of the subtracted silhouettes' outlines from the model's contours, the "
+    'flesh fitted once to all clips. Neighbouring points err together: the correlation is '
+    '{first:.2f} from one ring of a part to the next, {second:.2f} and {third:.2f} over two and '
+    'three, so that {points:.0f} points on the outline are worth {worth:.0f}.',
+)
+
+
+class Distances(NamedTuple):
+    """Distances of contour points to outlines: M points.
+
+    Attributes:
+        values: (M,) m, positive where the model is larger.
+        parts: (M,) index of the part.
+        ahead: (M,) whether the point is in front of its part or behind, not at a side.
+        rings: (M,) ring of the point; the second points of rings are numbered apart.
+        images: (M,) number of the image.
+    """
+
+    values: Array
+    parts: Index
+    ahead: Mask
+    rings: Index
+    images: Index
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """A clip at the poses that come nearest to the truth: T images.
+
+    Attributes:
+        body: with the true lengths.
+        camera: that saw it.
+        poses: (T, d).
+        observations: of the true silhouettes.
+        masks: subtracted silhouettes.
+    """
+
+    body: Body
+    camera: Camera
+    poses: Array
+    observations: list[Observation]
+    masks: list[Mask]
+
+
+def posed(folder: Path, every: int = EVERY) -> Posed:
+    """Reads a clip.
+
+    Raises:
+        ValueError: it can not be read, or lacks the true silhouettes or the empty scene.
+    """
+    clip, model = read_clip(folder), load_body('human37')
+    silhouettes = silhouettes_of(clip, every)
+    if {SUBTRACTED, TRUE} - set(silhouettes):
+        raise ValueError(f'{folder}: wanted true silhouettes and the empty scene')
+    begun = start_from_keypoints(model, clip.camera, read_subject(clip.subject, model))
+    body = with_true_lengths(begun.body, clip)
+    pairs = zip(clip.images[::every], silhouettes[TRUE], strict=True)
+    observations = [observe(*pair, wanted=('containment', 'coverage')) for pair in pairs]
+    poses = best_poses(body, clip, clip.stamps[::every], begun.poses[:STARTS])
+    return Posed(body, clip.camera, poses, observations, silhouettes[SUBTRACTED])
+
+
+def fitted_growth(clips: Sequence[Posed]) -> Array:
+    """How the groups of parts grow (G, 5) to fit the true silhouettes; poses are held.
+
+    Levenberg-Marquardt, with a Gaussian prior of the deviations `SPREAD`. The gradient is that of
+    differences: derivatives do not see which points of the contour come to light or are covered.
+    """
+    groups = len(ShapeSpace(clips[0].body).groups)
+    spread = np.tile(np.array([*SPREAD.values()]), groups)
+    growth, damping = np.zeros(len(spread)), 0.1
+    least, (gradient, curvature) = energy_of(clips, growth), derivatives_of(clips, growth)
+    for _ in range(MOST_STEPS):
+        damped = curvature + damping * np.diag(np.diagonal(curvature))
+        step = -np.linalg.solve(damped, gradient)
+        furthest = float(np.abs(step / spread).max())
+        step *= min(1.0, LARGEST_STEP / max(furthest, 1e-12))
+        energy = energy_of(clips, growth + step)
+        if energy < least:
+            growth, damping = growth + step, 0.3 * damping
+            if least - energy < CONVERGED * least:
+                break
+            least, (gradient, curvature) = energy, derivatives_of(clips, growth)
+        else:
+            damping *= 5.0
+    return growth.reshape(groups, -1)
+
+
+def energy_of(clips: Sequence[Posed], growth: Array) -> float:
+    """Energy of growth (G * 5,): of the true silhouettes of all clips, and of the prior."""
+    spread = np.tile(np.array([*SPREAD.values()]), len(growth) // len(SPREAD))
+    result = 0.5 * float(((growth / spread) ** 2).sum())
+    for clip in clips:
+        body = grown(clip.body, growth)
+        likelihood = ImageLikelihood(body, clip.camera, SETTINGS)
+        for pose, observation in zip(clip.poses, clip.observations, strict=True):
+            frames = forward(body.skeleton, pose[None])
+            result += float(likelihood.energies(frames, observation, derivatives=False).value[0])
+    return result
+
+
+def derivatives_of(clips: Sequence[Posed], growth: Array) -> tuple[Array, Array]:
+    """Gradient (G * 5,), by central differences, and Gauss-Newton Hessian of the energy."""
+    spread = np.tile(np.array([*SPREAD.values()]), len(growth) // len(SPREAD))
+    gradient, curvature = np.empty(len(growth)), np.diag(spread**-2.0)
+    for i, step in enumerate(DIFFERENCE * np.diag(spread)):
+        rise = energy_of(clips, growth + step) - energy_of(clips, growth - step)
+        gradient[i] = rise / (2.0 * step[i])
+    for clip in clips:
+        body = grown(clip.body, growth)
+        grows = slice(ShapeSpace(body).lengths, None)
+        likelihood, estimate = ImageLikelihood(body, clip.camera, SETTINGS), ShapeEstimate(body)
+        for pose, observation in zip(clip.poses, clip.observations, strict=True):
+            found = estimate.linearised(likelihood, observation, pose)
+            curvature += found.curvature[grows, grows]
+    return gradient, curvature
+
+
+def grown(body: Body, growth: Array) -> Body:
+    """A body whose groups of parts have grown, (G, 5) or flat."""
+    space = ShapeSpace(body)
+    return space.moved(np.concatenate([np.zeros(space.lengths), np.ravel(growth)]))
+
+
+def contour_distances(body: Body, camera: Camera, poses: Array, masks: Sequence[Mask]) -> Distances:
+    """Of the contour points that no part covers to the outlines of silhouettes, pose by pose."""
+    frames = forward(body.skeleton, poses)
+    surface, contour = project_surface(body, camera, frames), occluding_contour(body.flesh, frames)
+    columns, rows = np.round(surface.pixels).astype(np.intp)  # (P, N)
+    height, width = masks[0].shape
+    inner = (columns >= MARGIN) & (columns < width - MARGIN)
+    inner &= (rows >= MARGIN) & (rows < height - MARGIN)
+    found, count = [], len(body.flesh.ring_parts)
+    for n, mask in enumerate(masks):
+        use = np.flatnonzero(surface.valid[:, n] & ~surface.covered[:, n] & inner[:, n])
+        pixels = np.ascontiguousarray(mask).view(np.uint8)
+        window = ImageWindow(np.dstack([pixels] * 3), 0, 0, pixels, None)
+        away = window.signed_distance
+        assert away is not None
+        depths = surface.points[use, 2, n]
+        magnification = np.array([camera.magnification(float(z)) for z in depths])
+        values = away[rows[use, n], columns[use, n]] / magnification
+        ahead = np.abs(contour.turns[use, 1, n]) > AHEAD
+        rings = np.where(use < count, use, use + count)
+        found.append((values, contour.parts[use], ahead, rings, np.full(len(use), n)))
+    return Distances(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+
+
+def joined(found: Sequence[Distances]) -> Distances:
+    """Distances of several clips, whose images are numbered on."""
+    images, before = [], 0
+    for own in found:
+        images.append(own.images + before)
+        before += 1 + int(own.images.max(initial=-1))
+    columns = (np.concatenate([own[i] for own in found]) for i in range(4))
+    return Distances(*columns, np.concatenate(images))
+
+
+def robust_deviation(values: Array) -> float:
+    """Standard deviation of a Gaussian with the median absolute deviation of the values."""
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
+def correlation(found: Distances, apart: int) -> float:
+    """Correlation of distances on the same part of an image so many rings apart."""
+    places = {place: i for i, place in enumerate(zip(found.images, found.rings, strict=True))}
+    pairs = [
+        (i, other)
+        for (image, ring), i in places.items()
+        if (other := places.get((image, ring + apart))) is not None
+        and found.parts[i] == found.parts[other]
+    ]
+    first, second = np.clip(found.values[np.array(pairs, dtype=np.intp)], -FURTHEST, FURTHEST).T
+    return float((first * second).mean() / (first * first).mean())
+
+
+def independent_points(points: float, correlations: Sequence[float]) -> float:
+    """How many independent points so many are worth whose neighbours correlate."""
+    return points / (1.0 + 2.0 * sum(correlations))
+
+
+def groups_of(body: Body) -> list[str]:
+    """Name of the group of each part, without sides."""
+    names = [body.skeleton.segment_names[shape.segment] for shape in body.shapes]
+    return [name.removeprefix('left_').removeprefix('right_') for name in names]
+
+
+def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
+    """Deviations by group of parts, correlations, and the growth that was fitted.
+
+    Args:
+        clips: folder of the clips; None: the development clips.
+        quick: two clips.
+
+    Raises:
+        FileNotFoundError: a clip is not there.
+        ValueError: a clip that can not be used.
+    """
+    folder = clips or Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video'
+    wanted = CLIPS[:QUICK] if quick else CLIPS
+    lacking = [name for name in wanted if not (folder / name / 'truth.npz').is_file()]
+    if lacking:
+        raise FileNotFoundError(f'{folder} lacks {", ".join(lacking)} (set HMT_SHARED, or --clips)')
+    known = [posed(folder / name) for name in told('contour_noise', wanted)]
+    growth = fitted_growth(known)
+    found = joined(
+        [contour_distances(grown(x.body, growth), x.camera, x.poses, x.masks) for x in known]
+    )
+    return {'clips': list(wanted), **summary(found, known[0].body, growth)}
+
+
+def summary(found: Distances, body: Body, growth: Array) -> dict[str, Any]:
+    """Numbers by group of parts, and correlations."""
+    names = np.array(groups_of(body))[found.parts]
+    groups = ShapeSpace(body).groups
+    rows = {}
+    for name, own in zip(groups, growth, strict=True):
+        row: dict[str, Any] = {'growth': own.tolist()}
+        for side, at in (('side', ~found.ahead), ('ahead', found.ahead)):
+            values = found.values[(names == name) & at]
+            row[side] = {
+                'points': len(values),
+                'median': float(np.median(values)) if len(values) else None,
+                'deviation': robust_deviation(values) if len(values) else None,
+            }
+        rows[name] = row
+    points = len(found.values) / len(np.unique(found.images))
+    correlations = [correlation(found, apart) for apart in RINGS_APART]
+    return {
+        'groups': rows,
+        'points': points,
+        'correlations': correlations,
+        'independent_points': independent_points(points, correlations),
+    }
+
+
+def as_yaml(result: dict[str, Any]) -> str:
+    """The file that the likelihood reads; parts without a name have the median over the groups."""
+    rows = {
+        name: [row[side]['deviation'] for side in ('side', 'ahead')]
+        for name, row in result['groups'].items()
+    }
+    whole = np.array([*rows.values()], dtype=np.float64)
+    rows['other'] = np.nanmedian(whole, axis=0).tolist()
+    first, second, third = result['correlations']
+    numbers = {
+        'clips': len(result['clips']), 'first': first, 'second': second, 'third': third,
+        'points': result['points'], 'worth': result['independent_points'],
+    }  # fmt: skip
+    head = '\n#\n'.join(
+        textwrap.fill(text.format(**numbers), 100, initial_indent='# ', subsequent_indent='# ')
+        for text in HEADER
+    )
+    # A side that was never seen has the other's deviation.
+    lines = [
+        f'{name}: [{side or ahead:.3f}, {ahead or side:.3f}]'
+        for name, (side, ahead) in rows.items()
+    ]
+    return '\n'.join([head, *lines, ''])
+
+
+def as_text(result: dict[str, Any]) -> str:
+    """A table for people."""
+    rows = [['part', 'points', 'sides, mm', 'median', 'points', 'front and behind, mm', 'median']]
+    for name, row in result['groups'].items():
+        cells = [name]
+        for side in ('side', 'ahead'):
+            own = row[side]
+            numbers = (own['deviation'], own['median'])
+            cells += [str(own['points'])]
+            cells += ['-' if x is None else f'{1e3 * x:.1f}' for x in numbers]
+        rows.append(cells)
+    near = ', '.join(f'{x:.2f}' for x in result['correlations'])
+    return '\n\n'.join(
+        [
+            f'Contours of {", ".join(result["clips"])} against the model at the true poses.',
+            table(rows),
+            f'Correlation 1, 2 and 3 rings apart: {near}; {result["points"]:.0f} points an image '
+            f'are worth {result["independent_points"]:.0f}.',
+        ]
+    )
+
+
+def main(argv: list[str]) -> int:
+    """Runs the benchmark; without the clips it tells so and does nothing."""
+    parser = benchmark_parser('contour_noise', __doc__, quick=f'{QUICK} clips')
+    parser.add_argument('--clips', type=Path, metavar='DIR', help='folder of the clips')
+    parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='write a YAML file')
+    options = parser.parse_args(argv)
+    try:
+        result = measure(options.clips, quick=options.quick)
+    except FileNotFoundError as error:
+        print(f'contour_noise: skipped, {error}', file=sys.stderr)
+        return 0
+    except ValueError as error:
+        print(f'contour_noise: {error}', file=sys.stderr)
+        return 1
+    if options.output is not None:
+        options.output.write_text(as_yaml(result), 'utf-8')
+    return show(result, as_text, as_json=options.json)

@@ -1,0 +1,392 @@
+"""The estimate of the shape: against brute force, against true shapes, and what it keeps to."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks import numpy_likelihood as oracle
+from benchmarks.numpy_contour import occluding_contour
+from hmt_ros.body import Camera
+from hmt_ros.body.camera import Viewpoint
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.shape import ShapeSpace
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.motion.procedural_motion import procedural_motion
+from hmt_ros.rendering.renderer import render_frames
+from hmt_ros.rendering.scene import Scene
+from hmt_ros.tracking import TrackerSettings
+from hmt_ros.tracking.posterior import WIDEST, Posterior
+from hmt_ros.tracking.shape_estimation import (
+    LARGEST,
+    LARGEST_STEP,
+    LEAST_LENGTH_SIGMA,
+    SPREAD,
+    WANDERING,
+    Linearised,
+    ShapeEstimate,
+)
+
+VIEW = Viewpoint(distance=3.2)
+CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
+NAMES = ('containment', 'coverage')
+SILHOUETTE = {name: getattr(LikelihoodSettings(), name) for name in NAMES}
+STEP = 1e-5
+
+
+@pytest.fixture(scope='module')
+def poses(human37):
+    return procedural_motion('walk', human37, 1.2, 10.0, 3, viewpoint=VIEW)[::2]
+
+
+def seen(body, poses):
+    """Silhouettes of a body, as observations."""
+    frames = render_frames(body, poses, CAMERA, Scene(viewpoint=VIEW, seed=2))
+    return [
+        replace(
+            observe(x.image, x.mask, wanted=NAMES),
+            magnification=CAMERA.magnification(float(pose[2])),
+        )
+        for x, pose in zip(frames, poses)
+    ]
+
+
+@pytest.fixture(scope='module')
+def observation(human37, poses):
+    return seen(human37, poses[:1])[0]
+
+
+def exact_keypoints(body, pose, sigma=1.0):
+    pixels = CAMERA.project(body.joint_positions(pose[None]))[0]
+    n = len(pixels)
+    return Keypoints(body.joint_names, pixels, np.tile(sigma**2 * np.eye(2), (n, 1, 1)), np.ones(n))
+
+
+class Toy(ShapeEstimate):
+    """An estimate whose images are linear measurements y = A theta + B x with noise 1.
+
+    A pose is known besides with precision 1 around 0; the energy is that of both.
+    """
+
+    def __init__(self, body, by_shape, by_pose, measured):
+        super().__init__(body)
+        self.by_shape, self.by_pose, self.measured = by_shape, by_pose, measured
+
+    def theta(self):
+        return np.array([moved for moved, _ in self.deviations.values()])
+
+    def hessian(self):
+        return self.by_pose.T @ self.by_pose + np.eye(self.by_pose.shape[1])
+
+    def error(self, pose):
+        return self.by_shape @ self.theta() + self.by_pose @ pose - self.measured
+
+    def linearised(self, likelihood, observation, pose):
+        a, b = self.by_shape, self.by_pose
+        return Linearised(a.T @ self.error(pose), a.T @ a, a.T @ b)
+
+
+def toy(body, seed, noise=2e-3, measurements=120, pose_size=6):
+    """Measurements of some shape, which is far from none and within what people differ by."""
+    rng = np.random.default_rng(seed)
+    size = ShapeSpace(body).size
+    spread = np.sqrt(np.diagonal(ShapeEstimate(body).covariance))
+    true = np.clip(0.1 * rng.normal(size=size), -0.2, 0.2) * spread
+    by_shape = rng.normal(size=(measurements, size))
+    by_pose = rng.normal(size=(measurements, pose_size))
+    pose = 0.05 * rng.normal(size=pose_size)
+    measured = by_shape @ true + by_pose @ pose + noise * rng.normal(size=measurements)
+    return Toy(body, by_shape, by_pose, measured), true
+
+
+def update(estimate, pose, trust=1.0, dt=0.0):
+    """One update from one mode with the energy of the toy."""
+    gradient = estimate.by_pose.T @ estimate.error(pose) + pose
+    covariance = np.linalg.inv(estimate.hessian())
+    return estimate.update(
+        None, None, pose[None], np.ones(1), gradient[None], covariance[None], trust=trust, dt=dt
+    )
+
+
+@pytest.mark.parametrize('trust', [1.0, 0.35])
+@pytest.mark.parametrize('start', [0.0, 0.1])
+def test_an_update_is_joint_least_squares_of_shape_and_pose(human37, trust, start):
+    """Wherever the pose was linearised: the measurements are linear."""
+    estimate, _ = toy(human37, 0)
+    d = estimate.by_pose.shape[1]
+    prior = np.linalg.inv(estimate.covariance)
+    size = len(prior)
+    update(estimate, np.full(d, start), trust)
+    root = np.sqrt(trust)
+    rows = np.block(
+        [
+            [root * estimate.by_shape, root * estimate.by_pose],
+            [np.zeros((d, size)), root * np.eye(d)],
+            [np.linalg.cholesky(prior).T, np.zeros((size, d))],
+        ]
+    )
+    right = np.concatenate([root * estimate.measured, np.zeros(d + size)])
+    wanted = np.linalg.lstsq(rows, right, rcond=None)[0][:size]
+    covariance = np.linalg.inv(rows.T @ rows)[:size, :size]
+    assert np.allclose(estimate.theta(), wanted, atol=1e-9)
+    assert np.allclose(estimate.covariance, covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_modes_count_by_their_weights(human37):
+    """Two modes that linearise a linear energy at different poses say the same."""
+    both, one = (toy(human37, 1)[0] for _ in range(2))
+    poses = np.array([np.full(6, 0.05), np.full(6, -0.02)])
+    covariance = np.linalg.inv(both.hessian())
+    gradients = np.array([both.by_pose.T @ both.error(pose) + pose for pose in poses])
+    both.update(
+        None, None, poses, np.array([0.3, 0.7]), gradients, np.array([covariance] * 2),
+        trust=0.5, dt=0.0,
+    )  # fmt: skip
+    update(one, poses[0], trust=0.5)
+    assert np.allclose(both.theta(), one.theta(), atol=1e-12)
+    assert np.allclose(both.covariance, one.covariance)
+
+
+def test_information_only_shrinks_what_is_not_known(human37):
+    estimate, _ = toy(human37, 2)
+    for _ in range(3):
+        before = estimate.covariance
+        update(estimate, np.zeros(6), trust=0.2)
+        after = estimate.covariance
+        assert np.array_equal(after, after.T)
+        assert np.linalg.eigvalsh(after)[0] > 0
+        assert np.linalg.eigvalsh(before - after)[0] > -1e-12
+    assert estimate.images == 3
+
+
+def test_a_shape_wanders_between_images(human37):
+    estimate = ShapeEstimate(human37)
+    empty = np.zeros((1, human37.dimension))
+    before = np.diagonal(estimate.covariance).copy()
+    estimate.update(
+        ImageLikelihood(human37, CAMERA), Observation(), empty, np.ones(1), empty,
+        np.eye(human37.dimension)[None], trust=0.35, dt=10.0,
+    )  # fmt: skip
+    assert np.diagonal(estimate.covariance) == pytest.approx(before * (1 + 10 * WANDERING**2))
+    assert estimate.body.segment_lengths == pytest.approx(human37.segment_lengths)
+
+
+def test_steps_and_shapes_have_limits(human37):
+    estimate, _ = toy(human37, 3)
+    estimate.measured = 1e3 * estimate.measured
+    spread = np.sqrt(np.diagonal(estimate.covariance))
+    update(estimate, np.zeros(6))
+    assert np.abs(estimate.theta() / spread).max() == pytest.approx(LARGEST_STEP)
+    for _ in range(30):
+        update(estimate, np.zeros(6))
+    furthest = np.abs(estimate.theta() / spread)
+    assert furthest.max() == pytest.approx(LARGEST)
+    assert all(min(part.radii) > 0 for part in estimate.body.flesh.parts)
+
+
+def test_what_people_differ_by_is_where_an_estimate_begins(human37):
+    known = replace(human37, length_sigma=np.zeros_like(human37.length_sigma))
+    deviations = ShapeEstimate(known).deviations
+    assert deviations['thigh'] == (0.0, pytest.approx(LEAST_LENGTH_SIGMA))
+    assert deviations['trunk_depth'] == (0.0, pytest.approx(SPREAD['depth']))
+    assert deviations['foot_end'] == (0.0, pytest.approx(SPREAD['end']))
+
+
+# What an image says of shape and pose.
+
+
+def places_of(body, parts):
+    """Centres and radii (P, 3) of parts."""
+    rows = [body.flesh.parts[part] for part in parts]
+    return np.array([x.centre for x in rows]), np.array([x.radii for x in rows])
+
+
+def energy_over_shape(space, pose, observation, name):
+    """Function of the shape: the energy of a term of the points that now are on the contour."""
+    body, term = space.body, SILHOUETTE[name]
+    frames = forward(body.skeleton, pose[None])
+    surface = oracle.project_surface(body, CAMERA, frames)
+    contour = occluding_contour(body.flesh, frames)
+    centres, radii = places_of(body, contour.parts)
+    place = (contour.local[..., 0] - centres) / radii
+    sigma = np.hypot(term.sigma, observation.magnification * surface.noise)
+    energy = {'containment': oracle.containment, 'coverage': oracle.coverage}[name]
+
+    def value(change):
+        other = space.moved(change)
+        centres, radii = places_of(other, contour.parts)
+        moved = forward(other.skeleton, pose[None])
+        points = moved.points(surface.segments, centres + place * radii)
+        pixels, projection = CAMERA.project_with_derivative(points.transpose(1, 0, 2))
+        held = replace(surface, points=points, pixels=pixels, projection=projection)
+        return energy(held, observation.evidence[name], term, sigma).value[0]
+
+    return value
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_gradients_over_the_shape_at_material_points(human37, poses, observation, name):
+    """Points of the contour stay where they are on the skin, which grows under them."""
+    settings = LikelihoodSettings.of_terms(**{name: SILHOUETTE[name]})
+    likelihood = ImageLikelihood(human37, CAMERA, settings)
+    estimate, space = ShapeEstimate(human37), ShapeSpace(human37)
+    rng = np.random.default_rng(5)
+    for pose in poses[0] + 0.05 * rng.normal(size=(2, human37.dimension)):
+        pose = np.clip(pose, human37.lower, human37.upper)
+        value = energy_over_shape(space, pose, observation, name)
+        found = estimate.linearised(likelihood, observation, pose).by_shape
+        wanted = np.array([(value(x) - value(-x)) / 2e-6 for x in 1e-6 * np.eye(space.size)])
+        errors = np.abs(found - wanted) / np.abs(wanted).max()
+        assert np.quantile(errors, 0.95) < 1e-6
+        assert errors.max() < 1e-3
+
+
+def test_curvatures_of_keypoints_are_derivatives_of_their_gradients(human37, poses):
+    """At the truth, where residuals vanish, the Gauss-Newton Hessian is the Hessian."""
+    pose = poses[0]
+    observation = Observation(keypoints=exact_keypoints(human37, pose))
+    settings = LikelihoodSettings.of_terms(keypoints=TermSettings(1.0, 1.0, np.inf))
+    estimate, space = ShapeEstimate(human37), ShapeSpace(human37)
+
+    def gradient(change, pose):
+        body = space.moved(change)
+        other = ShapeEstimate(body)
+        likelihood = ImageLikelihood(body, CAMERA, settings)
+        return other.linearised(likelihood, observation, pose).by_shape
+
+    likelihood = ImageLikelihood(human37, CAMERA, settings)
+    found = estimate.linearised(likelihood, observation, pose)
+    assert np.allclose(found.by_shape, 0.0, atol=1e-6)
+    still = np.zeros(space.size)
+    for steps, wanted in (
+        (lambda x: (x, pose), found.curvature),
+        (lambda x: (still, pose + x), found.mixed),
+    ):
+        columns = [
+            (gradient(*steps(x)) - gradient(*steps(-x))) / (2 * STEP)
+            for x in STEP * np.eye(wanted.shape[1])
+        ]
+        difference = np.stack(columns, axis=1)
+        assert np.allclose(difference, wanted, atol=1e-6 * np.abs(wanted).max())
+    # Keypoints say nothing of the flesh.
+    assert not found.curvature[space.lengths :].any()
+
+
+def test_gradient_and_covariance_of_poses_that_give_way(human37, poses, observation):
+    posterior = Posterior(human37, CAMERA, TrackerSettings())
+    near = poses[:2].copy()
+    elbow = human37.dof_names.index('left_elbow')
+    near[1, elbow] = human37.upper[elbow]
+    energy = posterior.fit(near, observation).energy
+    gradient, hessian = energy.derivatives()
+    found, covariances = posterior.given_way(near, observation)
+    held = np.diagonal(covariances, axis1=1, axis2=2) == 0
+    assert not found[held].any()
+    assert np.allclose(found[~held], gradient[~held])
+    for k in range(2):
+        free = ~held[k]
+        inner = hessian[k][np.ix_(free, free)] + WIDEST**-2.0 * np.eye(free.sum())
+        assert np.allclose(covariances[k][np.ix_(free, free)] @ inner, np.eye(free.sum()))
+        assert not covariances[k][held[k]].any()
+        assert not covariances[k][:, held[k]].any()
+        assert np.linalg.eigvalsh(covariances[k])[0] > -1e-12
+    assert held[1, elbow] == (gradient[1, elbow] < 0)
+
+
+# Of persons whose shape is known.
+
+
+def fitted(model, person, poses, rounds=2):
+    """Follows images of a person with the body of another; returns the estimate."""
+    estimate = ShapeEstimate(model)
+    settings = TrackerSettings()
+    for _ in range(rounds):
+        for pose, image in zip(poses, seen(person, poses)):
+            posterior = Posterior(estimate.body, CAMERA, settings)
+            pose = posterior.minimise(posterior.of_image(image), pose[None], 6).x
+            gradients, covariances = posterior.given_way(pose, image)
+            estimate.update(
+                posterior.likelihood, image, pose, np.ones(1), gradients, covariances,
+                trust=0.35, dt=0.1,
+            )  # fmt: skip
+    return estimate
+
+
+@pytest.fixture(scope='module')
+def stout(human37):
+    """A person with wide trunk and pelvis, thick legs, and a longer head."""
+    growth = np.zeros_like(human37.growth)
+    names = [human37.skeleton.segment_names[shape.segment] for shape in human37.shapes]
+    for part, name in enumerate(names):
+        if name in ('trunk', 'pelvis') or name.endswith(('thigh', 'shin')):
+            growth[part, :2] = 0.25
+        if name == 'head':
+            growth[part, 2] = 0.02
+    return human37.with_growth(growth)
+
+
+def test_flesh_comes_nearer_to_the_true_one(human37, stout, poses):
+    """Of a walk that is seen from the side: depths come to light, and widths hardly."""
+    estimate = fitted(human37, stout, poses[:3])
+    known = estimate.deviations
+    for name in ('trunk_depth', 'thigh_depth', 'shin_depth'):
+        moved, sigma = known[name]
+        assert 0.1 < moved < 0.35, name
+        assert sigma < 0.7 * SPREAD['depth']
+        assert abs(moved - 0.25) < 2 * sigma, name
+    assert 0 < known['thigh_width'][0] < known['thigh_depth'][0]
+    assert known['thigh_width'][1] > known['thigh_depth'][1]
+    assert abs(known['forearm_depth'][0]) < 0.08
+    lengths = estimate.body.segment_lengths
+    for name, true in stout.segment_lengths.items():
+        assert abs(lengths[name] - true) < 0.03
+
+
+def test_the_own_shape_stays(human37, poses):
+    estimate = fitted(human37, human37, poses[:2], rounds=1)
+    sigmas = np.array([moved / sigma for moved, sigma in estimate.deviations.values()])
+    assert np.sqrt((sigmas**2).mean()) < 0.5
+    again = fitted(human37, human37, poses[:2], rounds=1)
+    assert np.array_equal(again.covariance, estimate.covariance)
+    assert again.deviations == estimate.deviations
+
+
+def test_lengths_come_nearer_to_the_true_ones_with_keypoints(human37, poses):
+    long = {name: 1.06 * human37.segment_lengths[name] for name in ('thigh', 'upper_arm')}
+    person = human37.with_segment_lengths(long)
+    estimate = ShapeEstimate(human37)
+    terms = LikelihoodSettings.of_terms(keypoints=TermSettings(1.0, 1.0, 5.0))
+    settings = TrackerSettings(likelihood=terms)
+    for pose in poses:
+        posterior = Posterior(estimate.body, CAMERA, settings)
+        image = Observation(keypoints=exact_keypoints(person, pose))
+        pose = posterior.minimise(posterior.of_image(image), pose[None], 6).x
+        estimate.update(
+            posterior.likelihood, image, pose, np.ones(1), *posterior.given_way(pose, image),
+            trust=0.35, dt=0.1,
+        )  # fmt: skip
+    for name, true in long.items():
+        before = true - human37.segment_lengths[name]
+        assert abs(estimate.body.segment_lengths[name] - true) < 0.7 * before
+
+
+def test_what_is_considered_is_that_of_the_uncertain_shape(human37, poses, observation):
+    posterior = Posterior(human37, CAMERA, TrackerSettings())
+    estimate = ShapeEstimate(human37)
+    _, covariances = posterior.given_way(poses[:2], observation)
+    found = estimate.considered(posterior.likelihood, observation, poses[:2], covariances)
+    for k, pose in enumerate(poses[:2]):
+        mixed = estimate.linearised(posterior.likelihood, observation, pose).mixed
+        moved = -covariances[k] @ mixed.T
+        assert np.allclose(found[k], moved @ estimate.covariance @ moved.T)
+        assert np.linalg.eigvalsh(found[k])[0] > -1e-12
+    before = np.trace(found, axis1=1, axis2=2)
+    # A shape that is known better is considered less.
+    estimate.covariance = 0.25 * estimate.covariance
+    found = estimate.considered(posterior.likelihood, observation, poses[:2], covariances)
+    assert np.trace(found, axis1=1, axis2=2) == pytest.approx(0.25 * before)
