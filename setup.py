@@ -26,6 +26,7 @@ setup(
             'body/models/*.yaml',
             'body/models/*.npz',
             'experts/models/*.npz',
+            'image/*.yaml',
             'app/report/page/*',
         ],
         # The message definitions are read by whoever works on bags without ROS.

@@ -117,7 +117,7 @@ def left_directions(body: Body, poses: Array) -> Array:
 
 
 def faces_back(body: Body, poses: Array, reference: Array) -> Mask:
-    """Which of poses (N, d) face another way than a reference pose (d,), as silhouettes may have it.
+    """Which of poses (N, d) face another way than a reference pose (d,).
 
     They face away from it, or one faces the camera where the other turns its back: a turn, seen
     from the side, may go either way on.

@@ -131,7 +131,7 @@ class _Model(NamedTuple):
     weight: float
 
 
-@njit(cache=True, nogil=True, fastmath={'reassoc', 'contract'})
+@njit(cache=True, nogil=True)
 def _evaluate(
     model: _Model, poses: Array, exact: bool, value: Array, gradient: Array, hessian: Array
 ) -> None:

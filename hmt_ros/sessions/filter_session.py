@@ -74,6 +74,8 @@ __all__ = [
 
 KEYPOINTS, PREDICTION = 'keypoints', 'pose_prediction'
 
+# Change of a length above which a body is described anew, m.
+RESHAPED = 0.005
 # Keypoints of a detector that saw nobody.
 NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 # A person hardly moves meanwhile.
@@ -353,7 +355,9 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     ) -> None:
         p = self.parameters
         shown = self._shown_body
-        starts = shown is None or tracker.body.skeleton is not shown.skeleton
+        starts = shown is None or not _looks_like(tracker.body, shown)
+        if starts:
+            self._shown_body = tracker.body
         frame = waiting.frame_id
         track = TrackedImage(
             image=waiting.image,
@@ -385,7 +389,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             self._wanted,
             lambda topic, message: self._publish(topic, waiting.stamp_ns, message),
         )
-        self._shown_body, self._shown_frames = tracker.body, (frame, p.frame_prefix)
+        self._shown_frames = (frame, p.frame_prefix)
         self._weights = posterior.weights
         self._log.counts['tracked'] += 1
 
@@ -435,3 +439,11 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if isinstance(initial, GaussianMixture):
             return 'an image'
         return f'an image of {initial.stamp_ns} ns or later, where the subject was seen'
+
+
+def _looks_like(body: Body, shown: Body) -> bool:
+    """Whether a body is the one that has been described, up to small changes of its estimate."""
+    if body.dof_names != shown.dof_names:
+        return False
+    change = np.abs(body.skeleton.lengths - shown.skeleton.lengths)
+    return bool(change.max(initial=0.0) <= RESHAPED)

@@ -9,8 +9,8 @@ same order give the same bytes. The rules:
 - A mixture that is not younger than the one before is skipped, or starts a new window with
   `reset_on_time_jump`.
 - A mixture names its body and carries the segment lengths of the person; without lengths it is
-  about the model at its own lengths. Another body, other lengths or another frame are a new track,
-  and start a new window.
+  about the model at its own lengths. Another body, lengths that jump or another frame are a new
+  track, and start a new window; lengths that change slowly are estimated better and better.
 - A likelihood without components says that nobody is in view any more: the window ends, and a
   smoothed mixture without components and markers that remove those before go out.
 - The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
@@ -22,6 +22,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.inference import GaussianMixture
@@ -50,6 +52,8 @@ from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 MIXTURE = 'likelihood_mixture'
 FINISH = 'finish'  # what `finish` calls the end of the stream
 NOBODY = 'nobody'  # status while nobody is in view
+# Change of a length from one mixture to the next above which it is another person's, m.
+SAME_PERSON = 0.02
 
 
 @dataclass(frozen=True)
@@ -246,6 +250,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         """Ends the window of another person."""
         known = self._of
         if known is not None and _same(known, of):
+            self._of = of
             return
         if self._newest is not None:
             text = 'mixtures are about another body: a new window begins'
@@ -351,8 +356,8 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
 
 
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:
-    return (one.body.name, one.body.segment_lengths, one.frame_id) == (
-        other.body.name,
-        other.body.segment_lengths,
-        other.frame_id,
-    )
+    """Whether two bodies are one person, whose lengths are estimated from image to image."""
+    if (one.body.name, one.frame_id) != (other.body.name, other.frame_id):
+        return False
+    change = np.abs(one.body.skeleton.lengths - other.body.skeleton.lengths)
+    return bool(change.max(initial=0.0) <= SAME_PERSON)

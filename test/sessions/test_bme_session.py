@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera
+from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, BmeSession
 from hmt_ros.sessions.camera_session import MASK
@@ -128,8 +129,10 @@ def test_predictions_take_those_before_into_account(session, somebody, stub_pred
     assert first is None
     assert len(second) == 2
     # The dynamics were learned for a step of 1/30 s; of the rest little is known.
-    gained = second.covariances[0] - 1e-2 * np.eye(37)
-    assert np.allclose(gained, np.diag(stub_predictor.body.rates * 2 / 30))
+    dynamics = motion_prior(stub_predictor.body)
+    known = 1e-2 * np.eye(37)[None]
+    _, wanted = dynamics.predict_poses(np.zeros((1, 37)), known, 2 / 30)
+    assert np.allclose(second.covariances[0], wanted[0])
     assert third is None
     alone = session()
     alone.take(CAMERA_INFO, somebody.info())

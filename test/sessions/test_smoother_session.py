@@ -19,7 +19,7 @@ LAG = 2
 WINDOW = ['trajectory_mixture', 'trajectory_markers']
 FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
 
-RANDOM_WALK = SmootherDynamics()
+RANDOM_WALK = SmootherDynamics(model='random_walk')
 
 
 @pytest.fixture
@@ -320,7 +320,7 @@ def test_time_that_jumps_back_begins_a_new_window(session, outputs, likelihoods)
 
 
 def test_gaps_are_bridged_and_told(session, outputs, likelihoods):
-    one = session(longest_interval=0.15)
+    one = session(longest_interval=0.15, error_correlation=0.0)
     handled = [one.take(MIXTURE, likelihoods.message(index)) for index in (0, 1, 6, 7, 14)]
     assert [len(h.faults) for h in handled] == [0] * 5
     assert [len(h.warnings) for h in handled] == [0, 0, 1, 0, 0]

@@ -145,7 +145,7 @@ def test_the_centred_view_undoes_place_and_lens() -> None:
         found, raw = silhouette_parts(centred_view(blob, camera)), silhouette_parts(blob.mask)
         error, without = (np.abs(x.distances - wanted.distances).mean() for x in (found, raw))
         assert error < 0.006  # radii of gyration
-        assert error < 0.6 * without
+        assert error < 0.62 * without
 
 
 def test_parts_have_their_sizes(masks: np.ndarray) -> None:
