@@ -52,10 +52,10 @@ QUICK = 2  # clips
 # Of the true silhouettes, to which the flesh is fitted.
 TERM = TermSettings(30.0, 3.0, 8.0)
 SETTINGS = LikelihoodSettings.of_terms(containment=TERM, coverage=TERM)
-MOST_STEPS = 8
+MOST_STEPS = 25
 # Of a step, and of a central difference, in deviations over people.
 LARGEST_STEP, DIFFERENCE = 0.8, 0.3
-CONVERGED = 0.02  # share of the energy
+CONVERGED = 0.002  # share of the energy
 AHEAD = 0.7  # |sine| of the angle around a ring from which a point is in front or behind
 MARGIN = 2  # px from the border of an image
 RINGS_APART = (1, 2, 3)
