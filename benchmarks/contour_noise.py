@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from benchmarks.clips import ROOT, read_clip, table
 from benchmarks.command import benchmark_parser, show, told
+from benchmarks.machine import description
 from benchmarks.numpy_contour import occluding_contour
 from benchmarks.numpy_likelihood import project_surface
 from benchmarks.tracking_oracle import (
@@ -52,10 +53,10 @@ QUICK = 2  # clips
 # Of the true silhouettes, to which the flesh is fitted.
 TERM = TermSettings(30.0, 3.0, 8.0)
 SETTINGS = LikelihoodSettings.of_terms(containment=TERM, coverage=TERM)
-MOST_STEPS = 8
+MOST_STEPS = 25
 # Of a step, and of a central difference, in deviations over people.
 LARGEST_STEP, DIFFERENCE = 0.8, 0.3
-CONVERGED = 0.02  # share of the energy
+CONVERGED = 0.002  # share of the energy
 AHEAD = 0.7  # |sine| of the angle around a ring from which a point is in front or behind
 MARGIN = 2  # px from the border of an image
 RINGS_APART = (1, 2, 3)
@@ -274,7 +275,8 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     found = joined(
         [contour_distances(grown(x.body, growth), x.camera, x.poses, x.masks) for x in known]
     )
-    return {'clips': list(wanted), **summary(found, known[0].body, growth)}
+    source = {'machine': description(), 'clips': list(wanted)}
+    return {**source, **summary(found, known[0].body, growth)}
 
 
 def summary(found: Distances, body: Body, growth: Array) -> dict[str, Any]:
@@ -327,7 +329,7 @@ def as_yaml(result: dict[str, Any]) -> str:
     return '\n'.join([head, *lines, ''])
 
 
-def as_text(result: dict[str, Any]) -> str:
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """A table for people."""
     rows = [['part', 'points', 'sides, mm', 'median', 'points', 'front and behind, mm', 'median']]
     for name, row in result['groups'].items():
@@ -342,7 +344,7 @@ def as_text(result: dict[str, Any]) -> str:
     return '\n\n'.join(
         [
             f'Contours of {", ".join(result["clips"])} against the model at the true poses.',
-            table(rows),
+            table(rows, markdown=markdown),
             f'Correlation 1, 2 and 3 rings apart: {near}; {result["points"]:.0f} points an image '
             f'are worth {result["independent_points"]:.0f}.',
         ]

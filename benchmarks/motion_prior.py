@@ -21,6 +21,7 @@ from scipy.stats import chi2
 
 from benchmarks.clips import ROOT
 from benchmarks.command import benchmark_parser, show
+from benchmarks.machine import description
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.experts.training_set import RATE, motion_files, recorded_sequence
@@ -31,6 +32,7 @@ Array = NDArray[np.float64]
 # What is seen before a pose: how far it may be from where it was predicted, and what that costs.
 Surprises = Iterator[tuple[Array, Array]]
 
+SHARED = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared'))
 NOISE = 0.01  # rad and m
 STEPS = (1, 3, 6)  # frames of 30 Hz
 KEPT, GAIN = 0.7, 0.5  # of the velocity, for the random walk that keeps one
@@ -91,8 +93,9 @@ def scores(surprises: list[tuple[Array, Array]]) -> dict[str, float]:
     }
 
 
-def measure(folder: Path, *, quick: bool = False) -> dict[str, Any]:
-    """Scores by interval and model, over the motions of a folder."""
+def measure(folder: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
+    """Scores by interval and model, over the motions of a folder; None: the development motions."""
+    folder = folder or SHARED / 'mocap' / 'dev'
     body: Body = load_body('human37')
     motions = []
     for path in motion_files(folder)[: 2 if quick else None]:
@@ -104,7 +107,7 @@ def measure(folder: Path, *, quick: bool = False) -> dict[str, Any]:
         f'random walk, {KEPT} of the velocity kept': walking(body.rates, KEPT),
         'learned': lambda poses, interval: filtered(learned, poses, interval),
     }
-    result: dict[str, Any] = {'motions': len(motions)}
+    result: dict[str, Any] = {'machine': description(), 'motions': len(motions)}
     for step in STEPS:
         found = {
             name: scores([x for poses in motions for x in model(poses[::step], step / RATE)])
@@ -114,12 +117,12 @@ def measure(folder: Path, *, quick: bool = False) -> dict[str, Any]:
     return result
 
 
-def as_text(result: dict[str, Any]) -> str:
-    """A table."""
+def as_text(result: dict[str, Any], *, markdown: bool = True) -> str:
+    """A table, which is always one for a Markdown page."""
     head = '| interval | model | log density a step | all inside 90 % | each inside 90 % |'
     lines = [head, '|---|---|---:|---:|---:|']
     for interval, models in result.items():
-        if isinstance(models, dict):
+        if interval.endswith(' s'):
             for name, one in models.items():
                 lines.append(
                     f'| {interval} | {name} | {one["log_density"]:.1f} | '
@@ -131,10 +134,7 @@ def as_text(result: dict[str, Any]) -> str:
 def main(argv: list[str]) -> int:
     """Runs the benchmark; 1: there are no motions."""
     parser = benchmark_parser('motion_prior', __doc__, quick='two motions')
-    shared = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared'))
-    parser.add_argument(
-        '--mocap', type=Path, default=shared / 'mocap' / 'dev', help='folder of motions'
-    )
+    parser.add_argument('--mocap', type=Path, help='folder of motions (the development motions)')
     options = parser.parse_args(argv)
     try:
         result = measure(options.mocap, quick=options.quick)

@@ -26,6 +26,8 @@ PAGES = {
     'soak': 'robustness.md',
     'flips': 'flips.md',
     'kernels': 'likelihood.md',
+    'contour_noise': 'likelihood.md',
+    'motion_prior': 'motion_prior.md',
     'kjs': 'sampling.md',
     'smoothing': 'smoothing.md',
     'experts': 'experts.md',

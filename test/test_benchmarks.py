@@ -247,8 +247,10 @@ def test_the_file_of_contour_noise_is_that_which_is_read(body, tmp_path):
     assert list(content) == [*numbers['groups'], 'other']
     shipped = ROOT / 'hmt_ros' / 'image' / 'contour_noise.yaml'
     assert sorted(content) == sorted(read_plain_yaml(shipped, 10_000))
-    for sides in content.values():
-        assert sides == pytest.approx([0.005, 0.005], abs=0.0015)
+    for name, row in numbers['groups'].items():
+        wanted = [row[side]['deviation'] for side in ('side', 'ahead')]
+        assert content[name] == pytest.approx(wanted, abs=6e-4)
+    assert content['other'] == pytest.approx([0.005, 0.005], abs=0.0015)
     assert 'walk, kick' in contour_noise.as_text(result)
 
 
