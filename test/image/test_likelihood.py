@@ -288,11 +288,7 @@ def test_self_intersection_falls_against_its_gradient(shot):
     assert (np.linalg.eigvalsh(hessian)[:, 0] > -1e-9 * value.max()).all()
     step = 1e-4 * gradient / np.linalg.norm(gradient, axis=1, keepdims=True)
     after = energy(poses - step)[0]
-<<<<<<< HEAD
     assert (after < value)[cosine > 0.0].all()
-=======
-    assert np.mean(after < value) > 0.97
->>>>>>> shapetests
 
 
 # Lists of residuals.
