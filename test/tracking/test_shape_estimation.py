@@ -190,7 +190,7 @@ def test_steps_and_shapes_have_limits(human37):
 
 
 def test_what_people_differ_by_is_where_an_estimate_begins(human37):
-    known = replace(human37, length_sigma=np.zeros_like(human37.length_sigma))
+    known = replace(human37, length_covariance=np.zeros_like(human37.length_covariance))
     deviations = ShapeEstimate(known).deviations
     assert deviations['thigh'] == (0.0, pytest.approx(LEAST_LENGTH_SIGMA))
     assert deviations['trunk_depth'] == (0.0, pytest.approx(SPREAD['depth']))
