@@ -184,4 +184,5 @@ def test_what_lies_above_the_common_frame_does_not_matter(buffer):
     buffer.put(message('world', 'base', stamp=START), static=False)
     buffer.put(message('base', 'camera'), static=True)
     buffer.put(message('base', 'imu'), static=True)
-    buffer.lookup('camera', 'imu', START + 100 * SECOND)
+    found = buffer.lookup('camera', 'imu', START + 100 * SECOND)
+    assert np.allclose(found.rotation @ found.rotation.T, np.eye(3))
