@@ -40,18 +40,23 @@ class Keypoints:
         pixels: (n, 2) column and row, px; NaN where a joint was not seen.
         covariances: (n, 2, 2) px^2.
         confidences: (n,) from 0, ignore, to 1, sure.
+        positions: (n, 3) of a detector that lifts, m, along the axes of the camera from an origin
+            that all share; NaN where there is none. None: it does not lift.
     """
 
     names: tuple[str, ...]
     pixels: Array
     covariances: Array
     confidences: Array
+    positions: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.names)
         shapes = (self.pixels.shape, self.covariances.shape, self.confidences.shape)
         if shapes != ((n, 2), (n, 2, 2), (n,)):
             raise ValueError(f'{n} keypoints with arrays of shapes {shapes}')
+        if self.positions is not None and self.positions.shape != (n, 3):
+            raise ValueError(f'{n} keypoints with positions of shape {self.positions.shape}')
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -61,8 +66,9 @@ class Keypoints:
     def __getitem__(self, which: Index) -> Keypoints:
         """Some of them."""
         names = tuple(self.names[i] for i in which)
+        positions = None if self.positions is None else self.positions[which]
         return Keypoints(
-            names, self.pixels[which], self.covariances[which], self.confidences[which]
+            names, self.pixels[which], self.covariances[which], self.confidences[which], positions
         )
 
     def named_for(self, body: Body) -> tuple[Keypoints, list[str]]:
