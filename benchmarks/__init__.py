@@ -12,6 +12,7 @@ BENCHMARKS = {
     'contour_noise': 'how far contours of people lie from those of the model',
     'experts': 'conditional densities: a toy, motions of people apart, clips, speed',
     'flips': 'time per leaf of the interpretation trees',
+    'keypoint_noise': 'where landmarks of a detector lie on the body, and how they err',
     'kernels': 'the compiled likelihood against vectorised numpy',
     'kjs': 'kinematic jumps against random sampling at finding minima',
     'motion_prior': 'how well the motion prior predicts motions of other people',

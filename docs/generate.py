@@ -27,6 +27,7 @@ PAGES = {
     'flips': 'flips.md',
     'kernels': 'likelihood.md',
     'contour_noise': 'likelihood.md',
+    'keypoint_noise': 'keypoints.md',
     'motion_prior': 'motion_prior.md',
     'kjs': 'sampling.md',
     'smoothing': 'smoothing.md',

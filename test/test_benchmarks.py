@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import bags, contour_noise, flips, kernels, kjs, nodes, votes
+from benchmarks import bags, contour_noise, flips, kernels, keypoint_noise, kjs, nodes, votes
 from benchmarks.__main__ import main
 from benchmarks.clips import find_clips, read_clip, table
 from benchmarks.command import run_stages
@@ -315,3 +315,27 @@ def test_nodes_that_lose_images_are_told():
     assert '60  4.0 ms  9.0 ms           missed, wanted all' in ' '.join(text.split('\n'))
     assert 'skipped: no ROS' in text
     assert nodes._prompt('raw').images[0].data.size == 640 * 480 * 3
+
+
+# keypoint_noise
+
+
+def test_offset_of_a_landmark_is_found_among_outliers():
+    rng = np.random.default_rng(0)
+    offset = np.array([0.02, -0.03, 0.01])
+    by_offset = rng.standard_normal((400, 2, 3))
+    errors = by_offset @ offset + 0.003 * rng.standard_normal((400, 2))
+    errors[:60] += 0.5
+    np.testing.assert_allclose(keypoint_noise.robust_offset(by_offset, errors), offset, atol=0.002)
+
+
+def test_correlation_of_keypoints_over_images():
+    rng = np.random.default_rng(1)
+    errors = [np.zeros((4000, 2))]
+    for t in range(1, 4000):
+        errors[0][t] = 0.8 * errors[0][t - 1] + 0.6 * 0.01 * rng.standard_normal(2)
+    images = [np.arange(4000)]
+    for apart in (1, 2):
+        found = keypoint_noise.correlation(errors, images, apart)
+        assert found == pytest.approx(0.8**apart, abs=0.05)
+    assert np.isnan(keypoint_noise.correlation(errors[:1], [np.arange(0, 8000, 2)], 1))

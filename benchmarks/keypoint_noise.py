@@ -1,0 +1,343 @@
+"""keypoint_noise: where a detector's landmarks lie on the body, and how they err.
+
+The poses of the body, with the true lengths, that come nearest to the true joints of rendered
+clips. Of every landmark the offset from its joint, in the frame of the joint's segment, that
+explains the detector's pixels best (robust least squares, both sides mirrored onto the right); the
+deviations that are left, in m at the person, by confidence and from image to image; slopes of the
+bones that the detector lifts; how often it takes left for right. What was made of it stands in
+`hmt_ros/image/keypoint_schemes.yaml`.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.clips import ROOT, SCHEME, Clip, read_clip, read_detections, table
+from benchmarks.command import benchmark_parser, show, told
+from benchmarks.machine import description
+from benchmarks.tracking_oracle import STARTS, best_poses, with_true_lengths
+from hmt_ros.body import Body, load_body
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image.keypoint_schemes import MIRROR, schemes
+from hmt_ros.image.terms.keypoints import EXCHANGED, Keypoints, KeypointTerm
+from hmt_ros.tracking import read_subject
+from hmt_ros.tracking.initialisation import start_from_keypoints
+
+Array = NDArray[np.float64]
+
+CLIPS = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'exercise')
+QUICK = 2
+# Scale of the robust kernel of offsets, m, and number of its iterations.
+KERNEL, ITERATIONS = 0.06, 30
+# Bins of the confidence, and of the number of images from one deviation to another.
+BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0001)
+IMAGES_APART = (1, 2, 5, 10, 20)
+# Deviations count up to this in correlations, m.
+FURTHEST = 0.1
+KINDS = ('none', 'all', 'arms', 'legs')
+# Fewer are no sample.
+FEWEST = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One landmark in the images of one clip, M of them.
+
+    Attributes:
+        name: of the landmark; of the left one it is mirrored to the right.
+        by_offset: (M, 2, 3) derivative of the pixel by the offset, over the magnification.
+        errors: (M, 2) pixel less that of the joint, over the magnification, m.
+        confidences: (M,).
+        images: (M,) numbers, increasing.
+    """
+
+    name: str
+    by_offset: Array
+    errors: Array
+    confidences: Array
+    images: NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Clips:
+    """What was found in clips: landmarks, exchanges image by image, slopes by bone."""
+
+    seen: list[Seen]
+    exchanges: list[NDArray[np.intp]]
+    slopes: list[tuple[str, Array]]
+
+
+def measured(folder: Path) -> Clips:
+    """What the detector says of one clip, beside the truth.
+
+    Raises:
+        ValueError: it can not be read, or has no keypoints.
+    """
+    clip, model = read_clip(folder), load_body('human37')
+    begun = start_from_keypoints(model, clip.camera, read_subject(clip.subject, model))
+    body = with_true_lengths(begun.body, clip)
+    detections = read_detections(folder).keypoints
+    stamps = [s for s in clip.stamps if s in detections and detections[s].seen.any()]
+    poses = best_poses(body, clip, stamps, begun.poses[:STARTS])
+    found = [detections[stamp] for stamp in stamps]
+    exchanges = np.array(
+        [_exchange(body, clip, x, pose) for x, pose in zip(found, poses, strict=True)]
+    )
+    return Clips(
+        _landmarks(body, clip, stamps, poses, found, exchanges), [exchanges],
+        _slopes(body, clip, found, poses, exchanges),
+    )  # fmt: skip
+
+
+def _term(body: Body, clip: Clip, keypoints: Keypoints, pose: Array) -> KeypointTerm:
+    even = np.log(np.full((1, len(EXCHANGED)), 1.0 / len(EXCHANGED)))
+    return KeypointTerm(
+        body.skeleton, clip.camera, keypoints,
+        magnification=clip.camera.magnification(float(pose[2])), exchanges=even,
+    )  # fmt: skip
+
+
+def _exchange(body: Body, clip: Clip, keypoints: Keypoints, pose: Array) -> int:
+    """The exchange of sides that explains keypoints best at the true pose."""
+    frames = forward(body.skeleton, pose[None])
+    found = _term(body, clip, keypoints, pose).exchanged(frames, np.zeros(1, dtype=np.intp))
+    return int(np.argmax(found[0]))
+
+
+def _landmarks(
+    body: Body,
+    clip: Clip,
+    stamps: Sequence[int],
+    poses: Array,
+    found: Sequence[Keypoints],
+    exchanges: NDArray[np.intp],
+) -> list[Seen]:
+    """Landmarks of images in which nothing is exchanged, both sides as the right one."""
+    frames = forward(body.skeleton, poses)
+    columns, _ = frames.by_pose()
+    truth = {name: i for i, name in enumerate(clip.truth.joint_names)}
+    true = np.array([clip.truth.joints[stamp] for stamp in stamps])
+    own = frames.joints().transpose(2, 0, 1)
+    raw = read_raw(clip.folder, stamps)
+    result = []
+    for name, mark in zip(schemes()[SCHEME].names, schemes()[SCHEME].landmarks, strict=True):
+        if not mark.joint:
+            continue
+        joint = body.joint_names.index(mark.joint)
+        places = true[:, truth[mark.joint]] if mark.joint in truth else own[:, joint]
+        pixels, confidences = (x[name] for x in raw)
+        centre, projection = clip.camera.project_with_derivative(places.T)
+        magnification = np.array([clip.camera.magnification(float(z)) for z in places[:, 2]])
+        segment = int(body.skeleton.joint_segments[joint])
+        by_offset = np.einsum('abn,ncb->nac', projection, columns[:, segment])
+        left = name.startswith('left_')
+        by_offset = by_offset * (MIRROR if left else 1.0)
+        errors = pixels - centre.T
+        use = np.flatnonzero(np.isfinite(errors).all(1) & (exchanges == 0))
+        scale = magnification[use, None]
+        result.append(
+            Seen(
+                name.replace('left_', 'right_'),
+                by_offset[use] / scale[..., None],
+                errors[use] / scale,
+                confidences[use],
+                use,
+            )
+        )
+    return result
+
+
+def read_raw(folder: Path, stamps: Sequence[int]) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Pixels (T, 2) and confidences (T,) of every landmark of a clip, by name."""
+    with np.load(folder / 'keypoints_mediapipe.npz') as content:
+        rows = {int(stamp): t for t, stamp in enumerate(content['stamps'])}
+        which = [rows[stamp] for stamp in stamps]
+        names = [str(name) for name in content['landmark_names']]
+        pixels, confidences = content['pixels'][which], content['visibility'][which]
+    return (
+        {name: pixels[:, i].astype(float) for i, name in enumerate(names)},
+        {name: confidences[:, i].astype(float) for i, name in enumerate(names)},
+    )
+
+
+def _slopes(
+    body: Body,
+    clip: Clip,
+    found: Sequence[Keypoints],
+    poses: Array,
+    exchanges: NDArray[np.intp],
+) -> list[tuple[str, Array]]:
+    """Measured less true slopes of the bones that were lifted, by segment."""
+    result = []
+    for keypoints, pose, exchange in zip(found, poses, exchanges, strict=True):
+        if exchange != 0:
+            continue
+        slopes = _term(body, clip, keypoints, pose)._slopes
+        columns = forward(body.skeleton, pose[None]).by_pose()[0][0]
+        own = slopes.segments[:, 0]
+        directions = np.einsum('bci,bc->bi', columns[own], slopes.directions[:, 0])
+        errors = slopes.slopes - (directions * slopes.rays).sum(1)
+        names = [body.skeleton.segment_names[s].split('_', 1)[-1] for s in own]
+        result += [(name, np.array([error])) for name, error in zip(names, errors, strict=True)]
+    return result
+
+
+def robust_offset(by_offset: Array, errors: Array) -> Array:
+    """The offset (3,) that explains errors (M, 2) best, by reweighted least squares."""
+    offset = np.zeros(3)
+    for _ in range(ITERATIONS):
+        left = errors - by_offset @ offset
+        weights = 1.0 / (1.0 + (left**2).sum(1) / KERNEL**2) ** 2
+        hessian = np.einsum('nab,nac,n->bc', by_offset, by_offset, weights)
+        hessian += 1e-3 * weights.sum() * np.eye(3)
+        offset = np.linalg.solve(hessian, np.einsum('nab,na,n->b', by_offset, errors, weights))
+    return offset
+
+
+def correlation(errors: Sequence[Array], images: Sequence[NDArray[np.intp]], apart: int) -> float:
+    """Correlation of errors (M, 2) of the same landmark so many images apart."""
+    product, square = 0.0, 0.0
+    for own, when in zip(errors, images, strict=True):
+        clipped = np.clip(own, -FURTHEST, FURTHEST)
+        later = {int(i): row for row, i in enumerate(when)}
+        pairs = [(r, later[int(i) + apart]) for r, i in enumerate(when) if int(i) + apart in later]
+        if pairs:
+            first, second = (clipped[[pair[i] for pair in pairs]] for i in range(2))
+            product += float((first * second).sum())
+            square += float((first * first).sum())
+    return product / square if square > 0 else float('nan')
+
+
+def summary(found: Sequence[Clips]) -> dict[str, Any]:
+    """Offsets, deviations, correlations, slopes and exchanges of clips."""
+    every = [seen for clip in found for seen in clip.seen]
+    landmarks, left, confidences, images = {}, [], [], []
+    for name in dict.fromkeys(seen.name for seen in every):
+        own = [seen for seen in every if seen.name == name]
+        by_offset, errors = (
+            np.concatenate([getattr(x, field) for x in own]) for field in ('by_offset', 'errors')
+        )
+        offset = robust_offset(by_offset, errors)
+        rest = [x.errors - x.by_offset @ offset for x in own]
+        left += rest
+        confidences += [x.confidences for x in own]
+        images += [x.images for x in own]
+        landmarks[name.removeprefix('right_')] = {
+            'offset': offset.tolist(),
+            'before': robust_sigma(errors),
+            'after': robust_sigma(np.concatenate(rest)),
+        }
+    whole, sure = np.concatenate(left), np.concatenate(confidences)
+    bins = []
+    for low, high in pairwise(BINS):
+        inside = whole[(sure >= low) & (sure < high)]
+        if len(inside) >= FEWEST:
+            bins.append(
+                {
+                    'confidence': [low, min(high, 1.0)],
+                    'points': len(inside),
+                    'median': robust_sigma(inside),
+                    'rms': float(np.sqrt((inside**2).mean())),
+                }
+            )
+    slopes: dict[str, list[float]] = {}
+    for clip in found:
+        for name, error in clip.slopes:
+            slopes.setdefault(name, []).append(float(error[0]))
+    moves = np.zeros((len(KINDS), len(KINDS)))
+    for clip in found:
+        for kinds in clip.exchanges:
+            np.add.at(moves, (kinds[:-1], kinds[1:]), 1.0)
+    return {
+        'landmarks': landmarks,
+        'noise': bins,
+        'correlations': {str(n): correlation(left, images, n) for n in IMAGES_APART},
+        'slopes': {name: float(np.sqrt(np.square(x).mean())) for name, x in slopes.items()},
+        'exchanges': {
+            name: {
+                'share': float(row.sum() / moves.sum()),
+                'next': (row / max(row.sum(), 1.0)).tolist(),
+            }
+            for name, row in zip(KINDS, moves, strict=True)
+        },
+    }
+
+
+def robust_sigma(errors: Array) -> float:
+    """Deviation of a coordinate by the median distance of errors (M, 2), as of a Gaussian."""
+    return float(np.median(np.linalg.norm(errors, axis=1)) / np.sqrt(2.0 * np.log(2.0)))
+
+
+def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
+    """Offsets and errors of the landmarks over clips.
+
+    Args:
+        clips: folder of the clips; None: the development clips.
+        quick: two clips.
+
+    Raises:
+        FileNotFoundError: a clip is not there.
+        ValueError: a clip that can not be used.
+    """
+    folder = clips or Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video'
+    wanted = CLIPS[:QUICK] if quick else CLIPS
+    lacking = [x for x in wanted if not (folder / x / 'keypoints_mediapipe.npz').is_file()]
+    if lacking:
+        raise FileNotFoundError(f'{folder} lacks {", ".join(lacking)} (set HMT_SHARED, or --clips)')
+    found = [measured(folder / name) for name in told('keypoint_noise', wanted)]
+    return {'machine': description(), 'clips': list(wanted), **summary(found)}
+
+
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+    """The numbers as tables."""
+
+    def mm(value: float) -> str:
+        return f'{1e3 * value:.0f}'
+
+    landmarks = [['landmark', 'offset x, y, z, mm', 'error at the joint, mm', 'at the offset, mm']]
+    landmarks += [
+        [name, ', '.join(map(mm, row['offset'])), mm(row['before']), mm(row['after'])]
+        for name, row in result['landmarks'].items()
+    ]
+    noise = [['confidence', 'keypoints', 'deviation by the median, mm', 'rms, mm']]
+    noise += [
+        [f'{low:g} to {high:g}', str(x['points']), mm(x['median']), mm(x['rms'])]
+        for x in result['noise']
+        for low, high in [x['confidence']]
+    ]
+    lasting = [['images apart', *result['correlations']]]
+    lasting += [['correlation', *(f'{x:.2f}' for x in result['correlations'].values())]]
+    slopes = [['bone', 'rms error of the slope']]
+    slopes += [[name, f'{x:.2f}'] for name, x in result['slopes'].items()]
+    exchanges = [['exchanged', 'share', *(f'then {name}' for name in KINDS)]]
+    exchanges += [
+        [name, f'{row["share"]:.3f}', *(f'{x:.3f}' for x in row['next'])]
+        for name, row in result['exchanges'].items()
+    ]
+    parts = (landmarks, noise, lasting, slopes, exchanges)
+    return '\n\n'.join(table(rows, markdown=markdown) for rows in parts)
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the command; returns its exit code."""
+    parser = benchmark_parser('keypoint_noise', __doc__, quick='two clips')
+    parser.add_argument('--clips', type=Path, help='folder of the clips')
+    options = parser.parse_args(arguments)
+    try:
+        result = measure(options.clips, quick=options.quick)
+    except FileNotFoundError as error:
+        print(f'keypoint_noise: skipped, {error}', file=sys.stderr)
+        return 0
+    except ValueError as error:
+        print(f'keypoint_noise: {error}', file=sys.stderr)
+        return 1
+    return show(result, as_text, as_json=options.json)
