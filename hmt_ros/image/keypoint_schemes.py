@@ -51,16 +51,18 @@ class SlopeModel:
         ends: names of the joints from which and to which it goes; `mid_x` is between the left and
             the right x.
         sigma: standard deviation of the cosine of its angle with the line of sight.
+        sign: of the slope where sides are exchanged, against that of the bone of the other side.
     """
 
     segment: str
     ends: tuple[str, str]
     sigma: float
+    sign: float
 
     def mirrored(self) -> SlopeModel:
         """The bone of the other side."""
         first, last = map(other_side, self.ends)
-        return SlopeModel(other_side(self.segment), (first, last), self.sigma)
+        return SlopeModel(other_side(self.segment), (first, last), self.sigma, self.sign)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +154,11 @@ def landmark_called(name: str) -> Landmark | None:
 def slope_models() -> tuple[SlopeModel, ...]:
     """The bones of lifted skeletons."""
     result = []
-    for segment, first, last, sigma in _table()['slopes']:
+    for segment, first, last, sigma, sign in _table()['slopes']:
         for side in SIDES if '{side}' in segment else SIDES[:1]:
             ends = (first.format(side=side), last.format(side=side))
-            result.append(SlopeModel(segment.format(side=side), ends, float(sigma)))
+            segment_name = segment.format(side=side)
+            result.append(SlopeModel(segment_name, ends, float(sigma), float(sign)))
     return tuple(result)
 
 

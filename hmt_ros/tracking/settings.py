@@ -115,7 +115,7 @@ class TrackerSettings:
     trust: float = 0.35
     error_correlation: float = 0.8
     motion: str = 'learned'
-    tails: float = 4.0
+    tails: float = 10.0
     least_log_weight: float = -14.0
     shape_images: int = 15
     shape_interval: int = 3

@@ -343,7 +343,7 @@ class KeypointTerm:
                 found.append(
                     (
                         (own, far),
-                        np.stack([columns[own] @ local, columns[far] @ swapped]),
+                        np.stack([columns[own] @ local, bone.sign * columns[far] @ swapped]),
                         ray,
                         float(measured @ ray),
                         1.0 / (self.settings.sigma * bone.sigma),
