@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from hmt_ros.app.truth import read_truth
 from hmt_ros.body import Camera, load_body
@@ -46,6 +47,8 @@ class Clip:
         truth: where the joints were.
         pixels: stamp -> (J, 2) true image positions of the joints of `truth`.
         background: the empty scene; None: the camera moves.
+        views: stamp -> true rotation (3, 3) and position (3,) of a camera that moves, in the world,
+            m; they stand for odometry. Empty: it stands still, or the clip does not tell.
         size: against that of the images in the bag.
     """
 
@@ -57,6 +60,7 @@ class Clip:
     pixels: dict[int, NDArray[np.float64]]
     background: NDArray[np.uint8] | None
     size: float = 1.0
+    views: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -180,6 +184,12 @@ def read_clip(folder: Path, frames: int | None = None) -> Clip:
     height, width = images[0].shape[:2]
     with np.load(folder / 'truth.npz') as content:
         pixels = dict(zip(map(int, content['stamps']), np.array(content['pixels']), strict=True))
+        views = {}
+        if background is None and 'camera_quaternion' in content:
+            turns = Rotation.from_quat(content['camera_quaternion']).as_matrix()
+            views = dict(
+                zip(pixels, zip(turns, content['camera_position'], strict=True), strict=True)
+            )
     return Clip(
         folder,
         camera_from_info(info, (width, height)),
@@ -188,6 +198,7 @@ def read_clip(folder: Path, frames: int | None = None) -> Clip:
         read_truth(folder / 'truth.npz'),
         pixels,
         None if background is None else np.asarray(background, dtype=np.uint8),
+        views=views,
     )
 
 

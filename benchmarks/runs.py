@@ -231,6 +231,9 @@ def follow(
         start = time.perf_counter()
         seen = None if keypoints is None else keypoints.get(stamp)
         prediction = None if predict is None else predict(image)
+        if stamp in clip.views:
+            rotation, position = clip.views[stamp]
+            tracker.set_camera(position, rotation)
         posterior, _ = tracker.step(image, stamp, seen, prediction)
         spent = time.perf_counter() - start
         if posterior is not None and stamp in clip.truth.joints:

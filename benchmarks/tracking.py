@@ -80,6 +80,8 @@ EVALUATIONS = Column('evaluations', 'evaluations')
 ERRORS = (
     HEAVIEST, Column('expected', 'expected_mm'), POINT, Column('PA', 'aligned_mm'), BEST, BLIND,
     KEPT, Column('root, %', 'root_percent', '.1f'), Column('depth, %', 'depth_percent', '+.1f'),
+    Column('path, %', 'path_percent', '.1f'),
+    Column('path length, %', 'path_length_percent', '+.1f'),
 )  # fmt: skip
 CALIBRATION = (
     Column('50 %', 'coverage_50', factor=100.0), Column('90 %', 'coverage_90', factor=100.0),
@@ -363,7 +365,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
             f'{", ".join(result["without_keypoints"])}.'
         )
     for group in result.get('accuracy', []):
-        parts.append(f'{group["group"]}: errors in mm; kept, root and depth in %.')
+        parts.append(f'{group["group"]}: errors in mm; kept, root, depth and path in %.')
         parts.append(_table(group, ERRORS, markdown))
         parts.append(f'{group["group"]}: calibration and motion.')
         parts.append(_table(group, CALIBRATION, markdown, worst_joint=True))

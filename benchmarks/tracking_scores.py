@@ -23,6 +23,8 @@ ANKLES = ('left_ankle', 'right_ankle')
 # Images are consecutive when no more time passes than this, in usual intervals.
 LONGEST_INTERVAL = 1.5
 DRAWS = 2000
+# Shortest true path of the root that is scored, m, and the steps that paths are measured in, s.
+LEAST_PATH, PATH_STEP = 1.0, 0.5
 
 
 def scores_of(record: Record) -> dict[str, Any]:
@@ -34,6 +36,9 @@ def scores_of(record: Record) -> dict[str, Any]:
         `blind_mm` of the blind control, `aligned_mm` of the point estimate after the similarity
         that fits best. Of the point estimate also `root_percent`, distance of the origin from its
         true position, and `depth_percent`, signed, both in % of the true distance and depth;
+        `path_percent`, the same distance in the world in % of the length of the true path, and
+        `path_length_percent`, by how much the estimated path is longer, where the true one has
+        `LEAST_PATH`;
         `acceleration` over that of the truth; `feet`, the speed of standing ankles, m/s. `kept` is
         the share of all images whose heaviest mode errs by less than 150 mm. Of the density:
         `coverage_50`, `coverage_90` of the region of all joints, `joint_coverage_50`,
@@ -66,6 +71,7 @@ def scores_of(record: Record) -> dict[str, Any]:
         'root_percent': 100.0
         * (np.linalg.norm(root - true_root, axis=1) / np.linalg.norm(true_root, axis=1)).mean(),
         'depth_percent': 100.0 * (root[:, 2] / true_root[:, 2] - 1.0).mean(),
+        **path_scores(record),
         'kept': (heaviest < LOST).sum() / record.images[0],
         'weights': np.log(weights[rows, nearest] * present.sum(1)).mean(),
         'coverage_50': coverage(record.levels, 0.5),
@@ -143,13 +149,34 @@ def acceleration_ratio(stamps: NDArray[np.int64], joints: Array, true: Array) ->
     return float(own / theirs) if theirs > 0 else float('nan')
 
 
+def path_scores(record: Record) -> dict[str, float]:
+    """Scores of the path of the point estimate's origin in the world; NaN: nobody goes anywhere."""
+    own, true = (in_world(record, joints[:, :1])[:, 0] for joints in (record.point, record.true))
+    # Steps in which nobody's trembling adds to the length.
+    usual = np.median(np.diff(record.stamps)) if len(own) > 1 else 1e9
+    step = max(round(PATH_STEP * 1e9 / usual), 1)
+    lengths = [np.linalg.norm(np.diff(x[::step], axis=0), axis=1).sum() for x in (own, true)]
+    if not lengths[1] >= LEAST_PATH:
+        return {'path_percent': np.nan, 'path_length_percent': np.nan}
+    apart = np.linalg.norm(own - true, axis=1).mean()
+    return {
+        'path_percent': float(100.0 * apart / lengths[1]),
+        'path_length_percent': float(100.0 * (lengths[0] / lengths[1] - 1.0)),
+    }
+
+
+def in_world(record: Record, joints: Array) -> Array:
+    """Joints (T, J, 3) of the camera frames of a record in the world, m."""
+    rotations, positions = record.views[:, :, :3], record.views[:, None, :, 3]
+    result: Array = joints @ rotations.transpose(0, 2, 1) + positions
+    return result
+
+
 def standing_speed(record: Record) -> float:
     """Speed of the point estimate's ankles in the world while the feet stand, m/s; NaN: unknown."""
     if len(record.contact) == 0:
         return float('nan')
-    ankles = record.point[:, [JOINTS.index(name) for name in ANKLES]]
-    rotations, positions = record.views[:, :, :3], record.views[:, None, :, 3]
-    placed = ankles @ rotations.transpose(0, 2, 1) + positions
+    placed = in_world(record, record.point[:, [JOINTS.index(name) for name in ANKLES]])
     speeds = np.linalg.norm(np.diff(placed, axis=0), axis=2)
     speeds /= 1e-9 * np.diff(record.stamps)[:, None]
     standing = record.contact[1:] & record.contact[:-1] & _consecutive(record.stamps)[:, None]

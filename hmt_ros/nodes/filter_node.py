@@ -40,7 +40,7 @@ class FilterNode(SessionNode[FilterSession, FilterParameters]):
         yield SubscribedTopic(KEYPOINTS, 'keypoints', 'hmt_msgs/msg/Keypoints2D')
         yield SubscribedTopic(PREDICTION, 'pose_prediction', 'hmt_msgs/msg/PoseMixture', RELIABLE)
         yield from MASK_TOPICS
-        if self._session is not None and self._session.gravity_frame is not None:
+        if self._session is not None and self._session.frames.wanted:
             yield from TRANSFORM_TOPICS
         yield image_topic(self._settings.image_transport)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 from hmt_ros.image.background import BackgroundSettings
 from hmt_ros.image.terms.registry import TERMS
+from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     FRACTION,
@@ -22,7 +23,6 @@ from hmt_ros.sessions.declared_parameters import (
     nested_parameters,
     parameter_field,
 )
-from hmt_ros.sessions.gravity_frame import unit_vector
 from hmt_ros.sessions.parameter_file import parameter_file_text
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.ground import KnownGround
@@ -84,9 +84,12 @@ class FilterParameters(CameraNodeParameters):
             the direction of gravity at every image, before gravity does; empty switches it off.
         floor_in_gravity_frame: If true, the floor is the plane z = 0 of gravity_frame, and /tf and
             /tf_static tell the height of the camera, before camera_height does.
+        fixed_frame: Name of a frame that stands still, such as odom; /tf and /tf_static then tell
+            how the camera moves, and the motion prior, gravity, floor and contacts are those of
+            that frame, while poses stay in the camera frame; empty switches it off.
         transform_timeout: Maximum time that an image waits for the transforms of its stamp,
             measured by the stamps of later images and transforms, s; then it goes on with the
-            direction that was known.
+            direction and with the motion of the camera that were known.
         overlay_modes: Maximum number of modes drawn on the image, the heaviest; 0 switches the
             overlay off.
         overlay_quality: JPEG quality of the overlay.
@@ -110,6 +113,7 @@ class FilterParameters(CameraNodeParameters):
     camera_height: float = parameter_field(0.0, NEXT_TRACK, (0.0, 100.0))
     gravity_frame: str = parameter_field('', NEXT_CONFIGURE)
     floor_in_gravity_frame: bool = parameter_field(False, NEXT_CONFIGURE)
+    fixed_frame: str = parameter_field('', NEXT_CONFIGURE)
     transform_timeout: float = parameter_field(0.1, AT_ONCE, (0.0, 60.0))
     overlay_modes: int = parameter_field(3, AT_ONCE, (0, 64))
     overlay_quality: int = parameter_field(85, AT_ONCE, (1, 100))
@@ -133,6 +137,11 @@ class FilterParameters(CameraNodeParameters):
             raise ValueError(
                 'floor_in_gravity_frame needs the name of gravity_frame, which is empty'
             )
+
+    @property
+    def uses_transforms(self) -> bool:
+        """Whether a frame is named that transforms lead to."""
+        return bool(self.gravity_frame or self.fixed_frame)
 
     @property
     def known_ground(self) -> KnownGround:

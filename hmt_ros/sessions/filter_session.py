@@ -9,9 +9,10 @@ order give the same bytes. The rules, besides those of `CameraSession`:
   stamp, or for an image that is `keypoints_timeout` younger; with `use_predictions` and
   `prediction_timeout` for a pose_prediction in the same way. Of several of one stamp the last
   counts; keypoints without names, and mixtures without components, say that nobody was seen.
-- With `gravity_frame` an image waits for the transforms of its stamp, or for an image or a
-  transform that is `transform_timeout` younger, and never so long that it would be dropped. What
-  was known of gravity before holds where they do not come.
+- With `gravity_frame` or `fixed_frame` an image waits for the transforms of its stamp, or for an
+  image or a transform that is `transform_timeout` younger, and never so long that it would be
+  dropped. Where they do not come, what was known of gravity before holds, and the camera is taken
+  to go on as before.
 - When the person is no longer in view one mixture without components of either kind goes out, with
   markers that remove those before, and then nothing until a new track starts.
 - A camera_info with another calibration, and ~/reset, start the track anew.
@@ -30,6 +31,7 @@ import numpy as np
 from hmt_ros.body import Body, Camera
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
     COMPRESSED_MASK,
@@ -40,7 +42,6 @@ from hmt_ros.sessions.camera_session import (
     WaitingImage,
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.gravity_frame import GravityFrame
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.session import SessionState, everything
 from hmt_ros.sessions.track_messages import (
@@ -134,7 +135,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
 
     Attributes:
         start: what the present track started from.
-        gravity_frame: where transforms tell gravity from; None: there is no such frame.
+        frames: that transforms lead to from the camera.
     """
 
     TOPICS = TOPICS
@@ -150,11 +151,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     ) -> None:
         super().__init__(parameters, publish, wanted)
         self.start = prepare_start(parameters)
-        self.gravity_frame: GravityFrame | None = None
-        if parameters.gravity_frame:
-            self.gravity_frame = GravityFrame(
-                parameters.gravity_frame, floor=parameters.floor_in_gravity_frame
-            )
+        p = parameters
+        self.frames = CameraFrames(p.gravity_frame, p.fixed_frame, floor=p.floor_in_gravity_frame)
         self._tracker: Tracker | None = None
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
@@ -196,8 +194,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         super()._forget_inputs(stamp)
         self._keypoints.clear()
         self._predictions.clear()
-        if self.gravity_frame is not None:
-            self.gravity_frame.forget_after(stamp)
+        self.frames.forget_after(stamp)
 
     def _stamp_of(self, source: str, message: Any) -> int:
         if source not in TRANSFORMS:
@@ -205,9 +202,9 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         return max((time_ns(each.header.stamp) for each in message.transforms), default=0)
 
     def _take_transforms(self, message: Any, *, static: bool) -> None:
-        if self.gravity_frame is None:
+        if not self.frames.wanted:
             return
-        for text in self.gravity_frame.take(message, static=static):
+        for text in self.frames.take(message, static=static):
             self._log.note(Fault.TRANSFORM, text)
         self._estimate_what_is_ready()
 
@@ -259,12 +256,12 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
 
     def _has_transforms(self) -> bool:
         """Whether the oldest image need not wait for transforms."""
-        frame, p, oldest = self.gravity_frame, self.parameters, self._waiting[0]
-        if frame is None or len(self._waiting) > p.queue_size:
+        p, oldest = self.parameters, self._waiting[0]
+        if not self.frames.wanted or len(self._waiting) > p.queue_size:
             return True
         timeout = p.transform_timeout * SECOND_NS
         assert self._newest is not None
-        return self._newest - oldest.stamp_ns > timeout or frame.is_settled(
+        return self._newest - oldest.stamp_ns > timeout or self.frames.is_settled(
             self._frame_of(oldest), oldest.stamp_ns, timeout
         )
 
@@ -289,11 +286,16 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         prediction = self._predictions.take(stamp) if self.parameters.use_predictions else None
         starts = self._tracker is None or self._tracker.status is Status.WAITING
         try:
-            known = self._known_ground(waiting)
+            self._look_at_frames(waiting)
             if self._tracker is None:
+                known = self.frames.known_ground(self.start.parameters.known_ground)
                 self._tracker = self.start.tracker(camera, known)
-            elif self.gravity_frame is not None and known.up is not None:
-                self._tracker.set_gravity(known.up)
+            elif self.frames.newest:
+                seen = self.frames.known_ground(KnownGround())
+                assert seen.up is not None
+                self._tracker.set_gravity(seen.up, seen.camera_height)
+            if (pose := self.frames.pose) is not None:
+                self._tracker.set_camera(pose.translation, pose.rotation)
             trusted = not self._tracker.silhouettes.doubted
             posterior, likelihood = self._tracker.step(
                 waiting.image,
@@ -320,14 +322,10 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             self._log.skip(Fault.START, f'no track starts at the image of {stamp} ns: {text}')
             self.restart(replace(self.start, background=None, initial=None))
 
-    def _known_ground(self, waiting: WaitingImage) -> KnownGround:
-        """What parameters and transforms tell of gravity and of the floor at an image."""
-        known, frame = self.start.parameters.known_ground, self.gravity_frame
-        if frame is None:
-            return known
-        for kind, text in frame.look(waiting.frame_id, waiting.stamp_ns):
+    def _look_at_frames(self, waiting: WaitingImage) -> None:
+        """Looks up what transforms tell of gravity and of the camera at an image."""
+        for kind, text in self.frames.look(waiting.frame_id, waiting.stamp_ns):
             self._log.note(kind, text)
-        return frame.known_ground(known)
 
     def _report_background(self, share: float, stamp_ns: int) -> None:
         self._log.note(

@@ -34,6 +34,7 @@ class Fault(Enum):
     LONE_MASK = 'mask without an image'
     TRANSFORM = 'transform'
     NO_TRANSFORM = 'no transform'
+    NO_CAMERA_POSE = 'no pose of the camera'
     CAMERA_HEIGHT = 'height of the camera'
     PREDICTION = 'pose_prediction'
     NO_PREDICTION = 'no pose_prediction'

@@ -12,6 +12,8 @@ which follows the pose slowly and so keeps what the first images of the contact 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hmt_ros.body.body import Body
@@ -20,6 +22,7 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mass import masses
 from hmt_ros.body.soles import FEET, soles
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.hypotheses import Modes
 
 # Rates at which a resting foot leaves the floor, and another comes to rest: those of walking, 1/s.
@@ -77,7 +80,7 @@ class FootContacts:
             plane: gravity and floor.
             modes: whose ancestors are the modes that were taken in before.
             dt: time since then, s.
-            still: whether the camera stands still; if not, no point is taken to rest.
+            still: whether the motion of the camera is known; if not, no point is taken to rest.
         """
         if self.stance is None:
             return self.begin(body, plane, modes)
@@ -99,6 +102,13 @@ class FootContacts:
         return self._take(
             body, plane, modes, points, points + kept[..., None] * offset, enter, leave
         )
+
+    def carry(self, motion: CameraMotion) -> None:
+        """Takes the places of the soles into the camera frame of the next image."""
+        if self.stance is None:
+            return
+        self._points = motion.points(self._points)
+        self.stance = replace(self.stance, anchors=motion.points(self.stance.anchors))
 
     def by_foot(self) -> dict[str, float]:
         """Probability that the heaviest mode rests on a foot, by 'left_foot' and 'right_foot'."""

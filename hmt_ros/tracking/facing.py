@@ -24,6 +24,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes
@@ -155,6 +156,11 @@ class Track:
         if both_ways:
             self._follow_both_ways(solved, np.zeros(len(poses)), observation, stamp)
         self._conclude(observation, stamp)
+
+    def carry(self, motion: CameraMotion) -> None:
+        """Takes the track into the camera frame of the next image."""
+        for one in self._filters:
+            one.carry(motion)
 
     def propagate(
         self, observation: Observation, stamp: int, dt: float, prediction: PosePrediction | None

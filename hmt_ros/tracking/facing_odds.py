@@ -17,6 +17,7 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import faces_back, left_directions
 from hmt_ros.inference.arrays import Array, Mask
+from hmt_ros.tracking.camera_motion import CameraMotion
 
 # Log odds up to which the way is known when the person is seen from the side, and how much better
 # from the front or from behind.
@@ -36,6 +37,12 @@ class FacingOdds:
         self.log_odds = NEW
         self._lead: Array | None = None
         self._left = np.zeros(3)
+
+    def carry(self, body: Body, motion: CameraMotion) -> None:
+        """Takes the pose that leads into the camera frame of the next image."""
+        if self._lead is not None:
+            self._lead = motion.poses(body, self._lead[None])[0]
+            self._left = motion.directions(self._left)
 
     def back(self, body: Body, poses: Array) -> Mask:
         """Which of poses (N, d) face the other way than the track did in the last image."""

@@ -23,6 +23,7 @@ from hmt_ros.inference.bounded_newton import Minimum, resting
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.ambiguities import ambiguity_classes
+from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.contact import FootContacts
 from hmt_ros.tracking.facing_odds import FacingOdds
 from hmt_ros.tracking.ground import GroundEstimator
@@ -236,6 +237,13 @@ class MixtureFilter:
         self._stand(None)
 
     # One image after another.
+
+    def carry(self, motion: CameraMotion) -> None:
+        """Takes everything that has a place into the camera frame of the next image."""
+        self._modes = motion.modes(self.body, self.modes)
+        self._facing.carry(self.body, motion)
+        self.contacts.carry(motion)
+        self._posterior.stance = self.contacts.stance
 
     def propagate(
         self, observation: Observation, dt: float, expected: GaussianMixture | None

@@ -20,6 +20,7 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mass import masses
 from hmt_ros.body.soles import soles
 from hmt_ros.inference.arrays import Array
+from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.hypotheses import Modes
 
 __all__ = ['Ground', 'GroundEstimator', 'GroundSettings', 'KnownGround']
@@ -122,9 +123,10 @@ class GroundEstimator:
     Attributes:
         known: what is known.
         estimate: the present one.
-        still: whether the camera stands still, so that what rests has a place in its frame; set by
-            who knows.
-        turning: whether a newer direction of gravity has told that the camera turns.
+        still: whether the motion of the camera is known, so that what rests has a known place in
+            its frame; set by who knows.
+        turning: whether a newer direction of gravity has told that the camera turns otherwise than
+            it was carried.
     """
 
     def __init__(self, known: KnownGround | None = None) -> None:
@@ -141,11 +143,31 @@ class GroundEstimator:
         self._distance = USUAL_DISTANCE
         self._conclude()
 
-    def set_gravity(self, up: ArrayLike) -> None:
-        """Takes a newer direction (3,) against gravity, camera frame."""
+    def carry(self, motion: CameraMotion) -> None:
+        """Takes what is known and estimated into the camera frame of the next image.
+
+        A camera height that would not be positive any more is unknown from then on.
+        """
+        up = motion.directions(self.estimate.up)
+        rise = -float(up @ motion.translation)
+        known = self.known
+        height = None if known.camera_height is None else known.camera_height + rise
+        self.known = KnownGround(
+            None if known.up is None else motion.directions(known.up),
+            height if height is not None and height > 0 else None,
+        )
+        self._mean = motion.directions(self._mean)
+        self._covariance = motion.rotation @ self._covariance @ motion.rotation.T
+        self._levels = deque((time, level + rise) for time, level in self._levels)
+        self._conclude()
+
+    def set_gravity(self, up: ArrayLike, camera_height: float | None = None) -> None:
+        """Takes a newer direction (3,) against gravity, camera frame, and height of the camera."""
         before, unit = self.known.up, unit_vector(up)
         self.turning = before is not None and float(np.linalg.norm(unit - before)) > TURNED
-        self.known = KnownGround(unit, self.known.camera_height)
+        self.known = KnownGround(
+            unit, self.known.camera_height if camera_height is None else camera_height
+        )
         self._conclude()
 
     @property

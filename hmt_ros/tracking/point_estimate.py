@@ -18,6 +18,7 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import left_directions, root_angles, root_rotation_dofs, root_rotations
 from hmt_ros.inference.arrays import Array, Mask
+from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.hypotheses import relative_joints
 
 # Weight of the other way to face above which the estimate turns about.
@@ -39,6 +40,14 @@ class PointEstimate:
     def __init__(self) -> None:
         self.pose: Array | None = None
         self._velocity = np.zeros(0)
+
+    def carry(self, body: Body, motion: CameraMotion) -> None:
+        """Takes the estimate into the camera frame of the next image."""
+        if self.pose is None:
+            return
+        before = self.pose[None]
+        self.pose = motion.poses(body, before)[0]
+        self._velocity = motion.jacobians(body, before, self.pose[None])[0] @ self._velocity
 
     def update(self, body: Body, poses: Array, weights: Array, dt: float) -> Array:
         """Takes in the modes of an image; returns the pose (d,).

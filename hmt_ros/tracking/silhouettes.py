@@ -59,6 +59,11 @@ class Silhouettes:
             return f'forgotten, {1 - unknown.mean():.0%} known again'
         return 'known' if self.background.frames else 'unknown'
 
+    def forget(self) -> None:
+        """Begins anew without a background: the camera sees another scene."""
+        self.background = BackgroundModel(self.background.settings)
+        self.share, self.doubted, self._learning = np.nan, False, True
+
     def learn(self, image: Image, mask: Mask | None) -> None:
         """Learns the background from an image before the track, unless a mask shows somebody."""
         if self._learning and not self.doubted and (mask is None or not mask.any()):

@@ -25,9 +25,10 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.camera_motion import SHIFTED, CameraPath, CameraPose
 from hmt_ros.tracking.facing import Track
 from hmt_ros.tracking.gravity import Gravity
-from hmt_ros.tracking.ground import Ground, GroundEstimator, KnownGround
+from hmt_ros.tracking.ground import Ground, GroundEstimator, KnownGround, unit_vector
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.initialisation import (
     poses_from_keypoints,
@@ -134,6 +135,10 @@ class Tracker:
         self._last_image: Image | None = None
         self._last_stamp: int | None = None
         self._followed: int | None = None
+        self._camera_path = CameraPath()
+        self._camera_pose: CameraPose | None = None
+        self._newer_gravity: KnownGround | None = None
+        self._scene_pose: CameraPose | None = None
 
     def reset(self, start: Subject | GaussianMixture | None = None) -> None:
         """Drops the track; the next image starts a new one.
@@ -152,6 +157,7 @@ class Tracker:
         self._drop_track()
         self._presence = Presence(self.settings.absence_time)
         self._last_stamp = None
+        self._camera_path = CameraPath()
 
     def step(
         self,
@@ -197,8 +203,9 @@ class Tracker:
         if self._last_stamp is not None and stamp <= self._last_stamp:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
         self.evaluations = 0
+        self._move_camera(stamp)
         known = self.background.frames > 0 and not self.silhouettes.doubted
-        self._ground.still = known and not self._ground.turning
+        self._ground.still = self._camera_path.known or (known and not self._ground.turning)
         view = self._view(image, keypoints, mask, nobody_predicted)
         found = self._take(view, stamp, prediction, masked=mask is not None)
         self._last_stamp = stamp
@@ -228,23 +235,41 @@ class Tracker:
         """Gravity and floor, as far as they are known or estimated."""
         return self._ground.estimate
 
-    def set_gravity(self, up: ArrayLike) -> None:
+    def set_gravity(self, up: ArrayLike, camera_height: float | None = None) -> None:
         """Takes a newer direction against gravity, before the image that it belongs to.
 
         Args:
             up: (3,) unit vector in the camera frame.
+            camera_height: height of the camera above the floor, m; None: as it was known before.
 
         Raises:
-            ValueError: it is no unit vector.
+            ValueError: it is no unit vector, or the height is not positive.
         """
-        self._ground.set_gravity(up)
+        self._newer_gravity = KnownGround(unit_vector(up), camera_height)
+
+    def set_camera(self, position: ArrayLike, rotation: ArrayLike) -> None:
+        """Takes the pose of the camera, before the image that it belongs to.
+
+        Motion, gravity, floor and contacts are then those of the fixed frame, while the mixture
+        stays in the camera frame. An image without a pose is taken to go on with the last motion
+        of the camera, for half a second at most.
+
+        Args:
+            position: (3,) of the camera in a frame that stands still, m; its axes may be any.
+            rotation: (3, 3) from the camera optical frame to that frame.
+
+        Raises:
+            ValueError: numbers that are not finite, or no rotation.
+        """
+        self._camera_pose = CameraPose.of(position, rotation)
 
     @property
     def contacts(self) -> dict[str, float]:
         """Probability by foot, 'left_foot' and 'right_foot', that the heaviest mode rests on it.
 
         Empty while it is unknown: there is no track, the body has no feet, the terms of the ground
-        are off, or the camera moves. It stands still where there is a background image.
+        are off, or the motion of the camera is unknown. The camera stands still where there is a
+        background image, and moves as `set_camera` says.
         """
         return self._track.contacts if self._ground.still else {}
 
@@ -277,6 +302,26 @@ class Tracker:
     def posterior(self) -> GaussianMixture:
         """The present posterior."""
         return self.modes.mixture(1.0 - self.settings.error_correlation)
+
+    def _move_camera(self, stamp: int) -> None:
+        """Carries what is known into the camera frame of the next image; takes newer gravity."""
+        pose, self._camera_pose = self._camera_pose, None
+        motion = self._camera_path.advance(stamp, pose)
+        if motion is not None:
+            self._ground.carry(motion)
+            self._point.carry(self.body, motion)
+            if self._track.begun:
+                self._track.carry(motion)
+        newer, self._newer_gravity = self._newer_gravity, None
+        if newer is not None and newer.up is not None:
+            self._ground.set_gravity(newer.up, newer.camera_height)
+        if pose is None:
+            return
+        if self._scene_pose is None:
+            self._scene_pose = pose
+        elif pose.shift(self._scene_pose, self.camera) > SHIFTED:
+            self.silhouettes.forget()
+            self._scene_pose = pose
 
     @property
     def _gravity(self) -> Gravity | None:

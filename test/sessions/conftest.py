@@ -45,6 +45,7 @@ class StubTracker:
         self.ground = Ground(up, 0.1, known_ground.camera_height, 0.02)
         self.contacts = {'left_foot': 0.75, 'right_foot': 0.0}
         self.gravities: list[Any] = []
+        self.poses: list[Any] = []
         self.seen: list[tuple[int, Any]] = []
         self.predictions: list[PosePrediction | None] = []
         self.masks: list[Any] = []
@@ -55,9 +56,13 @@ class StubTracker:
     def reset(self, start=None):
         self._start = start
 
-    def set_gravity(self, up):
+    def set_gravity(self, up, camera_height=None):
         self.gravities.append(up)
-        self.ground = replace(self.ground, up=up)
+        height = self.ground.height if camera_height is None else camera_height
+        self.ground = replace(self.ground, up=up, height=height)
+
+    def set_camera(self, position, rotation):
+        self.poses.append((position, rotation))
 
     @property
     def modes(self):

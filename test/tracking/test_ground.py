@@ -281,5 +281,7 @@ def test_a_tracker_knows_its_ground(ground, human32, camera, motion, keypoints_o
         elif ground.on:
             assert tracker.ground.height == pytest.approx(1.2, abs=0.2)
     assert max(errors) < 0.12
-    tracker.set_gravity(up_of(PITCHED))
+    tracker.set_gravity(up_of(PITCHED), 1.3)
+    tracker.step(black, 400_000_000, keypoints_of(human32, motion[4], 1.0, 4))
     assert tracker.ground.up == pytest.approx(up_of(PITCHED))
+    assert tracker.ground.height == pytest.approx(1.3)

@@ -118,7 +118,7 @@ def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
         recorded = replace(recorded, mask=None)
     if not parameters.filter.use_keypoints:
         recorded = replace(recorded, keypoints=None)
-    if not parameters.filter.gravity_frame:
+    if not parameters.filter.uses_transforms:
         recorded = replace(recorded, transforms=None)
     return recorded
 
@@ -129,7 +129,7 @@ def _play(
 ) -> Replayed:  # fmt: skip
     """Hands the messages of the bag to the nodes, and copies those that the new bag keeps."""
     result = Replayed()
-    # Transforms are copied so that a replay of the new bag sees the same gravity.
+    # Transforms are copied so that a replay of the new bag sees the same frames.
     copied = {GROUND_TRUTH, *TRANSFORMS}
     if options.with_images:
         copied |= {IMAGE, CAMERA_INFO}

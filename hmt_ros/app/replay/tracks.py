@@ -129,7 +129,7 @@ class LiveTrack(PlayedTrack):
                 COMPRESSED_MASK: ('mask/compressed', 'sensor_msgs/msg/CompressedImage'),
                 IMAGE: (topic, f'sensor_msgs/msg/{kind}'),
             }
-            if self._parameters.filter.gravity_frame:
+            if self._parameters.filter.uses_transforms:
                 inputs |= {each: (f'/{each}', TRANSFORMS_TYPE) for each in TRANSFORMS}
             live = partial(LiveNode, player, opened, write=self._write)
             sensors = (f'/{topic}', '/camera_info', *(f'/{each}' for each in MASKS))

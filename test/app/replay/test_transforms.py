@@ -158,3 +158,24 @@ def test_live_nodes_give_the_same_bytes(replayed, moving, tmp_path):
     arguments = [str(moving), '-o', str(out), *PERSON, *SMALL, *FRAME, '--with-images']
     assert main([*arguments, '--no-smoother', '--quiet', '--live']) == 0
     assert content(out) == content(replayed)
+
+
+def test_fixed_frame_of_a_camera_that_stands_still(replayed, moving, tmp_path):
+    """A camera that does not move in the fixed frame is as one of which nothing is told."""
+    out = tmp_path / 'out'
+    arguments = [str(moving), '-o', str(out), *PERSON, *SMALL, *FRAME, '--set', 'fixed_frame=world']
+    assert main([*arguments, '--no-smoother', '--quiet']) == 0
+    for topic in ESTIMATES[:-1]:
+        assert data(out, topic) == data(replayed, topic)
+    assert data(out, '/tf_static') == data(moving, '/tf_static')
+
+
+def test_fixed_frame_alone_reads_transforms(entries, tmp_path, capsys):
+    bag, out = write(tmp_path / 'bag', entries), tmp_path / 'out'
+    arguments = [str(bag), '-o', str(out), *PERSON, *SMALL, '--set', 'fixed_frame=odom']
+    assert main([*arguments, '--no-smoother']) == 0
+    streams = capsys.readouterr()
+    assert '2 of 2 images tracked' in streams.out
+    lines = [line for line in streams.err.splitlines() if 'fixed_frame' in line]
+    assert len(lines) == 1
+    assert "to fixed_frame 'odom' at the image of" in lines[0]

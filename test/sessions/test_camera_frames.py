@@ -217,3 +217,72 @@ def test_time_that_jumps_back_gives_the_same_again(session, stub_tracker, small_
     assert len(stub_tracker.made) == 2
     half = len(outputs) // 2
     assert outputs[:half] == outputs[half:]
+
+
+# The pose of the camera.
+
+
+@pytest.mark.parametrize('first', [TF, IMAGE])
+def test_the_pose_of_the_camera_at_every_image(session, stub_tracker, small_camera, first):
+    one = session(gravity_frame='', fixed_frame='world')
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in range(3):
+        pair = [(TF, at(small_camera, index)), (IMAGE, small_camera.image(index))]
+        for source, message in pair if first == TF else reversed(pair):
+            handled = one.take(source, message)
+        assert handled.warnings == ()
+    (tracker,) = stub_tracker.made
+    assert tracker.known_ground.up is None
+    assert tracker.gravities == []
+    for index, (position, rotation) in enumerate(tracker.poses):
+        seen = view(index)
+        np.testing.assert_allclose(position, seen.to_world(np.zeros(3)), atol=1e-12)
+        np.testing.assert_allclose(rotation, seen.rotation.T, atol=1e-12)
+    assert len(tracker.poses) == 3
+    assert one.state.faults == {}
+
+
+def test_height_of_a_camera_that_rises(session, stub_tracker, small_camera, outputs):
+    one = session(fixed_frame='world', floor_in_gravity_frame=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in range(3):
+        one.take(TF, at(small_camera, index, height=1.2 + 0.1 * index))
+        one.take(IMAGE, small_camera.image(index))
+    heights = [ground.height for ground in grounds(outputs)]
+    np.testing.assert_allclose(heights, [1.2, 1.3, 1.4], atol=1e-9)
+    assert len(stub_tracker.made[0].poses) == 3
+
+
+def test_a_missing_pose_is_told_once_and_loses_no_image(session, stub_tracker, small_camera):
+    one = session(gravity_frame='', fixed_frame='world', transform_timeout=0.0)
+    one.take(CAMERA_INFO, small_camera.info())
+    warnings = []
+    for index in range(5):
+        if index < 2:
+            one.take(TF, at(small_camera, index))
+        warnings += one.take(IMAGE, small_camera.image(index)).warnings
+    one.take(IMAGE, small_camera.image(5))
+    (tracker,) = stub_tracker.made
+    assert len(tracker.seen) == 5
+    assert len(tracker.poses) == 2
+    last, wanted = small_camera.stamp(1), small_camera.stamp(2)
+    assert warnings == [
+        f"no transform from 'lens' to fixed_frame 'world' at the image of {wanted} ns: 'lens' has "
+        f'transforms of {small_camera.stamp(0)} to {last} ns, wanted {wanted} ns; the camera is '
+        'taken to go on as before, and after 0.5 s its motion is unknown'
+    ]
+    assert one.state.faults == {'no pose of the camera': 3}
+
+
+def test_stale_gravity_is_not_given_again(session, stub_tracker, small_camera):
+    """Where transforms end the tracker carries gravity by itself."""
+    one = session(fixed_frame='world', transform_timeout=0.0)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in range(4):
+        if index < 2:
+            one.take(TF, at(small_camera, index))
+        one.take(IMAGE, small_camera.image(index))
+    (tracker,) = stub_tracker.made
+    assert len(tracker.seen) == 3
+    np.testing.assert_allclose(tracker.gravities, [up_of(1)], atol=1e-12)
+    assert len(tracker.poses) == 2

@@ -1,0 +1,156 @@
+"""What frames tell of the camera through transforms: gravity, its height, its pose.
+
+A frame with z up (`gravity_frame`) tells which way is up and, where z = 0 is the floor, how high
+the camera is. A frame that stands still (`fixed_frame`) tells how the camera moves. Both may be
+one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hmt_ros.inference.arrays import Array
+from hmt_ros.sessions.handled import Fault
+from hmt_ros.sessions.transform_buffer import Transform, TransformBuffer, TransformError
+from hmt_ros.tracking.camera_motion import LONGEST_GUESS
+from hmt_ros.tracking.ground import KnownGround
+
+# A vector that is shorter has no direction.
+_SHORTEST = 1e-6
+
+
+class SeenGravity(NamedTuple):
+    """What the transforms tell about a camera at a time.
+
+    Attributes:
+        up: (3,) unit vector against gravity, camera frame.
+        height: of the camera above z = 0 of the frame, m.
+    """
+
+    up: Array
+    height: float
+
+
+class CameraFrames:
+    """The frames that transforms lead to from the camera, and what they tell.
+
+    Args:
+        gravity_frame: name of a frame with z up; empty: there is none.
+        fixed_frame: name of a frame that stands still; empty: there is none.
+        floor: whether z = 0 of `gravity_frame` is the floor.
+
+    Attributes:
+        gravity: what was seen of it last; None: nothing yet.
+        newest: whether that was at the image that was looked up last.
+        pose: of the camera in `fixed_frame` at the image that was looked up last; None: unknown.
+    """
+
+    def __init__(self, gravity_frame: str, fixed_frame: str, *, floor: bool) -> None:
+        self.gravity_frame = gravity_frame
+        self.fixed_frame = fixed_frame
+        self.gravity: SeenGravity | None = None
+        self.newest = False
+        self.pose: Transform | None = None
+        self._floor = floor
+        self._transforms = TransformBuffer()
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there is a frame to look up."""
+        return bool(self.gravity_frame or self.fixed_frame)
+
+    def take(self, message: Any, *, static: bool) -> list[str]:
+        """Takes a tf2_msgs/TFMessage; see `TransformBuffer.put`."""
+        return self._transforms.put(message, static=static)
+
+    def forget_after(self, stamp_ns: int) -> None:
+        """See `TransformBuffer.forget_after`; what was seen is forgotten, too."""
+        self._transforms.forget_after(stamp_ns)
+        self.gravity, self.newest, self.pose = None, False, None
+
+    def is_settled(self, camera_frame: str, stamp_ns: int, timeout_ns: float) -> bool:
+        """Whether an image need not wait: its transforms are there, or those of a later time."""
+        newest = self._transforms.newest_ns
+        if newest is not None and newest - stamp_ns > timeout_ns:
+            return True
+        try:
+            for name in filter(None, (self.gravity_frame, self.fixed_frame)):
+                self._transforms.lookup(camera_frame, name, stamp_ns)
+        except TransformError:
+            return False
+        return True
+
+    def look(self, camera_frame: str, stamp_ns: int) -> list[tuple[Fault, str]]:
+        """Looks gravity and the pose of the camera up at the time of an image.
+
+        Returns:
+            What is wrong; where there is no transform, what was looked for and what there is.
+        """
+        faults = []
+        if self.gravity_frame:
+            faults += self._look_for_gravity(camera_frame, stamp_ns)
+        if self.fixed_frame:
+            faults += self._look_for_pose(camera_frame, stamp_ns)
+        return faults
+
+    def known_ground(self, otherwise: KnownGround) -> KnownGround:
+        """What was seen last, in place of what is known otherwise."""
+        if self.gravity is None:
+            return otherwise
+        height = otherwise.camera_height
+        if self._floor and self.gravity.height > 0:
+            height = self.gravity.height
+        return KnownGround(self.gravity.up, height)
+
+    def _look_for_gravity(self, camera_frame: str, stamp_ns: int) -> list[tuple[Fault, str]]:
+        name, self.newest = self.gravity_frame, False
+        try:
+            found = self._transforms.lookup(camera_frame, name, stamp_ns)
+        except TransformError as error:
+            text = (
+                f'no transform from gravity_frame {name!r} to {camera_frame!r} at the image '
+                f'of {stamp_ns} ns: {error}; the track goes on with what was known of gravity'
+            )
+            return [(Fault.NO_TRANSFORM, text)]
+        up = found.rotation[:, 2]
+        height = float(found.inverse().translation[2])
+        self.gravity, self.newest = SeenGravity(up / np.linalg.norm(up), height), True
+        if height > 0 or not self._floor:
+            return []
+        text = (
+            f'the camera lies {-height:.2f} m below z = 0 of gravity_frame {name!r}, which '
+            'can not be the floor'
+        )
+        return [(Fault.CAMERA_HEIGHT, text)]
+
+    def _look_for_pose(self, camera_frame: str, stamp_ns: int) -> list[tuple[Fault, str]]:
+        name = self.fixed_frame
+        try:
+            self.pose = self._transforms.lookup(name, camera_frame, stamp_ns)
+        except TransformError as error:
+            self.pose = None
+            text = (
+                f'no transform from {camera_frame!r} to fixed_frame {name!r} at the image of '
+                f'{stamp_ns} ns: {error}; the camera is taken to go on as before, and after '
+                f'{LONGEST_GUESS} s its motion is unknown'
+            )
+            return [(Fault.NO_CAMERA_POSE, text)]
+        return []
+
+
+def unit_vector(vector: Sequence[float], name: str) -> Array:
+    """A vector (3,) at unit length.
+
+    Raises:
+        ValueError: not three finite numbers, or a vector without length.
+    """
+    v = np.asarray(vector, dtype=np.float64)
+    length = float(np.linalg.norm(v)) if v.shape == (3,) else math.nan
+    if not _SHORTEST < length < math.inf:
+        raise ValueError(f'{name} must be three finite numbers, not all zero, saw {v.tolist()}')
+    result: Array = v / length
+    return result

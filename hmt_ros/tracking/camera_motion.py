@@ -1,0 +1,215 @@
+"""Motion of the camera between images, in a frame that stands still.
+
+    p' = R p + t                     of a point that stands still, in the frames of two images, m
+    R = C'^T C,  t = C'^T (c - c')   with poses of the camera p_fixed = C p + c
+
+A mixture over poses lives in the camera frame. Before it is predicted it is carried from the frame
+of the last image into that of the present one, so that velocities and predictions are those of the
+person in the fixed frame. With the rotation vectors of the root's angles, w = A(a) da/dt,
+
+    place' = R place + t,   Q(a') = R Q(a),   da' = A(a')^-1 R A(a) da
+
+and means of velocities and covariances of states follow with this Jacobian.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.mirror import root_angles, root_rotation_dofs, root_rotations
+from hmt_ros.inference.arrays import Array
+from hmt_ros.tracking.hypotheses import Modes
+
+# Time for which the last known motion of the camera is taken to go on, s.
+LONGEST_GUESS = 0.5
+# Most that the entries of R R' differ from those of the identity.
+NOT_ORTHOGONAL = 1e-3
+# Shift of the still scene above which a background is that of another view, px, and the distance at
+# which translations are turned into pixels, m.
+SHIFTED, SCENE_DISTANCE = 2.0, 3.0
+
+
+class CameraPose(NamedTuple):
+    """Pose of the camera optical frame in a frame that stands still: p_fixed = C p + c.
+
+    Attributes:
+        rotation: C (3, 3).
+        position: c (3,), m.
+    """
+
+    rotation: Array
+    position: Array
+
+    @classmethod
+    def of(cls, position: ArrayLike, rotation: ArrayLike) -> CameraPose:
+        """A pose from position (3,), m, and rotation (3, 3).
+
+        Raises:
+            ValueError: other shapes, numbers that are not finite, or no rotation.
+        """
+        place, turn = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
+        if place.shape != (3,) or not np.isfinite(place).all():
+            raise ValueError(
+                f'the position of the camera must be three finite numbers, saw {place.tolist()}'
+            )
+        if (
+            turn.shape != (3, 3)
+            or not np.abs(turn @ turn.T - np.eye(3)).max() < NOT_ORTHOGONAL
+            or np.linalg.det(turn) < 0
+        ):
+            raise ValueError(
+                f'the rotation of the camera must be a rotation matrix (3, 3), saw {turn.tolist()}'
+            )
+        return cls(turn, place)
+
+    def equals(self, other: CameraPose) -> bool:
+        """Whether the other pose has the very same numbers."""
+        return all(np.array_equal(a, b) for a, b in zip(self, other, strict=True))
+
+    def shift(self, other: CameraPose, camera: Camera) -> float:
+        """About how far the images of still points are apart from the two poses, px."""
+        angle = Rotation.from_matrix(self.rotation.T @ other.rotation).magnitude()
+        apart = float(np.linalg.norm(self.position - other.position))
+        return float(max(camera.fx, camera.fy) * (angle + apart / SCENE_DISTANCE))
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMotion:
+    """From the camera frame of one image into that of another: p' = R p + t.
+
+    Attributes:
+        rotation: R (3, 3).
+        translation: t (3,), m.
+    """
+
+    rotation: Array
+    translation: Array
+
+    @classmethod
+    def between(cls, before: CameraPose, now: CameraPose) -> CameraMotion | None:
+        """The motion from one pose of the camera to another; None: they are the same."""
+        if before.equals(now):
+            return None
+        back = now.rotation.T
+        return cls(back @ before.rotation, back @ (before.position - now.position))
+
+    def points(self, points: Array) -> Array:
+        """Points (..., 3) that stand still, m."""
+        return self.directions(points) + self.translation
+
+    def directions(self, directions: Array) -> Array:
+        """Directions (..., 3) that stand still."""
+        result: Array = directions @ self.rotation.T
+        return result
+
+    def poses(self, body: Body, poses: Array) -> Array:
+        """Poses (N, d) of a body in the new camera frame, within its limits."""
+        root, offset = root_rotation_dofs(body.skeleton), body.skeleton.offsets[0]
+        result = poses.copy()
+        result[:, :3] = self.points(poses[:, :3] + offset) - offset
+        angles = root_angles(body, self.rotation @ root_rotations(body, poses))
+        # The turn nearest to that of before.
+        angles[:, 0] += 2.0 * np.pi * np.round((poses[:, root[0]] - angles[:, 0]) / (2.0 * np.pi))
+        result[:, root] = angles
+        return np.clip(result, body.lower, body.upper)
+
+    def jacobians(self, body: Body, before: Array, after: Array) -> Array:
+        """Derivatives (N, d, d) of `poses` at poses (N, d), whose results are `after`."""
+        root = root_rotation_dofs(body.skeleton)
+        # Columns are the axes that the angles turn about.
+        old, new = (
+            forward(body.skeleton, poses).axes[root].transpose(2, 1, 0) for poses in (before, after)
+        )
+        result = np.tile(np.eye(body.dimension), (len(before), 1, 1))
+        result[:, :3, :3] = self.rotation
+        result[np.ix_(range(len(before)), root, root)] = np.linalg.solve(new, self.rotation @ old)
+        return result
+
+    def modes(self, body: Body, modes: Modes) -> Modes:
+        """Modes in the new camera frame: poses, velocities and covariances."""
+        poses = self.poses(body, modes.poses)
+        jacobians = self.jacobians(body, modes.poses, poses)
+        count = modes.state_covariances.shape[1] // body.dimension
+        states = np.zeros_like(modes.state_covariances)
+        for i in range(count):
+            own = slice(i * body.dimension, (i + 1) * body.dimension)
+            states[:, own, own] = jacobians
+        return replace(
+            modes,
+            poses=poses,
+            expected=self.poses(body, modes.expected),
+            velocities=(jacobians @ modes.velocities[..., None])[..., 0],
+            covariances=_propagated(jacobians, modes.covariances),
+            filtered=_propagated(jacobians, modes.filtered),
+            state_covariances=_propagated(states, modes.state_covariances),
+        )
+
+
+def _propagated(jacobians: Array, covariances: Array) -> Array:
+    result: Array = jacobians @ covariances @ jacobians.swapaxes(1, 2)
+    return 0.5 * (result + result.swapaxes(1, 2))
+
+
+class CameraPath:
+    """The poses of the camera at the images, given for most of them.
+
+    Where an image has none, the camera is taken to go on as between the last two poses that were
+    given, for `LONGEST_GUESS` at most; after that its motion is unknown until the next one is
+    given. What was guessed is not held against a later pose: the pose at the image before is then
+    interpolated.
+
+    Attributes:
+        known: whether the motion to the present image is known or guessed.
+    """
+
+    def __init__(self) -> None:
+        self.known = False
+        self._given: list[tuple[int, CameraPose]] = []
+        self._last_stamp = 0
+
+    def advance(self, stamp: int, pose: CameraPose | None) -> CameraMotion | None:
+        """The motion from the last image to the next one; None: none, or unknown.
+
+        Args:
+            stamp: of the image, ns.
+            pose: of the camera; None: not given.
+        """
+        last, self._last_stamp = self._last_stamp, stamp
+        if pose is not None:
+            self.known = True
+            before = self._given[-1:]
+            self._given = [*before, (stamp, pose)]
+            if not before:
+                return None
+            return CameraMotion.between(_pose_at(before[0], (stamp, pose), last), pose)
+        self.known = len(self._given) == 2 and self._is_near(stamp)
+        if not self.known:
+            return None
+        first, second = self._given
+        return CameraMotion.between(_pose_at(first, second, last), _pose_at(first, second, stamp))
+
+    def _is_near(self, stamp: int) -> bool:
+        return (stamp - self._given[-1][0]) * 1e-9 <= LONGEST_GUESS
+
+
+def _pose_at(
+    first: tuple[int, CameraPose], second: tuple[int, CameraPose], stamp: int
+) -> CameraPose:
+    """The pose at a stamp, by the constant motion between two poses with stamps, ns."""
+    (start, a), (end, b) = first, second
+    if stamp == end or a.equals(b):
+        return b
+    if stamp == start:
+        return a
+    share = (stamp - start) / (end - start)
+    turn = Rotation.from_matrix(a.rotation.T @ b.rotation).as_rotvec()
+    rotation = a.rotation @ Rotation.from_rotvec(share * turn).as_matrix()
+    return CameraPose(rotation, a.position + share * (b.position - a.position))

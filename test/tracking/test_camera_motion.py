@@ -1,0 +1,372 @@
+"""A camera that moves: what is carried from image to image, and tracks that do not notice it."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hmt_ros.body import Body, load_body
+from hmt_ros.body.kinematics import forward, point_energy
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.likelihood import LikelihoodSettings
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.energy import Derivatives, Energy
+from hmt_ros.motion.procedural_motion import procedural_motion
+from hmt_ros.tracking import GroundSettings, KnownGround, Tracker, TrackerSettings
+from hmt_ros.tracking.camera_motion import LONGEST_GUESS, CameraMotion, CameraPath, CameraPose
+from hmt_ros.tracking.contact import FootContacts
+from hmt_ros.tracking.ground import GroundEstimator
+from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
+from hmt_ros.tracking.point_estimate import PointEstimate
+from hmt_ros.tracking.prediction import dynamics_of, predicted_states
+
+FRAME = 100_000_000  # ns
+UP = np.array([0.0, -1.0, 0.0])
+SHARED = Path(os.environ.get('HMT_SHARED', Path(__file__).parents[2] / '..' / 'shared'))
+NO_IMAGE = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
+
+
+@pytest.fixture(scope='module')
+def body() -> Body:
+    return load_body('human37')
+
+
+@pytest.fixture(scope='module')
+def walking(body) -> np.ndarray:
+    """Poses (20, d) before a still camera, 10 Hz."""
+    return procedural_motion('walk', body, 2.0, 10.0, 1)
+
+
+def drive(t: float, pitch: float = 0.0) -> CameraPose:
+    """A camera that passes sideways at 0.8 m/s, turning by 20 degrees a second."""
+    turn = Rotation.from_euler('yx', [-20.0 * t, pitch], degrees=True).as_matrix()
+    return CameraPose.of([0.8 * t, -0.1 * t, 0.05 * np.sin(t)], turn)
+
+
+def motion_of(t: float, pitch: float = 0.0) -> CameraMotion:
+    found = CameraMotion.between(CameraPose.of(np.zeros(3), np.eye(3)), drive(t, pitch))
+    assert found is not None
+    return found
+
+
+def modes_of(body: Body, poses: np.ndarray, seed: int = 0) -> Modes:
+    """Modes with velocities and full covariances of states."""
+    k, d = poses.shape
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(k, 2 * d, 2 * d)) * 0.05 / np.sqrt(d)
+    states = root @ root.transpose(0, 2, 1) + 1e-5 * np.eye(2 * d)
+    velocities = rng.normal(size=(k, d))
+    own = np.ascontiguousarray(states[:, :d, :d])
+    return Modes(
+        **vars(new_hypotheses(poses, np.zeros(k))), velocities=velocities, covariances=own,
+        filtered=own, log_likelihoods=np.zeros(k), energies=np.zeros(k), state_covariances=states,
+    )  # fmt: skip
+
+
+# What is carried.
+
+
+@pytest.mark.parametrize('pitch', [0.0, 25.0])
+def test_joints_of_carried_poses_stand_where_they_stood(body, walking, pitch):
+    motion = motion_of(0.7, pitch)
+    before, after = body.joint_positions(walking), motion.poses(body, walking)
+    np.testing.assert_allclose(body.joint_positions(after), motion.points(before), atol=1e-9)
+    # Nobody turns about by a whole turn.
+    assert np.abs(after - walking)[:, 3].max() < 1.0
+
+
+@pytest.mark.parametrize('pitch', [0.0, 25.0])
+def test_jacobians_are_the_derivatives(body, walking, pitch):
+    motion, poses, step = motion_of(0.7, pitch), walking[:3], 1e-6
+    found = motion.jacobians(body, poses, motion.poses(body, poses))
+    for j in range(body.dimension):
+        moved = [poses + sign * step * np.eye(body.dimension)[j] for sign in (1.0, -1.0)]
+        high, low = (motion.poses(body, x) for x in moved)
+        np.testing.assert_allclose(found[:, :, j], (high - low) / (2 * step), atol=1e-6)
+
+
+def test_carrying_and_predicting_commute(body, walking):
+    """Before a level camera that turns about the vertical the dynamics are those of the world."""
+    modes, motion = modes_of(body, walking[:3]), motion_of(0.3)
+    dynamics = dynamics_of(body, 'learned')
+
+    def predicted(x: Modes) -> Modes:
+        states = predicted_states(x, x.state_covariances, body, dynamics, 0.1)
+        d = body.dimension
+        return replace(
+            x,
+            poses=states.poses,
+            velocities=states.means[:, d:],
+            state_covariances=states.covariances,
+        )
+
+    first = predicted(motion.modes(body, modes))
+    other = motion.modes(body, predicted(modes))
+    for name in ('poses', 'velocities', 'state_covariances'):
+        np.testing.assert_allclose(getattr(first, name), getattr(other, name), atol=1e-7)
+    # The same without being carried is another prediction.
+    assert np.abs(first.poses - predicted(modes).poses).max() > 0.1
+
+
+def test_the_point_estimate_is_carried_with_its_velocity(body, walking):
+    motion, estimates = motion_of(0.2), (PointEstimate(), PointEstimate())
+    one, other = estimates
+    for t in range(5):
+        for estimate in estimates:
+            estimate.update(body, walking[t : t + 1], np.ones(1), 0.1 * (t > 0))
+    one.carry(body, motion)
+    after = motion.poses(body, walking[5:6])
+    found = one.update(body, after, np.ones(1), 0.1)
+    wanted = other.update(body, walking[5:6], np.ones(1), 0.1)
+    np.testing.assert_allclose(found, motion.poses(body, wanted[None])[0], atol=1e-9)
+
+
+@pytest.mark.parametrize('known', [KnownGround(UP, 1.2), KnownGround(UP), KnownGround()])
+def test_heights_over_the_carried_ground_are_as_before(body, walking, known):
+    estimator, motion = GroundEstimator(known), motion_of(0.5, 12.0)
+    for pose in walking[:8]:
+        estimator.update(body, modes_of(body, pose[None]), 1.0, 0.1)
+    before = estimator.plane
+    points = np.random.default_rng(0).normal((0.0, 0.0, 4.0), size=(20, 3))
+    heights = points @ before.up + before.height
+    estimator.carry(motion)
+    after = estimator.plane
+    np.testing.assert_allclose(motion.points(points) @ after.up + after.height, heights, atol=1e-9)
+    assert (after.up_sigma, after.height_sigma) == pytest.approx(
+        (before.up_sigma, before.height_sigma)
+    )
+
+
+def test_feet_rest_before_a_moving_camera(body):
+    """Who stands, stands; without the motion of the camera the same feet would slide."""
+    standing = np.repeat(
+        procedural_motion('reach', body, 0.1, 10.0, 1)[:1], 15, axis=0
+    )  # fmt: skip
+    found = []
+    for carried in (True, False):
+        contacts, estimator = FootContacts(), GroundEstimator(KnownGround(UP, 1.0))
+        before = drive(0.0)
+        for t, pose in enumerate(standing):
+            now = drive(0.1 * t)
+            seen = CameraMotion.between(drive(0.0), now)
+            modes = modes_of(body, pose[None] if seen is None else seen.poses(body, pose[None]))
+            modes = replace(modes, velocities=np.zeros_like(modes.velocities))
+            step = CameraMotion.between(before, now)
+            if step is not None and carried:
+                contacts.carry(step)
+                estimator.carry(step)
+            if t == 0:
+                contacts.begin(body, estimator.plane, modes)
+            else:
+                contacts.update(body, estimator.plane, modes, 0.1, still=True)
+            estimator.update(body, modes, 1.0, 0.1)
+            before = now
+        found.append(max(contacts.by_foot().values()))
+    assert found[0] > 0.8
+    assert found[1] < 0.2
+
+
+# The path of the camera.
+
+
+def test_a_path_interpolates_and_goes_on():
+    path, poses = CameraPath(), [drive(0.1 * i) for i in range(12)]
+
+    def check(found: CameraMotion | None, a: CameraPose, b: CameraPose, atol: float) -> None:
+        wanted = CameraMotion.between(a, b)
+        assert found is not None
+        assert wanted is not None
+        np.testing.assert_allclose(found.rotation, wanted.rotation, atol=atol)
+        np.testing.assert_allclose(found.translation, wanted.translation, atol=atol)
+
+    assert path.advance(0, None) is None
+    assert not path.known
+    assert path.advance(FRAME, poses[1]) is None
+    check(path.advance(2 * FRAME, poses[2]), poses[1], poses[2], 1e-12)
+    # Two images without a pose: as before, up to what accelerates.
+    for i in (3, 4):
+        check(path.advance(i * FRAME, None), poses[i - 1], poses[i], 2e-3)
+        assert path.known
+    # What was guessed is not held against the pose that is given then.
+    check(path.advance(5 * FRAME, poses[5]), poses[4], poses[5], 2e-3)
+    # A pose between two images counts for none.
+    check(path.advance(6 * FRAME, poses[6]), poses[5], poses[6], 1e-12)
+    for i in range(7, 11):
+        path.advance(i * FRAME, None)
+    assert path.known
+    assert path.advance(int((6 + 10 * LONGEST_GUESS) * FRAME) + FRAME, None) is None
+    assert not path.known
+
+
+@pytest.mark.parametrize(
+    ('position', 'rotation', 'why'),
+    [
+        ([0.0, np.nan, 0.0], np.eye(3), 'three finite numbers'),
+        ([0.0, 0.0], np.eye(3), 'three finite numbers'),
+        (np.zeros(3), np.eye(2), 'rotation matrix'),
+        (np.zeros(3), np.full((3, 3), np.nan), 'rotation matrix'),
+        (np.zeros(3), 1.1 * np.eye(3), 'rotation matrix'),
+        (np.zeros(3), np.diag([1.0, 1.0, -1.0]), 'rotation matrix'),
+    ],
+)
+def test_what_is_no_pose(body, camera, position, rotation, why):
+    with pytest.raises(ValueError, match=why):
+        Tracker(body, camera).set_camera(position, rotation)
+
+
+# Tracks.
+
+
+@dataclass
+class Places:
+    """Joints of one person as a measurement in three dimensions: a `FrameTerm`."""
+
+    body: Body
+    targets: np.ndarray
+    sigma: float = 0.01
+
+    def energy(self, frames, rows, *, derivatives=Derivatives.POSITIVE) -> Energy:
+        skeleton, n = self.body.skeleton, frames.count
+        targets = np.repeat(self.targets[:, :, None], n, axis=2)
+        weights = np.full((len(self.targets), n), self.sigma**-2)
+        found = point_energy(
+            frames, skeleton.joint_segments, skeleton.joint_offsets, targets, weights
+        )
+        return Energy(*found) if derivatives else Energy(found[0])
+
+
+@pytest.fixture(scope='module')
+def track(body, camera, walking):
+    """Function (pose of the camera by time) -> a tracker of places, and what it finds.
+
+    The measurements are those of the fixed frame, so that the camera makes no difference to them.
+    """
+
+    def run(path, *, told: bool, background=None, frames=10):
+        black = np.zeros((camera.height, camera.width, 3), np.uint8)
+        settings = TrackerSettings(
+            max_hypotheses=1, candidates=2, likelihood=NO_IMAGE, shape_images=0, trust=1.0,
+            error_correlation=0.0, ground=GroundSettings(0.0, 0.0, 0.0, 0.0),
+            reversal_probability=0.0, iterations=12, base_iterations=12,
+        )  # fmt: skip
+        term = Places(body, np.zeros((1, 3)))
+        tracker = Tracker(body, camera, settings, background, extra=[term])
+        start = path(0.0)
+        began = CameraMotion.between(drive(0.0), start)
+        first = walking[:1] if began is None else began.poses(body, walking[:1])
+        covariance = 1e-2 * np.eye(body.dimension)[None]
+        tracker.reset(GaussianMixture(np.ones(1), first, covariance))
+        found = []
+        for t in range(frames):
+            pose = path(0.1 * t)
+            joints = body.joint_positions(walking[t : t + 1])[0]
+            term.targets = (joints - pose.position) @ pose.rotation
+            if told:
+                tracker.set_camera(pose.position, pose.rotation)
+            posterior, likelihood = tracker.step(black, t * FRAME)
+            found.append((posterior, likelihood, tracker.modes, tracker.point_estimate))
+        return tracker, found
+
+    return run
+
+
+def still(t: float) -> CameraPose:
+    return drive(0.0)
+
+
+def in_bytes(found) -> list[bytes]:
+    return [
+        array.tobytes()
+        for posterior, likelihood, modes, point in found
+        for array in (
+            *(x for m in (posterior, likelihood) for x in (m.weights, m.means, m.covariances)),
+            modes.velocities,
+            modes.state_covariances,
+            point,
+        )
+    ]
+
+
+def test_a_told_camera_that_stands_still_changes_no_bit(track, camera):
+    black = np.zeros((camera.height, camera.width, 3), np.uint8)
+    silent, told = (
+        track(still, told=told, background=BackgroundModel.from_image(black))
+        for told in (False, True)
+    )
+    assert in_bytes(silent[1]) == in_bytes(told[1])
+    assert silent[0].contacts == told[0].contacts
+
+
+def test_what_a_moving_camera_sees_is_what_a_still_one_sees(body, track):
+    """Poses, velocities and covariances are those of the still camera, in another frame."""
+    _, moving = track(drive, told=True)
+    _, resting = track(still, told=False)
+    _, untold = track(drive, told=False)
+    gaps, slips = [], []
+    for t in range(1, 10):
+        motion = motion_of(0.1 * t)
+        wanted = motion.modes(body, resting[t][2][np.zeros(1, dtype=np.intp)])
+        found = moving[t][2]
+        np.testing.assert_allclose(found.poses[0], wanted.poses[0], atol=2e-3)
+        np.testing.assert_allclose(found.velocities[0], wanted.velocities[0], atol=2e-2)
+        np.testing.assert_allclose(
+            found.state_covariances[0], wanted.state_covariances[0], atol=2e-3
+        )
+        pelvis = [body.joint_positions(x[None])[0, 0] for x in (moving[t][3], resting[t][3])]
+        gaps.append(np.linalg.norm(pelvis[0] - motion.points(pelvis[1])))
+        slips.append(np.linalg.norm(untold[t][2].velocities[0, :3] - wanted.velocities[0, :3]))
+    assert max(gaps) < 2e-3
+    # A camera that is not told of takes its own motion for the person's.
+    assert np.mean(slips[4:]) > 0.5
+
+
+def test_an_image_without_a_pose_is_tracked(body, track):
+    tracker, found = track(drive, told=True, frames=6)
+    pose = drive(0.6)
+    # The seventh image has no pose: the camera is taken to go on, and the person stands.
+    black = np.zeros((tracker.camera.height, tracker.camera.width, 3), np.uint8)
+    (term,) = tracker._extra
+    placed = term.targets @ drive(0.5).rotation.T + drive(0.5).position
+    term.targets = (placed - pose.position) @ pose.rotation
+    posterior, _ = tracker.step(black, 6 * FRAME)
+    assert posterior is not None
+    before = found[-1][3]
+    motion = CameraMotion.between(drive(0.5), pose)
+    assert motion is not None
+    place = body.joint_positions(posterior.means[:1])[0, 0]
+    assert np.linalg.norm(place - motion.points(body.joint_positions(before[None])[0, 0])) < 0.1
+
+
+def test_a_background_of_another_view_is_forgotten(body, camera, track):
+    grey = np.full((camera.height, camera.width, 3), 40, np.uint8)
+    tracker, _ = track(still, told=True, background=BackgroundModel.from_image(grey), frames=3)
+    assert tracker.background.frames > 0
+    tracker, _ = track(drive, told=True, background=BackgroundModel.from_image(grey), frames=3)
+    assert tracker.background.frames == 0
+    assert tracker.silhouettes.known == 'unknown'
+
+
+def test_frames_of_a_pose_are_the_carried_ones(body, walking):
+    motion = motion_of(0.4, 10.0)
+    one = forward(body.skeleton, walking[:2])
+    other = forward(body.skeleton, motion.poses(body, walking[:2]))
+    np.testing.assert_allclose(other.rotations(), motion.rotation @ one.rotations(), atol=1e-9)
+
+
+@pytest.mark.skipif(
+    not (SHARED / 'video' / 'follow').is_dir(), reason='the development clips are absent'
+)
+def test_root_path_of_a_clip_with_a_moving_camera():
+    from benchmarks.runs import BOTH, Run, run
+    from benchmarks.tracking_scores import in_world
+
+    record = run(Run(SHARED / 'video' / 'follow', BOTH, 0, limit=30))
+    own, true = (in_world(record, x[:, :1])[:, 0] for x in (record.point, record.true))
+    length = np.linalg.norm(np.diff(true[::10], axis=0), axis=1).sum()
+    assert np.linalg.norm(own - true, axis=1).mean() < 0.08
+    assert np.linalg.norm((own[-1] - own[0]) - (true[-1] - true[0])) < 0.1 * length
