@@ -61,7 +61,11 @@ setup(
     ],
     # OpenCV has several distributions of one module (apt, opencv-python, -headless): naming one
     # here would install it a second time next to another.
-    extras_require={'test': ['pytest', 'hypothesis'], 'dask': ['distributed']},
+    extras_require={
+        'test': ['pytest', 'hypothesis'],
+        'dask': ['distributed'],
+        'mediapipe': ['mediapipe==0.10.21'],
+    },
     zip_safe=False,
     entry_points={
         'console_scripts': [

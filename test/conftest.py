@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -57,6 +59,18 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     if item.get_closest_marker('ros') is not None and 'AMENT_PREFIX_PATH' not in os.environ:
         reason = 'no ROS environment: "make test" or "source tools/environment.bash" first'
         item.add_marker(pytest.mark.skip(reason=reason))
+
+
+@pytest.fixture(scope='session')
+def mediapipe() -> str:
+    """An interpreter that imports MediaPipe; tests that want it are skipped where there is none."""
+    python = os.environ.get('HMT_ROS_DETECTOR_PYTHON', sys.executable)
+    environment = {k: v for k, v in os.environ.items() if k != 'PYTHONPATH'}
+    command = [python, '-c', 'import mediapipe']
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
+    if done.returncode != 0:
+        pytest.skip(f'{python} does not import MediaPipe: run "make mediapipe"')
+    return python
 
 
 @pytest.fixture(scope='session')
