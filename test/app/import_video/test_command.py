@@ -172,11 +172,18 @@ def test_detector(video, tmp_path, monkeypatch):
 
 
 def test_mediapipe_itself(mediapipe, walk_video, tmp_path):
+    """It finds the hips of a rendered person, each on its side."""
     out = tmp_path / 'bag'
     assert run(walk_video / 'walk.mp4', out, '--detector', 'mediapipe') == 0
-    messages = [x for _, x in content(out)['keypoints']]
-    assert len(messages) == 8
-    assert {len(x.names) for x in messages} <= {0, 33}
+    messages = [x for _, x in content(out)['keypoints'] if len(x.names)]
+    assert len(messages) >= 6
+    truth = np.load(walk_video / 'rendered' / 'truth.npz')
+    for name in ('left_hip', 'right_hip'):
+        joint = list(truth['joint_names']).index(name)
+        i = list(messages[0].names).index(name)
+        found = np.array([[x.u[i], x.v[i]] for x in messages])
+        apart = np.linalg.norm(found - truth['pixels'][-len(messages) :, joint], axis=1)
+        assert np.median(apart) < 10.0
 
 
 def test_video_that_breaks_off_is_told(video, tmp_path, capsys):
