@@ -17,7 +17,7 @@ import numpy as np
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.replay.inputs import recorded_input
 from hmt_ros.body import Body, load_body
-from hmt_ros.image.keypoint_schemes import Scheme, recognised
+from hmt_ros.image.keypoint_schemes import Scheme, landmark_called, recognised
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools import BagReader
 from msg_tools.messages.headers import SECOND_NS, time_ns
@@ -33,8 +33,8 @@ WANTED = tuple(
 ENOUGH = 10
 FEWEST = 4  # that a subject file may have
 CONFIDENT = 0.5
-# Landmarks of a head that lie at its joint.
-_CENTRES_OF_HEADS = ('head', 'centre_of_head')
+# The landmark of a head that lies at its joint.
+_CENTRE_OF_HEAD = 'centre_of_head'
 # Standard deviation of a keypoint, in sizes of the person in the image, and at least, px.
 SIGMA, LEAST_SIGMA = 0.03, 2.0
 
@@ -198,14 +198,15 @@ def joints_of(keypoints: Keypoints | None, body: Body) -> Keypoints:
 
 def _joint(name: str, scheme: Scheme | None, body: Body) -> str | None:
     """The joint of a body that a landmark stands for; None: it stands for none."""
-    landmark = None if scheme is None else scheme.landmark(name)
-    if scheme is None or landmark is None:
-        joint = body.keypoint_aliases.get(name, name)
-        return joint if joint in body.joint_names else None
-    joint = landmark.joint
-    if joint not in body.joint_names or (name != joint and joint in scheme.names):
+    if scheme is None and name in body.joint_names:
+        return name
+    landmark = landmark_called(name) if scheme is None else scheme.landmark(name)
+    if landmark is None or landmark.joint not in body.joint_names:
         return None
-    return None if joint == 'head' and landmark.name not in _CENTRES_OF_HEADS else joint
+    joint = landmark.joint
+    if scheme is not None and name != joint and joint in scheme.names:
+        return None
+    return None if joint == 'head' and landmark.name != _CENTRE_OF_HEAD else joint
 
 
 def subject_text(seen: Seen, *, stature: float | None = None, sigma: float | None = None) -> str:

@@ -21,7 +21,7 @@ class Person:
     """A person in a frame.
 
     Attributes:
-        keypoints: under the detector's names; their covariances are not known.
+        keypoints: under the detector's names; their covariances are not known (NaN).
         track: what the detector calls the person in all frames; '' if it does not track.
     """
 
@@ -71,7 +71,7 @@ def person(
         return None
     places[unseen], sure[unseen] = np.nan, 0.0
     lifted = None if positions is None else np.array(positions, dtype=np.float64)
-    unknown = np.tile(np.eye(2), (n, 1, 1))
+    unknown = np.full((n, 2, 2), np.nan)
     return Person(Keypoints(tuple(names), places, unknown, sure, lifted), track)
 
 
