@@ -289,6 +289,7 @@ def _seer(
             return keypoints, detector.mask if options.detector_masks else mask
         if found is None:
             return None, mask
+        found.check_size(frame)
         chosen = chooser.of(frame.number, found.of(frame))
         return None if chosen is None else chosen.keypoints, mask
 

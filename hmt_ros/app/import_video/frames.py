@@ -23,6 +23,13 @@ MOST = 1e9  # frames; a head that announces more is damaged
 FASTEST = 1000.0  # frames per second; what a container claims beyond is damage
 _EXIF_WITHIN = 2**16  # bytes at the beginning of a JPEG
 _QUIET = '-8'  # AV_LOG_QUIET of FFmpeg
+_TURNS = {
+    90: cv2.ROTATE_90_CLOCKWISE,
+    180: cv2.ROTATE_180,
+    270: cv2.ROTATE_90_COUNTERCLOCKWISE,
+}
+# Ubuntu 24.04 ships OpenCV 4.6, which tells the turn of a video in the wrong direction.
+_TURNS_BACKWARDS = cv2.__version__.startswith('4.6.')
 
 
 @dataclass(frozen=True)
@@ -151,7 +158,7 @@ def open_source(path: Path, fps: float | None, first_number: int = 0) -> FrameSo
 
 
 class VideoFile(FrameSource):
-    """A video file. Phones write how they were held; OpenCV turns the frames upright.
+    """A video file. Phones write how they were held: the frames are turned upright.
 
     Args:
         path: of the file.
@@ -168,7 +175,10 @@ class VideoFile(FrameSource):
                 f'{path} is not a video that OpenCV can read: it is damaged or incomplete, or in a '
                 'format that this OpenCV does not know; convert it to .mp4'
             )
-        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+        # Versions of OpenCV differ in whether they turn frames, and in which direction.
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        angle = round(self._capture.get(cv2.CAP_PROP_ORIENTATION_META))
+        self._turn = _TURNS.get((-angle if _TURNS_BACKWARDS else angle) % 360)
         self._fps = fps
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.claimed = int(count) if 0 < count < MOST else 0
@@ -182,6 +192,8 @@ class VideoFile(FrameSource):
                 done, image = self._capture.retrieve()
                 if not done:
                     raise ValueError(f'{self.path}: frame {number} can not be decoded')
+                if self._turn is not None:
+                    image = cv2.rotate(image, self._turn)
                 yield Frame(number, time_ns, '', np.asarray(image, dtype=np.uint8))
         finally:
             self._capture.release()

@@ -40,6 +40,7 @@ _BY_COUNT = {
 }
 _MATCHING_NS = 10_000_000  # between the time of a row and that of its frame
 _FRACTION = 2.0  # px; what lies all within is given as fractions of the image
+_FARTHEST = 1e5  # px; no image is so large
 
 
 @dataclass
@@ -50,11 +51,13 @@ class FoundPersons:
         by_number: persons of frames, by number.
         by_time: persons of frames, by time since the first frame, ns.
         rows: number of frames that the file describes one by one; None: it skips frames.
+        size: width and height of the frames that the detector saw, px; None: not known.
     """
 
     by_number: dict[int, list[Person]] = field(default_factory=lambda: defaultdict(list))
     by_time: dict[int, list[Person]] = field(default_factory=lambda: defaultdict(list))
     rows: int | None = None
+    size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         self._times: list[int] = []
@@ -82,6 +85,16 @@ class FoundPersons:
         if near is None or abs(near - frame.time_ns) > _MATCHING_NS:
             return []
         return self.by_time[near]
+
+    def check_size(self, frame: Frame) -> None:
+        """Raises ValueError where the detector saw frames of another size."""
+        height, width = frame.image.shape[:2]
+        if self.size not in (None, (width, height)):
+            assert self.size is not None
+            raise ValueError(
+                f'the keypoints were found in images of {self.size[0]}x{self.size[1]} pixels, but '
+                f'the frames have {width}x{height}'
+            )
 
     def persons(self) -> Iterator[Person]:
         """All persons of all frames."""
@@ -121,6 +134,12 @@ def read_keypoints(path: Path, source: FrameSource, first_stamp_ns: int) -> Foun
         )
         if farthest is None:
             raise ValueError('no keypoint was seen in any frame')
+        if farthest > _FARTHEST:
+            raise ValueError(f'a keypoint lies {farthest:g} px away, wanted places in an image')
+        for names in {x.keypoints.names for x in found.persons()}:
+            if len({*names}) < len(names):
+                twice = next(x for x in names if names.count(x) > 1)
+                raise ValueError(f'two keypoints are called {twice}')
         if farthest <= _FRACTION:
             raise ValueError(
                 f'all keypoints lie within {farthest:g} px: they are fractions of the image, '
@@ -143,22 +162,28 @@ def _coco(content: Any, source: FrameSource) -> FoundPersons:
     """Results, a list of {image_id, keypoints}; or annotations, which name images and keypoints."""
     labels: dict[Any, str | int] = {}
     names: tuple[str, ...] | None = None
+    found = FoundPersons()
     annotated = isinstance(content, dict)
     if annotated:
         for image in _list(content, 'images'):
             labels[image.get('id')] = image.get('file_name') or image.get('id')
+            if isinstance(image.get('width'), int) and isinstance(image.get('height'), int):
+                found.size = image['width'], image['height']
         for category in content.get('categories') or []:
             if isinstance(category, dict) and category.get('keypoints'):
                 names = tuple(str(x) for x in category['keypoints'])
         content = _list(content, 'annotations')
     if not isinstance(content, list) or not all(isinstance(x, dict) for x in content):
         raise ValueError('not COCO: wanted a list of {image_id, keypoints, score}, or annotations')
-    found = FoundPersons()
     for i, entry in enumerate(content):
         label = entry.get('image_id')
         if not isinstance(label, (int, str)) or 'keypoints' not in entry:
             raise ValueError(f'entry {i} has no image_id or no keypoints')
         values = _triples(entry['keypoints'], f'entry {i}')
+        if names is not None and len(names) != len(values):
+            raise ValueError(
+                f'entry {i} has {len(values)} keypoints, but {len(names)} are named in categories'
+            )
         sure = values[:, 2]
         if np.isin(sure, (0.0, 1.0, 2.0)).all() and (annotated or (sure == 2.0).any()):
             sure = sure / 2  # flags: 0 not labelled, 1 hidden, 2 visible
@@ -248,6 +273,8 @@ def _table(path: Path, source: FrameSource, first_stamp_ns: int) -> FoundPersons
     rows: dict[tuple[str, str], dict[str, tuple[float, float, float]]] = defaultdict(dict)
     try:
         for row in reader:
+            if not row[when] or not (wide or row['name']):
+                raise ValueError(f'line {reader.line_num}: no {"name" if row[when] else when}')
             about = row[when], row.get('person') or ''
             for name in wide or [row['name']]:
                 kind = [f'{name}_{x}' for x in ('u', 'v', 'confidence')] if wide else None
@@ -299,7 +326,7 @@ def _triples(values: Any, where: str) -> Array:
     """(n, 3) column, row and confidence of the keypoints in a flat list."""
     try:
         flat = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f'{where}: keypoints are not numbers') from error
     if flat.ndim != 1 or flat.size == 0 or flat.size % 3:
         raise ValueError(f'{where} has {flat.size} numbers, wanted u, v and confidence for each')

@@ -39,12 +39,12 @@ def with_durations(content, durations):
     return bytes(changed)
 
 
-def turned(content):
-    """An MP4 file of a phone that was held upright: shown turned by 90 degrees clockwise."""
+def turned(content, a, b, c, d, x, y):
+    """An MP4 file that is shown turned: its pixel (u, v) at (a u + c v + x, b u + d v + y)."""
     (*_, begin), _ = find(content, 'moov', 'trak', 'tkhd')
     changed = bytearray(content)
-    one = 1 << 16
-    struct.pack_into('>9i', changed, begin + 48, 0, one, 0, -one, 0, 0, 48 << 16, 0, 1 << 30)
+    matrix = [x << 16 for x in (a, b, 0, c, d, 0, x, y)]
+    struct.pack_into('>9i', changed, begin + 48, *matrix, 1 << 30)
     return bytes(changed)
 
 
@@ -88,13 +88,20 @@ def test_times_of_a_variable_frame_rate(video):
     assert np.allclose([x.time_ns / 1e9 for x in frames], wanted, atol=1e-6)
 
 
-def test_video_of_a_phone_is_upright(video):
-    upright, _ = read(video)
-    video.write_bytes(turned(video.read_bytes()))
+@pytest.mark.parametrize(
+    ('matrix', 'turn'),
+    [
+        ((0, 1, -1, 0, 48, 0), cv2.ROTATE_90_CLOCKWISE),
+        ((0, -1, 1, 0, 0, 64), cv2.ROTATE_90_COUNTERCLOCKWISE),
+        ((-1, 0, 0, -1, 64, 48), cv2.ROTATE_180),
+    ],
+)
+def test_video_of_a_phone_is_upright(matrix, turn, video):
+    stored, _ = read(video)
+    video.write_bytes(turned(video.read_bytes(), *matrix))
     frames, _ = read(video)
-    assert frames[0].image.shape == (64, 48, 3)
-    expected = cv2.rotate(upright[0].image, cv2.ROTATE_90_CLOCKWISE)
-    assert np.array_equal(frames[0].image, expected)
+    assert len(frames) == 10
+    assert np.array_equal(frames[0].image, cv2.rotate(stored[0].image, turn))
 
 
 def test_folder_is_read_in_the_order_of_numbers(folder, number_in):

@@ -56,7 +56,10 @@ def test_coco_of_two_persons_with_tracks(tmp_path):
 def test_coco_annotations(tmp_path):
     """Images and keypoints have names; flags say how well a keypoint is seen."""
     content = {
-        'images': [{'id': 70, 'file_name': 'b.jpg'}, {'id': 71, 'file_name': 'a.jpg'}],
+        'images': [
+            {'id': 70, 'file_name': 'b.jpg'},
+            {'id': 71, 'file_name': 'a.jpg', 'width': 8, 'height': 4},
+        ],
         'annotations': [
             {'image_id': 70, 'keypoints': [5, 6, 2, 7, 8, 1, 9, 9, 0]},
             {'image_id': 71, 'keypoints': [1, 2, 2, 3, 4, 2, 5, 6, 2]},
@@ -68,6 +71,10 @@ def test_coco_annotations(tmp_path):
     assert seen.keypoints.names == ('nose', 'left_hip', 'tail')
     assert list(seen.keypoints.confidences) == [1.0, 0.5, 0.0]
     assert np.array_equal(seen.keypoints.pixels[:2], [[5, 6], [7, 8]])
+    found = read_keypoints(tmp_path / 'walk.json', source, START)
+    found.check_size(Frame(0, 0, '', np.zeros((4, 8, 3), np.uint8)))
+    with pytest.raises(ValueError, match='in images of 8x4 pixels, but the frames have 4x4'):
+        found.check_size(Frame(0, 0, '', IMAGE))
 
 
 def test_openpose(tmp_path):
@@ -161,6 +168,17 @@ def test_rows_far_from_a_frame_in_time_are_not_its(tmp_path):
         ('a.json', [{'image_id': 0, 'keypoints': [5.0] * 30}], '10 keypoints without names'),
         ('a.json', [{'image_id': 'walk', 'keypoints': [5.0] * 51}], 'walk is not the name of a fr'),
         ('a.json', [{'image_id': 0, 'keypoints': [0.5] * 51}], 'they are fractions of the image'),
+        ('a.json', [{'image_id': 0, 'keypoints': [1e9] * 51}], r'a keypoint lies 1e\+09 px away'),
+        ('a.json', [{'image_id': 0, 'keypoints': [10**400] * 51}], 'keypoints are not numbers'),
+        (
+            'a.json',
+            {
+                'images': [],
+                'annotations': [{'image_id': 0, 'keypoints': [5.0] * 6}],
+                'categories': [{'keypoints': ['a', 'b', 'c']}],
+            },
+            'entry 0 has 2 keypoints, but 3 are named in categories',
+        ),
         ('a.json', [], 'no keypoint was seen in any frame'),
         ('a.csv', 'u,v\n1,2\n', 'wanted a column frame, time_s or stamp_ns'),
         ('a.csv', 'frame,nose\n1,2\n', 'wanted columns NAME_u and NAME_v, or name, u and v'),
@@ -168,6 +186,8 @@ def test_rows_far_from_a_frame_in_time_are_not_its(tmp_path):
         ('a.csv', 'frame,a_u,a_v\n1,x,3\n', "line 2: a_u is 'x', wanted a number"),
         ('a.csv', 'time_s,a_u,a_v\nx,1,3\n', "time_s is 'x', wanted a number"),
         ('a.csv', 'frame,name,u,v\n1,a,1,3\n1,a,1,3\n', 'line 3: a twice in frame 1'),
+        ('a.csv', 'frame,name,u,v\n1,,1,3\n', 'line 2: no name'),
+        ('a.csv', 'name,u,v,frame\na,1,3\n', 'line 2: no frame'),
         ('a.npz', 'no archive', 'not a zip file'),
         ('a.txt', 'words', '.txt is not known; wanted COCO'),
     ],
@@ -185,6 +205,7 @@ def test_bad_files(name, content, message, tmp_path):
     [
         ({'pixels': np.zeros((4, 32, 2))}, r'pixels has shape \(4, 32, 2\), wanted \(4, 33, 2\)'),
         ({'visibility': np.zeros((3, 33))}, r'visibility has shape \(3, 33\), wanted \(4, 33\)'),
+        ({'landmark_names': np.array(['a'] * 33)}, 'two keypoints are called a'),
         ({'world': np.full((4, 33, 3), 'x')}, 'world holds <U1, wanted numbers'),
     ],
 )
