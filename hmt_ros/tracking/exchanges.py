@@ -49,8 +49,8 @@ class SideExchanges:
 
         Args:
             ancestors: modes of the image before.
-            anew: (N,) hypotheses that say that the track was wrong: if it was about the way that the
-                person faces, it was about the sides as well.
+            anew: (N,) hypotheses that say that the track was wrong: if it was about the way to
+                face, it was about the sides as well.
         """
         if self.prior is None:
             return np.repeat(usual_exchanges(), len(ancestors), axis=0)
