@@ -1,7 +1,7 @@
 # make demo   tracks the person of a bag in bags/      make lint   ruff and mypy
 # make test   all tests                                make bench  the benchmarks
 # make setup  the workspace alone                      make soak   nodes under load and faults
-# make clean  restores the state of a clone
+# make clean  restores the state of a clone            make mediapipe  MediaPipe in .mediapipe
 #
 # Each works as the first command after a clone: it installs its requirements into .venv and builds
 # the packages once. See CONTRIBUTING.md.
@@ -9,7 +9,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -e -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench soak clean lock
+.PHONY: help setup mediapipe demo test lint bench soak clean lock
 
 # Small matrices: a second BLAS thread costs more than it saves.
 export OMP_NUM_THREADS := 1
@@ -27,6 +27,10 @@ help:
 
 setup:
 	@$(WORKSPACE) ros test lint build
+
+# An environment of its own: MediaPipe needs numpy below 2.
+mediapipe:
+	@tools/mediapipe.sh
 
 demo:
 	@$(WORKSPACE) ros build
@@ -52,7 +56,7 @@ soak:
 	@$(SOURCED) python -m benchmarks soak --minutes $(SOAK_MINUTES) $(ARGS)
 
 clean:
-	rm -rf .venv build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info
+	rm -rf .venv .mediapipe build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The newest versions that fit together on every supported Python. Only this target changes them.

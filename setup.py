@@ -61,13 +61,20 @@ setup(
     ],
     # OpenCV has several distributions of one module (apt, opencv-python, -headless): naming one
     # here would install it a second time next to another.
-    extras_require={'test': ['pytest', 'hypothesis'], 'dask': ['distributed']},
+    extras_require={
+        'test': ['pytest', 'hypothesis'],
+        'dask': ['distributed'],
+        'mediapipe': ['mediapipe==0.10.21'],
+    },
     zip_safe=False,
     entry_points={
         'console_scripts': [
             'filter_node = hmt_ros.nodes.filter_node:main',
             'smoother_node = hmt_ros.nodes.smoother_node:main',
             'bme_node = hmt_ros.nodes.bme_node:main',
+            'track-video = hmt_ros.app.track_video:main',
+            'import-video = hmt_ros.app.import_video.command:main',
+            'subject = hmt_ros.app.subject:main',
             'replay = hmt_ros.app.replay.command:main',
             'recover = hmt_ros.app.recover:main',
             'make-bag = hmt_ros.app.make_bag:main',

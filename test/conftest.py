@@ -1,18 +1,26 @@
-"""What tests share: a ROS domain of their own, reproducible hypothesis runs, poses, motions."""
+"""What tests share: a ROS domain of their own, reproducible hypothesis runs, poses, clips."""
 
 from __future__ import annotations
 
+import json
 import os
 import socket
+import subprocess
+import sys
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import settings
 
+from hmt_ros.app import make_bag
 from hmt_ros.body import Body, load_body
+from hmt_ros.image.keypoint_schemes import schemes
+from msg_tools import BagReader
+from msg_tools.messages.images import decode_image
 
 # Speed is no property of a result: a busy machine must not fail a test.
 settings.register_profile('hmt_ros', deadline=None, derandomize=True)
@@ -60,6 +68,18 @@ def pytest_itemcollected(item: pytest.Item) -> None:
 
 
 @pytest.fixture(scope='session')
+def mediapipe() -> str:
+    """An interpreter that imports MediaPipe; tests that want it are skipped where there is none."""
+    python = os.environ.get('HMT_ROS_DETECTOR_PYTHON', sys.executable)
+    environment = {k: v for k, v in os.environ.items() if k != 'PYTHONPATH'}
+    command = [python, '-c', 'import mediapipe']
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
+    if done.returncode != 0:
+        pytest.skip(f'{python} does not import MediaPipe: run "make mediapipe"')
+    return python
+
+
+@pytest.fixture(scope='session')
 def mocap() -> Path:
     """Folder of the development motions; tests that want it are skipped where it is absent."""
     root = Path(__file__).resolve().parents[1]
@@ -97,3 +117,34 @@ def random_poses() -> RandomPoses:
         return poses
 
     return draw
+
+
+@pytest.fixture(scope='session')
+def walk_video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with walk.mp4, seen at 60 degrees, the results walk.json of a perfect detector of COCO
+    keypoints, and the rendered bag `rendered` that both come from, with truth.npz.
+    """
+    folder = tmp_path_factory.mktemp('video')
+    rendered = folder / 'rendered'
+    options = ['--duration', '0.8', '--fps', '10', '--size', '320x240', '--fov', '60']
+    options += ['--distance', '3.2', '--quiet', '-o', str(rendered)]
+    assert make_bag.main(['walk', *options]) == 0
+    kind = cv2.VideoWriter_fourcc(*'mp4v')  # type: ignore[attr-defined]
+    writer = cv2.VideoWriter(str(folder / 'walk.mp4'), kind, 10.0, (320, 240))
+    assert writer.isOpened()
+    with BagReader(rendered) as bag:
+        for stored in bag.messages(['image/compressed']):
+            writer.write(decode_image(stored.message))
+    writer.release()
+    truth = np.load(rendered / 'truth.npz')
+    joints = {name: i for i, name in enumerate(truth['joint_names'])}
+    results = []
+    for number, pixels in enumerate(truth['pixels']):
+        flat: list[float] = []
+        for name in schemes()['coco17'].names:
+            # The head has no joint of the eyes, the ears and the nose: the detector misses them.
+            seen = name in joints
+            flat += [*map(float, pixels[joints[name]]), 0.9] if seen else [0.0, 0.0, 0.0]
+        results.append({'image_id': number, 'category_id': 1, 'keypoints': flat, 'score': 0.9})
+    (folder / 'walk.json').write_text(json.dumps(results), 'utf-8')
+    return folder

@@ -33,6 +33,7 @@ LAYERS = [
     'hmt_ros.tracking',
     'hmt_ros.smoothing',
     'hmt_ros.experts',
+    'hmt_ros.detectors',
     'hmt_ros.rendering',
     'hmt_ros.motion',
     'hmt_ros.image',

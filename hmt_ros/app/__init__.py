@@ -10,6 +10,12 @@ from hmt_ros.app.command_line import until_nobody_reads
 
 # Command: (module, what it does). A module is imported when its command runs.
 COMMANDS = {
+    'track-video': ('hmt_ros.app.track_video', 'import a video, track the person, write a report'),
+    'import-video': (
+        'hmt_ros.app.import_video.command',
+        'write a video and the keypoints of a detector into a bag',
+    ),
+    'subject': ('hmt_ros.app.subject', 'write the start of a track from keypoints in a bag'),
     'replay': (
         'hmt_ros.app.replay.command',
         'track the person in a bag and write the poses into a new bag',

@@ -297,11 +297,16 @@ def compressed_image_message(
     quality: int = 90,
 ) -> Any:
     """sensor_msgs/CompressedImage with a JPEG of a picture, BGR (H, W, 3) or grey (H, W)."""
+    return jpeg_message(messages, encode_jpeg(image, quality), stamp_ns, frame_id)
+
+
+def jpeg_message(messages: MessageFactory, jpeg: bytes, stamp_ns: int, frame_id: str) -> Any:
+    """sensor_msgs/CompressedImage with the content of a JPEG file."""
     return messages.create(
         'sensor_msgs/msg/CompressedImage',
         header=header_message(messages, stamp_ns, frame_id),
         format='jpeg',
-        data=np.frombuffer(encode_jpeg(image, quality), dtype=np.uint8),
+        data=np.frombuffer(jpeg, dtype=np.uint8),
     )
 
 

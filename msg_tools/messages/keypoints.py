@@ -1,7 +1,13 @@
-"""hmt_msgs/Keypoints2D: image positions of joints, as arrays."""
+"""hmt_msgs/Keypoints2D and hmt_msgs/Keypoints3D: what a detector finds of a person, as arrays.
+
+A keypoint is not seen if its confidence is 0, if its position is not a number, or if it lies at
+(0, 0) in the image, where detectors put what they have not found. Nothing else of it matters then.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,8 +20,34 @@ from msg_tools.messages.message_types import MessageFactory
 
 Array = NDArray[np.float64]
 
+KEYPOINTS_2D, KEYPOINTS_3D = 'hmt_msgs/msg/Keypoints2D', 'hmt_msgs/msg/Keypoints3D'
 # Of one person; detectors find up to a few hundred.
 MAX_KEYPOINTS = 10_000
+# Numbers beyond these are no places of a person: px from the first pixel, m from the origin.
+FARTHEST_PIXEL, FARTHEST_POSITION = 1e6, 1e3
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Landmarks of a person in space, relative to each other, from a detector that lifts.
+
+    Attributes:
+        names: (n,) of the landmarks.
+        positions: (n, 3) m, along the axes of the camera from an origin that all share; NaN where
+            there is none.
+    """
+
+    names: tuple[str, ...]
+    positions: Array
+
+    def added_to(self, keypoints: Keypoints) -> Keypoints:
+        """The keypoints with the positions of the same names; NaN for those without."""
+        places = {name: i for i, name in enumerate(self.names)}
+        positions = np.full((len(keypoints.names), 3), np.nan)
+        for i, name in enumerate(keypoints.names):
+            if name in places:
+                positions[i] = self.positions[places[name]]
+        return replace(keypoints, positions=positions)
 
 
 def keypoints_of(message: Any, sigma_px: float) -> Keypoints:
@@ -25,54 +57,133 @@ def keypoints_of(message: Any, sigma_px: float) -> Keypoints:
         message: the message.
         sigma_px: standard deviation where the message has no covariance, px.
 
+    Returns:
+        The keypoints; those that were not seen have NaN as pixels, and confidence 0.
+
     Raises:
         MessageError: a name twice, arrays whose lengths contradict each other, a position of which
-            one half is missing, a covariance that is not positive definite, a confidence beyond 0
-            to 1.
+            one half is missing, or that is beyond all images, a covariance that is not positive
+            definite, a confidence beyond 0 to 1.
     """
-    if len(message.names) > MAX_KEYPOINTS:
-        raise MessageError(
-            f'keypoints has {len(message.names)} names, the limit is {MAX_KEYPOINTS}'
-        )
-    names = names_of(message.names, 'keypoints')
+    names = _names(message.names, 'keypoints')
     n = len(names)
-    if n == 0:
-        raise MessageError('keypoints has no names')
-    pixels = np.stack(
-        [numbers(message.u, (n,), 'keypoints: u'), numbers(message.v, (n,), 'keypoints: v')], 1
-    )
+    pixels = _columns([message.u, message.v], 'uv', n, 'keypoints')
     covariances = np.tile(sigma_px**2 * np.eye(2), (n, 1, 1))
     if len(message.covariance):
         covariances = numbers(message.covariance, (n, 2, 2), 'keypoints: covariance').copy()
-    confidences = np.ones(n)
-    if len(message.confidence):
-        confidences = numbers(message.confidence, (n,), 'keypoints: confidence')
-    missing = np.isnan(pixels)
-    halved = (missing[:, 0] != missing[:, 1]) | np.isinf(pixels).any(1)
-    outside = ~((confidences >= 0) & (confidences <= 1))
-    covariances[missing[:, 0]] = np.eye(2)
-    for i, name in enumerate(names):
-        if halved[i]:
-            raise MessageError(
-                f'keypoint {name} lies at {tuple(pixels[i].tolist())}, wanted numbers, or NaN '
-                'twice for not seen'
-            )
+    confidences = _confidences(message.confidence, n, 'keypoints')
+    seen = (confidences != 0) & ~np.isnan(pixels).all(1) & (pixels != 0).any(1)
+    for i in np.flatnonzero(seen):
+        name = names[i]
+        _check_place(pixels[i], FARTHEST_PIXEL, 'px', name)
         check_covariances(covariances[i], f'keypoint {name}')
-        if outside[i]:
-            raise MessageError(f'keypoint {name} has confidence {confidences[i]}, wanted 0 to 1')
+        _check_confidence(confidences[i], name)
+    pixels[~seen], covariances[~seen], confidences[~seen] = np.nan, np.eye(2), 0.0
     return Keypoints(names, pixels, covariances, confidences)
 
 
+def positions_of(message: Any) -> Positions:
+    """The content of an hmt_msgs/Keypoints3D, of `rosbags` or of ROS.
+
+    A landmark has a position unless its confidence is 0; by how much confidence exceeds 0 does not
+    matter here.
+
+    Raises:
+        MessageError: as `keypoints_of`.
+    """
+    names = _names(message.names, 'keypoints_3d')
+    n = len(names)
+    positions = _columns([message.x, message.y, message.z], 'xyz', n, 'keypoints_3d')
+    confidences = _confidences(message.confidence, n, 'keypoints_3d')
+    seen = (confidences != 0) & ~np.isnan(positions).all(1)
+    for i in np.flatnonzero(seen):
+        _check_place(positions[i], FARTHEST_POSITION, 'm', names[i])
+        _check_confidence(confidences[i], names[i])
+    positions[~seen] = np.nan
+    return Positions(names, positions)
+
+
 def keypoints_message(
-    messages: MessageFactory, keypoints: Keypoints, stamp_ns: int, frame_id: str
+    messages: MessageFactory,
+    keypoints: Keypoints,
+    stamp_ns: int,
+    frame_id: str,
+    *,
+    covariances: bool = True,
 ) -> Any:
-    """hmt_msgs/Keypoints2D of an image with a stamp, in the optical frame of its camera."""
+    """hmt_msgs/Keypoints2D of an image with a stamp, in the optical frame of its camera.
+
+    Args:
+        messages: makes the message.
+        keypoints: maybe none: nobody was seen.
+        stamp_ns: of the image.
+        frame_id: optical frame of the camera.
+        covariances: whether they are known; what reads the message assumes them otherwise.
+    """
     return messages.create(
-        'hmt_msgs/msg/Keypoints2D',
+        KEYPOINTS_2D,
         header=header_message(messages, stamp_ns, frame_id),
         names=list(keypoints.names),
         u=keypoints.pixels[:, 0],
         v=keypoints.pixels[:, 1],
-        covariance=keypoints.covariances.reshape(-1),
+        covariance=keypoints.covariances.reshape(-1) if covariances else np.empty(0),
         confidence=keypoints.confidences,
     )
+
+
+def positions_message(
+    messages: MessageFactory, keypoints: Keypoints, stamp_ns: int, frame_id: str
+) -> Any:
+    """hmt_msgs/Keypoints3D of keypoints that have positions, else of none."""
+    names, positions = list(keypoints.names), keypoints.positions
+    confidences = keypoints.confidences
+    if positions is None:
+        names, positions, confidences = [], np.empty((0, 3)), np.empty(0)
+    return messages.create(
+        KEYPOINTS_3D,
+        header=header_message(messages, stamp_ns, frame_id),
+        names=names,
+        x=positions[:, 0],
+        y=positions[:, 1],
+        z=positions[:, 2],
+        confidence=confidences,
+    )
+
+
+def _names(values: Sequence[str], what: str) -> tuple[str, ...]:
+    if len(values) > MAX_KEYPOINTS:
+        raise MessageError(f'{what} has {len(values)} names, the limit is {MAX_KEYPOINTS}')
+    names = names_of(values, what)
+    if not names:
+        raise MessageError(f'{what} has no names')
+    return names
+
+
+def _columns(fields: Sequence[Any], symbols: str, n: int, what: str) -> Array:
+    columns = [
+        numbers(values, (n,), f'{what}: {symbol}')
+        for values, symbol in zip(fields, symbols, strict=True)
+    ]
+    return np.stack(columns, axis=1)
+
+
+def _confidences(values: Any, n: int, what: str) -> Array:
+    return numbers(values, (n,), f'{what}: confidence') if len(values) else np.ones(n)
+
+
+def _check_place(place: Array, farthest: float, unit: str, name: str) -> None:
+    if not np.isfinite(place).all():
+        raise MessageError(
+            f'keypoint {name} lies at {tuple(place.tolist())}, wanted numbers, or NaN for all of '
+            'them where it was not seen'
+        )
+    if np.abs(place).max() > farthest:
+        raise MessageError(
+            f'keypoint {name} lies at {tuple(place.tolist())}, wanted numbers within {farthest:g} '
+            f'{unit}'
+        )
+
+
+def _check_confidence(confidence: float, name: str) -> None:
+    if not 0 <= confidence <= 1:
+        raise MessageError(f'keypoint {name} has confidence {confidence}, wanted 0 to 1')

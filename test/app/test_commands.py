@@ -39,8 +39,11 @@ def test_unknown_commands_are_one_line(arguments, message, capsys):
 
 @pytest.mark.parametrize(
     'command',
-    ['replay', 'recover', 'make-bag', 'learn-motion', 'learn-lengths', 'report', 'evaluate'],
-)
+    [
+        'track-video', 'import-video', 'subject', 'replay', 'recover', 'make-bag', 'learn-motion',
+        'learn-lengths', 'report', 'evaluate',
+    ],
+)  # fmt: skip
 def test_commands_explain_themselves(command, capsys):
     with pytest.raises(SystemExit) as caught:
         main([command, '--help'])

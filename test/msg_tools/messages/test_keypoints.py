@@ -1,4 +1,4 @@
-"""Keypoints2D to arrays and back, and what is refused."""
+"""Keypoints2D and Keypoints3D to arrays and back, and what is refused."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ import pytest
 
 from hmt_ros.body import load_body
 from msg_tools import MessageError, RosbagsMessages
-from msg_tools.messages.keypoints import keypoints_message, keypoints_of
+from msg_tools.messages.keypoints import (
+    keypoints_message,
+    keypoints_of,
+    positions_message,
+    positions_of,
+)
 
 
 def message(messages: RosbagsMessages, **changes: Any) -> Any:
@@ -38,7 +43,22 @@ def test_fields_become_arrays(messages: RosbagsMessages) -> None:
 def test_what_is_empty_is_filled_in(messages: RosbagsMessages) -> None:
     content = keypoints_of(message(messages, covariance=[], confidence=[]), 3.0)
     np.testing.assert_array_equal(content.covariances[0], 9 * np.eye(2))
-    np.testing.assert_array_equal(content.confidences, np.ones(3))
+    np.testing.assert_array_equal(content.confidences, [1, 0, 1])
+
+
+def test_what_was_not_seen_has_no_place_and_no_confidence(messages: RosbagsMessages) -> None:
+    changed = message(
+        messages,
+        names=['confidence', 'nan', 'corner', 'border', 'seen', 'anything'],
+        u=[10.0, np.nan, 0.0, 0.0, 5.0, np.inf],
+        v=[20.0, np.nan, 0.0, 7.0, 6.0, np.nan],
+        covariance=[np.nan] * 12 + [4.0, 0.0, 0.0, 4.0] * 2 + [-1.0] * 4,
+        confidence=[0.0, np.nan, 1.0, 0.5, 1.0, 0.0],
+    )
+    content = keypoints_of(changed, 3.0)
+    np.testing.assert_array_equal(content.seen, [False, False, False, True, True, False])
+    np.testing.assert_array_equal(content.confidences, [0, 0, 0, 0.5, 1, 0])
+    np.testing.assert_array_equal(content.covariances[[0, 1, 2, 5]], np.tile(np.eye(2), (4, 1, 1)))
 
 
 def test_covariance_of_a_joint_that_was_not_seen_does_not_matter(messages: RosbagsMessages) -> None:
@@ -58,11 +78,15 @@ def test_covariance_of_a_joint_that_was_not_seen_does_not_matter(messages: Rosba
         ({'v': [1.0] * 4}, r'keypoints: v has 4 values, wanted 3'),
         ({'covariance': [1.0] * 11}, r'keypoints: covariance has 11 values, wanted 12'),
         ({'confidence': [1.0]}, r'keypoints: confidence has 1 values, wanted 3'),
-        ({'confidence': [1.0, -0.1, 1.0]}, r'left_elbow has confidence -0.1, wanted 0 to 1'),
+        ({'confidence': [-0.1, 1.0, 1.0]}, r'neck has confidence -0.1, wanted 0 to 1'),
         ({'confidence': [1.0, 1.0, 1.1]}, r'head has confidence 1.1'),
         ({'confidence': [np.nan, 1.0, 1.0]}, r'neck has confidence nan'),
         ({'u': [1.0, np.nan, np.nan]}, r'keypoint head lies at \(nan, 40.5\), wanted numbers, or'),
         ({'u': [1.0, np.nan, np.inf]}, r'keypoint head lies at \(inf, 40.5\)'),
+        (
+            {'u': [1e300, np.nan, 1.0]},
+            r'keypoint neck lies at \(1e\+300, 20.0\), wanted .* 1e\+06 px',
+        ),
         ({'covariance': [0.0] * 12}, r'covariance of keypoint neck is not positive definite'),
         ({'covariance': [1.0, 2.0, 2.0, 1.0] * 3}, r'neck is not positive definite: .* -1$'),
         ({'covariance': [1.0, 0.5, 0.0, 1.0] * 3}, r'covariance of keypoint neck is not symmetric'),
@@ -83,3 +107,61 @@ def test_other_names_of_joints_are_those_of_the_body(messages: RosbagsMessages) 
     known, strange = keypoints_of(changed, 3.0).named_for(body)
     assert (known.names, strange) == (('neck', 'left_toe'), ['tail'])
     np.testing.assert_array_equal(known.pixels, [[10, 20], [np.nan, np.nan]])
+
+
+def message_3d(messages: RosbagsMessages, **changes: Any) -> Any:
+    fields: dict[str, Any] = {
+        'names': ['head', 'neck', 'nose'],
+        'x': [0.1, np.nan, 0.3],
+        'y': [-0.5, np.nan, -0.6],
+        'z': [0.0, np.nan, 0.2],
+        'confidence': [0.5, 1.0, 0.0],
+    }
+    return messages.create('hmt_msgs/msg/Keypoints3D', **{**fields, **changes})
+
+
+def test_positions_join_keypoints_by_name(messages: RosbagsMessages) -> None:
+    found = positions_of(message_3d(messages))
+    assert found.names == ('head', 'neck', 'nose')
+    np.testing.assert_array_equal(found.positions, [[0.1, -0.5, 0], [np.nan] * 3, [np.nan] * 3])
+    joined = found.added_to(keypoints_of(message(messages), 3.0))
+    assert joined.names == ('neck', 'left_elbow', 'head')
+    np.testing.assert_array_equal(joined.positions, [[np.nan] * 3, [np.nan] * 3, [0.1, -0.5, 0]])
+    again = positions_of(positions_message(messages, joined, 7, 'camera'))
+    assert again.names == joined.names
+    np.testing.assert_array_equal(again.positions, joined.positions)
+    without = positions_message(messages, keypoints_of(message(messages), 3.0), 7, 'camera')
+    assert (len(without.names), len(without.x), len(without.confidence)) == (0, 0, 0)
+
+
+def test_a_message_without_covariances(messages: RosbagsMessages) -> None:
+    content = keypoints_of(message(messages), 3.0)
+    written = keypoints_message(messages, content, 7, 'camera', covariances=False)
+    assert len(written.covariance) == 0
+    np.testing.assert_array_equal(keypoints_of(written, 5.0).covariances[0], 25 * np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ('changes', 'error'),
+    [
+        ({'names': [], 'x': [], 'y': [], 'z': []}, r'keypoints_3d has no names'),
+        ({'names': ['head', 'neck', 'head']}, r"keypoints_3d has the name 'head' twice"),
+        ({'names': ['x'] * 10_001}, r'keypoints_3d has 10001 names, the limit is 10000'),
+        ({'z': [1.0, 2.0]}, r'keypoints_3d: z has 2 values, wanted 3'),
+        ({'confidence': [1.0]}, r'keypoints_3d: confidence has 1 values, wanted 3'),
+        (
+            {'x': [np.nan, 1.0, 1.0]},
+            r'keypoint head lies at \(nan, -0.5, 0.0\), wanted numbers, or',
+        ),
+        ({'z': [np.inf, np.nan, 1.0]}, r'keypoint head lies at \(0.1, -0.5, inf\)'),
+        ({'y': [-1e300, np.nan, 1.0]}, r'lies at \(0.1, -1e\+300, 0.0\), wanted .* within 1000 m'),
+        ({'confidence': [1.5, 1.0, 1.0]}, r'head has confidence 1.5, wanted 0 to 1'),
+        ({'confidence': [np.nan, 1.0, 1.0]}, r'head has confidence nan'),
+    ],
+)
+def test_positions_that_contradict_themselves(
+    messages: RosbagsMessages, changes: dict[str, Any], error: str
+) -> None:
+    with pytest.raises(MessageError, match=error) as caught:
+        positions_of(message_3d(messages, **changes))
+    assert '\n' not in str(caught.value)

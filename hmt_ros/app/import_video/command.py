@@ -1,0 +1,420 @@
+"""import-video: writes a video, its camera and what a detector found in it into a bag for replay.
+
+The bag has the topics `image/compressed` and `camera_info`, and as far as they are known
+`keypoints`, `keypoints_3d` and `mask`, with the stamp of the frame that they belong to.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable, Generator, Iterable
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
+from hmt_ros.app.import_video.camera_file import camera_of_view, read_camera
+from hmt_ros.app.import_video.frames import Frame, FrameSource, Selection, open_source
+from hmt_ros.app.import_video.keypoint_files import FoundPersons, read_keypoints
+from hmt_ros.app.import_video.masks import Masks
+from hmt_ros.app.import_video.persons import Choice, Chooser
+from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
+from hmt_ros.body import Camera
+from hmt_ros.detectors.mediapipe_pose import MediaPipePose
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Mask
+from msg_tools import BagWriter, RosbagsMessages
+from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.images import encode_jpeg, image_message, jpeg_message
+from msg_tools.messages.keypoints import keypoints_message, positions_message
+
+IMAGE, CAMERA_INFO, MASK = 'image/compressed', 'camera_info', 'mask'
+KEYPOINTS, KEYPOINTS_3D = 'keypoints', 'keypoints_3d'
+MEDIAPIPE = 'mediapipe'
+# Least part of the keypoints that lies in the frames, or near them.
+_INSIDE, _NEAR = 0.5, 0.25
+
+EPILOG = """\
+SOURCE is any video file that OpenCV reads, or a folder of images in the order of the numbers in
+their names. Images that are JPEG files are copied as they are. Stamps are the times in the video
+file, counted from --first-stamp. Phones write how they were held: the frames are turned upright.
+
+--keypoints takes, under the names of the detector and in pixels of the upright frames,
+  FILE.json  COCO: results [{image_id, keypoints, score}], or annotations; without names 17
+             keypoints are those of COCO, 18 and 25 of OpenPose, 26 of Halpe, 33 of MediaPipe
+  FOLDER     OpenPose: a file such as walk_000000000012_keypoints.json for each frame
+  FILE.npz   landmark_names (n,), pixels (T, n, 2), optionally visibility (T, n), detected (T,) and
+             world (T, n, 3), the positions in m; row t is frame t
+  FILE.csv   a row for each person: frame, NAME_u, NAME_v, NAME_confidence, ...; or for each
+             keypoint: frame, name, u, v, confidence; time_s, in the video, or stamp_ns may replace
+             frame, and a column person keeps several persons apart
+An image_id, or the name of a file of keypoints or of a mask, is the name of the frame's file, or
+its last number is that of the frame, from --first-number on. What has confidence 0, or lies at
+(0, 0) or NaN, was not seen.
+
+examples:
+  import-video walk.mp4 -o walk --fov 60 --keypoints walk.json
+  import-video frames -o walk --fps 25 --camera camera.yaml --keypoints openpose --masks masks
+  import-video walk.mp4 -o walk --fov 60 --detector mediapipe --start 2 --end 10 --every 2
+
+exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
+"""
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """Arguments of the command, see its help."""
+
+    source: Path
+    output: Path
+    overwrite: bool = False
+    quiet: bool = False
+    fps: float | None = None
+    start: float = 0.0
+    end: float = math.inf
+    every: int = 1
+    first_stamp: int = START_NS
+    first_number: int = 0
+    jpeg_quality: int = 90
+    fov: float | None = None
+    vertical_fov: float | None = None
+    camera: Path | None = None
+    keypoints: Path | None = None
+    detector: str | None = None
+    person: Choice = Choice()  # noqa: RUF009 - frozen
+    masks: Path | None = None
+    detector_masks: bool = False
+
+    @classmethod
+    def of(cls, arguments: argparse.Namespace, output: Path) -> ImportOptions:
+        """The options in the arguments of a command, with a folder for the bag."""
+        names = [x.name for x in fields(cls) if x.name != 'output']
+        return cls(output=output, **{name: getattr(arguments, name) for name in names})
+
+
+@dataclass
+class Imported:
+    """What was written.
+
+    Attributes:
+        images: number of images.
+        with_keypoints: number of images in which keypoints were seen; None: none were given.
+        with_masks: number of images with a mask; None: none were given.
+        inside, outside: number of keypoints that lie in or near the frame, and farther out.
+    """
+
+    images: int = 0
+    with_keypoints: int | None = None
+    with_masks: int | None = None
+    inside: int = 0
+    outside: int = 0
+
+    def __str__(self) -> str:
+        counts = (('keypoints', self.with_keypoints), ('masks', self.with_masks))
+        text = ', '.join(f'{n} with {what}' for what, n in counts if n is not None)
+        return f'{self.images} images{", " if text else ""}{text}'
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command; 0: the bag is there, 1: bad input, which one line on stderr explains."""
+    return run_command(_parser(), _import, argv, whole_or_nothing=True)
+
+
+def _parser() -> CommandParser:
+    parser = CommandParser(
+        'import-video',
+        'Writes a video, its camera and the keypoints of a 2D detector into a bag for replay.',
+        EPILOG,
+    )
+    add_video_arguments(parser)
+    parser.add_output('BAG', 'bag', 'folder of the new bag')
+    return parser
+
+
+def add_video_arguments(parser: CommandParser) -> None:
+    """Adds the arguments that say what to import."""
+    parser.add_argument(
+        'source', type=Path, metavar='SOURCE', help='video file, or folder of images'
+    )
+    camera = parser.add_argument_group('camera, one of these')
+    camera = camera.add_mutually_exclusive_group(required=True)
+    angle = number(1, 150, what='an angle', unit=' degrees')
+    camera.add_argument(
+        '--fov', type=angle, metavar='DEGREES',
+        help='horizontal field of view, from the left border of the upright image to the right',
+    )  # fmt: skip
+    camera.add_argument(
+        '--vertical-fov', type=angle, metavar='DEGREES', help='field of view from top to bottom'
+    )
+    camera.add_argument(
+        '--camera', type=Path, metavar='FILE',
+        help='calibration file of OpenCV (YAML, XML, JSON) or of ROS (camera_info YAML)',
+    )  # fmt: skip
+    frames = parser.add_argument_group('frames')
+    frames.add_argument(
+        '--fps', type=number(0.01, 1000),
+        help='images per second of a folder; replaces the times in a video file',
+    )  # fmt: skip
+    seconds = number(0, 1e6, what='a time', unit=' s')
+    frames.add_argument(
+        '--start', type=seconds, default=0.0, help='time of the first frame to import, s'
+    )
+    frames.add_argument(
+        '--end', type=seconds, default=math.inf, help='time at which the import ends, s'
+    )
+    frames.add_argument(
+        '--every', type=whole_number(1), default=1, metavar='N', help='import every N-th frame'
+    )
+    frames.add_argument(
+        '--first-stamp', type=whole_number(1, 2**62), default=START_NS, metavar='NS',
+        help=f'stamp of the first frame of SOURCE, ns (default: {START_NS})',
+    )  # fmt: skip
+    frames.add_argument(
+        '--jpeg-quality', type=whole_number(1, 100), default=90, metavar='Q',
+        help='JPEG quality of images that are not JPEG files, 1 to 100 (default: 90)',
+    )  # fmt: skip
+    person = parser.add_argument_group('the person')
+    found = person.add_mutually_exclusive_group()
+    found.add_argument(
+        '--keypoints', type=Path, metavar='PATH', help='what a detector found, see below'
+    )
+    found.add_argument(
+        '--detector', choices=[MEDIAPIPE],
+        help='find keypoints with MediaPipe Pose, where it is installed',
+    )  # fmt: skip
+    person.add_argument(
+        '--person', type=_choice, default=Choice(), metavar='WHICH',
+        help='person to import if there are several: largest in each frame; nearest to the one '
+        'before, from the largest on; index:N, the N-th in the list of each frame, from 0; or '
+        'id:NAME, as the detector tracks them (default: nearest)',
+    )  # fmt: skip
+    person.add_argument(
+        '--masks', type=Path, metavar='PATH',
+        help='masks of the person, bright on black: a folder of images, or a video',
+    )  # fmt: skip
+    person.add_argument(
+        '--detector-masks', action='store_true', help='also take the masks of --detector'
+    )
+    person.add_argument(
+        '--first-number', type=whole_number(0), default=0, metavar='N',
+        help='number of the first frame for keypoints and masks (default: 0)',
+    )  # fmt: skip
+
+
+def _choice(text: str) -> Choice:
+    try:
+        return Choice.parse(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def _import(arguments: argparse.Namespace) -> int:
+    imported = import_video(ImportOptions.of(arguments, arguments.output), tell)
+    if not arguments.quiet:
+        print(f'{arguments.output}: {imported}')
+    return 0
+
+
+def tell(text: str) -> None:
+    """Prints a line for the user on stderr, above the progress bar."""
+    tqdm.write(f'import-video: {text}', file=sys.stderr)
+
+
+def import_video(options: ImportOptions, tell: Tell) -> Imported:
+    """Writes a video into a new bag, completely or not at all.
+
+    Args:
+        options: of the command.
+        tell: receives lines for the user.
+
+    Raises:
+        ValueError: bad input.
+    """
+    if options.detector_masks and (options.detector is None or options.masks is not None):
+        raise ValueError('--detector-masks goes with --detector, and not with --masks')
+    selection = Selection(options.start, options.end, options.every)
+    source = open_source(options.source, options.fps, options.first_number)
+    masks = None if options.masks is None else Masks(options.masks, source)
+    found = None
+    if options.keypoints is not None:
+        found = read_keypoints(options.keypoints, source, options.first_stamp)
+    with ExitStack() as opened:
+        see = _seer(options, found, masks, opened)
+        writer = opened.enter_context(BagWriter(options.output, overwrite=options.overwrite))
+        frames = opened.enter_context(closing(_same_size(source, selection)))
+        bar = opened.enter_context(
+            tqdm(frames, unit='image', desc=str(options.output), disable=options.quiet or None)
+        )
+        lifts = options.detector is not None or (found is not None and found.lifts)
+        result = _write(writer, options, bar, see, lifts)
+        if not result.images:
+            raise ValueError(
+                f'{options.source}: no frame was read'
+                + (f' of {source.count}; see --start and --end' if source.count else '')
+            )
+        _check_ends(options, source, found, masks, tell)
+        if found is not None:
+            _check_keypoints(options, result)
+        if masks is not None and not result.with_masks:
+            raise ValueError(
+                f'{options.masks}: no mask belongs to one of the {result.images} imported frames; '
+                'see --first-number'
+            )
+    return result
+
+
+Seer = Callable[[Frame, int], tuple[Keypoints | None, Mask | None]]
+
+
+def _seer(
+    options: ImportOptions, found: FoundPersons | None, masks: Masks | None, opened: ExitStack
+) -> Seer:
+    """What is known of a frame with a stamp: keypoints and mask."""
+    chooser = Chooser(options.person)
+    detector = None
+    if options.detector is not None:
+        detector = opened.enter_context(MediaPipePose(with_mask=options.detector_masks))
+
+    def see(frame: Frame, stamp_ns: int) -> tuple[Keypoints | None, Mask | None]:
+        mask = None if masks is None else masks.of(frame)
+        if detector is not None:
+            keypoints = detector.detect(frame.image, stamp_ns)
+            return keypoints, detector.mask if options.detector_masks else mask
+        if found is None:
+            return None, mask
+        found.check_size(frame)
+        chosen = chooser.of(frame.number, found.of(frame))
+        return None if chosen is None else chosen.keypoints, mask
+
+    return see
+
+
+def _same_size(source: FrameSource, selection: Selection) -> Generator[Frame, None, None]:
+    """The frames; one camera_info is for images of one size."""
+    size: tuple[int, ...] | None = None
+    for frame in source.frames(selection):
+        if size is not None and frame.image.shape != size:
+            (height, width), (rows, columns) = frame.image.shape[:2], size[:2]
+            raise ValueError(
+                f'{source.path}: {frame.name or f"frame {frame.number}"} has {width}x{height} '
+                f'pixels, the frames before it {columns}x{rows}; wanted one size'
+            )
+        size = frame.image.shape
+        yield frame
+
+
+def _camera(options: ImportOptions, size: tuple[int, int]) -> Camera:
+    if options.camera is not None:
+        return read_camera(options.camera, size)
+    return camera_of_view(size, options.fov, options.vertical_fov)
+
+
+def _write(
+    bag: BagWriter, options: ImportOptions, frames: Iterable[Frame], see: Seer, lifts: bool
+) -> Imported:
+    """Writes frame after frame; one is in memory at a time.
+
+    With `lifts` every image has a message with positions, maybe of none.
+    """
+    messages = RosbagsMessages()
+    result, camera = Imported(), None
+    if options.keypoints is not None or options.detector is not None:
+        result.with_keypoints = 0
+    if options.masks is not None or options.detector_masks:
+        result.with_masks = 0
+    for frame in frames:
+        height, width = frame.image.shape[:2]
+        camera = camera or _camera(options, (width, height))
+        stamp = options.first_stamp + frame.time_ns
+        jpeg = frame.jpeg or encode_jpeg(frame.image, options.jpeg_quality)
+        bag.write(IMAGE, stamp, jpeg_message(messages, jpeg, stamp, FRAME_ID))
+        bag.write(CAMERA_INFO, stamp, camera_info_message(messages, camera, stamp, FRAME_ID))
+        keypoints, mask = see(frame, stamp)
+        if result.with_keypoints is not None:
+            result.with_keypoints += keypoints is not None
+            content = keypoints or _NOBODY
+            message = keypoints_message(messages, content, stamp, FRAME_ID, covariances=False)
+            bag.write(KEYPOINTS, stamp, message)
+            if lifts:
+                lifted = positions_message(messages, content, stamp, FRAME_ID)
+                bag.write(KEYPOINTS_3D, stamp, lifted)
+            near = _are_near(content.pixels[content.seen], width, height)
+            result.inside += int(near.sum())
+            result.outside += int((~near).sum())
+        if mask is not None and result.with_masks is not None:
+            result.with_masks += 1
+            picture = mask.astype(np.uint8) * 255
+            bag.write(MASK, stamp, image_message(messages, picture, stamp, FRAME_ID))
+        result.images += 1
+    return result
+
+
+_NOBODY = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
+
+
+def _are_near(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Whether pixels (n, 2) lie in an image, or beside it by a quarter of its size at most."""
+    size = np.array([width, height])
+    return np.all((pixels > -_NEAR * size) & (pixels < (1 + _NEAR) * size), axis=1)
+
+
+def _check_ends(
+    options: ImportOptions,
+    source: FrameSource,
+    found: FoundPersons | None,
+    masks: Masks | None,
+    tell: Tell,
+) -> None:
+    """Whether frames, keypoints and masks are equally many, as far as the frames were read.
+
+    Raises:
+        ValueError: keypoints or masks are those of other frames.
+    """
+    if not source.ended:
+        return
+    count, claimed = source.count, source.claimed
+    if claimed > count:
+        tell(
+            f'{source.path}: {count} of the {claimed} frames that its head announces can be read; '
+            'keypoints and masks of later frames may belong to other frames'
+        )
+    of_masks = -1 if masks is None else masks.last
+    of_keypoints = -1 if found is None else found.last
+    if found is not None and found.rows is not None and found.rows != count:
+        raise ValueError(
+            f'{options.keypoints} has {found.rows} rows, but {source.path} has {count} frames; '
+            'wanted one row for each frame'
+        )
+    for path, last in ((options.keypoints, of_keypoints), (options.masks, of_masks)):
+        if last >= count:
+            first = options.first_number
+            raise ValueError(
+                f'{path} has frame {last + first}, but {source.path} has {count} frames, {first} '
+                f'to {count - 1 + first}; --first-number {first + 1} if it counts from '
+                f'{first + 1}'
+            )
+
+
+def _check_keypoints(options: ImportOptions, result: Imported) -> None:
+    """Raises ValueError where keypoints are not those of the images."""
+    if not result.with_keypoints:
+        raise ValueError(
+            f'{options.keypoints}: none of the {result.images} imported frames has keypoints of '
+            'the chosen person; see --person and --first-number'
+        )
+    if result.inside < _INSIDE * (result.inside + result.outside):
+        raise ValueError(
+            f'{options.keypoints}: {result.outside} of {result.inside + result.outside} keypoints '
+            'lie outside of the images; were they found in images of another size, or not upright?'
+        )
+
+
+if __name__ == '__main__':
+    sys.exit(main())

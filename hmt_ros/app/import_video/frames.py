@@ -1,0 +1,304 @@
+"""Frames of a video file or of a folder of images, one after the other, with their times."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hmt_ros.inference.arrays import Image
+from msg_tools.files.bounded_file import read_bytes
+from msg_tools.messages.headers import SECOND_NS
+from msg_tools.messages.images import MAX_PIXELS, ImageError, decode_picture
+
+IMAGE_SUFFIXES = ('.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.webp', '.ppm', '.pgm')
+LARGEST_IMAGE_FILE = 2**28  # bytes
+MOST = 1e9  # frames; a head that announces more is damaged
+FASTEST = 1000.0  # frames per second; what a container claims beyond is damage
+_EXIF_WITHIN = 2**16  # bytes at the beginning of a JPEG
+_QUIET = '-8'  # AV_LOG_QUIET of FFmpeg
+_TURNS = {
+    90: cv2.ROTATE_90_CLOCKWISE,
+    180: cv2.ROTATE_180,
+    270: cv2.ROTATE_90_COUNTERCLOCKWISE,
+}
+# Ubuntu 24.04 ships OpenCV 4.6, which tells the turn of a video in the wrong direction.
+_TURNS_BACKWARDS = cv2.__version__.startswith('4.6.')
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame of a source.
+
+    Attributes:
+        number: in the source, from 0.
+        time_ns: since the first frame of the source.
+        name: of its file; '' in a video file.
+        image: (H, W, 3) BGR, upright.
+        jpeg: the file that it was read from, if that is a JPEG with the same content; else None.
+    """
+
+    number: int
+    time_ns: int
+    name: str
+    image: Image
+    jpeg: bytes | None = None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which frames of a source are wanted.
+
+    Attributes:
+        start, end: times since the first frame of the source, s; the end is not included.
+        every: take each `every`-th frame from the first wanted on.
+    """
+
+    start: float = 0.0
+    end: float = math.inf
+    every: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.start < self.end:
+            raise ValueError(f'--start {self.start:g} is not before --end {self.end:g}')
+
+    def wanted(self, times_ns: Iterator[int]) -> Iterator[tuple[int, int, bool]]:
+        """Number and time of frames up to the end, and whether each is wanted."""
+        first = None
+        for number, time_ns in enumerate(times_ns):
+            if time_ns >= self.end * SECOND_NS:
+                return
+            if first is None and time_ns >= self.start * SECOND_NS:
+                first = number
+            yield number, time_ns, first is not None and (number - first) % self.every == 0
+
+
+class FrameSource:
+    """Frames of a file or a folder.
+
+    Args:
+        path: of the source.
+        names: of the files of its frames in their order; empty for a video file.
+        first_number: number of the first frame for those who number frames.
+
+    Attributes:
+        path, names: as given.
+        claimed: number of frames that the source announces; 0: it does not tell.
+        count: number of frames that were passed so far, wanted or not.
+        ended: whether the last frame was passed.
+    """
+
+    def __init__(self, path: Path, names: tuple[str, ...] = (), first_number: int = 0) -> None:
+        self.path = path
+        self.names = names
+        self.claimed = len(names)
+        self.count = 0
+        self.ended = False
+        self._first_number = first_number
+        self._by_name = {Path(x).stem: i for i, x in reversed([*enumerate(names)])}
+        self._by_name |= {x: i for i, x in enumerate(names)}
+
+    def frames(self, selection: Selection) -> Iterator[Frame]:
+        """The frames that are wanted; once only.
+
+        Raises:
+            ValueError: a frame can not be read.
+        """
+        raise NotImplementedError
+
+    def number_of(self, label: str | int) -> int:
+        """Number, from 0, of the frame that a label means.
+
+        Args:
+            label: name of the frame's file, with or without suffix; or a number or another name,
+                whose last number counts frames from `first_number` on, as walk_000012 does.
+
+        Raises:
+            ValueError: it means no frame.
+        """
+        name = Path(str(label))
+        for known in (name.name, name.stem):
+            if known in self._by_name:
+                return self._by_name[known]
+        digits = re.findall(r'\d+', name.stem)
+        if not digits:
+            raise ValueError(f'{label} is not the name of a frame and has no number')
+        number = int(digits[-1]) - self._first_number
+        if number < 0:
+            raise ValueError(
+                f'{label} is before the first frame, which has the number {self._first_number}'
+            )
+        return number
+
+
+def open_source(path: Path, fps: float | None, first_number: int = 0) -> FrameSource:
+    """Opens a video file or a folder of images.
+
+    Args:
+        path: of the source.
+        fps: frames per second; None: a video file has its own times.
+        first_number: number of the first frame for those who number frames.
+
+    Raises:
+        ValueError: it is not there, or has no frames.
+    """
+    if path.is_dir():
+        return ImageFolder(path, fps, first_number)
+    if not path.is_file():
+        raise ValueError(f'{path}: no such file; wanted a video file or a folder of images')
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        raise ValueError(f'{path} is one image; wanted a video file or a folder of images')
+    return VideoFile(path, fps, first_number)
+
+
+class VideoFile(FrameSource):
+    """A video file. Phones write how they were held: the frames are turned upright.
+
+    Args:
+        path: of the file.
+        fps: frames per second; None: the times in the file.
+        first_number: see `FrameSource`.
+    """
+
+    def __init__(self, path: Path, fps: float | None, first_number: int = 0) -> None:
+        super().__init__(path, first_number=first_number)
+        os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', _QUIET)
+        self._capture = cv2.VideoCapture(str(path))
+        if not self._capture.isOpened():
+            raise ValueError(
+                f'{path} is not a video that OpenCV can read: it is damaged or incomplete, or in a '
+                'format that this OpenCV does not know; convert it to .mp4'
+            )
+        # Versions of OpenCV differ in whether they turn frames, and in which direction.
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        angle = round(self._capture.get(cv2.CAP_PROP_ORIENTATION_META))
+        self._turn = _TURNS.get((-angle if _TURNS_BACKWARDS else angle) % 360)
+        self._fps = fps
+        count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        self.claimed = int(count) if 0 < count < MOST else 0
+
+    def frames(self, selection: Selection) -> Iterator[Frame]:
+        """See `FrameSource`."""
+        try:
+            for number, time_ns, wanted in selection.wanted(self._times()):
+                if not wanted:
+                    continue
+                done, image = self._capture.retrieve()
+                if not done:
+                    raise ValueError(f'{self.path}: frame {number} can not be decoded')
+                if self._turn is not None:
+                    image = cv2.rotate(image, self._turn)
+                yield Frame(number, time_ns, '', np.asarray(image, dtype=np.uint8))
+        finally:
+            self._capture.release()
+
+    def _times(self) -> Iterator[int]:
+        """Times of the frames, each of which is the present frame until the next is asked for."""
+        step = self._step()
+        first, last = 0.0, -1
+        while self._capture.grab():
+            shown = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+            if self.count == 0:
+                first = shown
+            time_ns = round((shown - first) * 1e6)
+            if self._fps is not None:
+                time_ns = round(self.count * SECOND_NS / self._fps)
+            elif time_ns <= last:
+                # Containers without times give zero, damaged ones jump back.
+                if step is None:
+                    raise ValueError(
+                        f'{self.path} has neither times nor a rate of frames; give --fps'
+                    )
+                time_ns = last + step
+            last = time_ns
+            self.count += 1
+            yield time_ns
+        self.ended = True
+
+    def _step(self) -> int | None:
+        fps = self._capture.get(cv2.CAP_PROP_FPS)
+        return round(SECOND_NS / fps) if 0 < fps <= FASTEST else None
+
+
+class ImageFolder(FrameSource):
+    """A folder of images, in the order of the numbers in their names.
+
+    Args:
+        path: of the folder.
+        fps: images per second; None: only their order is known.
+        first_number: see `FrameSource`.
+    """
+
+    def __init__(self, path: Path, fps: float | None, first_number: int = 0) -> None:
+        files = [x for x in path.iterdir() if x.suffix.lower() in IMAGE_SUFFIXES and x.is_file()]
+        if not files:
+            raise ValueError(f'{path} has no images, wanted files {" ".join(IMAGE_SUFFIXES)}')
+        self._files = sorted(files, key=lambda x: natural_order(x.name))
+        super().__init__(path, tuple(x.name for x in self._files), first_number)
+        self._fps = fps
+
+    def frames(self, selection: Selection) -> Iterator[Frame]:
+        """See `FrameSource`."""
+        if self._fps is None:
+            raise ValueError(f'{self.path} is a folder of images: give their rate by --fps')
+        step = SECOND_NS / self._fps
+        times = (round(i * step) for i in range(len(self._files)))
+        for number, time_ns, wanted in selection.wanted(times):
+            self.count = number + 1
+            if wanted:
+                yield self.frame(number, time_ns)
+        self.ended = self.count == len(self._files)
+
+    def frame(self, number: int, time_ns: int = 0) -> Frame:
+        """An image of the folder.
+
+        Raises:
+            ValueError: it can not be read.
+        """
+        file = self._files[number]
+        try:
+            content = read_bytes(file, LARGEST_IMAGE_FILE)
+            image, jpeg = _upright(content)
+        except ValueError as error:
+            raise ValueError(f'{file}: {error}') from error
+        return Frame(number, time_ns, file.name, image, jpeg)
+
+
+def _upright(content: bytes) -> tuple[Image, bytes | None]:
+    """The image in a file, upright, and the file if it is a JPEG that needs no turning.
+
+    Raises:
+        ValueError: there is no image in it.
+    """
+    if content.startswith(b'\xff\xd8\xff'):
+        as_stored = decode_picture(content, 'jpeg')
+        if b'Exif\0' not in content[:_EXIF_WITHIN]:
+            return as_stored, content
+        image = _decoded(content)
+        same = image.shape == as_stored.shape and np.array_equal(image, as_stored)
+        return image, content if same else None
+    return _decoded(content), None
+
+
+def _decoded(content: bytes) -> Image:
+    try:
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_COLOR)
+    except cv2.error as error:
+        raise ImageError(f'the image can not be decoded: {error.err}') from error
+    if image is None:
+        raise ImageError('not an image that OpenCV can read')
+    if image.shape[0] * image.shape[1] > MAX_PIXELS:
+        raise ImageError(f'the image has more than {MAX_PIXELS} pixels')
+    return np.asarray(image, dtype=np.uint8)
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Key that sorts names with numbers as people count: frame_9 before frame_10."""
+    parts = re.findall(r'\d+|\D+', name)
+    return [(int(x), '') if x.isdecimal() else (-1, x) for x in parts]

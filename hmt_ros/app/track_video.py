@@ -1,0 +1,111 @@
+"""track-video: from a video to a report: import-video, subject, replay and report in one command.
+
+track-video walk.mp4 -o walk --fov 60 --keypoints walk.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from tqdm import tqdm
+
+from hmt_ros.app.command_line import CommandParser, number, run_command
+from hmt_ros.app.import_video.command import ImportOptions, add_video_arguments, import_video
+from hmt_ros.app.replay.one_bag import replay_bag
+from hmt_ros.app.replay.options import ReplayOptions
+from hmt_ros.app.report.command import ReportOptions, write_report
+from hmt_ros.app.subject import find_start, subject_text
+from hmt_ros.body import load_body
+
+VIDEO, SUBJECT, TRACKED, REPORT = 'video', 'subject.yaml', 'tracked', 'report'
+
+EPILOG = """\
+DIR gets
+  video/              the bag that import-video writes, see import-video --help
+  subject.yaml        the start of the track, if there are keypoints, see subject --help
+  tracked/            the bag that replay writes, see replay --help
+  report/report.html  the page that report writes, for a browser
+
+examples:
+  track-video walk.mp4 -o walk --fov 60 --keypoints walk.json
+  track-video walk.mp4 -o walk --fov 60 --detector mediapipe --stature 1.75
+
+exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
+"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command; 0: the report is there, 1: bad input, which one line on stderr explains."""
+    return run_command(_parser(), _track, argv)
+
+
+def _parser() -> CommandParser:
+    parser = CommandParser(
+        'track-video', 'Imports a video, tracks the person in it, and writes a report.', EPILOG
+    )
+    add_video_arguments(parser)
+    parser.add_output('DIR', 'result', 'folder for the bags and the report')
+    parser.add_argument(
+        '--stature', type=number(0.3, 3), help='stature of the person, m (default: not known)'
+    )
+    parser.add_argument(
+        '--background', type=Path, metavar='FILE', help='image of the empty scene, see replay'
+    )
+    parser.add_argument('--seed', type=int, metavar='N', help='seed of all random numbers')
+    parser.add_argument(
+        '--set', action='append', default=[], dest='settings', metavar='NAME=VALUE',
+        help='one parameter of the tracker, see replay; may be repeated',
+    )  # fmt: skip
+    return parser
+
+
+def _track(arguments: argparse.Namespace) -> int:
+    folder, quiet = arguments.output, arguments.quiet
+    overwrite, stature = arguments.overwrite, arguments.stature
+
+    def say(text: object) -> None:
+        if not quiet:
+            print(text, flush=True)
+
+    with_keypoints = arguments.keypoints is not None or arguments.detector is not None
+    if stature is not None and not with_keypoints:
+        raise ValueError('--stature goes with --keypoints or --detector')
+    taken = [x for x in (VIDEO, SUBJECT, TRACKED, REPORT) if (folder / x).exists()]
+    if taken and not overwrite:
+        raise ValueError(f'{folder / taken[0]} exists; give another name, or --overwrite')
+
+    video, start = folder / VIDEO, folder / SUBJECT
+    imported = import_video(ImportOptions.of(arguments, video), tell)
+    say(f'{video}: {imported}')
+    if with_keypoints:
+        seen = find_start(video, load_body('human37'))
+        start.write_text(subject_text(seen, stature=stature), encoding='utf-8')
+        say(f'{start}: {len(seen.joints.names)} joints at {seen.stamp_ns} ns')
+    options = ReplayOptions(
+        overwrite=overwrite,
+        quiet=quiet,
+        subject=start if with_keypoints else None,
+        background=arguments.background,
+        seed=arguments.seed,
+        settings=arguments.settings,
+    )
+    replayed = replay_bag(video, folder / TRACKED, options, tell)
+    say(f'{folder / TRACKED}: {replayed}')
+    _, written = write_report(
+        ReportOptions(
+            folder / TRACKED, folder / REPORT, overwrite=overwrite, quiet=quiet, images=video
+        )
+    )
+    say(written)
+    return 0
+
+
+def tell(text: str) -> None:
+    """Prints a line for the user on stderr, above the progress bar."""
+    tqdm.write(f'track-video: {text}', file=sys.stderr)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

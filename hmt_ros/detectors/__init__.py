@@ -1,0 +1,1 @@
+"""Detectors of people in images that are not part of this package."""

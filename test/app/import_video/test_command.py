@@ -1,0 +1,284 @@
+import json
+import tracemalloc
+
+import cv2
+import numpy as np
+import pytest
+
+from hmt_ros.app.import_video import command
+from hmt_ros.app.rendered_bag import START_NS
+from hmt_ros.app.replay.inputs import recorded_input
+from hmt_ros.image.terms.keypoints import Keypoints
+from msg_tools import BagReader
+from msg_tools.messages.camera_info import camera_from_info
+from msg_tools.messages.headers import time_ns
+from msg_tools.messages.images import decode_image, decode_mask
+
+NAMES = ('left_hip', 'right_hip', 'left_knee')
+
+
+def run(source, out, *options, fov='60'):
+    view = ['--fov', fov] if fov else []
+    return command.main([str(source), '-o', str(out), '--quiet', *view, *map(str, options)])
+
+
+def content(bag):
+    """Messages by topic."""
+    found = {}
+    with BagReader(bag) as reader:
+        for stored in reader.messages():
+            stamp = time_ns(stored.message.header.stamp)
+            assert stored.log_time_ns == stamp
+            found.setdefault(stored.topic, []).append((stamp, stored.message))
+    return found
+
+
+def arrays(path, rows, **changed):
+    person = np.array([[10.0, 5], [14, 5], [10, 15]])
+    pixels = np.stack([person + np.array([i, 0]) for i in range(rows)])
+    columns = {
+        'landmark_names': np.array(NAMES),
+        'pixels': pixels,
+        'visibility': np.full((rows, 3), 0.5),
+        'world': np.ones((rows, 3, 3)),
+        'detected': np.arange(rows) != 2,
+    }
+    np.savez(path, **(columns | changed))
+    return path
+
+
+def test_video_with_keypoints(video, tmp_path, number_in):
+    keypoints = arrays(tmp_path / 'k.npz', 10)
+    assert run(video, tmp_path / 'bag', '--keypoints', keypoints) == 0
+    found = content(tmp_path / 'bag')
+    assert sorted(found) == ['camera_info', 'image/compressed', 'keypoints', 'keypoints_3d']
+    stamps = [START_NS + 40_000_000 * i for i in range(10)]
+    for topic, messages in found.items():
+        assert [stamp for stamp, _ in messages] == stamps, topic
+        assert {x.header.frame_id for _, x in messages} == {'camera_optical_frame'}
+    assert [number_in(decode_image(x)) for _, x in found['image/compressed']] == [*range(10)]
+    camera = camera_from_info(found['camera_info'][0][1], (64, 48))
+    assert camera.fx == pytest.approx(32 / np.tan(np.radians(30)))
+    messages = [x for _, x in found['keypoints']]
+    assert [len(x.names) for x in messages] == [3, 3, 0, 3, 3, 3, 3, 3, 3, 3]
+    assert tuple(messages[4].names) == NAMES
+    assert list(messages[4].u) == [14, 18, 14]
+    assert list(messages[4].confidence) == [0.5] * 3
+    assert len(messages[4].covariance) == 0
+    lifted = [x for _, x in found['keypoints_3d']]
+    assert [len(x.names) for x in lifted] == [len(x.names) for x in messages]
+    assert list(lifted[4].z) == [1.0] * 3
+    with BagReader(tmp_path / 'bag') as bag:
+        recorded = recorded_input(bag)
+        assert recorded.image.name == 'image/compressed'
+        assert recorded.keypoints is not None
+
+
+def test_jpeg_files_are_copied_and_masks_are_found_by_name(folder, tmp_path):
+    masks = tmp_path / 'masks'
+    masks.mkdir()
+    picture = np.zeros((48, 64), np.uint8)
+    picture[10:20, 30:40] = 255
+    for i in (1, 3):
+        assert cv2.imwrite(str(masks / f'img_{i}.png'), picture)
+    options = ['--fps', 10, '--masks', masks, '--first-stamp', 5]
+    assert run(folder, tmp_path / 'bag', *options) == 0
+    found = content(tmp_path / 'bag')
+    files = [(folder / f'img_{i}.jpg').read_bytes() for i in range(1, 11)]
+    assert [bytes(x.data) for _, x in found['image/compressed']] == files
+    assert [stamp for stamp, _ in found['mask']] == [5, 200_000_005]
+    assert np.array_equal(decode_mask(found['mask'][0][1]), picture > 0)
+
+
+def test_masks_of_a_video(video, tmp_path):
+    size = (64, 48)
+    writer = cv2.VideoWriter(
+        str(tmp_path / 'masks.mp4'), cv2.VideoWriter_fourcc(*'mp4v'), 25.0, size
+    )
+    for i in range(10):
+        picture = np.zeros((48, 64, 3), np.uint8)
+        picture[:, : 8 + 4 * i] = 255
+        writer.write(picture)
+    writer.release()
+    options = ['--masks', tmp_path / 'masks.mp4', '--start', '0.1', '--every', 3]
+    assert run(video, tmp_path / 'bag', *options) == 0
+    masks = [decode_mask(x) for _, x in content(tmp_path / 'bag')['mask']]
+    assert [round(x.mean() * 64) for x in masks] == pytest.approx([20, 32, 44], abs=1)
+
+
+def test_same_command_same_bytes(video, tmp_path):
+    for name in ('a', 'b'):
+        assert run(video, tmp_path / name / 'bag') == 0
+    one, other = ((tmp_path / x / 'bag' / 'bag.mcap').read_bytes() for x in ('a', 'b'))
+    assert one == other
+    assert run(video, tmp_path / 'a' / 'bag', '--overwrite', '--jpeg-quality', '20') == 0
+    assert (tmp_path / 'a' / 'bag' / 'bag.mcap').read_bytes() != one
+
+
+def test_one_of_several_persons(video, tmp_path):
+    def entry(i, u, track):
+        pixels = np.array([[u, 5.0, 1], [u + 4, 5, 1], [u, 15, 1]] + [[0.0, 0, 0]] * 14)
+        return {'image_id': i + 1, 'keypoints': pixels.reshape(-1).tolist(), 'track_id': track}
+
+    entries = [entry(i, u, k) for i in range(10) for u, k in ((10.0 + i, 8), (50.0 - i, 9))]
+    (tmp_path / 'k.json').write_text(json.dumps(entries), 'utf-8')
+    options = ['--keypoints', tmp_path / 'k.json', '--first-number', 1, '--person', 'id:9']
+    assert run(video, tmp_path / 'bag', *options) == 0
+    columns = [x.u[0] for _, x in content(tmp_path / 'bag')['keypoints']]
+    assert columns == [50.0 - i for i in range(10)]
+
+
+class FakePose:
+    """Finds the person in every second image, at the number of the call."""
+
+    def __init__(self, *, with_mask):
+        self.mask, self.calls, self.stamps, self._with_mask = None, 0, [], with_mask
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.stamps.append('closed')
+
+    def detect(self, image, stamp_ns):
+        self.calls += 1
+        self.stamps.append(stamp_ns)
+        if self._with_mask:
+            self.mask = np.zeros(image.shape[:2], bool)
+            self.mask[: self.calls] = True
+        if self.calls % 2:
+            return None
+        pixels = np.full((3, 2), float(self.calls))
+        return Keypoints(NAMES, pixels, np.tile(np.eye(2), (3, 1, 1)), np.ones(3), np.ones((3, 3)))
+
+
+def test_detector(video, tmp_path, monkeypatch):
+    made = []
+
+    def pose(**options):
+        made.append(FakePose(**options))
+        return made[-1]
+
+    monkeypatch.setattr(command, 'MediaPipePose', pose)
+    options = ['--detector', 'mediapipe', '--detector-masks', '--every', 2]
+    assert run(video, tmp_path / 'bag', *options) == 0
+    found = content(tmp_path / 'bag')
+    stamps = [START_NS + 80_000_000 * i for i in range(5)]
+    assert made[0].stamps == [*stamps, 'closed']
+    for topic in ('keypoints', 'keypoints_3d', 'mask'):
+        assert [stamp for stamp, _ in found[topic]] == stamps
+    assert [len(x.names) for _, x in found['keypoints']] == [0, 3, 0, 3, 0]
+    assert [decode_mask(x).any(1).sum() for _, x in found['mask']] == [1, 2, 3, 4, 5]
+
+
+def test_mediapipe_itself(mediapipe, walk_video, tmp_path):
+    """It finds the hips of a rendered person, each on its side."""
+    out = tmp_path / 'bag'
+    assert run(walk_video / 'walk.mp4', out, '--detector', 'mediapipe') == 0
+    messages = [x for _, x in content(out)['keypoints'] if len(x.names)]
+    assert len(messages) >= 6
+    truth = np.load(walk_video / 'rendered' / 'truth.npz')
+    for name in ('left_hip', 'right_hip'):
+        joint = list(truth['joint_names']).index(name)
+        i = list(messages[0].names).index(name)
+        found = np.array([[x.u[i], x.v[i]] for x in messages])
+        apart = np.linalg.norm(found - truth['pixels'][-len(messages) :, joint], axis=1)
+        assert np.median(apart) < 10.0
+
+
+def test_video_that_breaks_off_is_told(video, tmp_path, capsys):
+    path = tmp_path / 'broken.avi'
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 25.0, (64, 48))
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        writer.write(rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    writer.release()
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    assert run(path, tmp_path / 'bag') == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'of the 20 frames that its head announces can be read' in line
+
+
+def test_memory_does_not_grow_with_the_video(tmp_path, monkeypatch):
+    """Of 40 and of 400 frames the same memory is used."""
+    peaks = []
+    rng = np.random.default_rng(0)
+    pictures = rng.integers(0, 255, (4, 120, 160, 3), dtype=np.uint8)
+    for count in (40, 400):
+        path = tmp_path / f'{count}.avi'
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 25.0, (160, 120))
+        for i in range(count):
+            writer.write(pictures[i % 4])
+        writer.release()
+        tracemalloc.start()
+        assert run(path, tmp_path / f'bag{count}') == 0
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < peaks[0] + 3_000_000, peaks
+    assert 400 * pictures[0].nbytes > 20_000_000
+
+
+@pytest.mark.parametrize(
+    ('options', 'message'),
+    [
+        (['--keypoints', '{}/none.json'], 'none.json: no such file'),
+        (['--keypoints', '{}/nine.npz'], 'nine.npz has 9 rows, but'),
+        (['--keypoints', '{}/late.csv'], 'late.csv has frame 10, but'),
+        (['--keypoints', '{}/far.npz'], '27 of 27 keypoints lie outside of the images'),
+        (
+            ['--keypoints', '{}/ten.npz', '--person', 'index:3'],
+            'none of the 10 imported frames has',
+        ),
+        (['--keypoints', '{}/ten.npz', '--person', 'tall'], '--person: wanted largest, nearest,'),
+        (['--keypoints', 'k', '--detector', 'mediapipe'], '--detector: not allowed with argument'),
+        (['--masks', '{}/wide'], 'mask 0003.png has 32x24 pixels, wanted the 64x48 of its frame'),
+        (['--masks', '{}/full'], 'mask 3.png is zero nowhere'),
+        (['--masks', '{}/late'], 'late has frame 12, but'),
+        (['--masks', '{}/named'], 'person.png is not the name of a frame and has no number'),
+        (['--detector-masks'], '--detector-masks goes with --detector'),
+        (['--camera', 'c.yaml'], '--camera: not allowed with argument --fov'),
+        (['--vertical-fov', '50'], '--vertical-fov: not allowed with argument --fov'),
+        (['--fov', '0.5'], "--fov: wanted an angle from 1 to 150 degrees, saw '0.5'"),
+        (['--start', '5'], 'no frame was read of 10; see --start and --end'),
+        (['--start', '2', '--end', '1'], '--start 2 is not before --end 1'),
+        (['--every', '0'], '--every: wanted a whole number from 1'),
+        (['--fps', '0'], '--fps: wanted a number from 0.01 to 1000'),
+    ],
+)
+def test_bad_input_is_one_line(options, message, video, tmp_path, capfd):
+    arrays(tmp_path / 'nine.npz', 9)
+    arrays(tmp_path / 'ten.npz', 10)
+    arrays(tmp_path / 'far.npz', 10, pixels=np.full((10, 3, 2), 500.0))
+    (tmp_path / 'late.csv').write_text('frame,a_u,a_v\n1,5,6\n10,5,6\n', 'utf-8')
+    for name, shape, file in (
+        ('wide', (24, 32), '0003.png'),
+        ('full', (48, 64), '3.png'),
+        ('late', (48, 64), '12.png'),
+        ('named', (48, 64), 'person.png'),
+    ):
+        (tmp_path / name).mkdir()
+        assert cv2.imwrite(str(tmp_path / name / file), np.full(shape, 255, np.uint8))
+    out = tmp_path / 'new' / 'bag'
+    given = [x.format(tmp_path) for x in options]
+    assert run(video, out, *given) == 1
+    lines = capfd.readouterr().err.splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith('import-video: ')
+    assert message in lines[0]
+    assert not out.parent.exists() or not [*out.parent.iterdir()]
+
+
+def test_camera_is_wanted(video, tmp_path, capsys):
+    assert run(video, tmp_path / 'bag', fov=None) == 1
+    assert 'one of the arguments --fov --vertical-fov --camera is required' in (
+        capsys.readouterr().err
+    )
+
+
+def test_images_of_several_sizes(folder, tmp_path, capsys):
+    assert cv2.imwrite(str(folder / 'img_5.jpg'), np.zeros((40, 64, 3), np.uint8))
+    assert run(folder, tmp_path / 'bag', '--fps', 10) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'img_5.jpg has 64x40 pixels, the frames before it 64x48; wanted one size' in line
+    assert not (tmp_path / 'bag').exists()

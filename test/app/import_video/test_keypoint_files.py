@@ -1,0 +1,230 @@
+import json
+
+import numpy as np
+import pytest
+
+from hmt_ros.app.import_video.frames import Frame, FrameSource
+from hmt_ros.app.import_video.keypoint_files import read_keypoints
+from hmt_ros.image.keypoint_schemes import schemes
+
+START = 1_000_000_000_000
+IMAGE = np.zeros((4, 4, 3), np.uint8)
+
+
+def pixels(n, number):
+    """(n, 2) px of a person in a frame."""
+    return np.stack([10.0 + np.arange(n), 20.0 + 2 * np.arange(n) + number], 1)
+
+
+def flat(n, number, sure=0.5):
+    return np.column_stack([pixels(n, number), np.full(n, sure)]).reshape(-1).tolist()
+
+
+def found_in(path, number=2, source=None, time_ns=None):
+    source = source or FrameSource(path.parent / 'walk.mp4')
+    frame = Frame(number, 40_000_000 * number if time_ns is None else time_ns, '', IMAGE)
+    return read_keypoints(path, source, START).of(frame)
+
+
+def write(path, content):
+    path.write_text(content if isinstance(content, str) else json.dumps(content), 'utf-8')
+    return path
+
+
+@pytest.mark.parametrize(
+    ('n', 'scheme'),
+    [(17, 'coco17'), (18, 'skeleton2d'), (25, 'body25'), (26, 'halpe26'), (33, 'mediapipe33')],
+)
+def test_coco_results(n, scheme, tmp_path):
+    entries = [
+        {'image_id': i, 'category_id': 1, 'keypoints': flat(n, i), 'score': 0.7} for i in (0, 2, 3)
+    ]
+    path = write(tmp_path / 'walk.json', entries)
+    (seen,) = found_in(path)
+    assert seen.keypoints.names == schemes()[scheme].names
+    assert np.array_equal(seen.keypoints.pixels, pixels(n, 2))
+    assert (seen.keypoints.confidences == 0.5).all()
+    assert found_in(path, 1) == []
+
+
+def test_coco_of_two_persons_with_tracks(tmp_path):
+    entries = [{'image_id': '2.jpg', 'keypoints': flat(17, 2), 'idx': k} for k in (5, 4)]
+    found = found_in(write(tmp_path / 'walk.json', entries))
+    assert [x.track for x in found] == ['5', '4']
+
+
+def test_coco_annotations(tmp_path):
+    """Images and keypoints have names; flags say how well a keypoint is seen."""
+    content = {
+        'images': [
+            {'id': 70, 'file_name': 'b.jpg'},
+            {'id': 71, 'file_name': 'a.jpg', 'width': 8, 'height': 4},
+        ],
+        'annotations': [
+            {'image_id': 70, 'keypoints': [5, 6, 2, 7, 8, 1, 9, 9, 0]},
+            {'image_id': 71, 'keypoints': [1, 2, 2, 3, 4, 2, 5, 6, 2]},
+        ],
+        'categories': [{'id': 1, 'keypoints': ['nose', 'left_hip', 'tail']}],
+    }
+    source = FrameSource(tmp_path, ('a.jpg', 'b.jpg'))
+    (seen,) = found_in(write(tmp_path / 'walk.json', content), 1, source)
+    assert seen.keypoints.names == ('nose', 'left_hip', 'tail')
+    assert list(seen.keypoints.confidences) == [1.0, 0.5, 0.0]
+    assert np.array_equal(seen.keypoints.pixels[:2], [[5, 6], [7, 8]])
+    found = read_keypoints(tmp_path / 'walk.json', source, START)
+    found.check_size(Frame(0, 0, '', np.zeros((4, 8, 3), np.uint8)))
+    with pytest.raises(ValueError, match='in images of 8x4 pixels, but the frames have 4x4'):
+        found.check_size(Frame(0, 0, '', IMAGE))
+
+
+def test_openpose(tmp_path):
+    folder = tmp_path / 'openpose'
+    folder.mkdir()
+    for i in range(3):
+        people = [
+            {'person_id': [-1], 'pose_keypoints_2d': flat(25, i)},
+            {'person_id': [4], 'pose_keypoints_2d': flat(25, 100)},
+            {'person_id': [-1], 'pose_keypoints_2d': [0.0] * 75},
+        ]
+        write(folder / f'walk_{i:012d}_keypoints.json', {'version': 1.3, 'people': people})
+    first, second = found_in(folder)
+    assert first.keypoints.names == schemes()['body25'].names
+    assert np.array_equal(first.keypoints.pixels, pixels(25, 2))
+    assert (first.track, second.track) == ('', '4')
+
+
+def arrays(rows=4, n=33, **changed):
+    content = {
+        'landmark_names': np.array(schemes()['mediapipe33'].names),
+        'pixels': np.stack([pixels(n, i) for i in range(rows)]).astype(np.float32),
+        'visibility': np.full((rows, n), 0.25, np.float32),
+        'world': np.arange(rows * n * 3.0).reshape(rows, n, 3),
+        'detected': np.arange(rows) != 1,
+    }
+    return content | changed
+
+
+def test_arrays(tmp_path):
+    path = tmp_path / 'walk.npz'
+    content = arrays()
+    np.savez(path, **content)
+    (seen,) = found_in(path)
+    assert seen.keypoints.names == schemes()['mediapipe33'].names
+    assert np.array_equal(seen.keypoints.pixels, pixels(33, 2))
+    assert np.array_equal(seen.keypoints.positions, content['world'][2])
+    assert (seen.keypoints.confidences == 0.25).all()
+    assert found_in(path, 1) == []
+    found = read_keypoints(path, FrameSource(tmp_path), START)
+    assert (found.rows, found.lifts, found.last) == (4, True, 3)
+
+
+WIDE = """\
+frame,left_hip_u,left_hip_v,left_hip_confidence,nose_u,nose_v,nose_confidence
+1,11,12,0.5,13,14,0.25
+2,21,22,0.75,,,
+"""
+LONG = """\
+stamp_ns, name, u, v, confidence
+1000080000000,left_hip,21,22,0.75
+1000080000000,nose,0,0,0.9
+1000040000000,nose,3,4,0.9
+"""
+
+
+@pytest.mark.parametrize(
+    'text', [WIDE, LONG, WIDE.replace('frame', 'time_s').replace('\n2', '\n0.0801')]
+)
+def test_tables(text, tmp_path):
+    (seen,) = found_in(write(tmp_path / 'walk.csv', text))
+    assert {*seen.keypoints.names} == {'left_hip', 'nose'}
+    which = seen.keypoints.names.index('left_hip')
+    assert list(seen.keypoints.seen) == [x == 'left_hip' for x in seen.keypoints.names]
+    assert list(seen.keypoints.pixels[which]) == [21, 22]
+    assert seen.keypoints.confidences[which] == 0.75
+
+
+def test_table_without_confidences_of_two_persons(tmp_path):
+    path = write(tmp_path / 'walk.csv', 'frame,person,a_u,a_v\n2,x,5,6\n2,y,7,8\n3,x,9,9\n')
+    found = found_in(path)
+    assert [(x.track, *x.keypoints.pixels[0]) for x in found] == [('x', 5, 6), ('y', 7, 8)]
+    assert found[0].keypoints.confidences[0] == 1.0
+
+
+def test_rows_far_from_a_frame_in_time_are_not_its(tmp_path):
+    path = write(tmp_path / 'walk.csv', 'time_s,a_u,a_v\n0.5,5,6\n')
+    assert len(found_in(path, time_ns=491_000_000)) == 1
+    assert found_in(path, time_ns=489_000_000) == []
+
+
+@pytest.mark.parametrize(
+    ('name', 'content', 'message'),
+    [
+        ('a.json', '{', 'not JSON'),
+        ('a.json', {'people': []}, 'no list images'),
+        ('a.json', [1], 'not COCO: wanted a list of'),
+        ('a.json', [{'keypoints': []}], 'entry 0 has no image_id or no keypoints'),
+        ('a.json', [{'image_id': 0, 'keypoints': [1, 2]}], 'entry 0 has 2 numbers'),
+        ('a.json', [{'image_id': 0, 'keypoints': ['x'] * 3}], 'keypoints are not numbers'),
+        ('a.json', [{'image_id': 0, 'keypoints': [5.0] * 30}], '10 keypoints without names'),
+        ('a.json', [{'image_id': 'walk', 'keypoints': [5.0] * 51}], 'walk is not the name of a fr'),
+        ('a.json', [{'image_id': 0, 'keypoints': [0.5] * 51}], 'they are fractions of the image'),
+        ('a.json', [{'image_id': 0, 'keypoints': [1e9] * 51}], r'a keypoint lies 1e\+09 px away'),
+        ('a.json', [{'image_id': 0, 'keypoints': [10**400] * 51}], 'keypoints are not numbers'),
+        (
+            'a.json',
+            {
+                'images': [],
+                'annotations': [{'image_id': 0, 'keypoints': [5.0] * 6}],
+                'categories': [{'keypoints': ['a', 'b', 'c']}],
+            },
+            'entry 0 has 2 keypoints, but 3 are named in categories',
+        ),
+        ('a.json', [], 'no keypoint was seen in any frame'),
+        ('a.csv', 'u,v\n1,2\n', 'wanted a column frame, time_s or stamp_ns'),
+        ('a.csv', 'frame,nose\n1,2\n', 'wanted columns NAME_u and NAME_v, or name, u and v'),
+        ('a.csv', 'frame,nose_u\n1,2\n', 'no column nose_v'),
+        ('a.csv', 'frame,a_u,a_v\n1,x,3\n', "line 2: a_u is 'x', wanted a number"),
+        ('a.csv', 'time_s,a_u,a_v\nx,1,3\n', "time_s is 'x', wanted a number"),
+        ('a.csv', 'frame,name,u,v\n1,a,1,3\n1,a,1,3\n', 'line 3: a twice in frame 1'),
+        ('a.csv', 'frame,name,u,v\n1,,1,3\n', 'line 2: no name'),
+        ('a.csv', 'name,u,v,frame\na,1,3\n', 'line 2: no frame'),
+        ('a.npz', 'no archive', 'not a zip file'),
+        ('a.txt', 'words', '.txt is not known; wanted COCO'),
+    ],
+)
+def test_bad_files(name, content, message, tmp_path):
+    path = write(tmp_path / name, content)
+    with pytest.raises(ValueError, match=message) as caught:
+        found_in(path)
+    assert str(caught.value).startswith(f'{path}: ')
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('changed', 'message'),
+    [
+        ({'pixels': np.zeros((4, 32, 2))}, r'pixels has shape \(4, 32, 2\), wanted \(4, 33, 2\)'),
+        ({'visibility': np.zeros((3, 33))}, r'visibility has shape \(3, 33\), wanted \(4, 33\)'),
+        ({'landmark_names': np.array(['a'] * 33)}, 'two keypoints are called a'),
+        ({'world': np.full((4, 33, 3), 'x')}, 'world holds <U1, wanted numbers'),
+    ],
+)
+def test_arrays_that_contradict_each_other(changed, message, tmp_path):
+    np.savez(tmp_path / 'walk.npz', **arrays(**changed))
+    with pytest.raises(ValueError, match=message):
+        found_in(tmp_path / 'walk.npz')
+
+
+def test_bad_folders(tmp_path):
+    folder = tmp_path / 'openpose'
+    folder.mkdir()
+    with pytest.raises(ValueError, match=r'no \.json files in this folder'):
+        found_in(folder)
+    write(folder / 'walk_1_keypoints.json', {'people': [{'pose_keypoints_2d': [1.0] * 4}]})
+    with pytest.raises(ValueError, match=r'walk_1_keypoints\.json has 4 numbers'):
+        found_in(folder)
+    write(folder / 'walk_1_keypoints.json', {'persons': []})
+    with pytest.raises(ValueError, match=r'walk_1_keypoints\.json is not of OpenPose'):
+        found_in(folder)
+    with pytest.raises(ValueError, match='no such file'):
+        found_in(tmp_path / 'missing.json')

@@ -1,0 +1,145 @@
+import numpy as np
+import pytest
+
+from hmt_ros.app import subject
+from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
+from hmt_ros.body import Camera
+from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.tracking import read_subject
+from msg_tools import BagWriter, RosbagsMessages
+from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.images import compressed_image_message
+from msg_tools.messages.keypoints import keypoints_message
+
+MESSAGES = RosbagsMessages()
+CAMERA = Camera(100.0, 100.0, 31.5, 23.5, 64, 48)
+STEP = 100_000_000
+
+
+def person(scheme, confidences, *, shift=0.0):
+    """Landmark i of a scheme lies at (10 + i + shift, 100 + 2 i)."""
+    names = schemes()[scheme].names
+    n = len(names)
+    pixels = np.stack([10.0 + np.arange(n) + shift, 100.0 + 2 * np.arange(n)], 1)
+    sure = np.array([confidences.get(x, 0.9) for x in names])
+    return Keypoints(names, pixels, np.tile(np.eye(2), (n, 1, 1)), sure)
+
+
+def write_bag(path, found):
+    with BagWriter(path) as bag:
+        for i, keypoints in enumerate(found):
+            stamp = START_NS + i * STEP
+            image = np.zeros((48, 64, 3), np.uint8)
+            bag.write(
+                'image/compressed', stamp,
+                compressed_image_message(MESSAGES, image, stamp, FRAME_ID),
+            )  # fmt: skip
+            info = camera_info_message(MESSAGES, CAMERA, stamp, FRAME_ID)
+            bag.write('camera_info', stamp, info)
+            if keypoints is not None:
+                message = keypoints_message(MESSAGES, keypoints, stamp, FRAME_ID)
+                bag.write('keypoints', stamp, message)
+    return path
+
+
+def run(bag, *options):
+    file = bag.parent / 'subject.yaml'
+    return subject.main([str(bag), '-o', str(file), '--overwrite', *map(str, options)]), file
+
+
+NOBODY = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
+HIDDEN = {'left_ankle': 0.2, 'right_ankle': 0.2, 'left_knee': 0.2}
+
+
+def test_first_image_that_shows_enough(tmp_path, human37):
+    found = [NOBODY, person('coco17', HIDDEN), person('coco17', {'left_wrist': 0.4}, shift=3.0)]
+    bag = write_bag(tmp_path / 'bag', [*found, person('coco17', {})])
+    code, file = run(bag, '--stature', '1.8')
+    assert code == 0
+    read = read_subject(file, human37)
+    assert read.stamp_ns == START_NS + 2 * STEP
+    assert read.stature == 1.8
+    names = schemes()['coco17'].names
+    # Eyes, ears and nose are at no joint; the wrist is not seen well.
+    assert {*read.keypoints.names} == {*names[5:]} - {'left_wrist'}
+    knee = read.keypoints.names.index('right_knee')
+    i = names.index('right_knee')
+    assert list(read.keypoints.pixels[knee]) == [13.0 + i, 100.0 + 2 * i]
+    # 3 % of the height of the person: from the left shoulder (5) to the right ankle (16).
+    assert np.allclose(read.keypoints.covariances[0], 2.0**2 * np.eye(2))
+    code, file = run(bag, '--sigma', '7')
+    assert np.allclose(read_subject(file, human37).keypoints.covariances[0], 49 * np.eye(2))
+
+
+def test_image_that_shows_most(tmp_path, human37):
+    few = HIDDEN | {'right_knee': 0.0}
+    bag = write_bag(tmp_path / 'bag', [person('coco17', few), person('coco17', HIDDEN)] * 2)
+    _, file = run(bag)
+    assert read_subject(file, human37).stamp_ns == START_NS + STEP
+
+
+@pytest.mark.parametrize(
+    ('option', 'index'), [(['--stamp', START_NS + STEP], 1), (['--time', '0.16'], 2)]
+)
+def test_image_may_be_chosen(option, index, tmp_path, human37):
+    bag = write_bag(tmp_path / 'bag', [person('coco17', {})] * 3)
+    code, file = run(bag, *option)
+    assert code == 0
+    assert read_subject(file, human37).stamp_ns == START_NS + index * STEP
+
+
+@pytest.mark.parametrize(
+    ('scheme', 'extra', 'missing'),
+    [
+        ('body25', {'pelvis', 'neck', 'left_toe', 'right_toe'}, {'head', 'left_hand'}),
+        ('mediapipe33', {'left_hand', 'right_toe'}, {'pelvis', 'neck', 'head'}),
+        ('halpe26', {'pelvis', 'neck', 'left_toe'}, {'head'}),
+        ('h36m17', {'pelvis', 'neck', 'head'}, {'left_toe'}),
+    ],
+)
+def test_names_of_detectors(scheme, extra, missing, tmp_path, human37):
+    bag = write_bag(tmp_path / 'bag', [person(scheme, {})])
+    _, file = run(bag)
+    read = read_subject(file, human37).keypoints
+    assert {*subject.WANTED} | extra <= {*read.names}
+    assert not missing & {*read.names}
+    names = schemes()[scheme].names
+    if scheme == 'mediapipe33':
+        fingers = [names.index(f'left_{x}') for x in ('pinky', 'index', 'thumb')]
+        hand = read.pixels[read.names.index('left_hand')]
+        assert np.allclose(hand, [10 + np.mean(fingers), 100 + 2 * np.mean(fingers)], atol=0.05)
+        # The heel is not the ankle.
+        ankle = read.pixels[read.names.index('left_ankle')]
+        assert ankle[0] == 10 + names.index('left_ankle')
+
+
+@pytest.mark.parametrize(
+    ('found', 'options', 'message'),
+    [
+        ([None], [], 'has no keypoints: import them with the video'),
+        ([NOBODY] * 2, [], '0 joints of human37 are seen with confidence in each image, wanted 4'),
+        ([NOBODY, 'all'], ['--time', '0'], f'are seen with confidence at {START_NS} ns'),
+        (['all'], ['--stamp', '5'], f'no keypoints at 5 ns, the nearest are at {START_NS} ns'),
+        (['all'], ['--stamp', '5', '--time', '1'], 'not allowed with argument'),
+        (['all'], ['--body', 'nobody'], "no body 'nobody'"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line(found, options, message, tmp_path, capsys):
+    everything = person('coco17', {})
+    bag = write_bag(tmp_path / 'bag', [everything if x == 'all' else x for x in found])
+    code, file = run(bag, *options)
+    assert code == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith('subject: ')
+    assert message in line
+    assert not file.exists()
+
+
+def test_nothing_is_replaced_unasked(tmp_path, capsys):
+    bag = write_bag(tmp_path / 'bag', [person('coco17', {})])
+    file = tmp_path / 'subject.yaml'
+    file.write_text('mine', 'utf-8')
+    assert subject.main([str(bag), '-o', str(file)]) == 1
+    assert 'exists; give another name, or --overwrite' in capsys.readouterr().err
+    assert file.read_text('utf-8') == 'mine'
