@@ -11,6 +11,7 @@ import sys
 from dataclasses import dataclass, field
 
 from hmt_ros.image.background import BackgroundSettings
+from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
@@ -27,6 +28,8 @@ from hmt_ros.sessions.parameter_file import parameter_file_text
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.ground import KnownGround
 
+# Values of keypoint_scheme besides the names of the schemes.
+AUTO, JOINTS = 'auto', 'joints'
 # Settings that are parameters, with their limits.
 _TRACKER = {
     'max_hypotheses': (1, 64),
@@ -69,14 +72,15 @@ class FilterParameters(CameraNodeParameters):
         random_seed: Seed of all random numbers; the same images give the same results.
         use_keypoints: If true, keypoints are a measurement, and an image waits for the keypoints of
             its stamp.
+        keypoint_scheme: What the names of keypoints mean, 'auto' (recognised by the names),
+            'joints' (the joints of the body themselves), or a scheme of detectors: 'coco17',
+            'halpe26', 'body25', 'mediapipe33', 'h36m17' or 'skeleton2d'.
+        use_keypoints_3d: If true, positions of the same landmarks in space (topic keypoints_3d) are
+            weak evidence of depth, and an image waits for those of its stamp.
         keypoint_sigma_px: Standard deviation of keypoints that come without a covariance, px.
-        keypoints_timeout: Maximum time that an image waits for its keypoints, measured by the
-            stamps of later images, s; keypoints of a later stamp end the wait at once.
         use_predictions: If true, poses that bme_node predicts from the image start the track where
             there is no subject_file, and are among the hypotheses; an image then waits for the
             prediction of its stamp.
-        prediction_timeout: Maximum time that an image waits for its prediction, measured by the
-            stamps of later images, s; a prediction of a later stamp ends the wait at once.
         gravity: Direction of gravity in the camera optical frame, three numbers of any length;
             empty if unknown. A still camera that looks to the horizon has [0.0, 1.0, 0.0].
         camera_height: Height of the camera above the floor, m; 0 if unknown.
@@ -84,9 +88,6 @@ class FilterParameters(CameraNodeParameters):
             the direction of gravity at every image, before gravity does; empty switches it off.
         floor_in_gravity_frame: If true, the floor is the plane z = 0 of gravity_frame, and /tf and
             /tf_static tell the height of the camera, before camera_height does.
-        transform_timeout: Maximum time that an image waits for the transforms of its stamp,
-            measured by the stamps of later images and transforms, s; then it goes on with the
-            direction that was known.
         overlay_modes: Maximum number of modes drawn on the image, the heaviest; 0 switches the
             overlay off.
         overlay_quality: JPEG quality of the overlay.
@@ -102,15 +103,14 @@ class FilterParameters(CameraNodeParameters):
     body_model: str = parameter_field('human37', NEXT_TRACK)
     random_seed: int = parameter_field(0, NEXT_TRACK, (0, 2**31 - 1))
     use_keypoints: bool = parameter_field(False, AT_ONCE)
+    keypoint_scheme: str = parameter_field(AUTO, AT_ONCE)
+    use_keypoints_3d: bool = parameter_field(False, AT_ONCE)
     keypoint_sigma_px: float = parameter_field(5.0, AT_ONCE, (0.01, 1000.0))
-    keypoints_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
     use_predictions: bool = parameter_field(False, AT_ONCE)
-    prediction_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
     gravity: tuple[float, ...] = parameter_field((), NEXT_TRACK)
     camera_height: float = parameter_field(0.0, NEXT_TRACK, (0.0, 100.0))
     gravity_frame: str = parameter_field('', NEXT_CONFIGURE)
     floor_in_gravity_frame: bool = parameter_field(False, NEXT_CONFIGURE)
-    transform_timeout: float = parameter_field(0.1, AT_ONCE, (0.0, 60.0))
     overlay_modes: int = parameter_field(3, AT_ONCE, (0, 64))
     overlay_quality: int = parameter_field(85, AT_ONCE, (1, 100))
     publish_tf: bool = parameter_field(True, AT_ONCE)
@@ -127,6 +127,13 @@ class FilterParameters(CameraNodeParameters):
         super().__post_init__()
         if not self.body_model:
             raise ValueError("body_model must be a name or a file, saw ''")
+        known = (AUTO, JOINTS, *schemes())
+        if self.keypoint_scheme not in known:
+            raise ValueError(
+                f'keypoint_scheme must be one of {known}, saw {self.keypoint_scheme!r}'
+            )
+        if self.use_keypoints_3d and not self.use_keypoints:
+            raise ValueError('use_keypoints_3d needs use_keypoints, which is false')
         if self.gravity:
             unit_vector(self.gravity, 'gravity')
         if self.floor_in_gravity_frame and not self.gravity_frame:
