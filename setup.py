@@ -72,6 +72,8 @@ setup(
             'filter_node = hmt_ros.nodes.filter_node:main',
             'smoother_node = hmt_ros.nodes.smoother_node:main',
             'bme_node = hmt_ros.nodes.bme_node:main',
+            'keypoints_node = hmt_ros.nodes.keypoints_node:main',
+            'keypoints_adapter_node = hmt_ros.nodes.keypoints_adapter_node:main',
             'replay = hmt_ros.app.replay.command:main',
             'recover = hmt_ros.app.recover:main',
             'make-bag = hmt_ros.app.make_bag:main',

@@ -132,6 +132,8 @@ class _Worker:
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
                 env=environment,
+                # Who interrupts the program ends this process by closing its input.
+                start_new_session=True,
             )
         except OSError as error:
             self._errors.close()

@@ -31,6 +31,8 @@ class Fault(Enum):
     NO_KEYPOINTS = 'no keypoints'
     KEYPOINTS_3D = 'keypoints_3d'
     NO_KEYPOINTS_3D = 'no keypoints_3d'
+    DETECTIONS = 'detections'
+    DETECTOR = 'detector'
     MASK = 'mask'
     NO_MASK = 'no mask'
     LONE_MASK = 'mask without an image'

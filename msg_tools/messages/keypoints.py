@@ -71,7 +71,25 @@ def keypoints_of(message: Any, sigma_px: float) -> Keypoints:
     covariances = np.tile(sigma_px**2 * np.eye(2), (n, 1, 1))
     if len(message.covariance):
         covariances = numbers(message.covariance, (n, 2, 2), 'keypoints: covariance').copy()
-    confidences = _confidences(message.confidence, n, 'keypoints')
+    return checked_keypoints(
+        names, pixels, covariances, _confidences(message.confidence, n, 'keypoints')
+    )
+
+
+def checked_keypoints(
+    names: tuple[str, ...], pixels: Array, covariances: Array, confidences: Array
+) -> Keypoints:
+    """Keypoints as a detector tells them; those that were not seen lose the rest.
+
+    Args:
+        names: (n,), each once.
+        pixels: (n, 2) px; changed in place, like the others.
+        covariances: (n, 2, 2) px^2.
+        confidences: (n,).
+
+    Raises:
+        MessageError: as `keypoints_of`.
+    """
     seen = (confidences != 0) & ~np.isnan(pixels).all(1) & (pixels != 0).any(1)
     for i in np.flatnonzero(seen):
         name = names[i]
