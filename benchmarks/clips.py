@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.app.truth import read_truth
-from hmt_ros.body import Camera
+from hmt_ros.body import Camera, load_body
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.sessions.filter_parameters import FilterParameters
 from msg_tools import BagReader
 from msg_tools.files.array_file import read_archive
 from msg_tools.messages.camera_info import camera_from_info
@@ -220,11 +219,12 @@ _OF_SIDES = (
 LANDMARK_NAMES = (*_FACE, *(f'{side}_{x}' for x in _OF_SIDES for side in ('left', 'right')))
 # Landmarks of the detector that have other names than our joints.
 LANDMARKS = {'left_foot_index': 'left_toe', 'right_foot_index': 'right_toe'}
-# Standard deviation of a keypoint of confidence 1, px: the default of the filter node.
-KEYPOINT_SIGMA = FilterParameters().keypoint_sigma_px
+SCHEME = 'mediapipe33'
+# Standard deviation of a keypoint of the oracles, px.
+KEYPOINT_SIGMA = 5.0
 
 
-def read_detections(folder: Path) -> Detections:
+def read_detections(folder: Path, *, lifted: bool = True) -> Detections:
     """Reads the detector's keypoints of a clip.
 
     Raises:
@@ -234,19 +234,20 @@ def read_detections(folder: Path) -> Detections:
         content = read_archive(folder / 'keypoints_mediapipe.npz')
     except OSError as error:
         raise ValueError(f'{folder} has no keypoints_mediapipe.npz ({error.strerror})') from error
-    given = content.get('landmark_names', LANDMARK_NAMES)
-    names = [LANDMARKS.get(str(name), str(name)) for name in given]
+    given = tuple(str(name) for name in content.get('landmark_names', LANDMARK_NAMES))
+    names = [LANDMARKS.get(name, name) for name in given]
     known = [i for i, name in enumerate(names) if name in JOINTS_OF_DETECTOR]
     own = tuple(names[i] for i in known)
     stamps, found = [int(x) for x in content['stamps']], content['detected'].astype(bool)
-    covariances = np.tile(KEYPOINT_SIGMA**2 * np.eye(2), (len(known), 1, 1))
+    unknown, body = np.full((len(given), 2, 2), np.nan), load_body('human37')
     keypoints, joints = {}, {}
     for t, stamp in enumerate(stamps):
-        confidences = np.nan_to_num(content['visibility'][t, known].astype(float))
-        pixels = content['pixels'][t, known].astype(float)
-        keypoints[stamp] = Keypoints(own, pixels, covariances, confidences)
+        confidences = np.nan_to_num(content['visibility'][t].astype(float))
+        pixels, world = (content[key][t].astype(float) for key in ('pixels', 'world'))
+        every = Keypoints(given, pixels, unknown, confidences, world if lifted else None)
+        keypoints[stamp] = every.named_for(body, SCHEME)[0]
         if found[t]:
-            joints[stamp] = content['world'][t, known].astype(float)
+            joints[stamp] = world[known]
     return Detections(keypoints, own, joints)
 
 

@@ -93,7 +93,6 @@ class Body:
             at the default lengths; it scales with them).
         default_lengths: (L,) lengths of the model file, m.
         growth: (B, 5) how each part differs from the model's; see `GROWTH`.
-        keypoint_aliases: other names of joints, as keypoint detectors use them.
     """
 
     skeleton: Skeleton
@@ -106,7 +105,6 @@ class Body:
     stature_extra: float
     default_lengths: Array
     growth: Array = field(default_factory=lambda: np.zeros((0, len(GROWTH))))
-    keypoint_aliases: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         wanted = (len(self.shapes), len(GROWTH))

@@ -121,7 +121,7 @@ def _mount(entry: dict[str, Any]) -> Array:
 
 KEYS = {
     'name', 'lengths', 'stature_spread', 'stature', 'stature_extra', 'segments', 'joints',
-    'keypoint_aliases', 'chains', 'fixed',
+    'chains', 'fixed',
 }  # fmt: skip
 SEGMENT_KEYS = {
     'name', 'parent', 'offset', 'points', 'x_axis', 'length', 'diffusion', 'dofs', 'flesh',
@@ -210,12 +210,6 @@ def _build(content: dict[str, Any]) -> Body:
             joint_names.append(joint)
             joint_segments.append(segment)
             joint_basis.append(coefficients)
-    aliases = {}
-    for template, joint_template in content.get('keypoint_aliases', {}).items():
-        for alias, side in _sides(template):
-            joint = joint_template.format(side=side)
-            _named(joint, tuple(joint_names), f'keypoint_aliases: {alias}:')
-            aliases[alias] = joint
     chains = {}
     for template, members in content.get('chains', {}).items():
         for chain, side in _sides(template):
@@ -252,7 +246,6 @@ def _build(content: dict[str, Any]) -> Body:
         stature_lengths=tuple(content['stature']),
         stature_extra=float(content['stature_extra']),
         default_lengths=lengths,
-        keypoint_aliases=aliases,
     )
 
 

@@ -13,12 +13,15 @@ from importlib import resources
 from typing import Any
 
 import numpy as np
+from scipy.linalg import null_space
 
+from hmt_ros.body.skeleton import other_side
 from hmt_ros.inference.arrays import Array
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 SIDES = ('right', 'left')
-# Names that say nothing of the scheme: those of joints, which all detectors use.
+MIRROR = np.array([-1.0, 1.0, 1.0])
+AUTO, JOINTS = 'auto', 'joints'
 LARGEST_FILE = 1_000_000  # bytes
 NOT_AT_A_JOINT = ''
 
@@ -31,11 +34,34 @@ class Landmark:
         name: canonical.
         joint: of our bodies that it is at, or near; '': none.
         offset: (3,) from the joint in the frame of the joint's segment, m, of a person of 1.7 m.
+        sigma: standard deviation of each component of the offset over people, m.
     """
 
     name: str
     joint: str
     offset: Array
+    sigma: float
+
+
+@dataclass(frozen=True)
+class SlopeModel:
+    """A bone of a lifted skeleton whose slope against the line of sight is a measurement.
+
+    Attributes:
+        segment: of the body that it is fixed to.
+        ends: names of the joints from which and to which it goes; `mid_x` is between the left and
+            the right x.
+        sigma: standard deviation of the cosine of its angle with the line of sight.
+    """
+
+    segment: str
+    ends: tuple[str, str]
+    sigma: float
+
+    def mirrored(self) -> SlopeModel:
+        """The bone of the other side."""
+        first, last = map(other_side, self.ends)
+        return SlopeModel(other_side(self.segment), (first, last), self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,20 +84,26 @@ class Scheme:
 
 
 @cache
-def schemes() -> Mapping[str, Scheme]:
-    """All schemes by name."""
+def _table() -> Any:
     file = resources.files('hmt_ros.image') / 'keypoint_schemes.yaml'
     with resources.as_file(file) as path:
-        content: Any = read_plain_yaml(path, LARGEST_FILE)
+        return read_plain_yaml(path, LARGEST_FILE)
+
+
+@cache
+def schemes() -> Mapping[str, Scheme]:
+    """All schemes by name."""
+    content = _table()
     landmarks: dict[str, Landmark] = {}
     for template, entry in content['landmarks'].items():
         for side in SIDES if '{side}' in template else SIDES[:1]:
             name = template.format(side=side)
             offset = np.array(entry.get('offset', (0.0, 0.0, 0.0)), dtype=np.float64)
-            if side == 'left':
-                offset = offset * (-1.0, 1.0, 1.0)
-            joint = entry.get('joint', NOT_AT_A_JOINT).format(side=side)
-            landmarks[name] = Landmark(name, joint, offset)
+            joint = entry.get('joint', '').format(side=side)
+            sigma = float(entry.get('sigma', 0.0))
+            landmarks[name] = Landmark(
+                name, joint, offset * MIRROR if side == 'left' else offset, sigma
+            )
     result = {}
     for scheme, entries in content['schemes'].items():
         pairs = [next(iter(x.items())) if isinstance(x, dict) else (x, x) for x in entries]
@@ -80,7 +112,71 @@ def schemes() -> Mapping[str, Scheme]:
     return result
 
 
+def scheme_of(names: Sequence[str], scheme: str = AUTO) -> Scheme | None:
+    """The scheme of keypoints; None: their names are those of joints.
+
+    Args:
+        names: of the keypoints.
+        scheme: name of a scheme, 'joints', or 'auto': see `recognised`.
+
+    Raises:
+        ValueError: there is no such scheme.
+    """
+    if scheme == AUTO:
+        return recognised(names)
+    if scheme == JOINTS:
+        return None
+    if scheme not in schemes():
+        raise ValueError(
+            f'there is no keypoint scheme {scheme!r}, wanted one of {[AUTO, JOINTS, *schemes()]}'
+        )
+    return schemes()[scheme]
+
+
 def recognised(names: Sequence[str]) -> Scheme | None:
-    """The scheme that has all of the names, the smallest; None: no scheme has all."""
+    """The scheme that has all of the names, the smallest, if it has points of a face among them.
+
+    Limbs and trunk have the same names everywhere: alone they are taken for joints.
+    """
     fitting = [x for x in schemes().values() if set(names) <= set(x.names)]
-    return min(fitting, key=lambda x: len(x.names), default=None)
+    found = min(fitting, key=lambda x: len(x.names), default=None)
+    return found if 'nose' in names else None
+
+
+def landmark_called(name: str) -> Landmark | None:
+    """The landmark that the first scheme with a name calls by it; None: no scheme has the name."""
+    found = (scheme.landmark(name) for scheme in schemes().values())
+    return next((landmark for landmark in found if landmark is not None), None)
+
+
+@cache
+def slope_models() -> tuple[SlopeModel, ...]:
+    """The bones of lifted skeletons."""
+    result = []
+    for segment, first, last, sigma in _table()['slopes']:
+        for side in SIDES if '{side}' in segment else SIDES[:1]:
+            ends = (first.format(side=side), last.format(side=side))
+            result.append(SlopeModel(segment.format(side=side), ends, float(sigma)))
+    return tuple(result)
+
+
+def noise_of(confidences: Array) -> Array:
+    """Standard deviations (n,) of keypoints of some confidences (n,), m at the person."""
+    model = _table()['noise']
+    result: Array = np.interp(confidences, model['confidence'], model['sigma'])
+    return result
+
+
+@cache
+def exchange_rates() -> Array:
+    """(E, E) rates per second at which a detector goes from one exchange of sides to another."""
+    rates = np.array(_table()['exchanges']['rates'], dtype=np.float64)
+    return rates - np.diag(rates.sum(1))
+
+
+@cache
+def usual_exchanges() -> Array:
+    """(1, E) log probability of each exchange, where nothing is known of the images before."""
+    share = np.abs(null_space(exchange_rates().T)[:, 0])
+    result: Array = np.log(share / share.sum())[None]
+    return result

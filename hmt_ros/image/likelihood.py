@@ -23,6 +23,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames
 from hmt_ros.body.pose_prior import LEARNED, check_kind, pose_prior
 from hmt_ros.body.pose_terms import FrameTerm, Posed, SelfIntersection
+from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.surface import flesh_table_of, lens_of
 from hmt_ros.image.terms.image_term import Request, TermSettings, Weighting
@@ -129,6 +130,7 @@ class ImageLikelihood:
         observation: Observation,
         textures: Textures | None = None,
         texture_rows: Index | None = None,
+        exchanges: Array | None = None,
     ) -> Posed:
         """-log p(image | pose) - log prior(pose), of one observation.
 
@@ -136,8 +138,10 @@ class ImageLikelihood:
             observation: of the image.
             textures: of the last image, for the terms of intensity and motion.
             texture_rows: (N,) row of the textures that each problem carries; None: none.
+            exchanges: of sides, of each problem; see `KeypointTerm`.
         """
-        terms = (*self.seen(observation, textures, texture_rows), *self.priors)
+        seen = self.seen(observation, textures, texture_rows, exchanges=exchanges)
+        terms = (*seen, *self.priors)
         return Posed(self.body.skeleton, terms)
 
     def seen(
@@ -146,13 +150,28 @@ class ImageLikelihood:
         textures: Textures | None = None,
         texture_rows: Index | None = None,
         explained: Array | None = None,
+        exchanges: Array | None = None,
     ) -> tuple[FrameTerm, ...]:
         """The terms of the image and of the keypoints; arguments as for `given`, `energies`."""
         image = ObservedImage(self, observation, textures, texture_rows, explained)
         keypoints, s = observation.keypoints, self.settings.keypoints
         if keypoints is None or s.weight == 0:
             return (image,)
-        return (image, KeypointTerm(self.body.skeleton, self.camera, keypoints, s))
+        return (image, self.keypoint_term(observation, exchanges))
+
+    def keypoint_term(self, observation: Observation, exchanges: Array | None) -> KeypointTerm:
+        """The term of the keypoints of an observation that has some.
+
+        Args:
+            observation: of the image.
+            exchanges: of sides, see `KeypointTerm`; None: as usual for detectors.
+        """
+        assert observation.keypoints is not None
+        exchanges = usual_exchanges() if exchanges is None else exchanges
+        return KeypointTerm(
+            self.body.skeleton, self.camera, observation.keypoints, self.settings.keypoints,
+            observation.magnification, exchanges,
+        )  # fmt: skip
 
     @cached_property
     def priors(self) -> tuple[FrameTerm, ...]:

@@ -11,7 +11,7 @@ import sys
 from dataclasses import dataclass, field
 
 from hmt_ros.image.background import BackgroundSettings
-from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, schemes
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
@@ -28,8 +28,6 @@ from hmt_ros.sessions.parameter_file import parameter_file_text
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.ground import KnownGround
 
-# Values of keypoint_scheme besides the names of the schemes.
-AUTO, JOINTS = 'auto', 'joints'
 # Settings that are parameters, with their limits.
 _TRACKER = {
     'max_hypotheses': (1, 64),
@@ -77,7 +75,9 @@ class FilterParameters(CameraNodeParameters):
             'halpe26', 'body25', 'mediapipe33', 'h36m17' or 'skeleton2d'.
         use_keypoints_3d: If true, positions of the same landmarks in space (topic keypoints_3d) are
             weak evidence of depth, and an image waits for those of its stamp.
-        keypoint_sigma_px: Standard deviation of keypoints that come without a covariance, px.
+        keypoint_sigma_px: Standard deviation of keypoints that come without a covariance, px; 0
+            selects the one that is learned, which depends on confidence and on the size of the
+            person.
         use_predictions: If true, poses that bme_node predicts from the image start the track where
             there is no subject_file, and are among the hypotheses; an image then waits for the
             prediction of its stamp.
@@ -105,7 +105,7 @@ class FilterParameters(CameraNodeParameters):
     use_keypoints: bool = parameter_field(False, AT_ONCE)
     keypoint_scheme: str = parameter_field(AUTO, AT_ONCE)
     use_keypoints_3d: bool = parameter_field(False, AT_ONCE)
-    keypoint_sigma_px: float = parameter_field(5.0, AT_ONCE, (0.01, 1000.0))
+    keypoint_sigma_px: float = parameter_field(0.0, AT_ONCE, (0.0, 1000.0))
     use_predictions: bool = parameter_field(False, AT_ONCE)
     gravity: tuple[float, ...] = parameter_field((), NEXT_TRACK)
     camera_height: float = parameter_field(0.0, NEXT_TRACK, (0.0, 100.0))

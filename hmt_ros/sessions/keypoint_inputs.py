@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body
-from hmt_ros.image.keypoint_schemes import recognised, schemes
+from hmt_ros.image.keypoint_schemes import AUTO, JOINTS
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import StampedInputs
-from hmt_ros.sessions.filter_parameters import AUTO, JOINTS, FilterParameters
+from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from msg_tools import MessageError
 from msg_tools.messages.keypoints import Positions, keypoints_of, positions_of
@@ -81,7 +81,7 @@ class KeypointInputs:
                     f'keypoints_3d of {stamp_ns} ns has none of the names of its keypoints, such '
                     f'as {found.names[0]!r}, but {positions.names[0]!r}',
                 )
-        known, _ = _named(found, body, parameters.keypoint_scheme)
+        known, _ = found.named_for(body, parameters.keypoint_scheme)
         return known[np.flatnonzero(known.seen)] if known.names else None
 
     def _content(self, message: Any, parameters: FilterParameters, body: Body) -> Keypoints | None:
@@ -92,7 +92,7 @@ class KeypointInputs:
         except MessageError as error:
             self._log.fault(Fault.KEYPOINTS, str(error))
             return None
-        _, unknown = _named(content, body, parameters.keypoint_scheme)
+        _, unknown = content.named_for(body, parameters.keypoint_scheme)
         if unknown:
             self._report(unknown, parameters.keypoint_scheme)
         return content
@@ -102,25 +102,10 @@ class KeypointInputs:
         new = names not in self._unknown and len(self._unknown) < _MOST_WARNINGS
         if new:
             self._unknown.add(names)
-        known = {AUTO: 'of the body, or of a known scheme', JOINTS: 'of the body'}
+        known = {AUTO: 'of the body or of a known scheme', JOINTS: 'of the body'}
         self._log.note(
             Fault.KEYPOINT_NAMES,
             f'keypoints {unknown} are not used: wanted names of joints '
             f'{known.get(scheme, f"in the scheme {scheme}")}',
             warn=new,
         )
-
-
-def _named(keypoints: Keypoints, body: Body, scheme: str) -> tuple[Keypoints, list[str]]:
-    """Those that are joints of a body, under the body's names, and the names that mean nothing."""
-    names, unknown = keypoints.names, []
-    table = recognised(names) if scheme == AUTO else schemes().get(scheme)
-    if scheme != AUTO:
-        meant = body.joint_names if table is None else table.names
-        unknown = [name for name in names if name not in meant]
-        kept = [i for i, name in enumerate(names) if name in meant]
-        keypoints = keypoints[np.array(kept, dtype=np.intp)]
-    known, strange = keypoints.named_for(body)
-    # Landmarks that a scheme has, and the body has not, are no mistake.
-    unknown += [name for name in strange if table is None or table.landmark(name) is None]
-    return known, unknown

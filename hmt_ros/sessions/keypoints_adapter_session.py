@@ -130,7 +130,7 @@ class KeypointsAdapterSession(Session[KeypointsAdapterParameters, KeypointsAdapt
         if self._wanted(KEYPOINTS):
             found = NO_KEYPOINTS if person is None else _those_seen(person)
             frame = self._frame_of(message)
-            written = keypoints_message(self._messages, found, stamp, frame, covariances=False)
+            written = keypoints_message(self._messages, found, stamp, frame)
             self._publish(KEYPOINTS, stamp, written)
 
     def _take_camera_info(self, message: Any) -> None:

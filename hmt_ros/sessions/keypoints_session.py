@@ -114,9 +114,7 @@ class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
     def _publish_found(self, found: Keypoints, stamp: int, frame_id: str) -> None:
         messages = self._messages
         if self._wanted(KEYPOINTS):
-            # MediaPipe tells no covariances: the tracker knows what its visibilities mean.
-            message = keypoints_message(messages, found, stamp, frame_id, covariances=False)
-            self._publish(KEYPOINTS, stamp, message)
+            self._publish(KEYPOINTS, stamp, keypoints_message(messages, found, stamp, frame_id))
         if self._wanted(KEYPOINTS_3D):
             self._publish(KEYPOINTS_3D, stamp, positions_message(messages, found, stamp, frame_id))
         mask = self._detector.mask

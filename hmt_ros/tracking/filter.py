@@ -216,6 +216,7 @@ class MixtureFilter:
         """Makes modes at rest from minima and their log prior weights (N,)."""
         optimised = Optimised(new_hypotheses(solved.x, log_weights), solved)
         self._posterior.stance = None
+        self._posterior.exchanges.forget()
         least = self._weigh_and_select(optimised, None, observation)
         self._stand(None)
         self.log_evidence = -self.beta * least
@@ -231,6 +232,7 @@ class MixtureFilter:
         """Takes over modes; their textures are taken from the image anew."""
         textures = self._posterior.textures(modes.poses, observation)
         self._modes = replace(modes, textures=textures, texture_rows=np.arange(len(modes)))
+        self._posterior.exchanges.forget()
         self._stand(None)
 
     # One image after another.
@@ -247,6 +249,7 @@ class MixtureFilter:
         """
         s, modes, posterior = self.settings, self.modes, self._posterior
         observation = self._believed(observation)
+        posterior.exchanges.predict(dt)
         predicted, states = predict(modes, self.body, self.dynamics, dt)
         covariances, searched = states.pose_covariances, states.searched
         precisions = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
@@ -454,6 +457,10 @@ class MixtureFilter:
                 self._posterior.given_way(poses, observation)[1],
             )  # fmt: skip
         h = optimised.hypotheses[rows]
+        exchanges = self._posterior.exchanges
+        exchanges.update(
+            self._posterior.likelihood, observation, poses, self._posterior.exchanges_of(h)
+        )
         if states is None:
             velocities = np.zeros_like(poses)
             state_covariances = self.dynamics.states(filtered)
@@ -557,4 +564,5 @@ class MixtureFilter:
         self._posterior.evaluations = before.evaluations
         self._posterior.trust = before.trust
         self._posterior.stance = before.stance
+        self._posterior.exchanges = before.exchanges
         self._proposal = PROPOSALS[self.settings.proposals](self._posterior)

@@ -27,7 +27,7 @@ from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.image_term import TermSettings
-from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.image.terms.keypoints import NOT_EXCHANGED, Keypoints
 from hmt_ros.image.terms.silhouette import Outline
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise
@@ -94,7 +94,8 @@ def start_from_keypoints(
     least_squares = LikelihoodSettings.of_terms(keypoints=TermSettings(1.0, 1.0, np.inf))
     settings = replace(least_squares, prior_weight=prior_weight)
     leaning = body if upright is None else without_root_lean(body)
-    image = ImageLikelihood(leaning, camera, settings).given(Observation(keypoints=keypoints))
+    likelihood = ImageLikelihood(leaning, camera, settings)
+    image = likelihood.given(Observation(keypoints=keypoints), exchanges=NOT_EXCHANGED)
     energy = image if upright is None else Posed(body.skeleton, (*image.terms, upright.term(body)))
 
     heads = _distinct(_solve(energy, fits.x[:, :d], body), body, 4)

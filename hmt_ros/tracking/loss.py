@@ -7,14 +7,13 @@ A sample or keypoint is unexplained when it is further than 4 sigmas from where 
 
 from __future__ import annotations
 
-import numpy as np
-
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.image.likelihood import LikelihoodSettings
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.image_term import TermSettings
-from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.image.terms.keypoints import KeypointTerm
 from hmt_ros.inference.arrays import Array
 
 # A sample of the outline or a keypoint further away than this from where it should be is
@@ -40,11 +39,10 @@ def unexplained_share(
         settings: of the terms.
     """
     share = unexplained_outline(outline_costs, settings.coverage)
-    keypoints = observation.keypoints
-    if keypoints is None:
+    if observation.keypoints is None or settings.keypoints.weight == 0:
         return share
-    sigma = settings.keypoints.sigma
-    return max(share, unexplained_keypoints(body, camera, poses, keypoints, sigma))
+    likelihood = ImageLikelihood(body, camera, settings)
+    return max(share, unexplained_keypoints(likelihood.keypoint_term(observation, None), poses))
 
 
 def unexplained_outline(costs: Array, term: TermSettings) -> float:
@@ -61,22 +59,15 @@ def unexplained_outline(costs: Array, term: TermSettings) -> float:
     return float((costs > limit * most).mean(1).min())
 
 
-def unexplained_keypoints(
-    body: Body, camera: Camera, poses: Array, keypoints: Keypoints, sigma: float
-) -> float:
+def unexplained_keypoints(term: KeypointTerm, poses: Array) -> float:
     """Share of the keypoints that the best of poses (K, d) does not explain.
 
-    Args:
-        body, camera: who is seen by what.
-        poses: (K, d).
-        keypoints: those that were not seen do not count.
-        sigma: factor on their standard deviations.
+    Each pose is given the exchange of sides that is likeliest there.
     """
-    seen = np.flatnonzero(np.isfinite(keypoints.pixels).all(1))
-    if len(seen) == 0:
-        return 0.0
-    which = body.skeleton.joint_index([keypoints.names[i] for i in seen])
-    error = camera.project(body.joint_positions(poses)[:, which]) - keypoints.pixels[seen]
-    precisions = np.linalg.inv(keypoints.covariances[seen])
-    distance = np.einsum('kna,nab,knb->kn', error, precisions, error) / sigma**2
-    return float((~(distance < UNEXPLAINED**2)).mean(1).min())
+    shares = [1.0]
+    for pose in poses:
+        distances = term.distances(forward(term.skeleton, pose[None]))
+        if len(distances) == 0:
+            return 0.0
+        shares.append(float((~(distances < UNEXPLAINED)).mean()))
+    return min(shares)

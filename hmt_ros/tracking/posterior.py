@@ -35,6 +35,7 @@ from hmt_ros.inference.energy import (
     Sum,
     add_energies,
 )
+from hmt_ros.tracking.exchanges import SideExchanges
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.trust import Trust
 
@@ -95,6 +96,7 @@ class Posterior:
             body = without_root_lean(body)
         self.body, self.camera, self.settings, self.extra = body, camera, settings, extra
         self.stance: Stance | None = None
+        self.exchanges = SideExchanges()
         self._ground_term: GroundTerm | None = None
         self.trust = Trust(settings.trust, settings.error_correlation)
         self.evaluations = 0
@@ -119,7 +121,7 @@ class Posterior:
         texture_rows: Index | None = None,
     ) -> EnergyTerm:
         """The energy without what was expected; its evaluations are counted."""
-        return self._of_image(observation, textures, texture_rows, self.known)
+        return self._of_image(observation, textures, texture_rows, self.known, None)
 
     @property
     def known(self) -> tuple[FrameTerm, ...]:
@@ -146,8 +148,9 @@ class Posterior:
         textures: Textures | None,
         texture_rows: Index | None,
         known: tuple[FrameTerm, ...],
+        exchanges: Array | None,
     ) -> EnergyTerm:
-        terms = self.likelihood.given(observation, textures, texture_rows).terms
+        terms = self.likelihood.given(observation, textures, texture_rows, exchanges).terms
         return _Counted(Posed(self.body.skeleton, (*terms, *known)), self)
 
     def around(self, observation: Observation, centres: Array, precisions: Array) -> EnergyTerm:
@@ -162,8 +165,14 @@ class Posterior:
         known, ground = self.known, self._ground
         if ground is not None and self.stance is not None:
             known = (*self.extra, ground.following(self.stance[h.ancestors]))
-        image = self._of_image(observation, h.textures, h.texture_rows, known)
+        exchanges = self.exchanges_of(h)
+        image = self._of_image(observation, h.textures, h.texture_rows, known, exchanges)
         return Sum((image, self._motion_prior(h, precisions)))
+
+    def exchanges_of(self, hypotheses: Hypotheses) -> Array:
+        """Log probabilities (N, E) of exchanges of sides before the image, of hypotheses."""
+        anew = np.asarray(hypotheses.jumped.all(1), dtype=np.bool_)
+        return self.exchanges.of(hypotheses.ancestors, anew)
 
     def values(
         self, poses: Array, observation: Observation, textures: Textures | None, rows: Index

@@ -166,7 +166,7 @@ class ShapeEstimate:
         by_shape = self._space.point_derivatives(frames, segments, points, directions)
         keypoints, s = observation.keypoints, likelihood.settings.keypoints
         if keypoints is not None and s.weight > 0:
-            term = KeypointTerm(self._space.body.skeleton, likelihood.camera, keypoints, s)
+            term = likelihood.keypoint_term(observation, None)
             of_joints = self._of_keypoints(frames, term)
             pull, curvature, by_pose, by_shape = (
                 np.concatenate(pair)

@@ -33,7 +33,7 @@ class DetectedPerson(NamedTuple):
 
     Attributes:
         name: identity that the detector gives; '' if it gives none.
-        keypoints: all landmarks of the scheme; their covariances are not known.
+        keypoints: all landmarks of the scheme; their covariances are unknown.
     """
 
     name: str
@@ -134,9 +134,9 @@ def stamp_of_floats(message: Any) -> int | None:
 
 
 def _person(name: str, scheme: Scheme, rows: Array) -> DetectedPerson:
-    covariances = np.tile(np.eye(2), (len(rows), 1, 1))
-    found = checked_keypoints(scheme.names, rows[:, :2].copy(), covariances, rows[:, 2].copy())
-    return DetectedPerson(name, found)
+    return DetectedPerson(
+        name, checked_keypoints(scheme.names, rows[:, :2].copy(), rows[:, 2].copy())
+    )
 
 
 def _check_count(count: int) -> None:

@@ -401,7 +401,7 @@ def test_keypoints_that_the_body_does_not_have_are_left_out(session, small_camer
     one.take(CAMERA_INFO, small_camera.info())
     handled = one.take(KEYPOINTS, small_camera.keypoints(0, names=('tail', 'head')))
     assert handled.warnings == (
-        "keypoints ['tail'] are not used: wanted names of joints of the body, or of a known scheme",
+        "keypoints ['tail'] are not used: wanted names of joints of the body or of a known scheme",
     )
     assert handled.faults == ()
     one.take(IMAGE, small_camera.image(0))

@@ -38,11 +38,12 @@ def tracked(outputs):
 @pytest.mark.parametrize(
     ('scheme', 'names', 'unknown', 'used'),
     [
-        # No mistake: landmarks of a scheme that the body has no joint for.
-        ('auto', ('nose', 'head'), [], ('head',)),
+        ('auto', ('nose', 'left_ear'), [], ('head', 'head')),
+        # No mistake: a landmark of a scheme that no joint is near.
+        ('auto', ('nose', 'spine'), [], ('head',)),
         ('auto', ('tail', 'left_foot_index'), ['tail'], ('left_toe',)),
         ('joints', ('neck', 'mid_hip'), ['mid_hip'], ('neck',)),
-        ('body25', ('neck', 'mid_hip', 'pelvis', 'nose'), ['pelvis'], ('neck', 'pelvis')),
+        ('body25', ('neck', 'mid_hip', 'left_pinky'), ['left_pinky'], ('neck', 'pelvis')),
     ],
 )
 def test_what_names_mean(session, small_camera, stub_tracker, scheme, names, unknown, used):

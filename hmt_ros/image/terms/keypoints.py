@@ -1,34 +1,64 @@
-"""Keypoints: distances of projected joint centres from where joints were seen (KJS 2 and 5.1).
+"""Keypoints: distances of projected landmarks from where a detector saw them (KJS 2 and 5.1).
 
-    E(x) = sum_k c_k w sum_a rho([W_k (u_k(x) - p_k)]_a),      W_k' W_k = S_k^-1
+    E(x) = -log sum_e p_e exp(-sum_k E_k,e(x))
+    E_k,e(x) = w sum_a rho([W_k (u_k,e(x) - p_k)]_a),         W_k' W_k = (S_k + (m s_k)^2 I)^-1
 
-u_k projects the joint of keypoint k, which was seen at p_k with covariance S_k; a confidence c_k
-below 1 divides the precision.
+u_k,e projects the landmark that keypoint k shows, seen at p_k with covariance S_k (px^2) and noise
+s_k on the person (m, at the magnification m, px/m). Detectors take left for right: in the exchange
+e, of prior probability p_e, the keypoints of all limbs, of the arms or of the legs show the
+landmarks of the other side. What a detector says of depth counts by the slopes of bones.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.kinematics import Frames
-from hmt_ros.body.skeleton import Skeleton
-from hmt_ros.image.surface import lens_of, project
+from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.body.skeleton import Skeleton, other_side
+from hmt_ros.image.keypoint_schemes import (
+    JOINTS,
+    MIRROR,
+    Landmark,
+    SlopeModel,
+    landmark_called,
+    noise_of,
+    scheme_of,
+    slope_models,
+)
+from hmt_ros.image.surface import lens_of
 from hmt_ros.image.terms.image_term import TermSettings
-from hmt_ros.image.terms.residuals import add_residual, assemble_pose, geman_mcclure, tree_of
+from hmt_ros.image.terms.keypoint_kernel import (
+    Points,
+    Slopes,
+    add_keypoints,
+    exchange_log_posterior,
+    group_energies,
+)
+from hmt_ros.image.terms.residuals import tree_of
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
 
 KEYPOINTS = TermSettings(1.0, 1.0, 5.0)
-# A joint behind the camera errs by this much, in standard deviations.
-BEHIND = 1e3
+# Height of what keypoints show of a person whose distance is unknown, m.
+USUAL_EXTENT = 1.4
+# A person whose landmarks have the offsets of the table, m.
+USUAL_STATURE = 1.7
+# Least standard deviation of a keypoint whose noise is learned, px.
+SMALLEST_SIGMA = 1.5
+# Groups of landmarks that are exchanged together, and which of them (E, G) an exchange exchanges:
+# nothing, all, arms, legs.
+CENTRE, ARMS, LEGS = range(3)
+EXCHANGED = np.array([[0, 0, 0], [1, 1, 1], [0, 1, 0], [0, 0, 1]], dtype=np.int64)
+
+# (1, E) log probabilities of exchanges of keypoints that are known to be called by their sides.
+NOT_EXCHANGED = np.array([[0.0, -np.inf, -np.inf, -np.inf]])
 
 
 @dataclass(frozen=True)
@@ -36,12 +66,16 @@ class Keypoints:
     """Image positions of joints, from any 2D detector or by hand.
 
     Attributes:
-        names: (n,) joints of the body.
+        names: (n,) joints of the body; of a detector, before `named_for`, its landmarks.
         pixels: (n, 2) column and row, px; NaN where a joint was not seen.
-        covariances: (n, 2, 2) px^2.
+        covariances: (n, 2, 2) px^2; NaN before `named_for`: unknown.
         confidences: (n,) from 0, ignore, to 1, sure.
         positions: (n, 3) of a detector that lifts, m, along the axes of the camera from an origin
             that all share; NaN where there is none. None: it does not lift.
+        offsets: (n, 3) of what was seen from the joint in the frame of its segment, m; None: joints
+            were seen.
+        noise: (n,) standard deviation beside the covariances, m on the person; it accounts for the
+            confidences. None: none, and confidences divide the precisions.
     """
 
     names: tuple[str, ...]
@@ -49,37 +83,96 @@ class Keypoints:
     covariances: Array
     confidences: Array
     positions: Array | None = None
+    offsets: Array | None = None
+    noise: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.names)
         shapes = (self.pixels.shape, self.covariances.shape, self.confidences.shape)
         if shapes != ((n, 2), (n, 2, 2), (n,)):
             raise ValueError(f'{n} keypoints with arrays of shapes {shapes}')
-        if self.positions is not None and self.positions.shape != (n, 3):
-            raise ValueError(f'{n} keypoints with positions of shape {self.positions.shape}')
+        for name, shape in (('positions', (n, 3)), ('offsets', (n, 3)), ('noise', (n,))):
+            given = getattr(self, name)
+            if given is not None and given.shape != shape:
+                raise ValueError(f'{n} keypoints with {name} of shape {given.shape}')
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """(n,) joints that have a position."""
-        return np.asarray(np.isfinite(self.pixels).all(1), dtype=np.bool_)
+        """(n,) joints that have a position and are not to be ignored."""
+        return np.asarray(np.isfinite(self.pixels).all(1) & (self.confidences > 0), dtype=np.bool_)
 
     def __getitem__(self, which: Index) -> Keypoints:
         """Some of them."""
+        more = {
+            name: None if getattr(self, name) is None else getattr(self, name)[which]
+            for name in ('positions', 'offsets', 'noise')
+        }
         names = tuple(self.names[i] for i in which)
-        positions = None if self.positions is None else self.positions[which]
         return Keypoints(
-            names, self.pixels[which], self.covariances[which], self.confidences[which], positions
+            names, self.pixels[which], self.covariances[which], self.confidences[which], **more
         )
 
-    def named_for(self, body: Body) -> tuple[Keypoints, list[str]]:
-        """Those that are joints of a body, under the body's names, and the names of the others."""
-        names = [body.keypoint_aliases.get(name, name) for name in self.names]
-        strange = [name for name in names if name not in body.joint_names]
-        # A joint that a detector names twice counts once.
-        first = {name: i for i, name in reversed([*enumerate(names)]) if name not in strange}
-        which = np.array(sorted(first.values()), dtype=np.intp)
-        kept = self[which]
-        return replace(kept, names=tuple(names[i] for i in which)), strange
+    def named_for(self, body: Body, scheme: str = 'auto') -> tuple[Keypoints, list[str]]:
+        """Those that are at joints of a body, under the body's names, and the names of the others.
+
+        Unknown covariances become those that are learned for keypoints of a scheme.
+
+        Args:
+            body: with the joints.
+            scheme: of the names, see `keypoint_schemes`; 'auto': the one that has them all,
+                'joints': none, they are names of joints.
+
+        Raises:
+            ValueError: there is no such scheme.
+        """
+        marks = [self._landmark(name, body, scheme) for name in self.names]
+        names = [
+            name if mark is None else mark.joint
+            for name, mark in zip(self.names, marks, strict=True)
+        ]
+        strange = [
+            given
+            for given, name, mark in zip(self.names, names, marks, strict=True)
+            if name not in body.joint_names and (mark is None or mark.joint)
+        ]
+        kept = [i for i, name in enumerate(names) if name in body.joint_names]
+        known = self[np.array(kept, dtype=np.intp)]
+        size = body.stature / USUAL_STATURE
+        offsets = np.zeros((len(kept), 3))
+        sigma = np.zeros(len(kept))
+        for row, i in enumerate(kept):
+            mark = marks[i]
+            if mark is not None:
+                offsets[row], sigma[row] = size * mark.offset, mark.sigma
+        unknown = ~np.isfinite(known.covariances).all((1, 2))
+        covariances = known.covariances.copy()
+        covariances[unknown] = SMALLEST_SIGMA**2 * np.eye(2)
+        noise = None
+        if unknown.any():
+            by_confidence = noise_of(known.confidences)
+            noise = np.where(unknown, np.hypot(by_confidence, sigma), sigma)
+        renamed = replace(
+            known,
+            names=tuple(names[i] for i in kept),
+            covariances=covariances,
+            offsets=offsets if offsets.any() else None,
+            noise=noise,
+        )
+        return renamed, strange
+
+    def _landmark(self, name: str, body: Body, scheme: str) -> Landmark | None:
+        """What a name means; None: a joint of the body, or nothing that is known."""
+        found = scheme_of(self.names, scheme)
+        if found is not None:
+            return found.landmark(name)
+        return None if name in body.joint_names or scheme == JOINTS else landmark_called(name)
+
+    def magnification(self) -> float:
+        """About how many px a metre has at the person, by how far the keypoints reach."""
+        seen = self.pixels[self.seen]
+        if len(seen) < 2:
+            return 1.0
+        return max(float((seen.max(0) - seen.min(0)).max()) / USUAL_EXTENT, 1e-3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +186,9 @@ class KeypointTerm:
         keypoints: that were seen.
         settings: weight w, factor on the standard deviations, and scale of the kernel; inf: least
             squares.
+        magnification: px for a metre at the person; 0: unknown.
+        exchanges: (R, E) log probability of each exchange before the image, a row for each problem
+            or one for all; None: nothing is exchanged.
 
     Raises:
         KeyError: a keypoint that is not a joint of the body.
@@ -102,114 +198,224 @@ class KeypointTerm:
     camera: Camera
     keypoints: Keypoints
     settings: TermSettings = KEYPOINTS
+    magnification: float = 0.0
+    exchanges: Array | None = None
 
     def energy(
-        self, frames: Frames, _rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+        self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
         """See `hmt_ros.body.pose_terms.FrameTerm`."""
         n, d = frames.count, self.skeleton.dimension
         poses = n if derivatives else 0
         value, gradient, hessian = np.zeros(n), np.zeros((poses, d)), np.zeros((poses, d, d))
-        s = self.settings
-        _add_joints(
-            self._joints, tree_of(self.skeleton), lens_of(self.camera), float(s.scale),
-            float(s.weight / s.sigma**2), *frames.by_pose(), *frames.dofs_by_pose(), value,
-            gradient, hessian,
+        add_keypoints(
+            self._points, self._slopes, tree_of(self.skeleton), lens_of(self.camera),
+            float(self.settings.scale), float(self.settings.weight), *self._priors(rows, n),
+            *frames.by_pose(), *frames.dofs_by_pose(), value, gradient, hessian,
         )  # fmt: skip
         return Energy(value, gradient, hessian) if derivatives else Energy(value)
 
+    def exchanged(self, frames: Frames, rows: Index) -> Array:
+        """Log probabilities (N, E) of the exchanges at the frames of N poses."""
+        exchanged, priors = self._priors(rows, frames.count)
+        result = np.empty(priors.shape)
+        energies = np.empty((exchanged.shape[1], 2))
+        columns, origins = frames.by_pose()
+        for n in range(frames.count):
+            group_energies(
+                self._points, self._slopes, lens_of(self.camera), float(self.settings.scale),
+                columns[n], origins[n], energies,
+            )  # fmt: skip
+            exchange_log_posterior(
+                energies, float(self.settings.weight), exchanged, priors[n], result[n]
+            )
+        return result
+
     def residuals(self, frames: Frames) -> tuple[Index, Array, Array, Array, Array]:
-        """The residuals at the frames of one pose.
+        """The residuals at the frames of one pose, in the exchange that is likeliest there.
 
         Returns:
-            (M,) joint of the skeleton, (M, 3) its position, (M, 3) derivative of the residual by
-            the position, (M,) derivative and (M,) curvature of the energy by the residual; two
-            residuals a keypoint. Joints behind the camera have none.
+            (M,) joint of the skeleton, (M, 3) position of the landmark, (M, 3) derivative of the
+            residual by the position, (M,) derivative and (M,) curvature of the energy by the
+            residual; two residuals a keypoint. Landmarks behind the camera have none.
         """
-        k, seen = self.keypoints, self._counted
-        names = [name for name, ok in zip(k.names, seen, strict=True) if ok]
-        joints = self.skeleton.joint_index(names)
-        points = frames.joints()[joints, :, 0]
-        pixels, projection = self.camera.project_with_derivative(points.T)
+        joints, places, pixels, projection = self._likeliest(frames)
         shown = np.flatnonzero(np.isfinite(pixels).all(0))
-        whiteners = self._joints.whiteners[shown]
-        error = np.einsum('kab,kb->ka', whiteners, pixels.T[shown] - self._joints.pixels[shown])
+        whiteners = self._points.whiteners[shown]
+        error = np.einsum('kab,kb->ka', whiteners, pixels.T[shown] - self._points.pixels[shown])
         by_point = np.einsum('kab,bik->kai', whiteners, projection[..., shown])
         s = self.settings
         shrink = 1.0 / (1.0 + error**2 / s.scale**2)
-        curvature = s.weight / s.sigma**2 * shrink**2
+        curvature = s.weight * shrink**2
         return (
             np.repeat(joints[shown], 2),
-            np.repeat(points[shown], 2, axis=0),
+            np.repeat(places[shown], 2, axis=0),
             by_point.reshape(-1, 3),
             (curvature * error).reshape(-1),
             curvature.reshape(-1),
         )
 
-    @property
-    def _counted(self) -> NDArray[np.bool_]:
-        k = self.keypoints
-        return np.asarray(k.seen & (k.confidences > 0), dtype=np.bool_)
+    def distances(self, frames: Frames) -> Array:
+        """How far the keypoints (P,) that were seen are from the pose of frames, in deviations.
+
+        The exchange of sides is the likeliest; of a landmark behind the camera it is NaN.
+        """
+        pixels = self._likeliest(frames)[2]
+        error = pixels.T - self._points.pixels
+        whitened = np.einsum('kab,kb->ka', self._points.whiteners, error)
+        return np.asarray(np.linalg.norm(whitened, axis=1))
+
+    def _likeliest(self, frames: Frames) -> tuple[Index, Array, Array, Array]:
+        """In the likeliest exchange: joints (P,), places (P, 3), pixels (2, P), derivatives."""
+        points, everyone = self._points, np.zeros(1, dtype=np.intp)
+        exchanged, _ = self._priors(everyone, 1)
+        sides = exchanged[int(np.argmax(self.exchanged(frames, everyone)[0]))][points.groups]
+        every = np.arange(len(sides))
+        segments, offsets = points.segments[every, sides], points.offsets[every, sides]
+        columns, origins = (x[0] for x in frames.by_pose())
+        places = origins[segments] + np.einsum('kji,kj->ki', columns[segments], offsets)
+        pixels, projection = self.camera.project_with_derivative(places.T)
+        return self._joints[every, sides], places, pixels, projection
+
+    def _priors(self, rows: Index, count: int) -> tuple[NDArray[np.int64], Array]:
+        """Which groups each exchange exchanges (E, G), and log priors (N, E)."""
+        if self.exchanges is None:
+            return EXCHANGED[:1], np.zeros((count, 1))
+        chosen = self.exchanges[rows] if len(self.exchanges) > 1 else self.exchanges[[0] * count]
+        return EXCHANGED, np.ascontiguousarray(chosen)
 
     @cached_property
-    def _joints(self) -> _Joints:
-        k, skeleton = self.keypoints, self.skeleton
-        seen = self._counted
-        which = skeleton.joint_index([name for name, ok in zip(k.names, seen, strict=True) if ok])
-        precision = np.linalg.inv(k.covariances[seen])
-        precision *= k.confidences[seen][:, None, None]
-        whitener = np.linalg.cholesky(precision).transpose(0, 2, 1)
-        return _Joints(
-            skeleton.joint_segments[which].astype(np.int64),
-            skeleton.joint_offsets[which],
-            k.pixels[seen],
-            np.ascontiguousarray(whitener),
+    def _counted(self) -> Keypoints:
+        return self.keypoints[np.flatnonzero(self.keypoints.seen)]
+
+    @cached_property
+    def _joints(self) -> Index:
+        """(P, 2) joints of the skeleton that keypoints show, as they are called and exchanged."""
+        names, index = self._counted.names, self.skeleton.joint_index
+        known = self.skeleton.joint_names
+        others = [x if other_side(x) not in known else other_side(x) for x in names]
+        return np.stack([index(names), index(others)], axis=1)
+
+    @cached_property
+    def _points(self) -> Points:
+        k, skeleton, joints = self._counted, self.skeleton, self._joints
+        segments = skeleton.joint_segments[joints].astype(np.int64)
+        own = np.zeros((len(joints), 3)) if k.offsets is None else k.offsets
+        offsets = skeleton.joint_offsets[joints] + np.stack([own, own * MIRROR], axis=1)
+        covariances = self.settings.sigma**2 * k.covariances
+        confidences = k.confidences[:, None, None]
+        if k.noise is not None:
+            magnification = self.magnification or k.magnification()
+            blur = (self.settings.sigma * magnification * k.noise) ** 2
+            covariances = covariances + blur[:, None, None] * np.eye(2)
+            confidences = np.ones_like(confidences)
+        precision = np.linalg.inv(covariances) * confidences
+        whiteners = np.linalg.cholesky(precision).transpose(0, 2, 1)
+        groups = [_group_of(skeleton, name) for name in k.names]
+        return Points(
+            segments, offsets, k.pixels, np.ascontiguousarray(whiteners), np.array(groups, np.int64)
         )
 
+    @cached_property
+    def _slopes(self) -> Slopes:
+        """The bones that were lifted."""
+        k, skeleton = self._counted, self.skeleton
+        found = []
+        if k.positions is not None:
+            lifted = _first_of(k.names, k.positions)
+            pixels = _first_of(k.names, k.pixels)
+            at_rest = _rest(skeleton)
+            for bone in slope_models():
+                if bone.segment not in skeleton.segment_names:
+                    continue
+                measured = _bone(lifted, bone)
+                local = _bone(at_rest, bone)
+                middle = _middle(pixels, bone)
+                if measured is None or local is None or middle is None:
+                    continue
+                ray = self.camera.rays(middle[None])[0]
+                ray = ray / np.linalg.norm(ray)
+                other = bone.mirrored()
+                swapped = _bone(at_rest, other)
+                assert swapped is not None
+                own, far = (skeleton.segment_names.index(x.segment) for x in (bone, other))
+                columns = _rest_columns(skeleton)
+                found.append(
+                    (
+                        (own, far),
+                        np.stack([columns[own] @ local, columns[far] @ swapped]),
+                        ray,
+                        float(measured @ ray),
+                        1.0 / (self.settings.sigma * bone.sigma),
+                        _group_of(skeleton, bone.ends[0]),
+                    )
+                )
+        if not found:
+            return _NO_SLOPES
+        segments, directions, rays, slopes, weights, groups = zip(*found, strict=True)
+        return Slopes(
+            np.array(segments, np.int64), np.array(directions), np.array(rays), np.array(slopes),
+            np.array(weights), np.array(groups, np.int64),
+        )  # fmt: skip
 
-class _Joints(NamedTuple):
-    """Keypoints as the compiled code reads them: (P,), (P, 3), (P, 2), (P, 2, 2)."""
 
-    segments: NDArray[np.int64]
-    offsets: Array
-    pixels: Array
-    whiteners: Array
+_NO_SLOPES = Slopes(
+    np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0),
+    np.zeros(0, np.int64),
+)  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def _add_joints(  # type: ignore[no-untyped-def]
-    joints, tree, lens, scale, weight, columns, origins, axes, dof_origins, value, gradient,
-    hessian,
-):  # fmt: skip
-    """Adds energy, gradient and Hessian, pose by pose."""
-    count = len(joints.segments)
-    wrenches = np.empty((len(tree.parents), 6))
-    stiffnesses = np.empty((len(tree.parents), 6, 6))
-    pixels, projections = np.empty((1, 2)), np.empty((1, 2, 3))
-    for n in range(len(value)):
-        wrenches[:] = 0.0
-        stiffnesses[:] = 0.0
-        for k in range(count):
-            s = joints.segments[k]
-            x, y, z = origins[n, s, 0], origins[n, s, 1], origins[n, s, 2]
-            for i in range(3):
-                x += columns[n, s, i, 0] * joints.offsets[k, i]
-                y += columns[n, s, i, 1] * joints.offsets[k, i]
-                z += columns[n, s, i, 2] * joints.offsets[k, i]
-            seen = project(lens, x, y, z, 0, pixels, projections)
-            for i in range(2):
-                residual, a0, a1, a2 = BEHIND, 0.0, 0.0, 0.0
-                if seen:
-                    w0, w1 = joints.whiteners[k, i, 0], joints.whiteners[k, i, 1]
-                    residual = w0 * (pixels[0, 0] - joints.pixels[k, 0])
-                    residual += w1 * (pixels[0, 1] - joints.pixels[k, 1])
-                    a0 = w0 * projections[0, 0, 0] + w1 * projections[0, 1, 0]
-                    a1 = w0 * projections[0, 0, 1] + w1 * projections[0, 1, 1]
-                    a2 = w0 * projections[0, 0, 2] + w1 * projections[0, 1, 2]
-                rho, pull, curvature = geman_mcclure(residual, scale, weight)
-                value[n] += rho
-                add_residual(wrenches, stiffnesses, s, x, y, z, a0, a1, a2, pull, curvature)
-        if len(hessian) > 0:
-            assemble_pose(
-                tree, axes[n], dof_origins[n], wrenches, stiffnesses, gradient[n], hessian[n]
-            )
+@lru_cache(maxsize=16)
+def _rest(skeleton: Skeleton) -> dict[str, Array]:
+    """Positions (3,) of the joints of a skeleton at rest."""
+    joints = forward(skeleton, np.zeros((1, skeleton.dimension))).joints()[..., 0]
+    return dict(zip(skeleton.joint_names, joints, strict=True))
+
+
+@lru_cache(maxsize=16)
+def _rest_columns(skeleton: Skeleton) -> Array:
+    """(S, 3, 3) axes of the segments at rest, one a row."""
+    columns, _ = forward(skeleton, np.zeros((1, skeleton.dimension))).by_pose()
+    return np.asarray(columns[0])
+
+
+def _first_of(names: tuple[str, ...], values: Array) -> dict[str, Array]:
+    """Finite values by name, the first of each name."""
+    result: dict[str, Array] = {}
+    for name, value in zip(names, values, strict=True):
+        if name not in result and np.isfinite(value).all():
+            result[name] = value
+    return result
+
+
+def _end(places: Mapping[str, Array], name: str) -> Array | None:
+    """A place by name; that of `mid_x` is between the left and the right x."""
+    if not name.startswith('mid_'):
+        return places.get(name)
+    pair = [places.get(name.replace('mid_', side)) for side in ('left_', 'right_')]
+    if pair[0] is None or pair[1] is None:
+        return None
+    return 0.5 * (pair[0] + pair[1])
+
+
+def _bone(places: Mapping[str, Array], bone: SlopeModel) -> Array | None:
+    """Unit vector (3,) along a bone; None: an end is missing, or both are one."""
+    first, last = (_end(places, name) for name in bone.ends)
+    if first is None or last is None:
+        return None
+    length = float(np.linalg.norm(last - first))
+    return (last - first) / length if length > 0 else None
+
+
+def _middle(pixels: Mapping[str, Array], bone: SlopeModel) -> Array | None:
+    """Pixel (2,) half way along a bone."""
+    first, last = (_end(pixels, name) for name in bone.ends)
+    return None if first is None or last is None else 0.5 * (first + last)
+
+
+def _group_of(skeleton: Skeleton, joint: str) -> int:
+    """Group that a joint is exchanged with."""
+    joint = joint.replace('mid_', 'left_') if joint.startswith('mid_') else joint
+    if other_side(joint) == joint:
+        return CENTRE
+    return ARMS if any(x in joint for x in ('shoulder', 'elbow', 'wrist', 'hand')) else LEGS

@@ -1,0 +1,195 @@
+"""Keypoints, compiled: energies of all exchanges of sides, then gradient and Hessian of the sum.
+
+    E(x) = -log sum_e p_e exp(-sum_g E_g,e(x))          e: exchange, g: group of landmarks
+
+Given what a detector takes for what, groups add; over what it may take for what, likelihoods do.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from hmt_ros.image.surface import project
+from hmt_ros.image.terms.residuals import add_residual, assemble_pose, geman_mcclure
+from hmt_ros.inference.arrays import Array
+
+# A joint behind the camera errs by this much, in standard deviations.
+BEHIND = 1e3
+
+Ints = NDArray[np.int64]
+
+
+class Points(NamedTuple):
+    """Keypoints (P,), each with the landmark that it is, and the one it is if sides are exchanged.
+
+    Attributes:
+        segments: (P, 2) that carry the landmarks.
+        offsets: (P, 2, 3) of the landmarks in the frames of the segments, m.
+        pixels: (P, 2).
+        whiteners: (P, 2, 2) W, W' W is the precision.
+        groups: (P,) that are exchanged together.
+    """
+
+    segments: Ints
+    offsets: Array
+    pixels: Array
+    whiteners: Array
+    groups: Ints
+
+
+class Slopes(NamedTuple):
+    """Bones (B,) of a lifted skeleton: how far each points away from the camera.
+
+    Attributes:
+        segments: (B, 2) that the bone is fixed to, and that of the other side.
+        directions: (B, 2, 3) of the bone in the frames of the segments, unit vectors.
+        rays: (B, 3) lines of sight, unit vectors.
+        slopes: (B,) cosine of the angle between bone and line of sight, measured.
+        weights: (B,) square roots of the precisions.
+        groups: (B,) that are exchanged together.
+    """
+
+    segments: Ints
+    directions: Array
+    rays: Array
+    slopes: Array
+    weights: Array
+    groups: Ints
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def point_residual(points, k, e, lens, columns, origins, pixels, projections, place):  # type: ignore[no-untyped-def]
+    """Position of the landmark of keypoint k in exchange e into `place`; whether it has a pixel."""
+    s = points.segments[k, e]
+    for i in range(3):
+        place[i] = origins[s, i]
+        for j in range(3):
+            place[i] += columns[s, j, i] * points.offsets[k, e, j]
+    return project(lens, place[0], place[1], place[2], 0, pixels, projections)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def group_energies(points, slopes, lens, scale, columns, origins, result):  # type: ignore[no-untyped-def]
+    """Energies (G, 2) of the groups at one pose, as they are called and exchanged."""
+    pixels, projections, place = np.empty((1, 2)), np.empty((1, 2, 3)), np.empty(3)
+    result[:] = 0.0
+    for k in range(len(points.groups)):
+        for e in range(2):
+            seen = point_residual(points, k, e, lens, columns, origins, pixels, projections, place)
+            for i in range(2):
+                residual = BEHIND
+                if seen:
+                    residual = points.whiteners[k, i, 0] * (pixels[0, 0] - points.pixels[k, 0])
+                    residual += points.whiteners[k, i, 1] * (pixels[0, 1] - points.pixels[k, 1])
+                result[points.groups[k], e] += geman_mcclure(residual, scale, 1.0)[0]
+    for k in range(len(slopes.groups)):
+        for e in range(2):
+            residual = slope_residual(slopes, k, e, columns)[0]
+            result[slopes.groups[k], e] += geman_mcclure(residual, scale, 1.0)[0]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def slope_residual(slopes, k, e, columns):  # type: ignore[no-untyped-def]
+    """Residual of the slope of bone k in exchange e, and the direction of the bone (3,)."""
+    s = slopes.segments[k, e]
+    d0, d1, d2 = 0.0, 0.0, 0.0
+    for j in range(3):
+        local = slopes.directions[k, e, j]
+        d0 += columns[s, j, 0] * local
+        d1 += columns[s, j, 1] * local
+        d2 += columns[s, j, 2] * local
+    slope = d0 * slopes.rays[k, 0] + d1 * slopes.rays[k, 1] + d2 * slopes.rays[k, 2]
+    return slopes.weights[k] * (slope - slopes.slopes[k]), d0, d1, d2
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def exchange_log_posterior(energies, weight, exchanged, log_prior, result):  # type: ignore[no-untyped-def]
+    """Log probabilities (E,) of exchanges; returns minus the log of their sum before.
+
+    Args:
+        energies: (G, 2) of the groups, as they are called and exchanged, of weight 1.
+        weight: factor on the energies.
+        exchanged: (E, G) 1 where an exchange exchanges a group.
+        log_prior: (E,).
+        result: (E,).
+    """
+    top = -np.inf
+    for e in range(len(exchanged)):
+        total = log_prior[e]
+        for g in range(len(energies)):
+            total -= weight * energies[g, exchanged[e, g]]
+        result[e] = total
+        top = max(top, total)
+    mass = 0.0
+    for e in range(len(exchanged)):
+        mass += np.exp(result[e] - top)
+    total = top + np.log(mass)
+    for e in range(len(exchanged)):
+        result[e] -= total
+    return -total
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def add_keypoints(  # type: ignore[no-untyped-def]
+    points, slopes, tree, lens, scale, weight, exchanged, log_priors, columns, origins, axes,
+    dof_origins, value, gradient, hessian,
+):  # fmt: skip
+    """Adds energy, gradient and Hessian of poses (N,), one prior (E,) of the exchanges each."""
+    groups = exchanged.shape[1]
+    energies, posterior = np.empty((groups, 2)), np.empty(len(exchanged))
+    shares = np.empty((groups, 2))
+    wrenches = np.empty((len(tree.parents), 6))
+    stiffnesses = np.empty((len(tree.parents), 6, 6))
+    pixels, projections, place = np.empty((1, 2)), np.empty((1, 2, 3)), np.empty(3)
+    for n in range(len(value)):
+        group_energies(points, slopes, lens, scale, columns[n], origins[n], energies)
+        value[n] += exchange_log_posterior(energies, weight, exchanged, log_priors[n], posterior)
+        if len(hessian) == 0:
+            continue
+        shares[:] = 0.0
+        for e in range(len(exchanged)):
+            for g in range(groups):
+                shares[g, exchanged[e, g]] += np.exp(posterior[e])
+        wrenches[:] = 0.0
+        stiffnesses[:] = 0.0
+        for k in range(len(points.groups)):
+            for e in range(2):
+                share = weight * shares[points.groups[k], e]
+                if share < 1e-6 * weight or not point_residual(
+                    points, k, e, lens, columns[n], origins[n], pixels, projections, place
+                ):
+                    continue
+                for i in range(2):
+                    w0, w1 = points.whiteners[k, i, 0], points.whiteners[k, i, 1]
+                    residual = w0 * (pixels[0, 0] - points.pixels[k, 0])
+                    residual += w1 * (pixels[0, 1] - points.pixels[k, 1])
+                    _, pull, curvature = geman_mcclure(residual, scale, share)
+                    add_residual(
+                        wrenches, stiffnesses, points.segments[k, e], place[0], place[1], place[2],
+                        w0 * projections[0, 0, 0] + w1 * projections[0, 1, 0],
+                        w0 * projections[0, 0, 1] + w1 * projections[0, 1, 1],
+                        w0 * projections[0, 0, 2] + w1 * projections[0, 1, 2], pull, curvature,
+                    )  # fmt: skip
+        for k in range(len(slopes.groups)):
+            for e in range(2):
+                share = weight * shares[slopes.groups[k], e]
+                if share < 1e-6 * weight:
+                    continue
+                residual, d0, d1, d2 = slope_residual(slopes, k, e, columns[n])
+                _, pull, curvature = geman_mcclure(residual, scale, share)
+                # A rotation w of the segment moves the bone's direction d by w x d.
+                q0, q1, q2 = slopes.rays[k, 0], slopes.rays[k, 1], slopes.rays[k, 2]
+                turn = np.empty(3)
+                turn[0] = slopes.weights[k] * (d1 * q2 - d2 * q1)
+                turn[1] = slopes.weights[k] * (d2 * q0 - d0 * q2)
+                turn[2] = slopes.weights[k] * (d0 * q1 - d1 * q0)
+                s = slopes.segments[k, e]
+                for i in range(3):
+                    wrenches[s, 3 + i] += pull * turn[i]
+                    for j in range(i, 3):
+                        stiffnesses[s, 3 + i, 3 + j] += curvature * turn[i] * turn[j]
+        assemble_pose(tree, axes[n], dof_origins[n], wrenches, stiffnesses, gradient[n], hessian[n])

@@ -1,0 +1,157 @@
+"""The energy of keypoints: derivatives, exchanged sides, lifted bones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import Camera, load_body
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.skeleton import other_side
+from hmt_ros.image.keypoint_schemes import schemes, usual_exchanges
+from hmt_ros.image.terms.keypoints import KEYPOINTS, Keypoints, KeypointTerm
+
+CAMERA = Camera(600.0, 600.0, 320.0, 240.0, 640, 480)
+BODY = load_body('human37')
+NONE, ALL, ARMS, LEGS = range(4)
+EVERYONE = np.zeros(1, dtype=np.intp)
+
+
+@pytest.fixture
+def pose():
+    result = BODY.prior_mean.copy()
+    result[:3], result[3] = (0.1, 0.0, 4.0), 0.4
+    return result + 0.1 * np.random.default_rng(0).standard_normal(BODY.dimension)
+
+
+def seen(pose, *, lifted=True, noise=0.0, rng=None):
+    """What a detector of MediaPipe's landmarks would say of a pose."""
+    scheme = schemes()['mediapipe33']
+    n = len(scheme.names)
+    unknown = Keypoints(
+        scheme.names, np.zeros((n, 2)), np.full((n, 2, 2), np.nan), np.ones(n), np.zeros((n, 3))
+    )
+    known, _ = unknown.named_for(BODY, 'mediapipe33')
+    joints = BODY.skeleton.joint_index(known.names)
+    frames = forward(BODY.skeleton, pose[None])
+    columns, origins = (x[0] for x in frames.by_pose())
+    segments = BODY.skeleton.joint_segments[joints]
+    offsets = BODY.skeleton.joint_offsets[joints] + known.offsets
+    places = origins[segments] + np.einsum('kji,kj->ki', columns[segments], offsets)
+    centres = frames.joints()[joints][..., 0]
+    pixels = CAMERA.project(places)
+    if rng is not None:
+        pixels = pixels + noise * rng.standard_normal(pixels.shape)
+    return replace(known, pixels=pixels, positions=centres if lifted else None)
+
+
+def exchanged(keypoints, words):
+    """The keypoints of limbs whose names have one of some words, with left for right."""
+    names = tuple(
+        other_side(name) if any(word in name for word in words) else name
+        for name in keypoints.names
+    )
+    return replace(keypoints, names=names, offsets=keypoints.offsets * (-1, 1, 1))
+
+
+def term(keypoints, *, exchanges=True):
+    log_prior = usual_exchanges() if exchanges else None
+    return KeypointTerm(BODY.skeleton, CAMERA, keypoints, KEYPOINTS, 150.0, log_prior)
+
+
+@pytest.mark.parametrize('exchanges', [True, False])
+def test_derivatives(pose, exchanges):
+    rng = np.random.default_rng(1)
+    one = term(seen(pose, noise=8.0, rng=rng), exchanges=exchanges)
+    x = pose + 0.05 * rng.standard_normal(BODY.dimension)
+
+    def value(poses):
+        rows = np.zeros(len(poses), dtype=np.intp)
+        return one.energy(forward(BODY.skeleton, poses), rows, derivatives=False).value
+
+    found = one.energy(forward(BODY.skeleton, x[None]), EVERYONE)
+    step = 1e-6 * np.eye(BODY.dimension)
+    numerical = (value(x + step) - value(x - step)) / 2e-6
+    np.testing.assert_allclose(found.gradient[0], numerical, rtol=1e-5, atol=1e-4)
+    assert (np.linalg.eigvalsh(found.hessian[0]) > -1e-6).all()
+
+
+@pytest.mark.parametrize(
+    ('words', 'kind'),
+    [
+        ((), NONE),
+        (('shoulder', 'elbow', 'wrist', 'hand', 'hip', 'knee', 'ankle', 'toe'), ALL),
+        (('shoulder', 'elbow', 'wrist', 'hand'), ARMS),
+        (('hip', 'knee', 'ankle', 'toe'), LEGS),
+    ],
+)
+def test_exchanged_sides_are_recognised(pose, words, kind):
+    one = term(exchanged(seen(pose, lifted=False), words))
+    log_probabilities = one.exchanged(forward(BODY.skeleton, pose[None]), EVERYONE)[0]
+    assert np.argmax(log_probabilities) == kind
+    assert np.exp(log_probabilities[kind]) > 0.9
+    assert (one.distances(forward(BODY.skeleton, pose[None])) < 4.0).all()
+
+
+def test_an_exchange_costs_its_prior_and_no_more(pose):
+    frames = forward(BODY.skeleton, pose[None])
+    plain = seen(pose, lifted=False)
+    words = ('shoulder', 'elbow', 'wrist', 'hand', 'hip', 'knee', 'ankle', 'toe')
+    cost = (
+        term(exchanged(plain, words)).energy(frames, EVERYONE).value
+        - term(plain).energy(frames, EVERYONE).value
+    )
+    usual = usual_exchanges()[0]
+    assert cost == pytest.approx(usual[NONE] - usual[ALL], abs=1.0)
+    # Believed, they would cost more than any prior.
+    assert term(exchanged(plain, words), exchanges=False).energy(frames, EVERYONE).value > 50.0
+
+
+def test_each_problem_has_its_own_prior(pose):
+    sure = np.log(np.array([[1.0, 1e-9, 1e-9, 1e-9], [1e-9, 1.0, 1e-9, 1e-9]]))
+    one = replace(term(seen(pose)), exchanges=sure)
+    frames = forward(BODY.skeleton, np.stack([pose, pose]))
+    value = one.energy(frames, np.array([0, 1])).value
+    assert value[1] > value[0] + 10.0
+    np.testing.assert_array_equal(value[::-1], one.energy(frames, np.array([1, 0])).value)
+
+
+def test_lifted_bones_tell_towards_from_away(pose):
+    """A forearm that points away instead of towards the camera looks the same without them."""
+    elbow = BODY.dof_names.index('right_elbow')
+    other = pose.copy()
+    other[elbow] += 0.6
+    frames = forward(BODY.skeleton, np.stack([pose, other]))
+    rows = np.zeros(2, dtype=np.intp)
+    flat, lifted = (term(seen(pose, lifted=x)).energy(frames, rows).value for x in (False, True))
+    assert lifted[0] == pytest.approx(flat[0], abs=0.05)
+    assert lifted[1] > flat[1]
+
+
+def test_residuals_have_the_derivatives_of_the_energy(pose):
+    rng = np.random.default_rng(2)
+    one = term(seen(pose, lifted=False, noise=3.0, rng=rng), exchanges=False)
+    frames = forward(BODY.skeleton, pose[None])
+    joints, _, directions, pull, curvature = one.residuals(frames)
+    assert len(joints) == 2 * len(one.keypoints.names)
+    # A translation of the whole person moves all landmarks alike.
+    np.testing.assert_allclose(directions.T @ pull, one.energy(frames, EVERYONE).gradient[0, :3])
+    assert (curvature > 0).all()
+
+
+def test_what_was_not_seen_does_not_count(pose):
+    frames, all_seen = forward(BODY.skeleton, pose[None]), seen(pose, lifted=False)
+    pixels, confidences = all_seen.pixels.copy(), all_seen.confidences.copy()
+    pixels[0] = np.nan
+    confidences[1] = 0.0
+    pixels[1] += 500.0
+    one = term(replace(all_seen, pixels=pixels, confidences=confidences))
+    assert len(one.distances(frames)) == len(all_seen.names) - 2
+    assert one.energy(frames, EVERYONE).value < 1.0
+
+
+def test_shapes_are_checked():
+    with pytest.raises(ValueError, match=r'1 keypoints with noise of shape \(2,\)'):
+        Keypoints(('head',), np.zeros((1, 2)), np.eye(2)[None], np.ones(1), noise=np.ones(2))
