@@ -21,6 +21,8 @@ from hmt_ros.inference.arrays import Array, Index, Mask
 
 # Least probability of an exchange.
 LEAST = 1e-6
+# What else is exchanged when all that was is not: all for none, legs for arms.
+COMPLEMENT = [1, 0, 3, 2]
 
 
 class SideExchanges:
@@ -47,11 +49,14 @@ class SideExchanges:
 
         Args:
             ancestors: modes of the image before.
-            anew: (N,) hypotheses that say that the track was wrong; of them nothing is known.
+            anew: (N,) hypotheses that say that the track was wrong: if it was about the way to
+                face, it was about the sides as well.
         """
         if self.prior is None:
             return np.repeat(usual_exchanges(), len(ancestors), axis=0)
-        return np.where(anew[:, None], usual_exchanges(), self.prior[ancestors])
+        own = self.prior[ancestors]
+        either = np.logaddexp(own, own[:, COMPLEMENT]) - np.log(2.0)
+        return np.where(anew[:, None], either, own)
 
     def update(
         self, likelihood: ImageLikelihood, observation: Observation, poses: Array, prior: Array

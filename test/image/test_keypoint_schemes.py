@@ -96,6 +96,6 @@ def test_bones_of_lifted_skeletons_belong_to_the_body():
 def test_exchanges_are_rare():
     rates, usual = exchange_rates(), np.exp(usual_exchanges()[0])
     np.testing.assert_allclose(rates.sum(1), 0.0, atol=1e-12)
-    np.testing.assert_allclose(usual @ rates, 0.0, atol=1e-12)
+    assert rates[0, 1:].max() < 1.0
     assert usual.sum() == pytest.approx(1.0)
-    assert usual[0] > 0.85
+    assert usual[0] > 0.9

@@ -45,7 +45,7 @@ from hmt_ros.image.terms.residuals import tree_of
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
 
-KEYPOINTS = TermSettings(1.0, 1.0, 5.0)
+KEYPOINTS = TermSettings(0.5, 1.0, 3.0)
 # Height of what keypoints show of a person whose distance is unknown, m.
 USUAL_EXTENT = 1.4
 # A person whose landmarks have the offsets of the table, m.

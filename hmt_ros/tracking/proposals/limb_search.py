@@ -9,7 +9,7 @@ rest of the body explains of the silhouette's outline costs a limb nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from hmt_ros.inference.energy import Derivatives, Restricted, Student, Sum
 from hmt_ros.tracking.posterior import Posterior
 
 # Degrees of freedom of the Student prior that keeps a limb near its prediction: heavy tails.
+# Number of samples that are put where the keypoints are, and of Newton steps that do it.
+PLACED, PLACING_STEPS = 4, 8
 TAILS = 4.0
 # Factor on the standard deviations of the body's prior, of the samples that are drawn from it.
 WIDE = 1.3
@@ -77,6 +79,8 @@ class LimbSearch:
         body, own, s = self.posterior.body, self.dofs, self.posterior.settings
         block = covariance[np.ix_(own, own)]
         samples = self._draw(pose[own], block, rng)
+        placed = self._placed(pose, samples[:: max(len(samples) // PLACED, 1)], observation)
+        samples = np.concatenate([samples, placed])
         others = self._rest.energies(
             forward(body.skeleton, pose[None]), observation, derivatives=False
         )
@@ -91,10 +95,26 @@ class LimbSearch:
         )
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
         best = samples[np.argsort(value, kind='stable')[: s.search.refined]]
-        self.posterior.evaluations += s.search.samples + s.search.refined * s.search.iterations
+        self.posterior.evaluations += len(samples) + s.search.refined * s.search.iterations
         return minimise(
             term, best, body.lower[own], body.upper[own],
             step_scale=0.4, damping=1.0, max_iterations=s.search.iterations, tolerance=0.05,
+        ).x  # fmt: skip
+
+    def _placed(self, pose: Array, starts: Array, observation: Observation) -> Array:
+        """Angles of the limb, from starts (A, chain dofs), that put it where its keypoints are.
+
+        A limb that is far from its keypoints is not drawn to them by a robust kernel.
+        """
+        p, own = self.posterior, self.dofs
+        if observation.keypoints is None or p.settings.likelihood.keypoints.weight == 0:
+            return starts[:0]
+        robust = p.likelihood.keypoint_term(observation, None)
+        squares = replace(robust, settings=replace(robust.settings, scale=np.inf))
+        seen = Posed(p.body.skeleton, (squares, p.likelihood.pose_prior))
+        return minimise(
+            Restricted(seen, pose, own), starts, p.body.lower[own], p.body.upper[own],
+            step_scale=0.4, damping=1.0, max_iterations=PLACING_STEPS, tolerance=0.05,
         ).x  # fmt: skip
 
     def _draw(self, angles: Array, block: Array, rng: np.random.Generator) -> Array:
