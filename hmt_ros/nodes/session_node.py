@@ -128,13 +128,6 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         """The topics to subscribe to, the one that sets the pace last."""
 
-    def _prepare(self) -> None:
-        """Called before a session is made.
-
-        Raises:
-            ValueError: the parameters name something that is not there.
-        """
-
     def _finish(self, session: AnySession) -> None:
         """Publishes what is left when the node does not listen any more."""
 
@@ -163,7 +156,6 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Reads files, opens topics."""
         try:
-            self._prepare()
             self._session = self.SESSION(self._settings, self._publish, self._is_wanted)
         except ValueError as error:
             self._failure = error_line(error)
