@@ -75,6 +75,8 @@ setup(
             'track-video = hmt_ros.app.track_video:main',
             'import-video = hmt_ros.app.import_video.command:main',
             'subject = hmt_ros.app.subject:main',
+            'keypoints_node = hmt_ros.nodes.keypoints_node:main',
+            'keypoints_adapter_node = hmt_ros.nodes.keypoints_adapter_node:main',
             'replay = hmt_ros.app.replay.command:main',
             'recover = hmt_ros.app.recover:main',
             'make-bag = hmt_ros.app.make_bag:main',

@@ -21,6 +21,8 @@ PAGES = {
     'filter_node': 'nodes.md',
     'smoother_node': 'nodes.md',
     'bme_node': 'nodes.md',
+    'keypoints_node': 'nodes.md',
+    'keypoints_adapter_node': 'nodes.md',
     'bags': 'bags.md',
     'nodes': 'nodes.md',
     'soak': 'robustness.md',
@@ -80,12 +82,16 @@ def parameter_table(node: str) -> str:
     from hmt_ros.sessions.bme_parameters import BmeParameters
     from hmt_ros.sessions.declared_parameters import declared_parameters
     from hmt_ros.sessions.filter_parameters import FilterParameters
+    from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
+    from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
     from hmt_ros.sessions.smoother_parameters import SmootherParameters
 
     settings = {
         'filter_node': FilterParameters(),
         'smoother_node': SmootherParameters(),
         'bme_node': BmeParameters(),
+        'keypoints_node': KeypointsParameters(),
+        'keypoints_adapter_node': KeypointsAdapterParameters(),
     }
     lines = ['| parameter | default | range | takes effect | what |', '|---|---|---|---|---|']
     for parameter in declared_parameters(settings[node]):

@@ -26,7 +26,9 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 PACKAGE = 'hmt_ros'
-NODES = ('filter_node', 'smoother_node', 'bme_node')
+USUAL_NODES = ('filter_node', 'smoother_node', 'bme_node')
+DETECTORS = ('keypoints_node', 'keypoints_adapter_node')
+NODES = (*USUAL_NODES, *DETECTORS)
 # Default frame of images in the nodes; and the frame for views, which need z up.
 OPTICAL, UPRIGHT = 'camera_optical_frame', 'camera_upright'
 # Rotation from (x right, y down, z forward) to (x forward, y left, z up).
@@ -44,11 +46,18 @@ ARGUMENTS = (
         'topics are /humans/bodies/<body_id>/..., the frames body_<body_id>/...',
     ),
     ('namespace', '', 'namespace of the topics; empty: /humans/bodies/<body_id>'),
-    ('nodes', 'filter_node smoother_node bme_node', 'nodes to start, separated by blanks'),
+    (
+        'nodes',
+        ' '.join(USUAL_NODES),
+        f'nodes to start, separated by blanks; besides these {" or ".join(DETECTORS)}, whose '
+        'keypoints the filter then uses',
+    ),
     ('image', '/camera/image_raw', 'topic of the images, without /compressed'),
     ('camera_info', '', 'topic of the calibration; empty: camera_info beside the images'),
     ('image_transport', 'raw', "'raw', or 'compressed' for images on <image>/compressed"),
     ('keypoints', '', 'topic of the keypoints of a 2D detector; empty: none'),
+    ('detections', 'detections', 'topic of another detector, for keypoints_adapter_node'),
+    ('detections_source', 'skeleton2d', "their type: 'skeleton2d', 'yolo' or 'floats'"),
     ('mask', '', 'topic of the masks of a segmenter, without /compressed; empty: none'),
     (
         'gravity_frame',
@@ -121,6 +130,8 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
     info = given['camera_info'] or f'{image.rpartition("/")[0]}/camera_info'
     remappings = [('image', image), ('image/compressed', f'{image}/compressed')]
     remappings.append(('camera_info', info))
+    if 'keypoints_adapter_node' in names:
+        remappings.append(('detections', given['detections']))
     if given['keypoints']:
         remappings.append(('keypoints', given['keypoints']))
     mask = given['mask'].removesuffix('/compressed')
@@ -141,11 +152,14 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
             **_named(given, 'gravity_frame'),
             **_named(given, 'fixed_frame'),
             'use_predictions': 'bme_node' in names,
-            'use_keypoints': bool(given['keypoints']),
+            'use_keypoints': bool(given['keypoints']) or any(name in names for name in DETECTORS),
+            **({'use_keypoints_3d': True} if 'keypoints_node' in names else {}),
             'frame_prefix': f'{_frame(namespace)}/',
         },
         'smoother_node': common,
         'bme_node': {**camera, **_named(given, 'model_file')},
+        'keypoints_node': {**common, 'image_transport': transport},
+        'keypoints_adapter_node': {**common, 'source': given['detections_source']},
     }
     own = [given['params_file']] if given['params_file'] else []
     env = _room_for_images(share) if transport == 'raw' else {}

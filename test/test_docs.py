@@ -19,10 +19,18 @@ from benchmarks import BENCHMARKS
 from hmt_ros.app import COMMANDS, main
 from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import Scores
-from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
+from hmt_ros.sessions import (
+    bme_session,
+    keypoints_adapter_session,
+    keypoints_session,
+    smoothed_messages,
+    track_messages,
+)
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import declared_parameters
 from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
+from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.tracking.subject import parse_subject
 
@@ -40,6 +48,8 @@ NODES = {
     'filter_node': (FilterParameters(), track_messages.TOPICS),
     'smoother_node': (SmootherParameters(), smoothed_messages.TOPICS),
     'bme_node': (BmeParameters(), bme_session.TOPICS),
+    'keypoints_node': (KeypointsParameters(), keypoints_session.TOPICS),
+    'keypoints_adapter_node': (KeypointsAdapterParameters(), keypoints_adapter_session.TOPICS),
 }
 # Programs that are not part of this repository.
 FOREIGN = {

@@ -24,10 +24,12 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
+from hmt_ros.sessions import bme_session, keypoints_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import values_of, with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
+from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.parameter_file import read_parameter_file
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from msg_tools import BagReader
@@ -145,6 +147,31 @@ def test_three_nodes_in_the_namespace_of_a_person(actions):
     assert set(made['filter_node']['remappings']) == wanted
     assert set(made['bme_node']['remappings']) == wanted
     assert made['smoother_node']['remappings'] == []
+
+
+def test_nodes_that_find_keypoints(actions):
+    made = actions(nodes='filter_node keypoints_node', image_transport='compressed')
+    assert parameters(made['filter_node'])['use_keypoints'] is True
+    assert parameters(made['filter_node'])['use_keypoints_3d'] is True
+    own = parameters(made['keypoints_node'])
+    del own['use_sim_time']
+    assert with_values(KeypointsParameters(), own).image_transport == 'compressed'
+    made = actions(
+        nodes='filter_node keypoints_adapter_node', detections='/yolo', detections_source='yolo'
+    )
+    tracks, adapts = made['filter_node'], made['keypoints_adapter_node']
+    assert parameters(tracks)['use_keypoints'] is True
+    assert 'use_keypoints_3d' not in parameters(tracks)
+    own = parameters(adapts)
+    del own['use_sim_time']
+    assert with_values(KeypointsAdapterParameters(), own).source == 'yolo'
+    assert dict(adapts['remappings'])['detections'] == '/yolo'
+    allowed = policy()
+    assert allowed['keypoints_node']['publish'] >= {
+        f'{NAMESPACE}/{topic}' for topic in keypoints_session.TOPICS
+    }
+    assert f'{NAMESPACE}/keypoints_3d' in allowed['filter_node']['subscribe']
+    assert f'{NAMESPACE}/detections' in allowed['keypoints_adapter_node']['subscribe']
 
 
 def test_room_for_raw_images(actions, monkeypatch):

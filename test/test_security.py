@@ -14,7 +14,7 @@ from hmt_ros.sessions import camera_session, parameter_file
 from hmt_ros.tracking import subject
 from msg_tools.bags import bag_metadata, decompression
 from msg_tools.files import array_file
-from msg_tools.messages import images, keypoints, pose_mixtures
+from msg_tools.messages import detections, images, keypoints, pose_mixtures
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted(
@@ -101,6 +101,7 @@ def test_limits_are_those_of_the_page() -> None:
         camera_session._LARGEST_PICTURE_FILE,
         pose_mixtures.MAX_COMPONENTS,
         keypoints.MAX_KEYPOINTS,
+        detections.MAX_PEOPLE,
         model_file.LARGEST_FILE,
         subject.LARGEST_FILE,
         parameter_file._LARGEST_FILE,

@@ -31,7 +31,7 @@ done
 rm -rf .mediapipe
 printf 'hmt_ros: creating .mediapipe with %s, once\n' "$("$chosen" --version)" >&2
 "$chosen" -m venv .mediapipe
-.mediapipe/bin/python -m pip -q --disable-pip-version-check --no-input install -r requirements/mediapipe.txt
+.mediapipe/bin/python -m pip -qq --disable-pip-version-check --no-input install -r requirements/mediapipe.txt
 reason=$(.mediapipe/bin/python -c 'import mediapipe' 2>&1) ||
   fail "MediaPipe can not be imported: ${reason##*$'\n'}. Try: sudo apt install libgl1 libegl1"
 echo "$key" >.mediapipe/stamp

@@ -146,8 +146,8 @@ def _filter() -> Scene:
             {'subject_file': '', 'image_transport': 'raw', 'reset_on_time_jump': True},
             {'subject_file': '', 'use_keypoints': True, 'reset_on_time_jump': True},
             {'subject_file': '', 'background_file': '', 'reset_on_time_jump': True},
-            {'subject_file': '', 'use_predictions': True, 'prediction_timeout': 0.0},
-            {'subject_file': '', 'gravity_frame': 'robot', 'transform_timeout': 0.0},
+            {'subject_file': '', 'use_predictions': True, 'input_timeout': 0.0},
+            {'subject_file': '', 'gravity_frame': 'robot', 'input_timeout': 0.0},
         ),
     )
 

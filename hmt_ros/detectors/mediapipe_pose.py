@@ -26,8 +26,6 @@ from hmt_ros.inference.arrays import Image, Mask
 # Environment variable that names the interpreter.
 PYTHON = 'HMT_ROS_DETECTOR_PYTHON'
 SCHEME = 'mediapipe33'
-# Standard deviation of the landmarks of a person who is seen well, in images of 640x480, px.
-SIGMA_PX = 9.0
 # After such an interval without an image the person is sought anew, ns.
 _LONGEST_INTERVAL = 1_000_000_000
 # Variables of a ROS workspace that would lead the interpreter to packages of another one.
@@ -72,8 +70,8 @@ class MediaPipePose:
             stamp_ns: of the image.
 
         Returns:
-            The keypoints, with the visibilities as confidences, and positions in m from the middle
-            of the hips along the axes of the camera. None: nobody was seen.
+            The keypoints, with unknown covariances, the visibilities as confidences, and positions
+            in m from the middle of the hips along the axes of the camera. None: nobody was seen.
 
         Raises:
             DetectorError: the detector has ended; the next call starts it again.
@@ -95,7 +93,7 @@ class MediaPipePose:
         return Keypoints(
             self._names,
             found[:, :2].copy(),
-            np.tile(SIGMA_PX**2 * np.eye(2), (LANDMARKS, 1, 1)),
+            np.full((LANDMARKS, 2, 2), np.nan),
             found[:, 2].clip(0.0, 1.0),
             found[:, 3:].copy(),
         )
@@ -132,6 +130,8 @@ class _Worker:
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
                 env=environment,
+                # Who interrupts the program ends this process by closing its input.
+                start_new_session=True,
             )
         except OSError as error:
             self._errors.close()

@@ -19,9 +19,10 @@ from hmt_ros.nodes.subscribed_topic import (
     image_topic,
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
+from hmt_ros.sessions.filter_session import KEYPOINTS, KEYPOINTS_3D, PREDICTION, FilterSession
 from hmt_ros.sessions.track_start import prepare_start
 from msg_tools.files.error_line import error_line
+from msg_tools.messages import keypoints
 
 
 class FilterNode(SessionNode[FilterSession, FilterParameters]):
@@ -37,7 +38,8 @@ class FilterNode(SessionNode[FilterSession, FilterParameters]):
 
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         yield CAMERA_INFO_TOPIC
-        yield SubscribedTopic(KEYPOINTS, 'keypoints', 'hmt_msgs/msg/Keypoints2D')
+        yield SubscribedTopic(KEYPOINTS, KEYPOINTS, keypoints.KEYPOINTS_2D)
+        yield SubscribedTopic(KEYPOINTS_3D, KEYPOINTS_3D, keypoints.KEYPOINTS_3D)
         yield SubscribedTopic(PREDICTION, 'pose_prediction', 'hmt_msgs/msg/PoseMixture', RELIABLE)
         yield from MASK_TOPICS
         if self._session is not None and self._session.frames.wanted:

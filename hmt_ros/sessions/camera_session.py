@@ -2,7 +2,7 @@
 
 Images are taken in the order of their stamps. They wait until a calibrated camera_info has come; at
 most `queue_size` wait, the oldest are dropped. With `use_mask` an image also waits for the mask of
-exactly its stamp, for a mask of a later stamp, or for an image that is `mask_timeout` younger. A
+exactly its stamp, for a mask of a later stamp, or for an image that is `input_timeout` younger. A
 mask that can not be used counts as none; one without a pixel that is not zero says that nobody was
 seen.
 """
@@ -94,7 +94,7 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _has_mask(self, stamp: int) -> bool:
         p = self.parameters
-        return not p.use_mask or self._has(self._masks, stamp, p.mask_timeout)
+        return not p.use_mask or self._has(self._masks, stamp, p.input_timeout)
 
     def _has(self, inputs: StampedInputs[Any], stamp: int, timeout: float) -> bool:
         """Whether an image need not wait any longer for an input."""

@@ -42,6 +42,7 @@ NOT_NEGATIVE = (0.0, math.inf)
 FRACTION = (0.0, 1.0)
 
 TRANSPORTS = ('raw', 'compressed')
+LONGEST_TIMEOUT = 60.0  # s
 
 # Metadata of a field that is one parameter or holds several.
 _EFFECT, _LIMITS, _PREFIX = 'effect', 'limits', 'prefix'
@@ -94,27 +95,37 @@ class NodeParameters:
 
 
 @dataclass(frozen=True)
-class CameraNodeParameters(NodeParameters):
+class ImageNodeParameters(NodeParameters):
     """Parameters of the nodes that subscribe to images.
 
     Attributes:
         image_transport: Transport of the images, 'raw' (topic image) or 'compressed' (topic
             image/compressed).
-        use_mask: If true, masks of a segmenter replace background subtraction, and an image waits
-            for the mask of its stamp.
-        mask_timeout: Maximum time that an image waits for its mask, measured by the stamps of later
-            images, s; a mask of a later stamp ends the wait at once.
     """
 
     image_transport: str = parameter_field('raw', NEXT_CONFIGURE)
-    use_mask: bool = parameter_field(False, AT_ONCE)
-    mask_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
 
     def __post_init__(self) -> None:
         if self.image_transport not in TRANSPORTS:
             raise ValueError(
                 f'image_transport must be one of {TRANSPORTS}, saw {self.image_transport!r}'
             )
+
+
+@dataclass(frozen=True)
+class CameraNodeParameters(ImageNodeParameters):
+    """Parameters of the nodes that estimate from the images of a calibrated camera.
+
+    Attributes:
+        use_mask: If true, masks of a segmenter replace background subtraction, and an image waits
+            for the mask of its stamp.
+        input_timeout: Maximum time that an image waits for each other input of its stamp that is
+            used, measured by the stamps of later messages, s; an input of a later stamp ends the
+            wait for its kind at once.
+    """
+
+    use_mask: bool = parameter_field(False, AT_ONCE)
+    input_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, LONGEST_TIMEOUT))
 
 
 class ParameterError(ValueError):

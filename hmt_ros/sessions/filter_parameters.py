@@ -11,6 +11,7 @@ import sys
 from dataclasses import dataclass, field
 
 from hmt_ros.image.background import BackgroundSettings
+from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, schemes
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.declared_parameters import (
@@ -69,14 +70,17 @@ class FilterParameters(CameraNodeParameters):
         random_seed: Seed of all random numbers; the same images give the same results.
         use_keypoints: If true, keypoints are a measurement, and an image waits for the keypoints of
             its stamp.
-        keypoint_sigma_px: Standard deviation of keypoints that come without a covariance, px.
-        keypoints_timeout: Maximum time that an image waits for its keypoints, measured by the
-            stamps of later images, s; keypoints of a later stamp end the wait at once.
+        keypoint_scheme: What the names of keypoints mean, 'auto' (recognised by the names),
+            'joints' (the joints of the body themselves), or a scheme of detectors: 'coco17',
+            'halpe26', 'body25', 'mediapipe33', 'h36m17' or 'skeleton2d'.
+        use_keypoints_3d: If true, positions of the same landmarks in space (topic keypoints_3d) are
+            weak evidence of depth, and an image waits for those of its stamp.
+        keypoint_sigma_px: Standard deviation of keypoints that come without a covariance, px; 0
+            selects the one that is learned, which depends on confidence and on the size of the
+            person.
         use_predictions: If true, poses that bme_node predicts from the image start the track where
             there is no subject_file, and are among the hypotheses; an image then waits for the
             prediction of its stamp.
-        prediction_timeout: Maximum time that an image waits for its prediction, measured by the
-            stamps of later images, s; a prediction of a later stamp ends the wait at once.
         gravity: Direction of gravity in the camera optical frame, three numbers of any length;
             empty if unknown. A still camera that looks to the horizon has [0.0, 1.0, 0.0].
         camera_height: Height of the camera above the floor, m; 0 if unknown.
@@ -87,9 +91,6 @@ class FilterParameters(CameraNodeParameters):
         fixed_frame: Name of a frame that stands still, such as odom; /tf and /tf_static then tell
             how the camera moves, and the motion prior, gravity, floor and contacts are those of
             that frame, while poses stay in the camera frame; empty switches it off.
-        transform_timeout: Maximum time that an image waits for the transforms of its stamp,
-            measured by the stamps of later images and transforms, s; then it goes on with the
-            direction and with the motion of the camera that were known.
         overlay_modes: Maximum number of modes drawn on the image, the heaviest; 0 switches the
             overlay off.
         overlay_quality: JPEG quality of the overlay.
@@ -105,16 +106,15 @@ class FilterParameters(CameraNodeParameters):
     body_model: str = parameter_field('human37', NEXT_TRACK)
     random_seed: int = parameter_field(0, NEXT_TRACK, (0, 2**31 - 1))
     use_keypoints: bool = parameter_field(False, AT_ONCE)
-    keypoint_sigma_px: float = parameter_field(5.0, AT_ONCE, (0.01, 1000.0))
-    keypoints_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
+    keypoint_scheme: str = parameter_field(AUTO, AT_ONCE)
+    use_keypoints_3d: bool = parameter_field(False, AT_ONCE)
+    keypoint_sigma_px: float = parameter_field(0.0, AT_ONCE, (0.0, 1000.0))
     use_predictions: bool = parameter_field(False, AT_ONCE)
-    prediction_timeout: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
     gravity: tuple[float, ...] = parameter_field((), NEXT_TRACK)
     camera_height: float = parameter_field(0.0, NEXT_TRACK, (0.0, 100.0))
     gravity_frame: str = parameter_field('', NEXT_CONFIGURE)
     floor_in_gravity_frame: bool = parameter_field(False, NEXT_CONFIGURE)
     fixed_frame: str = parameter_field('', NEXT_CONFIGURE)
-    transform_timeout: float = parameter_field(0.1, AT_ONCE, (0.0, 60.0))
     overlay_modes: int = parameter_field(3, AT_ONCE, (0, 64))
     overlay_quality: int = parameter_field(85, AT_ONCE, (1, 100))
     publish_tf: bool = parameter_field(True, AT_ONCE)
@@ -131,6 +131,13 @@ class FilterParameters(CameraNodeParameters):
         super().__post_init__()
         if not self.body_model:
             raise ValueError("body_model must be a name or a file, saw ''")
+        known = (AUTO, JOINTS, *schemes())
+        if self.keypoint_scheme not in known:
+            raise ValueError(
+                f'keypoint_scheme must be one of {known}, saw {self.keypoint_scheme!r}'
+            )
+        if self.use_keypoints_3d and not self.use_keypoints:
+            raise ValueError('use_keypoints_3d needs use_keypoints, which is false')
         if self.gravity:
             unit_vector(self.gravity, 'gravity')
         if self.floor_in_gravity_frame and not self.gravity_frame:

@@ -6,11 +6,11 @@ order give the same bytes. The rules, besides those of `CameraSession`:
 - An image that is not younger than the one before is skipped, or starts the track anew with
   `reset_on_time_jump`.
 - With `use_keypoints` an image waits for keypoints of exactly its stamp, for keypoints of a later
-  stamp, or for an image that is `keypoints_timeout` younger; with `use_predictions` and
-  `prediction_timeout` for a pose_prediction in the same way. Of several of one stamp the last
-  counts; keypoints without names, and mixtures without components, say that nobody was seen.
+  stamp, or for an image that is `input_timeout` younger; with `use_keypoints_3d` for keypoints_3d,
+  and with `use_predictions` for a pose_prediction, in the same way. Of several of one stamp the
+  last counts; keypoints without names, and mixtures without components, say that nobody was seen.
 - With `gravity_frame` or `fixed_frame` an image waits for the transforms of its stamp, or for an
-  image or a transform that is `transform_timeout` younger, and never so long that it would be
+  image or a transform that is `input_timeout` younger, and never so long that it would be
   dropped. Where they do not come, what was known of gravity before holds, and the camera is taken
   to go on as before.
 - When the person is no longer in view one mixture without components of either kind goes out, with
@@ -29,7 +29,6 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body, Camera
-from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.camera_session import (
@@ -43,6 +42,7 @@ from hmt_ros.sessions.camera_session import (
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.handled import Fault, Output
+from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D, KeypointInputs
 from hmt_ros.sessions.session import SessionState, everything
 from hmt_ros.sessions.track_messages import (
     TOPICS,
@@ -55,11 +55,9 @@ from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
 from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker
 from hmt_ros.tracking.ground import KnownGround
-from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.headers import SECOND_NS, time_ns
-from msg_tools.messages.keypoints import keypoints_of
 from msg_tools.messages.pose_mixtures import pose_mixture_of
 
 __all__ = [
@@ -67,18 +65,17 @@ __all__ = [
     'COMPRESSED_MASK',
     'IMAGE',
     'KEYPOINTS',
+    'KEYPOINTS_3D',
     'MASK',
     'PREDICTION',
     'FilterSession',
     'FilterState',
 ]
 
-KEYPOINTS, PREDICTION = 'keypoints', 'pose_prediction'
+PREDICTION = 'pose_prediction'
 
 # Change of a length above which a body is described anew, m.
 RESHAPED = 0.005
-# Keypoints of a detector that saw nobody.
-NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 # A person hardly moves meanwhile.
 _SAME_MOMENT_NS = SECOND_NS // 5
 _IN_BACKGROUND = 'the background was learned with the person in it'
@@ -156,7 +153,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._tracker: Tracker | None = None
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
-        self._keypoints: StampedInputs[Keypoints] = StampedInputs()
+        self._keypoints = KeypointInputs(self._log)
         self._predictions: StampedInputs[PosePrediction | Status] = StampedInputs()
         self.state = self._present_state()
 
@@ -176,7 +173,10 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
         if source == KEYPOINTS:
-            self._keypoints.put(stamp, self._keypoints_in(message))
+            self._keypoints.put(message, stamp, self.parameters, self.start.body)
+            self._estimate_what_is_ready()
+        elif source == KEYPOINTS_3D:
+            self._keypoints.put_3d(message, stamp)
             self._estimate_what_is_ready()
         elif source == PREDICTION:
             self._predictions.put(stamp, self._prediction_in(message))
@@ -218,23 +218,6 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     def _start_again(self) -> None:
         self.restart(self.start)
 
-    def _keypoints_in(self, message: Any) -> Keypoints | None:
-        """The keypoints that were seen, maybe none; None: they can not be used."""
-        if len(message.names) == 0:
-            return NO_KEYPOINTS
-        try:
-            content = keypoints_of(message, self.parameters.keypoint_sigma_px)
-        except MessageError as error:
-            self._log.fault(Fault.KEYPOINTS, str(error))
-            return None
-        known, strange = content.named_for(self.start.body)
-        if strange:
-            text = f'keypoints {strange} are no joints of the body'
-            self._log.note(Fault.KEYPOINT_NAMES, text)
-        if not known.names:
-            return None
-        return known[np.flatnonzero(known.seen)]
-
     def _prediction_in(self, message: Any) -> PosePrediction | Status | None:
         """The mixture and its body, see `body_of`; `NOBODY`: was seen; None: not to be used."""
         if len(message.components) == 0:
@@ -249,8 +232,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     def _is_ready(self, stamp: int) -> bool:
         return (
             super()._is_ready(stamp)
-            and self._has_keypoints(stamp)
-            and self._has_prediction(stamp)
+            and self._missing_here(stamp) is None
             and self._has_transforms()
         )
 
@@ -259,31 +241,37 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         p, oldest = self.parameters, self._waiting[0]
         if not self.frames.wanted or len(self._waiting) > p.queue_size:
             return True
-        timeout = p.transform_timeout * SECOND_NS
+        timeout = p.input_timeout * SECOND_NS
         assert self._newest is not None
         return self._newest - oldest.stamp_ns > timeout or self.frames.is_settled(
             self._frame_of(oldest), oldest.stamp_ns, timeout
         )
 
-    def _has_keypoints(self, stamp: int) -> bool:
-        p = self.parameters
-        return not p.use_keypoints or self._has(self._keypoints, stamp, p.keypoints_timeout)
-
-    def _has_prediction(self, stamp: int) -> bool:
-        p = self.parameters
-        return not p.use_predictions or self._has(self._predictions, stamp, p.prediction_timeout)
-
     def _missing_input(self, stamp: int) -> Fault:
-        if not self._has_keypoints(stamp):
-            return Fault.NO_KEYPOINTS
-        return Fault.NO_MASK if not self._has_mask(stamp) else Fault.NO_PREDICTION
+        return self._missing_here(stamp) or super()._missing_input(stamp)
+
+    def _missing_here(self, stamp: int) -> Fault | None:
+        """What an image is waiting for, of the inputs that have its stamp besides masks."""
+        p = self.parameters
+        wanted = (
+            (p.use_keypoints, self._keypoints.plane, Fault.NO_KEYPOINTS),
+            (p.use_keypoints_3d, self._keypoints.space, Fault.NO_KEYPOINTS_3D),
+            (p.use_predictions, self._predictions, Fault.NO_PREDICTION),
+        )
+        for used, inputs, fault in wanted:
+            if used and not self._has(inputs, stamp, p.input_timeout):
+                return fault
+        return None
 
     # Outputs.
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
         stamp = waiting.stamp_ns
-        keypoints = self._keypoints.take(stamp) if self.parameters.use_keypoints else None
-        prediction = self._predictions.take(stamp) if self.parameters.use_predictions else None
+        p = self.parameters
+        keypoints = None
+        if p.use_keypoints:
+            keypoints = self._keypoints.take(stamp, p, self.start.body)
+        prediction = self._predictions.take(stamp) if p.use_predictions else None
         starts = self._tracker is None or self._tracker.status is Status.WAITING
         try:
             self._look_at_frames(waiting)

@@ -29,6 +29,10 @@ class Fault(Enum):
     KEYPOINTS = 'keypoints'
     KEYPOINT_NAMES = 'names of keypoints'
     NO_KEYPOINTS = 'no keypoints'
+    KEYPOINTS_3D = 'keypoints_3d'
+    NO_KEYPOINTS_3D = 'no keypoints_3d'
+    DETECTIONS = 'detections'
+    DETECTOR = 'detector'
     MASK = 'mask'
     NO_MASK = 'no mask'
     LONE_MASK = 'mask without an image'
@@ -108,11 +112,11 @@ class HandlingLog:
         self._told.append(one_line(text))
         self.note(kind, text)
 
-    def note(self, kind: Fault | MessageFault, text: str) -> None:
-        """Warns of the first of a kind; the others are counted."""
+    def note(self, kind: Fault | MessageFault, text: str, *, warn: bool = False) -> None:
+        """Warns of the first of a kind, and where `warn` says so; the others are counted."""
         self.faults[kind.value] += 1
         self.last_fault = one_line(text)
-        if self.faults[kind.value] == 1:
+        if warn or self.faults[kind.value] == 1:
             self._warned.append(self.last_fault)
 
     def skip(self, kind: Fault | MessageFault, text: str) -> None:

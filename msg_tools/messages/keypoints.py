@@ -55,10 +55,11 @@ def keypoints_of(message: Any, sigma_px: float) -> Keypoints:
 
     Args:
         message: the message.
-        sigma_px: standard deviation where the message has no covariance, px.
+        sigma_px: standard deviation where the message has no covariance, px; 0: unknown.
 
     Returns:
-        The keypoints; those that were not seen have NaN as pixels, and confidence 0.
+        The keypoints; those that were not seen have NaN as pixels, and confidence 0. Unknown
+        covariances are NaN.
 
     Raises:
         MessageError: a name twice, arrays whose lengths contradict each other, a position of which
@@ -68,17 +69,42 @@ def keypoints_of(message: Any, sigma_px: float) -> Keypoints:
     names = _names(message.names, 'keypoints')
     n = len(names)
     pixels = _columns([message.u, message.v], 'uv', n, 'keypoints')
-    covariances = np.tile(sigma_px**2 * np.eye(2), (n, 1, 1))
+    covariances = None
     if len(message.covariance):
         covariances = numbers(message.covariance, (n, 2, 2), 'keypoints: covariance').copy()
     confidences = _confidences(message.confidence, n, 'keypoints')
+    found = checked_keypoints(names, pixels, confidences, covariances)
+    if covariances is not None or not sigma_px:
+        return found
+    return replace(found, covariances=np.tile(sigma_px**2 * np.eye(2), (n, 1, 1)))
+
+
+def checked_keypoints(
+    names: tuple[str, ...], pixels: Array, confidences: Array, covariances: Array | None = None
+) -> Keypoints:
+    """Keypoints as a detector tells them; those that were not seen lose the rest.
+
+    Args:
+        names: (n,), each once.
+        pixels: (n, 2) px; changed in place, like the others.
+        confidences: (n,).
+        covariances: (n, 2, 2) px^2; None: unknown.
+
+    Raises:
+        MessageError: as `keypoints_of`.
+    """
     seen = (confidences != 0) & ~np.isnan(pixels).all(1) & (pixels != 0).any(1)
     for i in np.flatnonzero(seen):
         name = names[i]
         _check_place(pixels[i], FARTHEST_PIXEL, 'px', name)
-        check_covariances(covariances[i], f'keypoint {name}')
+        if covariances is not None:
+            check_covariances(covariances[i], f'keypoint {name}')
         _check_confidence(confidences[i], name)
-    pixels[~seen], covariances[~seen], confidences[~seen] = np.nan, np.eye(2), 0.0
+    pixels[~seen], confidences[~seen] = np.nan, 0.0
+    if covariances is None:
+        covariances = np.full((len(names), 2, 2), np.nan)
+    else:
+        covariances[~seen] = np.eye(2)
     return Keypoints(names, pixels, covariances, confidences)
 
 
@@ -104,29 +130,24 @@ def positions_of(message: Any) -> Positions:
 
 
 def keypoints_message(
-    messages: MessageFactory,
-    keypoints: Keypoints,
-    stamp_ns: int,
-    frame_id: str,
-    *,
-    covariances: bool = True,
+    messages: MessageFactory, keypoints: Keypoints, stamp_ns: int, frame_id: str
 ) -> Any:
     """hmt_msgs/Keypoints2D of an image with a stamp, in the optical frame of its camera.
 
     Args:
         messages: makes the message.
-        keypoints: maybe none: nobody was seen.
+        keypoints: maybe none: nobody was seen. A message has no covariances if one is unknown, NaN.
         stamp_ns: of the image.
         frame_id: optical frame of the camera.
-        covariances: whether they are known; what reads the message assumes them otherwise.
     """
+    known = bool(np.isfinite(keypoints.covariances).all())
     return messages.create(
         KEYPOINTS_2D,
         header=header_message(messages, stamp_ns, frame_id),
         names=list(keypoints.names),
         u=keypoints.pixels[:, 0],
         v=keypoints.pixels[:, 1],
-        covariance=keypoints.covariances.reshape(-1) if covariances else np.empty(0),
+        covariance=keypoints.covariances.reshape(-1) if known else np.empty(0),
         confidence=keypoints.confidences,
     )
 

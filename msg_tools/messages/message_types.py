@@ -16,6 +16,7 @@ import re
 from collections.abc import Callable, Iterable
 from functools import cache
 from importlib import resources
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -46,6 +47,27 @@ def typestore() -> Typestore:
             types.update(get_types_from_msg(file.read_text('utf-8'), name))
     store.register(types)
     return store
+
+
+def register_definitions(package: str, folder: Path) -> None:
+    """Adds the messages of another package to `typestore()`.
+
+    Args:
+        package: its name.
+        folder: with its .msg files.
+
+    Raises:
+        ValueError: a file that can not be understood.
+    """
+    types: Typesdict = {}
+    try:
+        for file in sorted(folder.glob('*.msg')):
+            types.update(get_types_from_msg(file.read_text('utf-8'), f'{package}/msg/{file.stem}'))
+        store = typestore()
+        store.register({name: x for name, x in types.items() if name not in store.fielddefs})
+    except Exception as error:
+        # The parser meets any text here, and does not say what it may raise.
+        raise ValueError(f'the messages of {package} in {folder} can not be understood') from error
 
 
 def typestore_of_definition(msgtype: str, encoding: str, definition: str) -> Typestore:

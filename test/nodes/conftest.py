@@ -104,10 +104,10 @@ class World:
         )
         return self
 
-    def send(self, source, message):
-        """Publishes a message; what became of it."""
+    def send(self, source, message, topic=None):
+        """Publishes a message, on the topic of its source's name or another; what became of it."""
         count = len(self.handled)
-        self.publishers[source].publish(serialise(message))
+        self.publishers[topic or source].publish(serialise(message))
         # A latched message may be handled in between.
         self.spin_until(
             lambda: any(handled.source == source for handled in self.handled[count:]),

@@ -175,13 +175,24 @@ class SmallCamera:
         )
 
     def keypoints(self, index, names=JOINTS, **fields):
-        fields.setdefault('u', np.arange(len(names), dtype=float))
-        fields.setdefault('v', np.arange(len(names), dtype=float))
+        # At (0, 0) they would not be seen.
+        fields.setdefault('u', np.arange(1.0, 1 + len(names)))
+        fields.setdefault('v', np.arange(1.0, 1 + len(names)))
         return self.messages.create(
             'hmt_msgs/msg/Keypoints2D',
             header=header_message(self.messages, self.stamp(index), 'lens'),
             names=list(names),
             **fields,
+        )
+
+    def keypoints_3d(self, index, names=JOINTS, **fields):
+        """Landmark i is i m to the right."""
+        fields.setdefault('x', np.arange(len(names), dtype=float))
+        return self.messages.create(
+            'hmt_msgs/msg/Keypoints3D',
+            header=header_message(self.messages, self.stamp(index), 'lens'),
+            names=list(names),
+            **{axis: fields.get(axis, np.zeros(len(names))) for axis in 'xyz'},
         )
 
 

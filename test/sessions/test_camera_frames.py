@@ -115,7 +115,7 @@ def test_transforms_of_other_times_and_frames_are_joined(session, stub_tracker, 
 
 
 def test_missing_transforms_do_not_stop_the_track(session, stub_tracker, small_camera, outputs):
-    one = session(gravity=[0.0, 1.0, 0.0], transform_timeout=0.15)
+    one = session(gravity=[0.0, 1.0, 0.0], input_timeout=0.15)
     one.take(CAMERA_INFO, small_camera.info())
     one.take(TF_STATIC, transforms(0, frames=('map', 'base')))
     warnings = []
@@ -142,7 +142,7 @@ def test_missing_transforms_do_not_stop_the_track(session, stub_tracker, small_c
 
 
 def test_no_image_is_dropped_for_want_of_transforms(session, stub_tracker, small_camera, outputs):
-    one = session(queue_size=2, transform_timeout=60.0)
+    one = session(queue_size=2, input_timeout=60.0)
     one.take(CAMERA_INFO, small_camera.info())
     for index in range(6):
         one.take(IMAGE, small_camera.image(index))
@@ -183,7 +183,7 @@ def test_a_camera_below_the_floor_has_no_height(session, stub_tracker, small_cam
     ],
 )
 def test_bad_transforms_are_counted(session, small_camera, outputs, spoil, why):
-    one = session(transform_timeout=0.0)
+    one = session(input_timeout=0.0)
     one.take(CAMERA_INFO, small_camera.info())
     for index in range(2):
         bad = at(small_camera, index)
@@ -254,7 +254,7 @@ def test_height_of_a_camera_that_rises(session, stub_tracker, small_camera, outp
 
 
 def test_a_missing_pose_is_told_once_and_loses_no_image(session, stub_tracker, small_camera):
-    one = session(gravity_frame='', fixed_frame='world', transform_timeout=0.0)
+    one = session(gravity_frame='', fixed_frame='world', input_timeout=0.0)
     one.take(CAMERA_INFO, small_camera.info())
     warnings = []
     for index in range(5):
@@ -276,7 +276,7 @@ def test_a_missing_pose_is_told_once_and_loses_no_image(session, stub_tracker, s
 
 def test_stale_gravity_is_not_given_again(session, stub_tracker, small_camera):
     """Where transforms end the tracker carries gravity by itself."""
-    one = session(fixed_frame='world', transform_timeout=0.0)
+    one = session(fixed_frame='world', input_timeout=0.0)
     one.take(CAMERA_INFO, small_camera.info())
     for index in range(4):
         if index < 2:

@@ -261,7 +261,7 @@ def test_what_is_no_list_of_numbers(given):
         ({'camera_height': -1.0}, 'camera_height must lie between 0 and 100, saw -1.0'),
         ({'camera_height': math.nan}, 'camera_height must lie between 0 and 100, saw nan'),
         ({'floor_in_gravity_frame': True}, 'needs the name of gravity_frame, which is empty'),
-        ({'transform_timeout': -0.1}, 'transform_timeout must lie between 0 and 60'),
+        ({'input_timeout': -0.1}, 'input_timeout must lie between 0 and 60'),
     ],
 )
 def test_what_is_no_ground(values, message):

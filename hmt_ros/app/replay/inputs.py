@@ -1,4 +1,4 @@
-"""The input of the filter in a bag: images, their calibration, masks, keypoints, transforms."""
+"""The input of the filter in a bag: images, calibration, masks, keypoints, transforms."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
-from hmt_ros.sessions.filter_session import KEYPOINTS
+from hmt_ros.sessions.filter_session import KEYPOINTS, KEYPOINTS_3D
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools import BagError, BagMessage, BagReader, Topic
+from msg_tools.messages import keypoints
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 RAW, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
-_KEYPOINTS = 'hmt_msgs/msg/Keypoints2D'
 
 # Names of topics that are preferred to all others.
 _USUAL = ('image/compressed', 'image')
@@ -29,6 +29,7 @@ class RecordedInput:
         camera_info: topic of their calibration.
         mask: topic of masks of the person; None if the bag has none.
         keypoints: topic of 2D keypoints; None if the bag has none.
+        keypoints_3d: topic of their positions in space; None if the bag has none.
         ground_truth: topic of the ground truth; None if the bag has none.
         transforms: topics of transforms by source, those that the bag has of `TRANSFORMS`; None if
             transforms are not used.
@@ -38,6 +39,7 @@ class RecordedInput:
     camera_info: Topic
     mask: Topic | None
     keypoints: Topic | None
+    keypoints_3d: Topic | None
     ground_truth: Topic | None
     transforms: Mapping[str, Topic] | None = None
 
@@ -58,6 +60,8 @@ class RecordedInput:
             sources[self.mask.name] = MASK if raw else COMPRESSED_MASK
         if self.keypoints is not None:
             sources[self.keypoints.name] = KEYPOINTS
+        if self.keypoints_3d is not None:
+            sources[self.keypoints_3d.name] = KEYPOINTS_3D
         if self.ground_truth is not None:
             sources[self.ground_truth.name] = GROUND_TRUTH
         sources |= {topic.name: source for source, topic in (self.transforms or {}).items()}
@@ -87,7 +91,8 @@ def recorded_input(
         image,
         _camera_info_topic(bag, image, camera_info_topic),
         _named(bag, MASK, (RAW,)) or _named(bag, COMPRESSED_MASK, (COMPRESSED,)),
-        _named(bag, 'keypoints', (_KEYPOINTS,)),
+        _named(bag, KEYPOINTS, (keypoints.KEYPOINTS_2D,)),
+        _named(bag, KEYPOINTS_3D, (keypoints.KEYPOINTS_3D,)),
         _named(bag, GROUND_TRUTH, (POSE_MIXTURE,)),
         {source: topic for source, topic in found.items() if topic is not None},
     )

@@ -17,20 +17,19 @@ from hmt_ros.app.replay.options import NodeParameters, ReplayOptions, node_param
 from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PlayedTrack
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, MASK
-from hmt_ros.sessions.filter_session import KEYPOINTS
+from hmt_ros.sessions.declared_parameters import LONGEST_TIMEOUT
+from hmt_ros.sessions.filter_session import KEYPOINTS, KEYPOINTS_3D
 from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
 from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
+from msg_tools.messages import keypoints
 from msg_tools.messages.headers import SECOND_NS, header_message, time_ns
 from msg_tools.messages.images import ImageError, decode_image, image_message
 from msg_tools.messages.states import transforms_message
 
 Tell = Callable[[str], None]
-
-# Of the parameter transform_timeout, s.
-LONGEST_TIMEOUT = 60
 
 
 @dataclass
@@ -118,6 +117,8 @@ def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
         recorded = replace(recorded, mask=None)
     if not parameters.filter.use_keypoints:
         recorded = replace(recorded, keypoints=None)
+    if not parameters.filter.use_keypoints_3d:
+        recorded = replace(recorded, keypoints_3d=None)
     if not parameters.filter.uses_transforms:
         recorded = replace(recorded, transforms=None)
     return recorded
@@ -129,8 +130,8 @@ def _play(
 ) -> Replayed:  # fmt: skip
     """Hands the messages of the bag to the nodes, and copies those that the new bag keeps."""
     result = Replayed()
-    # Transforms are copied so that a replay of the new bag sees the same frames.
-    copied = {GROUND_TRUTH, *TRANSFORMS}
+    # Small inputs are copied, so that a replay of the new bag has the same as this one.
+    copied = {GROUND_TRUTH, KEYPOINTS, KEYPOINTS_3D, *TRANSFORMS}
     if options.with_images:
         copied |= {IMAGE, CAMERA_INFO}
 
@@ -161,7 +162,9 @@ def _play(
                 bar.update()
         # The last images need not wait any longer.
         if recorded.keypoints is not None:
-            check(track.take(KEYPOINTS, _nobody(result.last_stamp)))
+            check(track.take(KEYPOINTS, _nobody(keypoints.KEYPOINTS_2D, result.last_stamp)))
+        if recorded.keypoints_3d is not None:
+            check(track.take(KEYPOINTS_3D, _nobody(keypoints.KEYPOINTS_3D, result.last_stamp)))
         if recorded.mask is not None:
             check(track.take(MASK, _mask_after(result.last_stamp)))
         if recorded.transforms is not None:
@@ -212,12 +215,10 @@ def _readable(
         yield found
 
 
-def _nobody(stamp_ns: int) -> Any:
-    """hmt_msgs/Keypoints2D of an image without joints."""
+def _nobody(msgtype: str, stamp_ns: int) -> Any:
+    """hmt_msgs/Keypoints2D or 3D of an image without joints."""
     messages = RosbagsMessages()
-    return messages.create(
-        'hmt_msgs/msg/Keypoints2D', header=header_message(messages, stamp_ns, '')
-    )
+    return messages.create(msgtype, header=header_message(messages, stamp_ns, ''))
 
 
 def _mask_after(stamp_ns: int) -> Any:
@@ -227,7 +228,7 @@ def _mask_after(stamp_ns: int) -> Any:
 
 def _transform_after(stamp_ns: int) -> Any:
     """tf2_msgs/TFMessage after the last image, which no transform of that image can follow."""
-    after = stamp_ns + LONGEST_TIMEOUT * SECOND_NS + 1
+    after = stamp_ns + round(LONGEST_TIMEOUT) * SECOND_NS + 1
     return transforms_message(
         RosbagsMessages(), ['hmt_ros'], ['hmt_ros/end'], np.eye(3)[None], np.zeros((1, 3)), after
     )

@@ -131,6 +131,8 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
         if value is not None:
             values[name] = str(value) if isinstance(value, Path) else value
     values.setdefault('use_keypoints', recorded.keypoints is not None)
+    has_depth = recorded.keypoints_3d is not None and values['use_keypoints'] is True
+    values.setdefault('use_keypoints_3d', has_depth)
     values.setdefault('use_mask', recorded.mask is not None)
     values['image_transport'] = recorded.transport
     return with_values(FilterParameters(), values)
@@ -152,7 +154,7 @@ def _bme_parameters(
     values = {
         'background_file': tracking.background_file,
         'use_mask': tracking.use_mask,
-        'mask_timeout': tracking.mask_timeout,
+        'input_timeout': tracking.input_timeout,
         **_given_values(options, BME),
         'image_transport': recorded.transport,
     }

@@ -36,6 +36,7 @@ class Player:
                 Ground,
                 Handled,
                 Keypoints2D,
+                Keypoints3D,
                 PoseMixture,
                 TrajectoryMixture,
             )
@@ -51,7 +52,7 @@ class Player:
             ) from error
         kinds = (
             Body, CameraInfo, CompressedImage, Ground, Handled, Image, JointState, Keypoints2D,
-            MarkerArray, PoseMixture, String, TFMessage, TrajectoryMixture,
+            Keypoints3D, MarkerArray, PoseMixture, String, TFMessage, TrajectoryMixture,
         )  # fmt: skip
         self.classes: dict[str, Any] = {
             f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}': kind for kind in kinds

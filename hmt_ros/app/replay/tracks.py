@@ -18,10 +18,11 @@ from hmt_ros.app.replay.player import Player
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
-from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
+from hmt_ros.sessions.filter_session import KEYPOINTS, KEYPOINTS_3D, PREDICTION, FilterSession
 from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
+from msg_tools.messages import keypoints
 from msg_tools.messages.cdr import deserialise
 
 # Topics of the filter that the smoother takes, as sources of the same names.
@@ -124,7 +125,8 @@ class LiveTrack(PlayedTrack):
                 kind, topic = 'CompressedImage', 'image/compressed'
             inputs = {
                 CAMERA_INFO: ('camera_info', 'sensor_msgs/msg/CameraInfo'),
-                KEYPOINTS: ('keypoints', 'hmt_msgs/msg/Keypoints2D'),
+                KEYPOINTS: (KEYPOINTS, keypoints.KEYPOINTS_2D),
+                KEYPOINTS_3D: (KEYPOINTS_3D, keypoints.KEYPOINTS_3D),
                 MASK: ('mask', 'sensor_msgs/msg/Image'),
                 COMPRESSED_MASK: ('mask/compressed', 'sensor_msgs/msg/CompressedImage'),
                 IMAGE: (topic, f'sensor_msgs/msg/{kind}'),
@@ -142,7 +144,7 @@ class LiveTrack(PlayedTrack):
                 self._parameters.filter,
                 inputs=inputs,
                 topics=track_messages.TOPICS,
-                sensors=(*sensors, '/keypoints'),
+                sensors=(*sensors, f'/{KEYPOINTS}', f'/{KEYPOINTS_3D}'),
             )
             if self._parameters.smoother is not None:
                 self._smoother = live(

@@ -76,7 +76,7 @@ class StandingStill:
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
         self.track_id = 1
-        self.keypoints, self.predictions, self.masks = [], [], []
+        self.keypoints, self.positions, self.predictions, self.masks = [], [], [], []
         self.ground, self.contacts = Ground(np.array([0.0, -1.0, 0.0]), 0.3, None, np.inf), {}
         self.silhouettes = SimpleNamespace(doubted=False, known='known')
         StandingStill.made.append(self)
@@ -98,6 +98,7 @@ class StandingStill:
         self, image, stamp, keypoints=None, prediction=None, mask=None, *, nobody_predicted=False
     ):
         self.keypoints.append(None if keypoints is None else keypoints.names)
+        self.positions.append(None if keypoints is None else keypoints.positions)
         self.predictions.append(prediction)
         self.masks.append(None if mask is None else int(mask.sum()))
         if stamp < self.start.stamp_ns:
@@ -292,6 +293,38 @@ def test_keypoints_of_the_bag_are_used(still, entries, tmp_path):
     assert len(read(tmp_path / 'out')['pose_mixture']) == IMAGES
     assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_keypoints=false']) == 0
     assert still[-1].keypoints == [None] * IMAGES
+
+
+def keypoints_3d(stamp, names):
+    return MESSAGES.create(
+        'hmt_msgs/msg/Keypoints3D',
+        header=header_message(MESSAGES, stamp, ''),
+        names=list(names),
+        **{axis: np.arange(1.0, 1 + len(names)) for axis in 'xyz'},
+    )
+
+
+def test_positions_in_space_of_the_bag_are_used_and_kept(still, entries, tmp_path):
+    stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
+    # Positions of the first image alone, and late.
+    extra = [
+        ('/keypoints', stamps[0] + 1000, keypoints(stamps[0])),
+        ('/keypoints_3d', stamps[0] + 2000, keypoints_3d(stamps[0], ('head', 'nose'))),
+        ('/keypoints', stamps[1] + 1000, keypoints(stamps[1], ('head',))),
+    ]
+    bag = write(tmp_path / 'bag', sorted(entries + extra, key=lambda entry: entry[1]))
+    options = [*SUBJECT, '--quiet', '-o']
+    assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
+    found, *later = still[-1].positions
+    np.testing.assert_array_equal(found, [[1, 1, 1], [np.nan] * 3, [np.nan] * 3])
+    assert later == [None] * (IMAGES - 1)
+    kept = read(tmp_path / 'out')
+    assert [len(kept[topic]) for topic in ('/keypoints', '/keypoints_3d')] == [2, 1]
+    for given in ('use_keypoints', 'use_keypoints_3d'):
+        target = tmp_path / f'without_{given}'
+        assert main([str(bag), *options, str(target), '--set', f'{given}=false']) == 0
+        assert still[-1].positions == [None] * IMAGES
+        assert '/keypoints_3d' not in read(target)
 
 
 def mask(picture, stamp):

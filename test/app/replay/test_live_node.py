@@ -145,14 +145,21 @@ def test_same_of_raw_images_with_keypoints_masks_and_faults(tmp_path, capsys):
             seen = MESSAGES.create(
                 'hmt_msgs/msg/Keypoints2D',
                 header=header_message(MESSAGES, stamp, ''),
-                names=['left_wrist', 'nose', 'right_wrist'],
+                names=['left_wrist', 'tail', 'right_wrist'],
                 u=np.array([272.0, 10.0, np.nan]),
                 v=np.array([213.0, 10.0, np.nan]),
+            )
+            lifted = MESSAGES.create(
+                'hmt_msgs/msg/Keypoints3D',
+                header=header_message(MESSAGES, stamp, ''),
+                names=['right_wrist', 'left_wrist'],
+                **{axis: np.array([0.1, -0.1]) for axis in 'xyz'},
             )
             half = image_message(MESSAGES, picture[::2].copy(), stamp + 5000, 'lens')
             entries.append(('image', time, image_message(MESSAGES, picture, stamp, '')))
             entries.append(('image', time + 5000, half))
             entries.append(('keypoints', time + 9000, seen))
+            entries.append(('keypoints_3d', time + 9500, lifted))
             shown = picture.max(2) > 128
             mask = image_message(MESSAGES, shown.astype(np.uint8), stamp, '')
             mask.encoding = '8UC1' if len(entries) < 4 else 'rgb8'
@@ -168,7 +175,7 @@ def test_same_of_raw_images_with_keypoints_masks_and_faults(tmp_path, capsys):
     (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
     assert one == other
     assert one[0] == 0
-    assert "keypoints ['nose'] are no joints" in one[2]
+    assert "keypoints ['tail'] are not used" in one[2]
     assert "mask has encoding 'rgb8', wanted mono8 or 8UC1" in one[2]
     assert 'has 480x180 pixels' in one[2]
     assert 'the track starts anew' in one[2]

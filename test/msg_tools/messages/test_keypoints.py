@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -136,9 +137,13 @@ def test_positions_join_keypoints_by_name(messages: RosbagsMessages) -> None:
 
 def test_a_message_without_covariances(messages: RosbagsMessages) -> None:
     content = keypoints_of(message(messages), 3.0)
-    written = keypoints_message(messages, content, 7, 'camera', covariances=False)
+    unknown = replace(content, covariances=np.full((3, 2, 2), np.nan))
+    written = keypoints_message(messages, unknown, 7, 'camera')
     assert len(written.covariance) == 0
     np.testing.assert_array_equal(keypoints_of(written, 5.0).covariances[0], 25 * np.eye(2))
+    np.testing.assert_array_equal(
+        keypoints_of(written, 0.0).covariances[0], np.full((2, 2), np.nan)
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,37 @@
+"""keypoints_node: images in, keypoints of MediaPipe out; a node around a `KeypointsSession`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from hmt_ros.nodes.run_node import run
+from hmt_ros.nodes.session_node import SessionNode
+from hmt_ros.nodes.subscribed_topic import SubscribedTopic, image_topic
+from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+from hmt_ros.sessions.keypoints_session import KeypointsSession
+
+
+class KeypointsNode(SessionNode[KeypointsSession, KeypointsParameters]):
+    """The node; its parameters are the fields of `KeypointsParameters`."""
+
+    NAME = 'keypoints_node'
+    SUBJECT = 'detection'
+    SESSION = KeypointsSession
+    DEFAULTS = KeypointsParameters()
+
+    def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
+        return ()
+
+    def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
+        yield image_topic(self._settings.image_transport)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Runs the node until a signal stops it; returns 0, or 1 if it could not start."""
+    return run(KeypointsNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,130 @@
+"""A detector of keypoints behind its topics: images in, keypoints of one person out.
+
+- Every image that can be used gets one keypoints, one keypoints_3d and, with `publish_mask`, one
+  mask, all with its stamp and frame. Messages without names, and a mask of zeros, say that nobody
+  was seen.
+- An image that is not younger than the one before is skipped, or is the first of a new sequence
+  with `reset_on_time_jump`.
+- What can not be used is skipped, and so is an image at which the detector ends; it is started
+  again. The first fault of each kind is logged; all are counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hmt_ros.detectors.mediapipe_pose import DetectorError, MediaPipePose
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.sessions.camera_session import IMAGE, MASK
+from hmt_ros.sessions.handled import Fault, Output
+from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D, NO_KEYPOINTS
+from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState, everything
+from msg_tools.messages import keypoints
+from msg_tools.messages.images import ImageError, decode_image, image_message
+from msg_tools.messages.keypoints import keypoints_message, positions_message
+
+TOPICS = {
+    KEYPOINTS: PublishedTopic(keypoints.KEYPOINTS_2D),
+    KEYPOINTS_3D: PublishedTopic(keypoints.KEYPOINTS_3D),
+    MASK: PublishedTopic('sensor_msgs/msg/Image'),
+}
+
+
+@dataclass(frozen=True)
+class KeypointsState(SessionState):
+    """State of the detection: its status is 'waiting', 'nobody' or 'detecting'.
+
+    Of the counts 'detected' are images with or without somebody, 'empty' those without.
+
+    Attributes:
+        landmarks: number of those that were found in the last image.
+    """
+
+    landmarks: int = 0
+
+    def summary(self) -> str:
+        """The present detection in a few words."""
+        return f'{self.landmarks} landmarks'
+
+    def values(self) -> list[tuple[str, str]]:
+        """Keys and values of the diagnostics."""
+        return [
+            ('images without a person', str(self.counts['empty'])),
+            ('landmarks', str(self.landmarks)),
+        ]
+
+
+class KeypointsSession(Session[KeypointsParameters, KeypointsState]):
+    """Detects the keypoints of one person; see `Session` for arguments and attributes."""
+
+    TOPICS = TOPICS
+    COUNTED = IMAGE
+    UNIT = 'image'
+    DONE = 'detected'
+    ESTIMATE = 'the sequence'
+    CHECKED = ()
+
+    def __init__(
+        self,
+        parameters: KeypointsParameters,
+        publish: Callable[[Output], None],
+        wanted: Callable[[str], bool] = everything,
+    ) -> None:
+        super().__init__(parameters, publish, wanted)
+        self._detector = MediaPipePose(
+            parameters.detector_python, with_mask=parameters.publish_mask
+        )
+        self._newest: int | None = None
+        self._landmarks = 0
+        self.state = self._present_state()
+
+    def _forget(self) -> None:
+        # The detector sees by the stamps that a new sequence begins.
+        self._newest = None
+        self._landmarks = 0
+
+    def _take(self, source: str, message: Any, stamp: int) -> None:
+        order = self._order(stamp, self._newest)
+        if order is Order.SKIPPED:
+            return
+        if order is Order.JUMP:
+            self.restart()
+        try:
+            image = decode_image(message)
+            found = self._detector.detect(image, stamp)
+        except ImageError as error:
+            self._log.skip(Fault.IMAGE, str(error))
+            return
+        except DetectorError as error:
+            self._log.skip(Fault.DETECTOR, f'image of {stamp} ns: {error}')
+            return
+        self._newest = stamp
+        self._landmarks = 0 if found is None else len(found.names)
+        self._log.counts['detected'] += 1
+        self._log.counts['empty'] += found is None
+        self._publish_found(
+            NO_KEYPOINTS if found is None else found, stamp, str(message.header.frame_id)
+        )
+
+    def _publish_found(self, found: Keypoints, stamp: int, frame_id: str) -> None:
+        messages = self._messages
+        if self._wanted(KEYPOINTS):
+            self._publish(KEYPOINTS, stamp, keypoints_message(messages, found, stamp, frame_id))
+        if self._wanted(KEYPOINTS_3D):
+            self._publish(KEYPOINTS_3D, stamp, positions_message(messages, found, stamp, frame_id))
+        mask = self._detector.mask
+        if mask is not None and self._wanted(MASK):
+            picture = np.where(mask, np.uint8(255), np.uint8(0))
+            self._publish(MASK, stamp, image_message(messages, picture, stamp, frame_id))
+
+    def _present_state(self) -> KeypointsState:
+        if self._newest is None:
+            status, wants = 'waiting', 'an image'
+        else:
+            status, wants = 'detecting' if self._landmarks else 'nobody', ''
+        return KeypointsState(status, wants, **self._totals(), landmarks=self._landmarks)

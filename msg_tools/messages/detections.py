@@ -1,0 +1,144 @@
+"""People in the messages of other detectors, as keypoints of a scheme.
+
+- hri_msgs/Skeleton2D (REP 155): one person, 18 landmarks in units of the image.
+- yolo_msgs/DetectionArray (yolo_ros): people with an id, landmarks that are numbered from 1.
+- std_msgs/Float32MultiArray: rows u, v or u, v, confidence, px, of one person, or of several with
+  an outermost dimension. The label of the outermost dimension may be the stamp of the image, ns.
+
+vision_msgs has no message with keypoints.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.image.keypoint_schemes import Scheme, schemes
+from hmt_ros.image.terms.keypoints import Keypoints
+from msg_tools.messages.keypoints import checked_keypoints
+from msg_tools.messages.message_error import MessageError
+
+Array = NDArray[np.float64]
+
+SKELETON_2D, YOLO = 'hri_msgs/msg/Skeleton2D', 'yolo_msgs/msg/DetectionArray'
+FLOATS = 'std_msgs/msg/Float32MultiArray'
+# People in one image.
+MAX_PEOPLE = 1000
+
+
+class DetectedPerson(NamedTuple):
+    """A person in an image.
+
+    Attributes:
+        name: identity that the detector gives; '' if it gives none.
+        keypoints: all landmarks of the scheme; their covariances are unknown.
+    """
+
+    name: str
+    keypoints: Keypoints
+
+
+def person_of_skeleton(message: Any, width: int, height: int) -> DetectedPerson:
+    """The person in an hri_msgs/Skeleton2D.
+
+    Args:
+        message: the message.
+        width, height: size of the image, px.
+
+    Raises:
+        MessageError: another number of landmarks, numbers that are no positions.
+    """
+    scheme = schemes()['skeleton2d']
+    wanted = len(scheme.names)
+    if len(message.skeleton) != wanted:
+        raise MessageError(f'Skeleton2D has {len(message.skeleton)} points, wanted {wanted}')
+    rows = np.array([(p.x, p.y, p.c) for p in message.skeleton], dtype=np.float64)
+    rows[(rows[:, :2] == 0).all(1)] = np.nan, np.nan, 0.0
+    # (0, 0) is the edge of the first pixel, whose centre is the origin here.
+    rows[:, :2] = rows[:, :2] * (width, height) - 0.5
+    return _person('', scheme, rows)
+
+
+def people_of_yolo(message: Any, scheme: Scheme) -> list[DetectedPerson]:
+    """The people with keypoints in a yolo_msgs/DetectionArray.
+
+    Args:
+        message: the message.
+        scheme: whose order the numbers of the keypoints follow.
+
+    Raises:
+        MessageError: a number that the scheme does not have, or one that is there twice; numbers
+            that are no positions.
+    """
+    _check_count(len(message.detections))
+    people = []
+    for detection in message.detections:
+        points = detection.keypoints.data
+        if not len(points):
+            continue
+        rows = np.full((len(scheme.names), 3), (np.nan, np.nan, 0.0))
+        numbers = [int(point.id) for point in points]
+        for number, point in zip(numbers, points, strict=True):
+            if not 1 <= number <= len(rows):
+                raise MessageError(
+                    f'keypoint has the id {number}, wanted 1 to {len(rows)} of the scheme '
+                    f'{scheme.name}'
+                )
+            rows[number - 1] = point.point.x, point.point.y, point.score
+        if len(set(numbers)) < len(numbers):
+            twice = next(number for number in numbers if numbers.count(number) > 1)
+            raise MessageError(f'detection {detection.id!r} has the keypoint {twice} twice')
+        people.append(_person(str(detection.id), scheme, rows))
+    return people
+
+
+def people_of_floats(message: Any, scheme: Scheme) -> list[DetectedPerson]:
+    """The people in a std_msgs/Float32MultiArray.
+
+    Args:
+        message: (n, 2) or (n, 3), or (people, n, 2) or (people, n, 3); without dimensions, one
+            person. An empty array says that nobody was seen.
+        scheme: with n landmarks, in the order of the rows.
+
+    Raises:
+        MessageError: another shape; numbers that are no positions.
+    """
+    n = len(scheme.names)
+    data = np.array(message.data, dtype=np.float64)[int(message.layout.data_offset) :]
+    if data.size == 0:
+        return []
+    shape = tuple(int(dimension.size) for dimension in message.layout.dim)
+    if not shape:
+        shape = (n, data.size // n)
+    if len(shape) == 2:
+        shape = (1, *shape)
+    if len(shape) != 3 or shape[1] != n or shape[2] not in (2, 3) or data.size != np.prod(shape):
+        seen = 'x'.join(str(dimension.size) for dimension in message.layout.dim) or 'no'
+        raise MessageError(
+            f'array has {data.size} numbers in {seen} dimensions, wanted {n}x2 or {n}x3 of the '
+            f'scheme {scheme.name}, or as many for each of several people'
+        )
+    _check_count(shape[0])
+    rows = np.ones((*shape[:2], 3))
+    rows[..., : shape[2]] = data.reshape(shape)
+    return [_person('', scheme, each) for each in rows]
+
+
+def stamp_of_floats(message: Any) -> int | None:
+    """The stamp of the image of a std_msgs/Float32MultiArray, ns; None where it does not say."""
+    dimensions = message.layout.dim
+    label = str(dimensions[0].label) if len(dimensions) else ''
+    return int(label) if label.isascii() and label.isdigit() and len(label) < 20 else None
+
+
+def _person(name: str, scheme: Scheme, rows: Array) -> DetectedPerson:
+    return DetectedPerson(
+        name, checked_keypoints(scheme.names, rows[:, :2].copy(), rows[:, 2].copy())
+    )
+
+
+def _check_count(count: int) -> None:
+    if count > MAX_PEOPLE:
+        raise MessageError(f'message has {count} people, the limit is {MAX_PEOPLE}')

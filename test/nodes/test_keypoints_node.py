@@ -1,0 +1,120 @@
+"""The keypoints node itself, over DDS, with a stand-in and with MediaPipe."""
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hmt_ros.sessions import keypoints_session
+from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+from msg_tools import BagReader
+from test.sessions.test_keypoints_session import StubDetector
+
+pytestmark = pytest.mark.ros
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = ROOT / 'hmt_ros' / 'config' / 'keypoints_node.yaml'
+CLIP = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video' / 'wander'
+
+
+@pytest.fixture
+def world(world_of):
+    from sensor_msgs.msg import CompressedImage, Image
+
+    from hmt_ros.nodes.keypoints_node import KeypointsNode
+
+    def make(**values):
+        inputs = {'image': Image}
+        if values.get('image_transport') == 'compressed':
+            inputs = {'image/compressed': CompressedImage}
+        return world_of(KeypointsNode, 'keypoints_node', inputs, **values)
+
+    return make
+
+
+def listening(one):
+    """Messages of all topics of the node, by topic."""
+    from hmt_msgs.msg import Keypoints2D, Keypoints3D
+    from sensor_msgs.msg import Image
+
+    found = {'keypoints': [], 'keypoints_3d': [], 'mask': []}
+    for kind, topic in zip((Keypoints2D, Keypoints3D, Image), found, strict=True):
+        one.listen(kind, topic, found[topic])
+        one.spin_until(lambda topic=topic: one.node._is_wanted(topic))
+    return found
+
+
+def stamp_of(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+def test_images_become_keypoints(world, somebody, monkeypatch):
+    monkeypatch.setattr(keypoints_session, 'MediaPipePose', StubDetector)
+    one = world(publish_mask=True).start()
+    found = listening(one)
+    for message in (somebody.image(0), somebody.empty(1)):
+        published = one.send('image', message).published
+        assert [topic for topic, _ in published] == list(found)
+    one.spin_until(lambda: all(len(messages) == 2 for messages in found.values()))
+    assert [len(message.names) for message in found['keypoints']] == [33, 0]
+    assert [len(message.x) for message in found['keypoints_3d']] == [33, 0]
+    assert [any(message.data) for message in found['mask']] == [True, False]
+    for messages in found.values():
+        assert [stamp_of(message) for message in messages] == [somebody.stamp(i) for i in (0, 1)]
+    level, text, values = one.diagnosis()
+    assert (level, text) == (0, 'nobody, 0 landmarks')
+    assert (values['images detected'], values['images without a person']) == ('2', '1')
+    one.assert_described(KeypointsParameters())
+
+
+def test_lifecycle(world, somebody, monkeypatch):
+    monkeypatch.setattr(keypoints_session, 'MediaPipePose', StubDetector)
+    one = world(autostart=False)
+    one.node.start()
+    assert one.change_state('configure')
+    assert one.change_state('activate')
+    one.connect()
+    assert one.send('image', somebody.image(0)).faults == ()
+    assert one.change_state('deactivate')
+    assert one.change_state('cleanup')
+    assert one.state == 'unconfigured'
+
+
+def test_without_a_detector_one_line_says_what_to_do(executable):
+    lines = executable('keypoints_node', '-p', 'detector_python:=/bin/false').stop_at(
+        'can not run MediaPipe'
+    )
+    (line,) = (line for line in lines if 'can not run MediaPipe' in line)
+    assert '[ERROR]' in line
+    assert 'run "make mediapipe"' in line
+
+
+def test_mediapipe_itself(world, mediapipe):
+    """It finds in images of the topic what it found when the clip was made."""
+    if not CLIP.is_dir():
+        pytest.skip(f'no development clip in {CLIP} (set HMT_SHARED)')
+    with np.load(CLIP / 'keypoints_mediapipe.npz') as file:
+        pixels, world_positions = file['pixels'], file['world']
+    one = world(image_transport='compressed', detector_python=mediapipe, publish_mask=True).start()
+    found = listening(one)
+    with BagReader(CLIP) as bag:
+        for _, stored in zip(range(5), bag.messages(['image/compressed'])):
+            assert one.send('image', stored.message, 'image/compressed').faults == ()
+    one.spin_until(lambda: all(len(messages) == 5 for messages in found.values()))
+    for index, message in enumerate(found['keypoints']):
+        np.testing.assert_allclose(np.stack([message.u, message.v], 1), pixels[index], atol=0.5)
+        lifted = found['keypoints_3d'][index]
+        positions = np.stack([lifted.x, lifted.y, lifted.z], 1)
+        np.testing.assert_allclose(positions, world_positions[index], atol=0.01)
+    mask = np.array(found['mask'][0].data).reshape(480, 640)
+    assert set(np.unique(mask)) == {0, 255}
+    _, _, _, height = cv2.boundingRect(mask)
+    seen = pixels[0]
+    assert height == pytest.approx(np.ptp(seen[:, 1]), rel=0.3)
+
+
+def test_ends_cleanly(executable, mediapipe):
+    node = executable('keypoints_node', '--params-file', str(CONFIG))
+    assert len(node.stop_at('images from /image')) == 1

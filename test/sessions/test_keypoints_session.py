@@ -1,0 +1,125 @@
+"""The rules of the detection, with a detector that costs nothing."""
+
+import numpy as np
+import pytest
+
+from hmt_ros.detectors.mediapipe_pose import DetectorError
+from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.sessions import keypoints_session
+from hmt_ros.sessions.camera_session import IMAGE
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.handled import Handled
+from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+from hmt_ros.sessions.keypoints_session import TOPICS, KeypointsSession
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.images import decode_mask
+from msg_tools.messages.keypoints import keypoints_of, positions_of
+
+NAMES = schemes()['mediapipe33'].names
+
+
+class StubDetector:
+    """What `MediaPipePose` shows; somebody is where the image is white."""
+
+    def __init__(self, python, with_mask):
+        if python == 'nowhere':
+            raise DetectorError('nowhere can not run MediaPipe')
+        self.with_mask, self.mask, self.fault = with_mask, None, None
+
+    def detect(self, image, stamp_ns):
+        if self.fault is not None:
+            raise self.fault
+        seen = (image == 250).all(2)
+        self.mask = seen if self.with_mask else None
+        if not seen.any():
+            return None
+        pixels = np.tile(np.argwhere(seen)[0, ::-1].astype(float), (33, 1))
+        covariances = np.full((33, 2, 2), np.nan)
+        return Keypoints(NAMES, pixels, covariances, np.full(33, 0.5), np.full((33, 3), 0.25))
+
+
+@pytest.fixture
+def session(outputs, monkeypatch):
+    monkeypatch.setattr(keypoints_session, 'MediaPipePose', StubDetector)
+
+    def make(wanted=lambda topic: True, **values):
+        parameters = with_values(KeypointsParameters(), values)
+        return KeypointsSession(parameters, outputs.append, wanted)
+
+    return make
+
+
+def read(outputs):
+    """The messages of each image by topic, in their order."""
+    found = {}
+    for topic, stamp, data in outputs:
+        found.setdefault(stamp, {})[topic] = deserialise(data, TOPICS[topic].msgtype)
+    return list(found.values())
+
+
+def test_every_image_has_keypoints(session, outputs, somebody):
+    one = session(publish_mask=True)
+    assert (one.state.status, one.state.wants) == ('waiting', 'an image')
+    stamp = somebody.stamp(0)
+    assert one.take(IMAGE, somebody.image(0)) == Handled(
+        IMAGE, stamp, (), (), (('keypoints', stamp), ('keypoints_3d', stamp), ('mask', stamp))
+    )
+    (messages,) = read(outputs)
+    plane = messages['keypoints']
+    assert plane.header.frame_id == 'lens'
+    assert len(plane.covariance) == 0
+    keypoints = keypoints_of(plane, 5.0)
+    assert keypoints.names == NAMES
+    np.testing.assert_array_equal(keypoints.pixels, np.tile([20.0, 12.0], (33, 1)))
+    np.testing.assert_array_equal(keypoints.confidences, np.full(33, 0.5))
+    np.testing.assert_array_equal(positions_of(messages['keypoints_3d']).positions, 0.25)
+    assert decode_mask(messages['mask']).sum() == 240
+    assert (one.state.status, one.state.wants, one.state.landmarks) == ('detecting', '', 33)
+
+
+def test_nobody_is_an_answer(session, outputs, somebody):
+    one = session(publish_mask=True)
+    one.take(IMAGE, somebody.empty(0))
+    (messages,) = read(outputs)
+    assert len(messages['keypoints'].names) == len(messages['keypoints_3d'].names) == 0
+    assert not decode_mask(messages['mask']).any()
+    assert one.state.counts == {'received': 1, 'detected': 1, 'empty': 1}
+    assert (one.state.status, one.state.trouble()) == ('nobody', '')
+
+
+def test_only_what_is_wanted_is_published(session, outputs, somebody):
+    one = session(wanted=lambda topic: topic == 'keypoints', publish_mask=True)
+    one.take(IMAGE, somebody.image(0))
+    assert [output.topic for output in outputs] == ['keypoints']
+    two = session()
+    two.take(IMAGE, somebody.compressed(1))
+    assert [output.topic for output in outputs][1:] == ['keypoints', 'keypoints_3d']
+
+
+def test_what_goes_wrong_is_told(session, outputs, somebody):
+    one = session()
+    one.take(IMAGE, somebody.image(5))
+    (fault,) = one.take(IMAGE, somebody.image(5)).faults
+    assert 'wanted stamps that increase' in fault
+    (fault,) = one.take(IMAGE, somebody.image(4)).faults
+    assert 'with reset_on_time_jump the sequence would start anew' in fault
+    bad = somebody.image(6)
+    bad.encoding = 'morse'
+    assert 'morse' in one.take(IMAGE, bad).faults[0]
+    one._detector.fault = DetectorError('MediaPipe has ended: it says nothing')
+    (fault,) = one.take(IMAGE, somebody.image(7)).faults
+    assert fault == f'image of {somebody.stamp(7)} ns: MediaPipe has ended: it says nothing'
+    one._detector.fault = None
+    assert one.take(IMAGE, somebody.image(8)).faults == ()
+    assert one.state.counts['skipped'] == 4
+    with pytest.raises(ValueError, match='nowhere can not run MediaPipe'):
+        session(detector_python='nowhere')
+
+
+def test_time_that_jumps_back(session, outputs, somebody):
+    one = session(reset_on_time_jump=True)
+    one.take(IMAGE, somebody.image(5))
+    handled = one.take(IMAGE, somebody.image(1))
+    assert 'the sequence starts anew' in handled.warnings[0]
+    assert len(handled.published) == 2
