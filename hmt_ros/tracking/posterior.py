@@ -10,7 +10,7 @@ the user of a tracker adds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -173,6 +173,17 @@ class Posterior:
         """Log probabilities (N, E) of exchanges of sides before the image, of hypotheses."""
         anew = np.asarray(hypotheses.jumped.all(1), dtype=np.bool_)
         return self.exchanges.of(hypotheses.ancestors, anew)
+
+    def placing(self, observation: Observation) -> Posed | None:
+        """The prior and the squares of the distances from keypoints; None: there are none.
+
+        A limb or a person far from the keypoints is not drawn to them by a robust kernel.
+        """
+        if observation.keypoints is None or self.settings.likelihood.keypoints.weight == 0:
+            return None
+        robust = self.likelihood.keypoint_term(observation, None)
+        squares = replace(robust, settings=replace(robust.settings, scale=np.inf))
+        return Posed(self.body.skeleton, (squares, self.likelihood.pose_prior))
 
     def values(
         self, poses: Array, observation: Observation, textures: Textures | None, rows: Index

@@ -340,7 +340,7 @@ def _write(
         if result.with_keypoints is not None:
             result.with_keypoints += keypoints is not None
             content = keypoints or _NOBODY
-            message = keypoints_message(messages, content, stamp, FRAME_ID, covariances=False)
+            message = keypoints_message(messages, content, stamp, FRAME_ID)
             bag.write(KEYPOINTS, stamp, message)
             if lifts:
                 lifted = positions_message(messages, content, stamp, FRAME_ID)

@@ -3,7 +3,8 @@
     log p(jump) = log epsilon
 
 When every mode explains an image badly, the trunk may be wrong, and jumps of limbs do not mend it.
-Then poses of all headings at the same place are optimised, and the best are proposed.
+Then poses of all headings at the same place, or where the keypoints are, are optimised, and the
+best are proposed.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from hmt_ros.tracking.posterior import Posterior
 COUNT = 8
 # Newton steps from each.
 ITERATIONS = 12
+# Newton steps to the keypoints before, if there are any.
+PLACING_STEPS = 10
 # Number of optima that are proposed.
 KEPT = 4
 
@@ -57,6 +60,9 @@ class Headings:
         upright = body.prior_mean.copy()
         upright[:6] = pose[:6]
         starts = np.concatenate([turned(body, one, COUNT) for one in (pose, upright)])
+        placing = self.posterior.placing(observation)
+        if placing is not None:
+            starts = self.posterior.minimise(placing, starts, PLACING_STEPS).x
         term = self.posterior.of_image(observation)
         solved = self.posterior.minimise(term, starts, ITERATIONS)
         order = np.argsort(solved.value, kind='stable')[:KEPT]

@@ -9,7 +9,7 @@ rest of the body explains of the silhouette's outline costs a limb nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -102,18 +102,12 @@ class LimbSearch:
         ).x  # fmt: skip
 
     def _placed(self, pose: Array, starts: Array, observation: Observation) -> Array:
-        """Angles of the limb, from starts (A, chain dofs), that put it where its keypoints are.
-
-        A limb that is far from its keypoints is not drawn to them by a robust kernel.
-        """
-        p, own = self.posterior, self.dofs
-        if observation.keypoints is None or p.settings.likelihood.keypoints.weight == 0:
+        """Angles of the limb, from starts (A, chain dofs), that put it where its keypoints are."""
+        body, own, placing = self.posterior.body, self.dofs, self.posterior.placing(observation)
+        if placing is None:
             return starts[:0]
-        robust = p.likelihood.keypoint_term(observation, None)
-        squares = replace(robust, settings=replace(robust.settings, scale=np.inf))
-        seen = Posed(p.body.skeleton, (squares, p.likelihood.pose_prior))
         return minimise(
-            Restricted(seen, pose, own), starts, p.body.lower[own], p.body.upper[own],
+            Restricted(placing, pose, own), starts, body.lower[own], body.upper[own],
             step_scale=0.4, damping=1.0, max_iterations=PLACING_STEPS, tolerance=0.05,
         ).x  # fmt: skip
 

@@ -136,7 +136,7 @@ IMAGE, INFO = ('image', image(0)), ('camera_info', info(0))
         ),
         pytest.param(
             [INFO, ('keypoints', keypoints(0, [np.nan, 1.0])), IMAGE],
-            'keypoint head lies at (nan, 1.0), wanted numbers, or NaN twice',
+            'keypoint head lies at (nan, 1.0), wanted numbers, or NaN',
             id='nan in keypoints',
         ),
         pytest.param(
