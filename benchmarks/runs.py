@@ -48,6 +48,8 @@ Item = TypeVar('Item')
 Result = TypeVar('Result')
 IMAGES, BOTH, KEYPOINTS = 'images', 'images + keypoints', 'keypoints'
 INPUTS = (IMAGES, BOTH, KEYPOINTS)
+SUBJECT = 'subject'
+STARTS = (SUBJECT, KEYPOINTS)
 KEPT = ROOT / 'build' / 'benchmarks' / 'tracking'
 # Joints of a record: the origin, then those that are scored.
 JOINTS = (ORIGIN, *EVALUATED_JOINTS)
@@ -66,6 +68,7 @@ class Run:
         changes: settings of the tracker, by their path, that differ from the defaults.
         limit: number of images; None: all.
         size: of the images against those in the bag; other sizes go with images alone.
+        start: what the track starts from, one of `STARTS`.
     """
 
     folder: Path
@@ -74,6 +77,7 @@ class Run:
     changes: tuple[tuple[str, Any], ...] = ()
     limit: int | None = None
     size: float = 1.0
+    start: str = SUBJECT
 
     @property
     def clip(self) -> str:
@@ -169,11 +173,14 @@ def keypoints_only(settings: TrackerSettings) -> TrackerSettings:
     return replace(settings, likelihood=likelihood)
 
 
-def new_tracker(clip: Clip, body: Body, settings: TrackerSettings, seed: int) -> Tracker:
-    """A tracker that starts with the subject of a clip."""
+def new_tracker(
+    clip: Clip, body: Body, settings: TrackerSettings, seed: int, *, with_subject: bool = True
+) -> Tracker:
+    """A tracker that starts with the subject of a clip, or with whom its inputs show."""
     background = None if clip.background is None else BackgroundModel.from_image(clip.background)
     tracker = Tracker(body, clip.camera, settings, background, seed)
-    tracker.reset(subject_of(clip, body))
+    if with_subject:
+        tracker.reset(subject_of(clip, body))
     return tracker
 
 
@@ -203,7 +210,8 @@ def run(one: Run) -> Record:
     keypoints = None if one.inputs == IMAGES else read_detections(one.folder).keypoints
     if one.inputs == KEYPOINTS:
         settings = keypoints_only(settings)
-    return follow(clip, new_tracker(clip, body, settings, one.seed), one.seed, keypoints)
+    tracker = new_tracker(clip, body, settings, one.seed, with_subject=one.start == SUBJECT)
+    return follow(clip, tracker, one.seed, keypoints)
 
 
 def follow(

@@ -20,7 +20,16 @@ from numpy.typing import NDArray
 from benchmarks.clips import find_clips, read_clip, table
 from benchmarks.command import benchmark_parser, show
 from benchmarks.machine import description
-from benchmarks.runs import IMAGES, INPUTS, Run, changed, parsed_changes, run_all
+from benchmarks.runs import (
+    IMAGES,
+    INPUTS,
+    STARTS,
+    SUBJECT,
+    Run,
+    changed,
+    parsed_changes,
+    run_all,
+)
 from benchmarks.tracking_oracle import as_text as oracle_as_text
 from benchmarks.tracking_oracle import oracle
 from benchmarks.tracking_scores import detector_scores, interval, scores_of
@@ -108,6 +117,10 @@ def main(argv: list[str]) -> int:
     )
     parser.add_argument('--only', nargs='+', default=(), metavar='NAME', help='some of the clips')
     parser.add_argument('--inputs', nargs='+', choices=INPUTS, default=INPUTS)
+    parser.add_argument(
+        '--start', choices=STARTS, default=SUBJECT,
+        help='start from the subject file of a clip, or from its keypoints where they are an input',
+    )  # fmt: skip
     parser.add_argument('--seeds', type=int, nargs='+', default=SEEDS, metavar='N')
     parser.add_argument(
         '--parts', nargs='+', choices=PARTS, help='all, or none where settings are compared'
@@ -129,7 +142,7 @@ def main(argv: list[str]) -> int:
         result = measure(
             options.clips, options.only, options.inputs, options.seeds, parts,
             parsed_changes(options.against), options.processes, options.frames,
-            quick=options.quick,
+            quick=options.quick, start=options.start,
         )  # fmt: skip
     except ValueError as error:
         print(f'tracking: {error}', file=sys.stderr)
@@ -148,6 +161,7 @@ def measure(
     frames: int = 0,
     *,
     quick: bool = False,
+    start: str = SUBJECT,
 ) -> dict[str, Any]:
     """Everything that was asked for.
 
@@ -161,6 +175,7 @@ def measure(
         processes: number of processes; 0: one a core.
         frames: over so many images memory is followed.
         quick: 20 images a clip, one seed.
+        start: what tracks start from, one of `runs.STARTS`; with images alone always the subject.
 
     Raises:
         ValueError: there is no such clip, or it can not be read.
@@ -173,7 +188,7 @@ def measure(
         raise ValueError(f'none of the clips {list(only)} is there')
     lacking = [folder.name for folder in folders if not _has_keypoints(folder)]
     runs = [
-        Run(folder, given, seed, limit=limit)
+        Run(folder, given, seed, limit=limit, start=SUBJECT if given == IMAGES else start)
         for folder in folders
         for given in inputs
         if given == IMAGES or folder.name not in lacking

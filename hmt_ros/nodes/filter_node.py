@@ -52,18 +52,24 @@ class FilterNode(SessionNode[FilterSession, FilterParameters]):
             response.success, response.message = False, 'the node is not active'
             return response
         try:
-            start = prepare_start(session.parameters, request.initial, session.state.body)
+            start = prepare_start(
+                session.parameters, request.initial, session.state.body, request.box
+            )
         except ValueError as error:
             response.success, response.message = False, error_line(error)
             return response
         thread.restart(lambda: session.restart(start))
         response.success = True
-        if start.initial is None and start.parameters.use_predictions:
-            response.message = 'the next pose_prediction starts a new track'
-        elif start.initial is None:
-            response.message = 'the track is dropped; nothing starts a new one without subject_file'
-        else:
+        sources = start.parameters.sources
+        if start.box is not None or start.initial is not None:
             response.message = 'the next image starts a new track'
+        elif sources:
+            response.message = f'the next image with {" or ".join(sources)} starts a new track'
+        else:
+            response.message = (
+                'the track is dropped; nothing starts a new one without subject_file, '
+                'use_keypoints, use_mask or use_predictions'
+            )
         return response
 
 

@@ -63,13 +63,14 @@ class FilterParameters(CameraNodeParameters):
 
     Attributes:
         subject_file: YAML file with the joints of the person in one image, which starts the track;
-            if empty, a pose_prediction (with use_predictions) or a mixture (by ~/reset) starts it.
+            if empty, keypoints (with use_keypoints), a mask (with use_mask), a pose_prediction
+            (with use_predictions), or a mixture or a box (by ~/reset) starts it.
         background_file: Image of the empty scene as the camera sees it; if empty, the background is
             learned from the images before the track starts.
         body_model: Body model, 'human37', 'human34', 'human32' or a YAML file.
         random_seed: Seed of all random numbers; the same images give the same results.
-        use_keypoints: If true, keypoints are a measurement, and an image waits for the keypoints of
-            its stamp.
+        use_keypoints: If true, keypoints are a measurement and start the track where there is no
+            subject_file, and an image waits for the keypoints of its stamp.
         keypoint_scheme: What the names of keypoints mean, 'auto' (recognised by the names),
             'joints' (the joints of the body themselves), or a scheme of detectors: 'coco17',
             'halpe26', 'body25', 'mediapipe33', 'h36m17' or 'skeleton2d'.
@@ -144,6 +145,16 @@ class FilterParameters(CameraNodeParameters):
             raise ValueError(
                 'floor_in_gravity_frame needs the name of gravity_frame, which is empty'
             )
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What may start a track that has no subject_file."""
+        used = {
+            'keypoints of a person': self.use_keypoints,
+            'a mask of a person': self.use_mask,
+            'a pose_prediction with components': self.use_predictions,
+        }
+        return tuple(source for source, use in used.items() if use)
 
     @property
     def uses_transforms(self) -> bool:

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -41,9 +41,10 @@ from hmt_ros.sessions.camera_session import (
     WaitingImage,
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.filter_state import IN_BACKGROUND, FilterState
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D, KeypointInputs
-from hmt_ros.sessions.session import SessionState, everything
+from hmt_ros.sessions.session import everything
 from hmt_ros.sessions.track_messages import (
     TOPICS,
     Presentation,
@@ -78,53 +79,6 @@ PREDICTION = 'pose_prediction'
 RESHAPED = 0.005
 # A person hardly moves meanwhile.
 _SAME_MOMENT_NS = SECOND_NS // 5
-_IN_BACKGROUND = 'the background was learned with the person in it'
-
-
-@dataclass(frozen=True)
-class FilterState(SessionState):
-    """State of the filter: its status is 'no camera', or a value of `Status`.
-
-    Attributes:
-        body: of the present track; None: there is none.
-        modes: components of the posterior.
-        misfit: share of the image that no mode explains.
-        evaluations: of the likelihood in the last image.
-        background: what is known of it, in a few words.
-        doubted: whether it was learned with the person in it, and is not known again.
-        track_id: number of the present track, or of the last one; 0 before the first.
-    """
-
-    body: Body | None = None
-    modes: int = 0
-    misfit: float = 0.0
-    evaluations: int = 0
-    background: str = 'unknown'
-    doubted: bool = False
-    track_id: int = 0
-
-    def summary(self) -> str:
-        """The present estimate in a few words."""
-        return f'{self.modes} modes'
-
-    def trouble(self) -> str:
-        """Whether the track is lost, nobody is in view, or the background is of no use."""
-        if self.status == Status.NOBODY.value:
-            return 'nobody in view'
-        if self.status == Status.LOST.value:
-            return f'lost: misfit {self.misfit:.2f}'
-        return f'{_IN_BACKGROUND}; {self.background}' if self.doubted else ''
-
-    def values(self) -> list[tuple[str, str]]:
-        """Keys and values of the diagnostics."""
-        return [
-            ('track', str(self.track_id)),
-            ('modes', str(self.modes)),
-            ('entropy of the weights, nats', f'{self.entropy:.3f}'),
-            ('misfit', f'{self.misfit:.3f}'),
-            ('background', self.background),
-            ('evaluations of the likelihood', str(self.evaluations)),
-        ]
 
 
 class FilterSession(CameraSession[FilterParameters, FilterState]):
@@ -296,7 +250,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             if trusted and self._tracker.silhouettes.doubted:
                 self._report_background(self._tracker.silhouettes.share, stamp)
             if starts and posterior is not None:
-                self._report_old_start(stamp)
+                self._report_start(self._tracker, stamp)
             if posterior is not None and likelihood is not None:
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
             elif len(self._weights):
@@ -308,7 +262,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 return
             # The next image would fail as this one did, after as long a time.
             self._log.skip(Fault.START, f'no track starts at the image of {stamp} ns: {text}')
-            self.restart(replace(self.start, background=None, initial=None))
+            self.restart(replace(self.start, background=None, initial=None, box=None))
 
     def _look_at_frames(self, waiting: WaitingImage) -> None:
         """Looks up what transforms tell of gravity and of the camera at an image."""
@@ -318,13 +272,15 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     def _report_background(self, share: float, stamp_ns: int) -> None:
         self._log.note(
             Fault.BACKGROUND,
-            f'{_IN_BACKGROUND}, of whom only {share:.0%} are foreground in the image of {stamp_ns} '
+            f'{IN_BACKGROUND}, of whom only {share:.0%} are foreground in the image of {stamp_ns} '
             'ns: silhouettes are not used until the scene has been seen where the person is now; '
             'give background_file, or begin with the empty scene',
         )
 
-    def _report_old_start(self, stamp_ns: int) -> None:
-        initial = self.start.initial
+    def _report_start(self, tracker: Tracker, stamp_ns: int) -> None:
+        initial, source = self.start.initial, tracker.started_from
+        if initial is None and source is not None:
+            self._log.tell(f'the track starts from {source.value} at the image of {stamp_ns} ns')
         if isinstance(initial, Subject) and stamp_ns - initial.stamp_ns > _SAME_MOMENT_NS:
             age = (stamp_ns - initial.stamp_ns) / SECOND_NS
             self._log.note(
@@ -400,6 +356,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     def _present_state(self) -> FilterState:
         tracker = self._tracker if len(self._weights) else None
         silhouettes = None if self._tracker is None else self._tracker.silhouettes
+        source = None if self._tracker is None else self._tracker.started_from
         return FilterState(
             *self._status_and_wants(),
             **self._totals(),
@@ -410,6 +367,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             background='unknown' if silhouettes is None else silhouettes.known,
             doubted=silhouettes is not None and silhouettes.doubted,
             track_id=0 if self._tracker is None else self._tracker.track_id,
+            started_from='' if source is None else source.value,
         )
 
     def _status(self) -> tuple[str, str]:
@@ -418,12 +376,16 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
 
     def _wants(self) -> str:
         initial = self.start.initial
-        if initial is None and self.parameters.use_predictions:
-            return 'a pose_prediction with components'
-        if initial is None:
-            return 'subject_file, use_predictions, or ~/reset with a mixture'
-        if isinstance(initial, GaussianMixture):
+        sources = self.parameters.sources
+        if self.start.box is not None or isinstance(initial, GaussianMixture):
             return 'an image'
+        if initial is None and sources:
+            return ' or '.join(sources)
+        if initial is None:
+            return (
+                'subject_file, use_keypoints, use_mask, use_predictions, or ~/reset with a mixture '
+                'or a box'
+            )
         return f'an image of {initial.stamp_ns} ns or later, where the subject was seen'
 
 

@@ -74,7 +74,7 @@ class Handled:
         source: where it came from.
         stamp_ns: of the message.
         faults: why it, or something that waited for it, could not be used; empty if it was used.
-        warnings: for the log: the first fault of each kind, an estimate that starts anew.
+        warnings: for the log: the first fault of each kind, and where an estimate starts.
         published: (topic, stamp) of all messages that were published, in their order.
     """
 
@@ -118,6 +118,10 @@ class HandlingLog:
         self.last_fault = one_line(text)
         if warn or self.faults[kind.value] == 1:
             self._warned.append(self.last_fault)
+
+    def tell(self, text: str) -> None:
+        """Logs something that is no fault."""
+        self._warned.append(one_line(text))
 
     def skip(self, kind: Fault | MessageFault, text: str) -> None:
         """Reports a message that was to be estimated from and can not be used."""

@@ -1,4 +1,4 @@
-"""The start of a track: body, background, subject or mixture, all read and checked at once."""
+"""The start of a track: body, background, subject, mixture or box, read and checked at once."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.observation import Box
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_session import read_picture
 from hmt_ros.sessions.filter_parameters import FilterParameters
@@ -28,13 +29,16 @@ class TrackStart:
         parameters: of the track.
         body: the model, or for a mixture the body that its poses are of.
         background: (H, W, 3) BGR image of the empty scene, or None: to be learned.
-        initial: prior of the first image; None: a prediction has to start the track.
+        initial: prior of the first image; None: keypoints, a mask or a prediction start the track.
+        box: (left, top, right, bottom) in which the person is in the next image, px, before
+            `initial`; None: unknown.
     """
 
     parameters: FilterParameters
     body: Body
     background: NDArray[np.uint8] | None
     initial: Subject | GaussianMixture | None
+    box: Box | None = None
 
     def tracker(self, camera: Camera, ground: KnownGround | None = None) -> Tracker:
         """A tracker that waits for its first image.
@@ -44,7 +48,7 @@ class TrackStart:
             ground: what is known of gravity and of the floor; None: what the parameters tell.
 
         Raises:
-            ValueError: the background was taken by another camera.
+            ValueError: the background was taken by another camera, or the box is not in its image.
         """
         p = self.parameters
         background = BackgroundModel(p.background)
@@ -60,12 +64,15 @@ class TrackStart:
         tracker = Tracker(
             self.body, camera, p.tracker, background, p.random_seed, known_ground=known
         )
-        tracker.reset(self.initial)
+        tracker.reset(self.initial, box=self.box)
         return tracker
 
 
 def prepare_start(
-    parameters: FilterParameters, mixture: Any = None, present: Body | None = None
+    parameters: FilterParameters,
+    mixture: Any = None,
+    present: Body | None = None,
+    region: Any = None,
 ) -> TrackStart:
     """Reads the files that the parameters name.
 
@@ -73,6 +80,7 @@ def prepare_start(
         parameters: of the track.
         mixture: hmt_msgs/PoseMixture to start from; without components or None: the subject file.
         present: body of the present track, if any: a mixture without segment lengths is about it.
+        region: sensor_msgs/RegionOfInterest in which the person is; None, or of no width: unknown.
 
     Raises:
         ValueError: a file or a mixture that can not be used; one line that says why.
@@ -87,7 +95,16 @@ def prepare_start(
         body, initial = body_of(content, body), content.mixture
     elif parameters.subject_file:
         initial = read_subject(parameters.subject_file, body)
-    return TrackStart(parameters, body, background, initial)
+    return TrackStart(parameters, body, background, initial, _box_of(region))
+
+
+def _box_of(region: Any) -> Box | None:
+    if region is None or region.width == 0:
+        return None
+    if region.height == 0:
+        raise ValueError(f'box has the width {region.width} and the height 0: wanted an area')
+    left, top = int(region.x_offset), int(region.y_offset)
+    return left, top, left + int(region.width), top + int(region.height)
 
 
 def _body(model: str) -> Body:

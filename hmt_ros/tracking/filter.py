@@ -459,8 +459,9 @@ class MixtureFilter:
         fit = self._posterior.fit(poses, observation)
         covariances = alone = filtered
         if observation.evidence:
-            alone = self._posterior.covariances(fit, solved.free[rows])
-            covariances = alone + self.shape.considered(
+            alone = covariances = self._posterior.covariances(fit, solved.free[rows])
+        if observation.evidence or observation.keypoints is not None:
+            covariances = covariances + self.shape.considered(
                 self._posterior.likelihood, observation, poses,
                 self._posterior.given_way(poses, observation)[1],
             )  # fmt: skip

@@ -19,19 +19,20 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.ground_terms import without_root_lean
-from hmt_ros.body.kinematics import forward, joint_length_jacobians, point_jacobians
+from hmt_ros.body.kinematics import directed_derivatives, forward, joint_length_jacobians
 from hmt_ros.body.length_prior import held
 from hmt_ros.body.pose_terms import Posed
 from hmt_ros.flips.best_combinations import distinct_poses
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
-from hmt_ros.image.observation import Observation
+from hmt_ros.image.observation import Box, Observation
 from hmt_ros.image.terms.image_term import TermSettings
-from hmt_ros.image.terms.keypoints import NOT_EXCHANGED, Keypoints
+from hmt_ros.image.terms.keypoints import NOT_EXCHANGED, Keypoints, KeypointTerm
 from hmt_ros.image.terms.silhouette import Outline
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import Derivatives, EnergyFunction, EnergyTerm, Quadratic
+from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.gravity import Gravity
 from hmt_ros.tracking.subject import Subject
 
@@ -39,6 +40,9 @@ from hmt_ros.tracking.subject import Subject
 # a skull and a heel that are not the model's, m.
 MEASURED, STATURE_MEASURED = 0.01, 0.02
 HEADINGS = 8
+LEAST_SQUARES = TermSettings(1.0, 1.0, np.inf)
+# Standard deviation of the place of a person of whom a box is known, as a share of the distance.
+BOX_SIGMA = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +95,7 @@ def start_from_keypoints(
     spread = np.linalg.inv(fits.hessian[best[0]])[d:, d:]
     body = replace(body, length_covariance=0.5 * (spread + spread.T))
 
-    least_squares = LikelihoodSettings.of_terms(keypoints=TermSettings(1.0, 1.0, np.inf))
+    least_squares = LikelihoodSettings.of_terms(keypoints=LEAST_SQUARES)
     settings = replace(least_squares, prior_weight=prior_weight)
     leaning = body if upright is None else without_root_lean(body)
     likelihood = ImageLikelihood(leaning, camera, settings)
@@ -119,6 +123,43 @@ def poses_from_keypoints(
 def poses_from_outline(body: Body, camera: Camera, outline: Outline) -> Array:
     """Mean poses (HEADINGS, d) of all headings, as high and where the silhouette is."""
     low, high = np.quantile(outline.pixels, 0.02, axis=0), np.quantile(outline.pixels, 0.98, axis=0)
+    return _poses_between(body, camera, low, high)
+
+
+def mixture_from_box(body: Body, camera: Camera, box: Box) -> GaussianMixture:
+    """Mean poses of all headings in a box (left, top, right, bottom), px.
+
+    Limbs are as uncertain as the prior of the body says, the place by a share of the distance.
+    """
+    poses = _poses_between(body, camera, np.array(box[:2], float), np.array(box[2:], float))
+    variances = np.tile(
+        np.where(np.isfinite(body.prior_sigma), body.prior_sigma, 0.5) ** 2, (HEADINGS, 1)
+    )
+    places = np.flatnonzero(~body.skeleton.dof_is_rotation)
+    variances[:, places] = (BOX_SIGMA * poses[:, 2:3]) ** 2
+    variances[:, body.dof_names.index('root_z')] = (np.pi / HEADINGS) ** 2
+    covariances = variances[:, :, None] * np.eye(body.dimension)
+    return GaussianMixture(np.full(HEADINGS, 1.0 / HEADINGS), poses, covariances)
+
+
+def check_box(box: Box, camera: Camera) -> None:
+    """Checks a box (left, top, right, bottom) in which a person is to be, px.
+
+    Raises:
+        ValueError: no finite numbers, a box without an area, or one beside the image.
+    """
+    left, top, right, bottom = box
+    if not np.isfinite(box).all() or left >= right or top >= bottom:
+        raise ValueError(f'a box must be (left, top, right, bottom) with an area, saw {tuple(box)}')
+    if right <= 0 or bottom <= 0 or left >= camera.width or top >= camera.height:
+        raise ValueError(
+            f'a box must lie in the image of {camera.width}x{camera.height} pixels, '
+            f'saw {tuple(box)}'
+        )
+
+
+def _poses_between(body: Body, camera: Camera, low: Array, high: Array) -> Array:
+    """Mean poses (HEADINGS, d) of all headings between two corners (2,) of a box, px."""
     middle = 0.5 * (low + high)
     ends = camera.rays(np.array([[middle[0], low[1]], [middle[0], high[1]], middle]))
     ends = ends / ends[:, 2:]
@@ -159,10 +200,9 @@ def _fit_with_lengths(
     """Fits (pose, lengths) to the joints from several headings; x is (HEADINGS, d + L)."""
     skeleton = body.skeleton
     d, count = body.dimension, len(skeleton.length_names)
-    which = skeleton.joint_index(keypoints.names)
-    seen = np.asarray(np.isfinite(keypoints.pixels).all(1), dtype=np.bool_)
-    precision = np.linalg.inv(keypoints.covariances) * seen[:, None, None]
-    target = np.where(seen[:, None], keypoints.pixels, 0.0)
+    # Slopes of bones that were lifted are weighed once the lengths are known.
+    term = KeypointTerm(skeleton, camera, replace(keypoints, positions=None), LEAST_SQUARES)
+    residuals = 2 * int(keypoints.seen.sum())
     sigma = body.length_sigma
     length_precision = np.asarray(np.linalg.inv(body.length_covariance), dtype=np.float64)
     leaning, lean = body, None
@@ -181,25 +221,23 @@ def _fit_with_lengths(
         for i in range(len(x)):
             own = skeleton.with_lengths(dict(zip(skeleton.length_names, lengths[i], strict=True)))
             frames = forward(own, poses[i : i + 1])
-            points = frames.joints()[which]
-            by_pose = point_jacobians(frames, skeleton.joint_segments[which], points)[..., 0]
-            by_length = joint_length_jacobians(own, poses[i : i + 1])[0][which]
-            pixels, projection = camera.project_with_derivative(points[..., 0].T)
-            if not np.isfinite(pixels).all():
+            joints, places, directions, error, _ = replace(term, skeleton=own).residuals(frames)
+            if len(error) < residuals:
                 value[i], gradient[i], hessian[i] = np.inf, 0.0, np.eye(d + count)
                 continue
-            error = pixels.T - target
+            lengthened = joint_length_jacobians(own, poses[i : i + 1])[0][joints]
             jacobian = np.concatenate(
                 [
-                    np.einsum('aij,jdi->jad', projection, by_pose),
-                    np.einsum('aij,jil->jal', projection, by_length),
+                    directed_derivatives(
+                        frames, skeleton.joint_segments[joints], places, directions
+                    ),
+                    np.einsum('mk,mkl->ml', directions, lengthened),
                 ],
-                axis=2,
+                axis=1,
             )
-            weighted = np.einsum('jab,jbd->jad', precision, jacobian)
-            value[i] = 0.5 * np.einsum('ja,jab,jb->', error, precision, error)
-            gradient[i] = np.einsum('jad,ja->d', weighted, error)
-            hessian[i] = np.einsum('jad,jae->de', weighted, jacobian)
+            value[i] = 0.5 * error @ error
+            gradient[i] = error @ jacobian
+            hessian[i] = jacobian.T @ jacobian
             if lean is not None:
                 of_lean = lean.energy(frames, rows[i : i + 1])
                 slope, curvature = of_lean.derivatives()
@@ -241,7 +279,7 @@ def _first_guesses(
     body: Body, camera: Camera, keypoints: Keypoints, upright: Gravity | None
 ) -> Array:
     """Mean poses at several headings, where the joints are and as far as their spread says."""
-    seen = np.asarray(np.isfinite(keypoints.pixels).all(1), dtype=np.bool_)
+    seen = keypoints.seen
     pixels = keypoints.pixels[seen]
     names = [x for x, ok in zip(keypoints.names, seen, strict=True) if ok]
     rays = camera.rays(pixels)

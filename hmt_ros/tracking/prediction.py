@@ -20,6 +20,7 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.energy import Quadratic, Sum
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
+from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses
 from hmt_ros.tracking.motion_states import PredictedStates
 from hmt_ros.tracking.posterior import Posterior
@@ -65,6 +66,28 @@ def predicted_states(
     has_velocities = dynamics.state_dimension > dynamics.dimension
     wandered = body.rates * dt if has_velocities else np.zeros(body.dimension)
     return PredictedStates(dynamics, *dynamics.predict(means, covariances, dt), wandered)
+
+
+def expected_poses(
+    modes: Modes, weights: Array, body: Body, motion: str, dt: float
+) -> GaussianMixture:
+    """The mixture over poses after dt seconds in which nothing is seen.
+
+    Args:
+        modes: of the last image in which the person was seen.
+        weights: (K,) of the modes, as they were published.
+        body: with the limits.
+        motion: the setting.
+        dt: time since that image, s.
+    """
+    d = body.dimension
+    known = modes.state_covariances.copy()
+    # What is published of the poses is less certain than what is propagated.
+    known[:, :d, :] = known[:, :, :d] = 0.0
+    known[:, :d, :d] = modes.covariances
+    states = predicted_states(modes, known, body, dynamics_of(body, motion), dt)
+    means = np.clip(states.poses, body.lower, body.upper)
+    return GaussianMixture(weights, means, states.pose_covariances)
 
 
 def follow_flow(

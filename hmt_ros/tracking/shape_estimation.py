@@ -33,7 +33,7 @@ LEAST_LENGTH_SIGMA = 0.008
 WANDERING = 0.02
 # Largest change by one image, and in all, in standard deviations over people.
 LARGEST_STEP, LARGEST = 0.5, 3.0
-# A pose gives way by this much at most while its shape is estimated, rad or m.
+# An angle gives way by this much at most while the shape is estimated, rad.
 LARGEST_SHIFT = 0.2
 
 
@@ -119,8 +119,7 @@ class ShapeEstimate:
         ):
             linear = self.linearised(likelihood, observation, pose)
             given_way = covariance @ linear.mixed.T
-            shift = covariance @ gradient
-            shift *= min(1.0, LARGEST_SHIFT / max(float(np.abs(shift).max()), 1e-12))
+            shift = self._limited(covariance @ gradient, covariance)
             information += weight * (linear.curvature - linear.mixed @ given_way)
             pull += weight * (linear.by_shape - linear.mixed @ shift)
         before = self.covariance + np.diag((WANDERING * self._spread) ** 2 * dt)
@@ -151,7 +150,8 @@ class ShapeEstimate:
         result = np.empty_like(covariances)
         for k, (pose, covariance) in enumerate(zip(poses, covariances, strict=True)):
             moved = covariance @ self.linearised(likelihood, observation, pose).mixed.T
-            result[k] = moved @ self.covariance @ moved.T
+            added = moved @ self.covariance @ moved.T
+            result[k] = 0.5 * (added + added.T)
         return result
 
     def linearised(
@@ -174,6 +174,26 @@ class ShapeEstimate:
             )
         weighted = by_shape * curvature[:, None]
         return Linearised(by_shape.T @ pull, weighted.T @ by_shape, weighted.T @ by_pose)
+
+    def _limited(self, shift: Array, covariance: Array) -> Array:
+        """A shift (d,) of a pose whose angles are limited.
+
+        The root goes where it then is best: an image does not tell the size of a person from the
+        distance, and a root that was held back would.
+        """
+        if np.abs(shift).max(initial=0.0) <= LARGEST_SHIFT:
+            return shift
+        turns = self._space.body.skeleton.dof_is_rotation
+        excess = shift[turns] * (
+            1.0 - min(1.0, LARGEST_SHIFT / max(float(np.abs(shift[turns]).max()), 1e-12))
+        )
+        among = covariance[np.ix_(turns, turns)]
+        result = shift.copy()
+        result[turns] -= excess
+        # Angles that rest on a limit have no variance.
+        by_turns = np.linalg.lstsq(among, excess, rcond=1e-12)[0]
+        result[~turns] -= covariance[np.ix_(~turns, turns)] @ by_turns
+        return result
 
     def _of_keypoints(
         self, frames: Frames, term: KeypointTerm

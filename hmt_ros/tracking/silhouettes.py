@@ -31,6 +31,8 @@ LEAST_FOREGROUND = 0.35
 INSIDE, AROUND = 0.01, 0.06
 # Largest share of the person's area that may be unknown where silhouettes are used.
 MOST_UNKNOWN = 0.02
+# Margin around all joints of all modes, as a fraction of their extent: where the silhouette may be.
+REGION_MARGIN = 0.3
 
 
 class Silhouettes:
@@ -110,6 +112,22 @@ class Silhouettes:
         trusted, self.doubted = not self.doubted, not known
         if known and not trusted:
             self.check(image, body, camera, poses[:1])
+
+
+def region_of(body: Body, camera: Camera, poses: Array) -> Box | None:
+    """Where a person in poses (K, d) can be in the next image; None: anywhere."""
+    pixels = camera.project(body.joint_positions(poses)).reshape(-1, 2)
+    pixels = pixels[np.isfinite(pixels).all(1)]
+    if len(pixels) == 0:
+        return None
+    low, high = pixels.min(0), pixels.max(0)
+    margin = REGION_MARGIN * max(float((high - low).max()), 1.0)
+    size = (camera.width, camera.height)
+    left, top = (int(x) for x in np.clip(np.floor(low - margin), 0, size))
+    right, bottom = (int(x) for x in np.clip(np.ceil(high + margin), 0, size))
+    if right - left < 2 or bottom - top < 2:
+        return None
+    return left, top, right, bottom
 
 
 def _area(body: Body, camera: Camera, poses: Array) -> Mask:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,39 +24,32 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.beginning import (
+    Arrival,
+    Beginning,
+    Source,
+    beginning_given,
+    beginning_seen,
+    poses_to_search,
+    time_to_first,
+    time_to_next,
+)
 from hmt_ros.tracking.camera_motion import SHIFTED, CameraPath, CameraPose
 from hmt_ros.tracking.facing import Track
 from hmt_ros.tracking.gravity import Gravity
 from hmt_ros.tracking.ground import Ground, GroundEstimator, KnownGround, unit_vector
 from hmt_ros.tracking.hypotheses import Modes
-from hmt_ros.tracking.initialisation import (
-    poses_from_keypoints,
-    poses_from_outline,
-    start_from_keypoints,
-)
+from hmt_ros.tracking.initialisation import check_box
 from hmt_ros.tracking.point_estimate import PointEstimate
-from hmt_ros.tracking.prediction import dynamics_of, predicted_states
-from hmt_ros.tracking.presence import (
-    FEWEST_KEYPOINTS,
-    MOST_CHANGED,
-    ROUNDING,
-    Presence,
-    View,
-    looks_like_person,
-    sees_person,
-)
+from hmt_ros.tracking.prediction import expected_poses
+from hmt_ros.tracking.presence import Presence, View
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
-from hmt_ros.tracking.silhouettes import Silhouettes
+from hmt_ros.tracking.silhouettes import Silhouettes, region_of
 from hmt_ros.tracking.subject import Subject
 
-# A new track starts when somebody has been seen for so long, s; if a side of the image may cut the
-# silhouette, when it has been seen for the longer time.
-ARRIVAL, ARRIVAL_AT_BORDER = 0.2, 0.6
 # The person may be where modes say that have at least this log weight, nats; the sign is changed.
 LIKELY = 4.0
-# Margin around all joints of all modes, as a fraction of their extent: where the silhouette may be.
-REGION_MARGIN = 0.3
 # Share of the time for which somebody stands on both feet, where contact is unknown.
 RESTING = 0.3
 
@@ -65,26 +57,10 @@ RESTING = 0.3
 class Status(Enum):
     """What the tracker is doing."""
 
-    WAITING = 'waiting'  # for the image that the subject's joints were seen in
+    WAITING = 'waiting'  # for the image that the subject's joints were seen in, or for somebody
     TRACKING = 'tracking'
     LOST = 'lost'
     NOBODY = 'nobody'  # is in view
-
-
-class _Beginning(NamedTuple):
-    """What `Track.begin` is given of a start; see there."""
-
-    body: Body
-    start: GaussianMixture | Array
-    both_ways: bool
-    clicked: Keypoints | None = None
-
-    @property
-    def best(self) -> Array:
-        """The most probable pose (1, d)."""
-        if isinstance(self.start, GaussianMixture):
-            return self.start.means[[int(np.argmax(self.start.weights))]]
-        return self.start[:1]
 
 
 class Tracker:
@@ -106,6 +82,7 @@ class Tracker:
         contacts: probabilities that the feet stand on the floor, by name.
         evaluations: of the likelihood in the last image.
         track_id: number of the present track, or of the last one; 0 before the first.
+        started_from: what that track began from; None before the first.
     """
 
     def __init__(
@@ -124,14 +101,16 @@ class Tracker:
         self.silhouettes = Silhouettes(background or BackgroundModel())
         self.evaluations = 0
         self.track_id = 0
+        self.started_from: Source | None = None
         self._seed = seed
         self._start: Subject | GaussianMixture | None = None
+        self._box: Box | None = None
         self._extra = tuple(extra)
         self._ground = GroundEstimator(known_ground)
         self._track = self._new_track(body)
         self._point = PointEstimate()
         self._presence = Presence(self.settings.absence_time)
-        self._arrived: int | None = None
+        self._arrival = Arrival()
         self._last_image: Image | None = None
         self._last_stamp: int | None = None
         self._followed: int | None = None
@@ -140,20 +119,31 @@ class Tracker:
         self._newer_gravity: KnownGround | None = None
         self._scene_pose: CameraPose | None = None
 
-    def reset(self, start: Subject | GaussianMixture | None = None) -> None:
-        """Drops the track; the next image starts a new one.
+    def reset(
+        self, start: Subject | GaussianMixture | None = None, *, box: Box | None = None
+    ) -> None:
+        """Drops the track; a new one starts.
 
         Args:
             start: a subject, whose track starts at the first image at or after its stamp, or a
-                mixture over poses of the present body, or None: the start that was given last.
+                mixture over poses of the present body, or None: the start that was given last. If
+                none was given, keypoints, a mask or a prediction start it, whichever comes first.
+            box: (left, top, right, bottom) in which the person is in the next image, px; the track
+                starts there.
+
+        Raises:
+            ValueError: a mixture of another dimension, or a box that is not in the image.
         """
         if isinstance(start, GaussianMixture) and start.dimension != self.body.dimension:
             raise ValueError(
                 f'a start for {self.body.name} has {self.body.dimension} dimensions, '
                 f'saw {start.dimension}'
             )
+        if box is not None:
+            check_box(box, self.camera)
         if start is not None:
             self._start = start
+        self._box = box
         self._drop_track()
         self._presence = Presence(self.settings.absence_time)
         self._last_stamp = None
@@ -177,9 +167,9 @@ class Tracker:
             keypoints: joints seen in this image; without any that was seen: the detector saw
                 nobody. None: there is no detector, or it has not answered.
             prediction: poses that a regression expects by this image, if any. They start a track
-                that has no other start, with the lengths that they assume, are among the hypotheses
-                of every image, and of a lost track; they are no evidence, which would count the
-                image twice.
+                that has no other start, and no keypoints that suffice, with the lengths that they
+                assume, are among the hypotheses of every image, and of a lost track; they are no
+                evidence, which would count the image twice.
             mask: (H, W) where a segmenter sees the person, which replaces background subtraction;
                 all false: it sees nobody; None: unknown.
             nobody_predicted: whether that regression saw nobody in this image.
@@ -337,7 +327,7 @@ class Tracker:
         self._track = self._new_track(self.body)
         self._point = PointEstimate()
         self._ground.reset()
-        self._arrived = None
+        self._arrival = Arrival()
         self._last_image, self._followed = None, None
 
     def _take(
@@ -376,18 +366,17 @@ class Tracker:
         self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool
     ) -> Observation | None:
         """Starts a track, if it starts at this image; returns what it was started with."""
-        if self._presence.absent:
-            if not self._has_arrived(view, stamp, prediction):
+        if self._presence.absent and self._box is None:
+            if not self._arrival.lasts(stamp, time_to_next(view, prediction)):
                 return None
             observation = self._observe(view, None)
             self._begin_next(observation, stamp, prediction)
         else:
-            start = self._start_at(stamp, prediction)
-            if start is None:
-                mask = view.silhouette if masked else None
-                self.silhouettes.learn(view.image, mask)
+            beginning = self._beginning(view, stamp, prediction, masked=masked)
+            if beginning is None:
+                if not self._arrival.somebody:
+                    self.silhouettes.learn(view.image, view.silhouette if masked else None)
                 return None
-            beginning = self._beginning(start, view.keypoints)
             if not masked:
                 self.silhouettes.check(view.image, beginning.body, self.camera, beginning.best)
                 if self.silhouettes.doubted:
@@ -399,38 +388,38 @@ class Tracker:
                 observation = self._observe(view, beginning.best[0])
                 self._begin(observation, beginning, stamp)
         self.track_id += 1
+        self._box = None
         self._presence = Presence(self.settings.absence_time)
         self._is_seen(view, stamp)
         return observation
 
+    def _beginning(
+        self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool
+    ) -> Beginning | None:
+        """What a track starts from at an image; None: it does not start there."""
+        start, box, gravity = self._start, self._box, self._gravity
+        if start is not None and box is None:
+            if isinstance(start, Subject) and stamp < start.stamp_ns:
+                return None
+            return beginning_given(start, self.model, self.body, self.camera, gravity)
+        if box is None:
+            wanted = time_to_first(view, self.model, prediction, masked=masked)
+            if not self._arrival.lasts(stamp, wanted):
+                return None
+        return beginning_seen(
+            view, self.model, self.camera, gravity, prediction, box,
+            lambda: self._observe(view, None),
+        )  # fmt: skip
+
     def _expected(self, stamp: int) -> GaussianMixture:
         """The posterior of a time at which nothing is seen."""
         assert self._followed is not None
-        modes, body, d = self.modes, self.body, self.body.dimension
         dt = (stamp - self._followed) * 1e-9
-        known = modes.state_covariances.copy()
-        # What is published of the poses is less certain than what is propagated.
-        known[:, :d, :] = known[:, :, :d] = 0.0
-        known[:, :d, :d] = modes.covariances
-        dynamics = dynamics_of(body, self.settings.motion)
-        states = predicted_states(modes, known, body, dynamics, dt)
-        means = np.clip(states.poses, body.lower, body.upper)
-        return GaussianMixture(self.posterior.weights, means, states.pose_covariances)
+        motion = self.settings.motion
+        return expected_poses(self.modes, self.posterior.weights, self.body, motion, dt)
 
     def _is_seen(self, view: View, stamp: int) -> bool:
         return self._presence.sees(view, stamp, self.body, self.camera, self.modes.poses[0])
-
-    def _has_arrived(self, view: View, stamp: int, prediction: PosePrediction | None) -> bool:
-        """Whether somebody has been in view for long enough to start the next track."""
-        if not self._shows_somebody(view, prediction):
-            self._arrived = None
-            return False
-        if self._arrived is None:
-            self._arrived = stamp
-        wanted = ARRIVAL
-        if view.silhouette is not None and view.silhouette[:, [0, -1]].any():
-            wanted = ARRIVAL_AT_BORDER
-        return (stamp - self._arrived) * 1e-9 + ROUNDING >= wanted
 
     def _begin_next(
         self, observation: Observation, stamp: int, prediction: PosePrediction | None
@@ -440,42 +429,16 @@ class Tracker:
         assert poses is not None
         magnification = self.camera.magnification(float(np.median(poses[:, 2])))
         observation = replace(observation, magnification=magnification)
-        both_ways = observation.keypoints is None
-        self._track.begin(self.body, poses, observation, stamp, both_ways=both_ways)
+        self.started_from = Source.ARRIVAL
+        self._track.begin(self.body, poses, observation, stamp, both_ways=True)
 
-    def _shows_somebody(self, view: View, prediction: PosePrediction | None) -> bool:
-        """Whether somebody is in an image, of whom a track does not know yet."""
-        if sees_person(view.keypoints):
-            return True
-        if view.silhouette is None:
-            return prediction is not None
-        return view.changed <= MOST_CHANGED and looks_like_person(view.silhouette)
-
-    def _start_at(
-        self, stamp: int, prediction: PosePrediction | None
-    ) -> Subject | GaussianMixture | PosePrediction | None:
-        """What a track starts from at an image; None: it does not start there."""
-        start = self._start
-        if start is None:
-            return prediction
-        return None if isinstance(start, Subject) and stamp < start.stamp_ns else start
-
-    def _beginning(
-        self, start: Subject | GaussianMixture | PosePrediction, keypoints: Keypoints | None
-    ) -> _Beginning:
-        """The body and the poses that a track begins with."""
-        if isinstance(start, Subject):
-            begun = start_from_keypoints(self.model, self.camera, start, upright=self._gravity)
-            return _Beginning(begun.body, begun.poses, both_ways=False, clicked=start.keypoints)
-        if isinstance(start, PosePrediction):
-            poses = start.both_ways(start.body)
-            return _Beginning(start.body, poses, both_ways=keypoints is None)
-        return _Beginning(self.body, start, both_ways=False)
-
-    def _begin(self, observation: Observation, beginning: _Beginning, stamp: int) -> None:
+    def _begin(self, observation: Observation, beginning: Beginning, stamp: int) -> None:
         """Starts the track."""
-        body, start, both_ways, clicked = beginning
-        self._track.begin(body, start, observation, stamp, both_ways=both_ways, clicked=clicked)
+        self.started_from = beginning.source
+        self._track.begin(
+            beginning.body, beginning.start, observation, stamp,
+            both_ways=beginning.both_ways, clicked=beginning.clicked,
+        )  # fmt: skip
 
     def _follow(
         self, observation: Observation, stamp: int, prediction: PosePrediction | None
@@ -487,26 +450,13 @@ class Tracker:
             dt = (stamp - self._followed) * 1e-9
             self._track.propagate(observation, stamp, dt, prediction)
         else:
-            both_ways = observation.keypoints is None
-            self._track.begin_anew(poses, observation, stamp, both_ways=both_ways)
+            self._track.begin_anew(poses, observation, stamp, both_ways=True)
 
     def _poses_to_search(
         self, observation: Observation, prediction: PosePrediction | None
     ) -> Array | None:
-        """Poses (N, d) that a lost track starts anew from, by an image alone; None: it shows none.
-
-        The body keeps its lengths and flesh. From keypoints come all poses that explain them, from
-        a silhouette mean poses of several headings at its place, and what was predicted.
-        """
-        found = []
-        keypoints = observation.keypoints
-        if keypoints is not None and np.isfinite(keypoints.pixels).all(1).sum() >= FEWEST_KEYPOINTS:
-            found.append(poses_from_keypoints(self.body, self.camera, keypoints, self._gravity))
-        elif observation.outline is not None:
-            found.append(poses_from_outline(self.body, self.camera, observation.outline))
-        if prediction is not None:
-            found.append(prediction.both_ways(self.body).means)
-        return np.concatenate(found) if found else None
+        """See `poses_to_search`."""
+        return poses_to_search(self.body, self.camera, observation, prediction, self._gravity)
 
     def _view(
         self,
@@ -545,15 +495,4 @@ class Tracker:
         """Where the person can be in the next image; None: anywhere."""
         if not self._track.begun or self._track.lost:
             return None
-        pixels = self.camera.project(self.body.joint_positions(self.modes.poses)).reshape(-1, 2)
-        pixels = pixels[np.isfinite(pixels).all(1)]
-        if len(pixels) == 0:
-            return None
-        low, high = pixels.min(0), pixels.max(0)
-        margin = REGION_MARGIN * max(float((high - low).max()), 1.0)
-        size = (self.camera.width, self.camera.height)
-        left, top = (int(x) for x in np.clip(np.floor(low - margin), 0, size))
-        right, bottom = (int(x) for x in np.clip(np.ceil(high + margin), 0, size))
-        if right - left < 2 or bottom - top < 2:
-            return None
-        return left, top, right, bottom
+        return region_of(self.body, self.camera, self.modes.poses)

@@ -14,6 +14,7 @@ from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions import bme_session, track_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
+from hmt_ros.tracking.beginning import Source
 from hmt_ros.tracking.ground import Ground
 from msg_tools import RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
@@ -39,7 +40,7 @@ class StubTracker:
         self.background = background
         self.silhouettes = SimpleNamespace(doubted=False, share=0.9, known='known')
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
-        self.track_id = 0
+        self.track_id, self.started_from = 0, None
         self.known_ground = known_ground
         up = np.array([0.0, -1.0, 0.0]) if known_ground.up is None else known_ground.up
         self.ground = Ground(up, 0.1, known_ground.camera_height, 0.02)
@@ -53,8 +54,8 @@ class StubTracker:
         self._start = None
         StubTracker.made.append(self)
 
-    def reset(self, start=None):
-        self._start = start
+    def reset(self, start=None, *, box=None):
+        self._start, self._box = start, box
 
     def set_gravity(self, up, camera_height=None):
         self.gravities.append(up)
@@ -81,6 +82,7 @@ class StubTracker:
             raise self.fault
         if self._start is None and prediction is not None:
             self._start = prediction.mixture
+            self.started_from = Source.PREDICTION
         if self._start is None or (
             isinstance(self._start, Subject) and stamp < self._start.stamp_ns
         ):

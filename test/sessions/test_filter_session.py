@@ -14,6 +14,7 @@ from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.track_start import prepare_start
+from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 from test.sessions.conftest import JOINTS, Likelihoods
@@ -655,7 +656,40 @@ def test_nothing_starts_without_a_subject(session, small_camera, outputs):
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
     assert tracked(outputs) == []
-    assert one.state.wants == 'subject_file, use_predictions, or ~/reset with a mixture'
+    assert one.state.wants.startswith('subject_file, use_keypoints, use_mask, use_predictions, or')
+
+
+def test_keypoints_may_start_a_track(session, small_camera):
+    one = session(subject_file='', use_keypoints=True, use_mask=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    assert one.state.wants == 'keypoints of a person or a mask of a person'
+
+
+def test_what_a_track_starts_from_is_told(session, small_camera, likelihoods, stub_tracker):
+    one = session(subject_file='', use_predictions=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(PREDICTION, likelihoods.message(1, kind=MixtureKind.PREDICTION))
+    (text,) = one.take(IMAGE, small_camera.image(1)).warnings
+    stamp = small_camera.stamp(1)
+    assert text == f'the track starts from a pose prediction at the image of {stamp} ns'
+    assert dict(one.state.values())['started from'] == 'a pose prediction'
+    assert not one.state.faults
+
+
+def test_restarts_from_a_box(session, small_camera, stub_tracker, outputs):
+    one = session()
+    region = RosbagsMessages().create(
+        'sensor_msgs/msg/RegionOfInterest', x_offset=4, y_offset=2, width=10, height=20,
+        do_rectify=False,
+    )  # fmt: skip
+    one.restart(prepare_start(one.parameters, region=region))
+    one.take(CAMERA_INFO, small_camera.info())
+    assert one.state.wants == 'an image'
+    one.take(IMAGE, small_camera.image(0))
+    assert stub_tracker.made[0]._box == (4, 2, 14, 22)
+    region.height = 0
+    with pytest.raises(ValueError, match='box has the width 10 and the height 0'):
+        prepare_start(one.parameters, region=region)
 
 
 def test_settings_reach_the_tracker(session, small_camera, stub_tracker, background_file):
@@ -718,7 +752,7 @@ def test_failed_start_is_told_and_not_tried_again(session, small_camera, stub_tr
     stub_tracker.fault = None
     one.take(IMAGE, small_camera.image(1))
     assert tracked(outputs) == []
-    assert one.state.wants == 'subject_file, use_predictions, or ~/reset with a mixture'
+    assert one.state.wants.startswith('subject_file, use_keypoints, use_mask, use_predictions, or')
     one.restart()
     one.take(IMAGE, small_camera.image(2))
     assert tracked(outputs) == [small_camera.stamp(2)]

@@ -24,6 +24,7 @@ from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.posterior import WIDEST, Posterior
 from hmt_ros.tracking.shape_estimation import (
     LARGEST,
+    LARGEST_SHIFT,
     LARGEST_STEP,
     LEAST_LENGTH_SIGMA,
     SPREAD,
@@ -177,13 +178,13 @@ def test_a_shape_wanders_between_images(human37):
 
 
 def test_steps_and_shapes_have_limits(human37):
-    estimate, _ = toy(human37, 3)
+    estimate, _ = toy(human37, 3, pose_size=human37.dimension)
     estimate.measured = 1e3 * estimate.measured
     spread = np.sqrt(np.diagonal(estimate.covariance))
-    update(estimate, np.zeros(6))
+    update(estimate, np.zeros(human37.dimension))
     assert np.abs(estimate.theta() / spread).max() == pytest.approx(LARGEST_STEP)
     for _ in range(30):
-        update(estimate, np.zeros(6))
+        update(estimate, np.zeros(human37.dimension))
     furthest = np.abs(estimate.theta() / spread)
     assert furthest.max() == pytest.approx(LARGEST)
     assert all(min(part.radii) > 0 for part in estimate.body.flesh.parts)
@@ -390,3 +391,31 @@ def test_what_is_considered_is_that_of_the_uncertain_shape(human37, poses, obser
     estimate.covariance = 0.25 * estimate.covariance
     found = estimate.considered(posterior.likelihood, observation, poses[:2], covariances)
     assert np.trace(found, axis1=1, axis2=2) == pytest.approx(0.25 * before)
+
+
+def test_keypoints_tell_nothing_of_the_size(human37, poses):
+    """A person of twice the size at twice the distance looks alike, however far angles give way."""
+    settings = TrackerSettings(
+        likelihood=LikelihoodSettings.of_terms(keypoints=TermSettings(1.0, 1.0, np.inf))
+    )
+    posterior = Posterior(human37, CAMERA, settings)
+    pixels = CAMERA.project(human37.joint_positions(poses[2:3]))[0]
+    n = len(pixels)
+    seen = Keypoints(human37.joint_names, pixels, np.tile(9.0 * np.eye(2), (n, 1, 1)), np.ones(n))
+    observation = Observation(keypoints=seen)
+    (gradient,), (covariance,) = posterior.given_way(poses[:1], observation)
+    estimate = ShapeEstimate(human37)
+    linear = estimate.linearised(posterior.likelihood, observation, poses[0])
+    whole = covariance @ gradient
+    turns = human37.skeleton.dof_is_rotation
+    shift = estimate._limited(whole, covariance)
+    assert np.abs(whole[turns]).max() > LARGEST_SHIFT
+    assert np.abs(shift[turns]).max() == pytest.approx(LARGEST_SHIFT)
+    lengths = human37.skeleton.lengths
+    size = len(lengths)
+    free, limited = (linear.by_shape - linear.mixed @ x for x in (whole, shift))
+    scale = float(np.abs(linear.by_shape[:size] * lengths).sum())
+    assert abs(free[:size] @ lengths) < 5e-4 * scale
+    assert abs(limited[:size] @ lengths) < 5e-4 * scale
+    held = whole * (LARGEST_SHIFT / np.abs(whole).max())
+    assert abs((linear.by_shape - linear.mixed @ held)[:size] @ lengths) > 5e-3 * scale

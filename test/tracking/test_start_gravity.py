@@ -97,7 +97,7 @@ def test_a_tracker_passes_gravity_to_a_start_only_where_it_is_known(body, camera
         seen.append(upright)
         raise ValueError('enough')
 
-    monkeypatch.setattr('hmt_ros.tracking.tracker.start_from_keypoints', start)
+    monkeypatch.setattr('hmt_ros.tracking.beginning.start_from_keypoints', start)
     keypoints = Keypoints(('neck',), np.zeros((1, 2)), np.eye(2)[None], np.ones(1))
     image = np.zeros((camera.height, camera.width, 3), np.uint8)
     off = TrackerSettings(ground=GroundSettings(upright_weight=0.0))

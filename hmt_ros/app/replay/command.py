@@ -1,6 +1,7 @@
 """replay: tracks and smooths the person in a bag, offline or through live nodes, into a new bag.
 
-Without a subject file the track starts from the prediction of a trained model.
+Without a subject file the track starts from the keypoints in the bag, or from the prediction of a
+trained model.
 
 Both ways hand the same messages to the same objects in the same order, and write the results in the
 order in which they come: the bags are the same, byte for byte. `hmt_ros.sessions.track_messages`,
@@ -22,8 +23,8 @@ from hmt_ros.app.replay.options import ReplayOptions
 
 EPILOG = """\
 A track starts from a subject file, which gives the joints of the person in one image. Without one
-it starts from the prediction of a model trained on silhouettes (--bme), which does not know the
-size of the person:
+it starts from the keypoints of a detector, if the bag has some, or else from the prediction of a
+model trained on silhouettes (--bme); neither knows the size of the person:
 
   stamp_ns: 1700000000000000000          # stamp of that image
   sigma_px: 3.0                          # standard deviation of a click
@@ -106,7 +107,8 @@ def _parser() -> CommandParser:
         nargs='?',
         const='',
         metavar='MODEL',
-        help='also predict poses with a trained model and use them (always without --subject); '
+        help='also predict poses with a trained model and use them (always without --subject and '
+        'keypoints); '
         'without MODEL use the small model that comes with the package',
     )
     person.add_argument(

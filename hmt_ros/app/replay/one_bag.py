@@ -74,7 +74,8 @@ def replay_bag(source: Path, target: Path, options: ReplayOptions, tell: Tell) -
         # The files that the parameters name are read before a node starts.
         subject = prepare_start(parameters.filter).initial
         if subject is None and not options.quiet:
-            tell(f'no --subject: the track starts from a prediction{_subject_hint(source)}')
+            sources = ' or '.join(parameters.filter.sources)
+            tell(f'no --subject: the track starts from {sources}{_subject_hint(source)}')
         recorded = _used(recorded, parameters)
         with BagWriter(target, overwrite=options.overwrite) as out:
             topics = dict(track_messages.TOPICS)
@@ -243,7 +244,8 @@ def _why_nothing(result: Replayed, subject: object) -> str:
     if subject is None and not result.last_fault:
         return (
             f'nobody is seen in its {result.images} images: give an image of the empty scene by '
-            '--background FILE, or the joints of the person in one image by --subject FILE'
+            '--background FILE, the joints of the person in one image by --subject FILE, or a '
+            'bag with keypoints'
         )
     why = f': {result.last_fault}' if result.last_fault else ''
     return f'none of its {result.images} images was tracked{why}'

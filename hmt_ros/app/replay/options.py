@@ -109,7 +109,8 @@ def node_parameters(options: ReplayOptions, recorded: RecordedInput) -> NodePara
     tracking = _filter_parameters(options, recorded)
     smoothing = _smoother_parameters(options) if options.with_smoother else None
     predicting = None
-    if options.bme is not None or not tracking.subject_file:
+    started = tracking.subject_file or tracking.use_keypoints
+    if options.bme is not None or not started:
         predicting = _bme_parameters(options, recorded, tracking)
         tracking = replace(tracking, use_predictions=True)
     else:

@@ -246,7 +246,7 @@ def test_without_a_subject_somebody_must_be_seen(tmp_path, capsys):
     bag = write(tmp_path / 'bag', INFO, IMAGE)
     assert main([str(bag), '-o', str(out)]) == 1
     told, line = capsys.readouterr().err.splitlines()
-    assert told == 'replay: no --subject: the track starts from a prediction'
+    assert told == 'replay: no --subject: the track starts from a pose_prediction with components'
     assert 'nobody is seen in its 1 images: give an image of the empty scene by' in line
     assert not out.exists()
 

@@ -186,7 +186,10 @@ def test_without_a_subject_a_prediction_starts_the_track(short, tmp_path, capsys
     out = tmp_path / 'out'
     command = [str(short), '-o', str(out), '--background', str(REACH / 'background.png')]
     assert main(command) == 0
-    assert 'no --subject: the track starts from a prediction' in capsys.readouterr().err
+    assert (
+        'no --subject: the track starts from a pose_prediction with components'
+        in capsys.readouterr().err
+    )
     found = read(out)
     assert {len(found[topic]) for topic in ('pose_prediction', 'pose_mixture')} == {IMAGES}
     predicted = pose_mixture_of(found['pose_prediction'][0].message)

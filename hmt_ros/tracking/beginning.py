@@ -1,0 +1,287 @@
+"""What a track begins from, and when.
+
+    subject      at the image that its joints were seen in
+    mixture      at the next image
+    box          at the next image; keypoints or a prediction of that image come before it
+    nothing      at the first image, or once somebody has been seen for so long:
+
+        keypoints that suffice     0.1 s     most of the trunk, and 6 joints in all, with confidence
+        keypoints of a part        0.4 s     a person, with both shoulders or both hips
+        prediction                 at once
+        mask                       0.2 s, 0.6 s where a side of the image may cut it
+
+After a track has ended the next one starts once somebody has been seen for 0.2 s, or 0.6 s.
+
+Keypoints give poses, depth and lengths (see `initialisation`); a mask or a box gives mean poses of
+several headings. A detector may take left for right, and silhouettes do not tell sides at all: with
+every pose comes its reversal in depth, and both ways to face are followed (see `facing`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.mirror import reverse_depth
+from hmt_ros.image.observation import Box, Observation
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.gravity import Gravity
+from hmt_ros.tracking.initialisation import (
+    mixture_from_box,
+    poses_from_keypoints,
+    poses_from_outline,
+    start_from_keypoints,
+)
+from hmt_ros.tracking.presence import (
+    FEWEST_KEYPOINTS,
+    MOST_CHANGED,
+    ROUNDING,
+    View,
+    looks_like_person,
+    sees_person,
+)
+from hmt_ros.tracking.proposals import PosePrediction
+from hmt_ros.tracking.subject import Subject
+
+# A new track starts when somebody has been seen for so long, s; if a side of the image may cut the
+# silhouette, when it has been seen for the longer time.
+ARRIVAL, ARRIVAL_AT_BORDER = 0.2, 0.6
+# The first track starts from keypoints that have been seen for so long, s: one image alone may show
+# a detector somebody where nobody is. Of a part of a person more may be seen soon.
+SURE_KEYPOINTS, KEYPOINTS_OF_A_PART = 0.1, 0.4
+# A keypoint of this confidence is where it says, and this many of the joints of the trunk tell
+# where the person is and how the person is turned, as a fraction of all.
+CONFIDENT = 0.5
+MOST_OF_THE_TRUNK = 0.75
+# Number of the best poses from keypoints whose reversals in depth are searched, too.
+REVERSED = 24
+
+
+class Source(Enum):
+    """What a track began from."""
+
+    SUBJECT = 'the subject file'
+    MIXTURE = 'a mixture'
+    KEYPOINTS = 'keypoints'
+    PREDICTION = 'a pose prediction'
+    MASK = 'a mask'
+    BOX = 'a box'
+    ARRIVAL = 'who has come into view'
+
+
+@dataclass(frozen=True, eq=False)
+class Beginning:
+    """What `Track.begin` is given of a start; see there.
+
+    Attributes:
+        source: what it comes from.
+    """
+
+    source: Source
+    body: Body
+    start: GaussianMixture | Array
+    both_ways: bool
+    clicked: Keypoints | None = None
+
+    @property
+    def best(self) -> Array:
+        """The most probable pose (1, d)."""
+        if isinstance(self.start, GaussianMixture):
+            return self.start.means[[int(np.argmax(self.start.weights))]]
+        return self.start[:1]
+
+
+class Arrival:
+    """How long somebody has been in view of whom no track knows."""
+
+    def __init__(self) -> None:
+        self._since: int | None = None
+
+    @property
+    def somebody(self) -> bool:
+        """Whether somebody was seen in the last image."""
+        return self._since is not None
+
+    def lasts(self, stamp: int, wanted: float | None) -> bool:
+        """Whether that has been long enough.
+
+        Args:
+            stamp: of the image, ns.
+            wanted: time, s; None: the image shows nobody.
+        """
+        if wanted is None:
+            self._since = None
+            return False
+        if self._since is None:
+            self._since = stamp
+        return (stamp - self._since) * 1e-9 + ROUNDING >= wanted
+
+
+def time_to_first(
+    view: View, body: Body, prediction: PosePrediction | None, *, masked: bool
+) -> float | None:
+    """Time for which somebody must have been seen for a first track that has no start, s.
+
+    Args:
+        view: what the image shows.
+        body: model of the person.
+        prediction: by the image, if any.
+        masked: whether the silhouette is a segmenter's.
+
+    Returns:
+        None: the image shows nobody that a track could start from.
+    """
+    waits = []
+    if suffices(view.keypoints, body):
+        return SURE_KEYPOINTS
+    if prediction is not None:
+        return 0.0
+    if _shows_a_part(view.keypoints, body):
+        waits.append(KEYPOINTS_OF_A_PART)
+    if masked and view.silhouette is not None and looks_like_person(view.silhouette):
+        waits.append(_time_of_silhouette(view))
+    return min(waits, default=None)
+
+
+def time_to_next(view: View, prediction: PosePrediction | None) -> float | None:
+    """Time for which somebody must have been seen after a track has ended, s; None: nobody is."""
+    if view.silhouette is None:
+        shown = prediction is not None
+    else:
+        shown = view.changed <= MOST_CHANGED and looks_like_person(view.silhouette)
+    return _time_of_silhouette(view) if shown or sees_person(view.keypoints) else None
+
+
+def _time_of_silhouette(view: View) -> float:
+    cut = view.silhouette is not None and view.silhouette[:, [0, -1]].any()
+    return ARRIVAL_AT_BORDER if cut else ARRIVAL
+
+
+def suffices(keypoints: Keypoints | None, body: Body) -> bool:
+    """Whether keypoints tell at once where a person is and which way the person faces."""
+    if keypoints is None:
+        return False
+    names = _confident(keypoints)
+    trunk = [name for pair in body.trunk_pairs for name in pair]
+    of_trunk = sum(name in names for name in trunk)
+    return len(names) >= FEWEST_KEYPOINTS and of_trunk >= MOST_OF_THE_TRUNK * len(trunk)
+
+
+def _shows_a_part(keypoints: Keypoints | None, body: Body) -> bool:
+    """Whether keypoints are a person, and tell which way the person faces."""
+    if keypoints is None or not sees_person(keypoints):
+        return False
+    names = _confident(keypoints)
+    return any(left in names and right in names for left, right in body.trunk_pairs)
+
+
+def _confident(keypoints: Keypoints) -> set[str]:
+    sure = keypoints.seen & (keypoints.confidences >= CONFIDENT)
+    return {keypoints.names[i] for i in np.flatnonzero(sure)}
+
+
+def beginning_given(
+    start: Subject | GaussianMixture, model: Body, body: Body, camera: Camera,
+    upright: Gravity | None,
+) -> Beginning:  # fmt: skip
+    """The body and the poses that a track begins with, of a start that was given.
+
+    Args:
+        start: what it starts from.
+        model: body that a subject's lengths replace those of.
+        body: that the poses of a mixture are of.
+        camera: that sees the person.
+        upright: what is known of gravity.
+    """
+    if isinstance(start, GaussianMixture):
+        return Beginning(Source.MIXTURE, body, start, both_ways=False)
+    begun = start_from_keypoints(model, camera, start, upright=upright)
+    return Beginning(
+        Source.SUBJECT, begun.body, begun.poses, both_ways=False, clicked=start.keypoints
+    )
+
+
+def beginning_seen(
+    view: View,
+    model: Body,
+    camera: Camera,
+    upright: Gravity | None,
+    prediction: PosePrediction | None,
+    box: Box | None,
+    observed: Callable[[], Observation],
+) -> Beginning | None:
+    """The body and the poses that a track begins with, of what an image shows.
+
+    Args:
+        view: what the image shows.
+        model: body whose lengths are fitted to keypoints.
+        camera: that sees the person.
+        upright: what is known of gravity.
+        prediction: by the image, if any.
+        box: in which the person is, if one was given.
+        observed: makes the observation of the image.
+
+    Returns:
+        None: nobody is shown.
+    """
+    keypoints = view.keypoints
+    enough = suffices(keypoints, model)
+    if keypoints is not None and (
+        enough or (prediction is None and _shows_a_part(keypoints, model))
+    ):
+        begun = start_from_keypoints(model, camera, Subject(0, keypoints, {}), upright=upright)
+        poses = [with_reversals(begun.body, begun.poses)]
+        if prediction is not None:
+            poses.append(prediction.seen_as(begun.body).means)
+        return Beginning(Source.KEYPOINTS, begun.body, np.concatenate(poses), both_ways=True)
+    if prediction is not None:
+        both = prediction.both_ways(prediction.body)
+        return Beginning(Source.PREDICTION, prediction.body, both, both_ways=view.keypoints is None)
+    if box is not None:
+        start = mixture_from_box(model, camera, box)
+        return Beginning(Source.BOX, model, start, both_ways=True)
+    outline = observed().outline
+    if outline is None:
+        return None
+    return Beginning(Source.MASK, model, poses_from_outline(model, camera, outline), both_ways=True)
+
+
+def poses_to_search(
+    body: Body,
+    camera: Camera,
+    observation: Observation,
+    prediction: PosePrediction | None,
+    upright: Gravity | None,
+) -> Array | None:
+    """Poses (N, d) that a person may have by an image alone; None: it shows none.
+
+    The body keeps its lengths and flesh. From keypoints come all poses that explain them, from
+    a silhouette mean poses of several headings at its place, and what was predicted.
+    """
+    found = []
+    keypoints = observation.keypoints
+    if keypoints is not None and keypoints.seen.sum() >= FEWEST_KEYPOINTS:
+        explained = poses_from_keypoints(body, camera, keypoints, upright)
+        found.append(with_reversals(body, explained))
+    elif observation.outline is not None:
+        found.append(poses_from_outline(body, camera, observation.outline))
+    if prediction is not None:
+        found.append(prediction.both_ways(body).means)
+    return np.concatenate(found) if found else None
+
+
+def with_reversals(body: Body, poses: Array) -> Array:
+    """Poses (N, d), best first, and the reversals in depth of the best.
+
+    A reversal explains the same keypoints if the detector has taken left for right.
+    """
+    if not body.trunk_pairs:
+        return poses
+    return np.concatenate([poses, reverse_depth(body, poses[:REVERSED])])

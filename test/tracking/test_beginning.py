@@ -1,0 +1,234 @@
+"""What a track begins from without a subject: keypoints, masks and boxes."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hmt_ros.body.camera import Viewpoint
+from hmt_ros.body.mirror import left_directions
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.likelihood import LikelihoodSettings
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.motion.procedural_motion import procedural_motion
+from hmt_ros.rendering.renderer import render_silhouettes
+from hmt_ros.tracking import Status, Tracker, TrackerSettings
+from hmt_ros.tracking.beginning import Source, suffices, with_reversals
+
+FRAME = 100_000_000  # ns
+SHARED = Path(os.environ.get('HMT_SHARED', Path(__file__).resolve().parents[3] / 'shared'))
+FAST = TrackerSettings(
+    candidates=8, max_hypotheses=4, searched_chains=1,
+    likelihood=LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints),
+)  # fmt: skip
+# What COCO's detectors see.
+NAMES = tuple(
+    f'{side}_{x}'
+    for x in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
+    for side in ('left', 'right')
+)
+
+
+@pytest.fixture(scope='module')
+def black(camera):
+    return np.zeros((camera.height, camera.width, 3), np.uint8)
+
+
+@pytest.fixture(scope='module')
+def walk(human37):
+    return procedural_motion('walk', human37, 1.2, 10.0, 3, viewpoint=Viewpoint(distance=3.5))
+
+
+def detected(keypoints_of, body, pose, seed=0, names=NAMES, exchanged=False, sigma=2.0):
+    """Keypoints of some joints with the noise of a detector."""
+    every = keypoints_of(body, pose, sigma, seed)
+    called = list(names)
+    rows = [every.names.index(name) for name in names]
+    if exchanged:
+        called = [
+            x.replace('left', '?').replace('right', 'left').replace('?', 'right') for x in names
+        ]
+    part = every[np.array(rows)]
+    return replace(part, names=tuple(called))
+
+
+@pytest.fixture(scope='module')
+def start(human37, camera, black, keypoints_of, walk):
+    """Function (body, **of `detected`) -> tracker after some images."""
+
+    def run(body=human37, images=4, settings=FAST, **given):
+        tracker = Tracker(human37, camera, settings)
+        for i in range(images):
+            keypoints = detected(keypoints_of, body, walk[i], seed=i, **given)
+            tracker.step(black, i * FRAME, keypoints)
+        return tracker
+
+    return run
+
+
+def error(body, pose, true_body, true_pose):
+    """Mean distance of joints, from the pelvis, in the size of the true person, m."""
+    joints = body.joint_positions(pose[None])[0] * true_body.scale / body.scale
+    truth = true_body.joint_positions(true_pose[None])[0]
+    rows = [body.joint_names.index(x) for x in NAMES]
+    relative = (joints - joints[0]) - (truth - truth[0])
+    return float(np.linalg.norm(relative[rows], axis=1).mean())
+
+
+def test_keypoints_start_a_track_once_they_last(human37, camera, black, keypoints_of, walk):
+    tracker = Tracker(human37, camera, FAST)
+    seen = [detected(keypoints_of, human37, walk[i], seed=i) for i in range(3)]
+    nothing = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
+    # A person in one image may be a mistake.
+    for i, keypoints in enumerate((seen[0], nothing, seen[1])):
+        assert tracker.step(black, i * FRAME, keypoints) == (None, None)
+        assert tracker.status is Status.WAITING
+    posterior, _ = tracker.step(black, 3 * FRAME, seen[2])
+    assert tracker.status is Status.TRACKING
+    assert tracker.started_from is Source.KEYPOINTS
+    assert error(tracker.body, posterior.means[0], human37, walk[2]) < 0.08
+    # The background is not learned with the person in it.
+    assert tracker.background.frames == 1
+
+
+@pytest.mark.parametrize('stature', [1.55, 1.85])
+def test_depth_is_as_uncertain_as_the_stature(start, human37, walk, stature):
+    """One view tells no size; the covariance of the first mixture says so."""
+    person = human37.with_stature(stature)
+    tracker = start(person, 2)
+    mixture = tracker.posterior
+    sigma = np.sqrt(mixture.covariances[0, 2, 2])
+    wrong = mixture.means[0, 2] - walk[1, 2]
+    assert 0.04 * walk[1, 2] < sigma < 0.12 * walk[1, 2]
+    assert abs(wrong) < 2.5 * sigma
+    # In proportion to the size the depth is right.
+    assert mixture.means[0, 2] / tracker.body.stature == pytest.approx(
+        walk[1, 2] / stature, rel=0.06
+    )
+
+
+def test_without_legs_it_takes_longer(start, human37, walk):
+    names = tuple(x for x in NAMES if not x.endswith(('hip', 'knee', 'ankle')))
+    assert start(images=4, names=names).status is Status.WAITING
+    tracker = start(images=6, names=names)
+    assert tracker.status is Status.TRACKING
+    rows = [human37.joint_names.index(x) for x in names]
+    joints = tracker.body.joint_positions(tracker.posterior.means)[:, rows]
+    truth = human37.joint_positions(walk[5:6])[:, rows]
+    wrong = (joints - joints.mean(1, keepdims=True)) - (truth - truth.mean(1, keepdims=True))
+    # From the side arms and shoulders alone hardly tell which way the person faces.
+    assert np.abs(wrong[0, :, :2]).mean() < 0.05
+    assert np.linalg.norm(wrong, axis=2).mean(1).min() < 0.15
+
+
+def test_what_suffices(human37, keypoints_of, walk):
+    seen = detected(keypoints_of, human37, walk[0])
+    assert suffices(seen, human37)
+    assert not suffices(None, human37)
+    doubtful = replace(seen, confidences=np.full(len(NAMES), 0.4))
+    assert not suffices(doubtful, human37)
+    # One hip may be hidden, both may not.
+    for hidden, enough in ((1, True), (2, False)):
+        confidences = seen.confidences.copy()
+        confidences[[NAMES.index(f'{side}_hip') for side in ('left', 'right')][:hidden]] = 0.0
+        assert suffices(replace(seen, confidences=confidences), human37) is enough
+
+
+def test_a_detector_that_begins_with_sides_exchanged(human37, camera, black, keypoints_of, walk):
+    """Exchanged in the first images: the person is the right way round within a second."""
+    tracker = Tracker(human37, camera, FAST)
+    back = []
+    for i in range(12):
+        keypoints = detected(keypoints_of, human37, walk[i], seed=i, exchanged=i < 3)
+        posterior, _ = tracker.step(black, i * FRAME, keypoints)
+        if posterior is not None:
+            left = left_directions(tracker.body, posterior.means[:1])[0]
+            back.append(left @ left_directions(human37, walk[i : i + 1])[0] < 0)
+    assert not any(back[8:])
+
+
+def test_reversals_explain_exchanged_sides(human37, camera, walk):
+    poses = with_reversals(human37, walk[:2])
+    assert len(poses) == 4
+    pixels = camera.project(human37.joint_positions(poses))
+    hips = [human37.joint_names.index(x) for x in ('left_hip', 'right_hip')]
+    assert np.abs(pixels[2, hips] - pixels[0, hips[::-1]]).max() < 3.0
+
+
+def test_the_same_keypoints_give_the_same_track(start):
+    first, second = (start(images=3).posterior for _ in range(2))
+    assert first.means.tobytes() == second.means.tobytes()
+    assert first.covariances.tobytes() == second.covariances.tobytes()
+
+
+def near(tracker, truth):
+    """Whether the place of the heaviest mode is that of a pose, in a fifth of the distance."""
+    return np.abs(tracker.posterior.means[0, :3] - truth[:3]).max() < 0.2 * truth[2]
+
+
+def test_a_mask_starts_a_track(human37, camera, black, walk):
+    masks = render_silhouettes(human37, walk, camera)
+    tracker = Tracker(human37, camera, replace(FAST, likelihood=LikelihoodSettings()))
+    for i in range(3):
+        assert tracker.status is Status.WAITING
+        tracker.step(black, i * FRAME, mask=masks[i])
+    assert tracker.status is Status.TRACKING
+    assert tracker.started_from is Source.MASK
+    assert near(tracker, walk[2])
+
+
+def test_a_box_starts_a_track(human37, camera, black, walk):
+    (mask,) = render_silhouettes(human37, walk[:1], camera)
+    rows, columns = np.nonzero(mask)
+    box = (int(columns.min()), int(rows.min()), int(columns.max()), int(rows.max()))
+    tracker = Tracker(human37, camera, replace(FAST, likelihood=LikelihoodSettings()))
+    tracker.reset(box=box)
+    posterior, _ = tracker.step(black, 0)
+    assert tracker.started_from is Source.BOX
+    assert near(tracker, walk[0])
+    assert np.sqrt(posterior.covariances[0, 2, 2]) > 0.05 * walk[0, 2]
+    # It is known for one image only.
+    tracker.reset()
+    assert tracker.step(black, FRAME) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ('box', 'message'),
+    [
+        ((10, 10, 10, 50), 'with an area, saw'),
+        ((400, 10, 500, 50), 'must lie in the image of 320x240 pixels'),
+        ((float('nan'), 10, 500, 50), 'with an area, saw'),
+    ],
+)
+def test_boxes_that_are_none(human37, camera, box, message):
+    with pytest.raises(ValueError, match=message):
+        Tracker(human37, camera).reset(box=box)
+
+
+@pytest.mark.parametrize('name', ['wander', 'follow'])
+def test_keypoints_of_a_detector_start_a_track(human37, name):
+    folder = SHARED / 'video' / name
+    if not (folder / 'keypoints_mediapipe.npz').is_file():
+        pytest.skip(f'{folder} is absent')
+    from benchmarks.clips import read_clip, read_detections
+
+    clip, seen = read_clip(folder, 8), read_detections(folder).keypoints
+    background = None if clip.background is None else BackgroundModel.from_image(clip.background)
+    tracker = Tracker(human37, clip.camera, FAST, background)
+    for stamp, image in zip(clip.stamps, clip.images, strict=True):
+        tracker.step(image, stamp, seen[stamp])
+    names, stamp = clip.truth.joint_names, clip.stamps[-1]
+    rows = [names.index(x) for x in NAMES]
+    true = clip.truth.joints[stamp][rows]
+    found = tracker.body.joint_positions(tracker.posterior.means[:1])[0]
+    found = found[[human37.joint_names.index(x) for x in NAMES]]
+    hips = [NAMES.index('left_hip'), NAMES.index('right_hip')]
+    wrong = (found - found[hips].mean(0)) - (true - true[hips].mean(0))
+    assert np.linalg.norm(wrong, axis=1).mean() < 0.12
+    sigma = np.sqrt(tracker.posterior.covariances[0, 2, 2])
+    depth = found[hips].mean(0)[2] - true[hips].mean(0)[2]
+    assert abs(depth) < 2.5 * sigma
