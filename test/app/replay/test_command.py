@@ -75,13 +75,13 @@ class StandingStill:
     def __init__(self, body, camera, settings, background, seed, known_ground=None):
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
-        self.track_id = 1
+        self.track_id, self.started_from = 1, None
         self.keypoints, self.positions, self.predictions, self.masks = [], [], [], []
         self.ground, self.contacts = Ground(np.array([0.0, -1.0, 0.0]), 0.3, None, np.inf), {}
         self.silhouettes = SimpleNamespace(doubted=False, known='known')
         StandingStill.made.append(self)
 
-    def reset(self, start):
+    def reset(self, start, *, box=None):
         self.start = start
 
     @property
