@@ -9,7 +9,7 @@ from typing import Any
 
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.tracking import filter as filter_module
-from hmt_ros.tracking import tracker as tracker_module
+from hmt_ros.tracking import observer as observer_module
 from hmt_ros.tracking.facing import Track
 from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.posterior import Posterior
@@ -21,7 +21,7 @@ from hmt_ros.tracking.proposals.sampling import CovarianceScaledSamples
 Stages = Sequence[tuple[Any, str, str]]
 STAGES: Stages = (
     (BackgroundModel, 'split', 'background'),
-    (tracker_module, 'observe', 'observation'),
+    (observer_module, 'observe', 'observation'),
     (Track, 'begin', 'start of the track'),
     (filter_module, 'follow_flow', 'motion'),
     (KinematicJumps, 'propose', 'combinations'),

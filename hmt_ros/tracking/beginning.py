@@ -187,6 +187,59 @@ def _confident(keypoints: Keypoints) -> set[str]:
     return {keypoints.names[i] for i in np.flatnonzero(sure)}
 
 
+class Starts:
+    """Decides at which image a track starts, and what it begins from.
+
+    Args:
+        model: of a person; a subject's lengths replace the model's.
+        camera: that sees the person.
+
+    Attributes:
+        given: what the track starts from; None: what the images show.
+        box: (left, top, right, bottom) of the person in the next image, px; None: unknown.
+        arrival: of somebody of whom no track knows.
+    """
+
+    def __init__(self, model: Body, camera: Camera) -> None:
+        self.given: Subject | GaussianMixture | None = None
+        self.box: Box | None = None
+        self.arrival = Arrival()
+        self._model, self._camera = model, camera
+
+    def first(
+        self,
+        view: View,
+        stamp: int,
+        body: Body,
+        upright: Gravity | None,
+        prediction: PosePrediction | None,
+        observed: Callable[[], Observation],
+        *,
+        masked: bool,
+    ) -> Beginning | None:
+        """What a track begins from at an image; None: it does not start there.
+
+        Args:
+            view: what the image shows.
+            stamp: of the image, ns.
+            body: that the poses of a mixture are of.
+            upright: what is known of gravity.
+            prediction: by the image, if any.
+            observed: makes the observation of the image.
+            masked: whether the silhouette is a segmenter's.
+        """
+        given, model, camera = self.given, self._model, self._camera
+        if given is not None and self.box is None:
+            if isinstance(given, Subject) and stamp < given.stamp_ns:
+                return None
+            return beginning_given(given, model, body, camera, upright)
+        if self.box is None:
+            wanted = time_to_first(view, model, prediction, masked=masked)
+            if not self.arrival.lasts(stamp, wanted):
+                return None
+        return beginning_seen(view, model, camera, upright, prediction, self.box, observed)
+
+
 def beginning_given(
     start: Subject | GaussianMixture, model: Body, body: Body, camera: Camera,
     upright: Gravity | None,

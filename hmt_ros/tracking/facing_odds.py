@@ -69,6 +69,31 @@ class FacingOdds:
             change = gamma * float(energies[back & known].min() - energies[~back & known].min())
         self.log_odds = float(np.clip(self.log_odds + change, -most, most))
 
+    def weigh(
+        self,
+        body: Body,
+        poses: Array,
+        energies: Array,
+        log_weights: Array,
+        known: Mask,
+        gamma: float,
+    ) -> Array:
+        """Takes in the hypotheses of an image; returns their log weights (N,) with the odds.
+
+        Args:
+            body: of the poses.
+            poses: (N, d).
+            energies: (N,) nats.
+            log_weights: (N,) without the odds.
+            known: (N,) which were followed from the image before.
+            gamma: factor on differences of energies.
+        """
+        back = self.back(body, poses)
+        self.update(back, energies, known, poses[0, :3], gamma)
+        log_weights = self.shared(back, log_weights)
+        self.follow(body, poses, log_weights, back)
+        return log_weights
+
     def shared(self, back: Mask, log_weights: Array) -> Array:
         """Log weights (N,) with the odds of the two ways; within each they keep their ratios."""
         if back.all() or not back.any():

@@ -2,15 +2,15 @@
 
 predict     x_k | ancestor       motion prior, optical flow                       prediction
 propose     x_k^0                jumps, samples, predictions of others            proposals
-optimise    x_k = argmin E(x)    bounded Newton from x_k^0                        posterior
-weigh       log w_k = log p(ancestor) + log p(jumps) - beta E(x_k)                weighting, trust
+optimise    x_k = argmin E(x)    bounded Newton from x_k^0                        optimisation
+weigh       log w_k = log p(ancestor) + log p(jumps) - beta E(x_k)                weighting
 select      K of N hypotheses    the least expected distance to one that is kept  selection
 """
 
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,8 +18,8 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
-from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.bounded_newton import Minimum, resting
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.ambiguities import ambiguity_classes
@@ -27,55 +27,34 @@ from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.contact import FootContacts
 from hmt_ros.tracking.facing_odds import FacingOdds
 from hmt_ros.tracking.ground import GroundEstimator
-from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses, relative_joints
+from hmt_ros.tracking.hypotheses import Modes, Optimised, new_hypotheses, relative_joints
+from hmt_ros.tracking.laplace_approximation import likelihood_modes, posterior_modes
 from hmt_ros.tracking.loss import unexplained_share
-from hmt_ros.tracking.motion_states import PredictedStates, fused
+from hmt_ros.tracking.motion_states import PredictedStates
+from hmt_ros.tracking.optimisation import Search, UsualEnergy
 from hmt_ros.tracking.posterior import Posterior, free_covariances
 from hmt_ros.tracking.prediction import dynamics_of, follow_flow, predict
 from hmt_ros.tracking.proposals import PROPOSALS, PredictedPoses, Proposal
 from hmt_ros.tracking.proposals.headings import Headings
 from hmt_ros.tracking.proposals.reversals import Reversals
-from hmt_ros.tracking.proposals.sampling import covariance_scaled_samples
 from hmt_ros.tracking.reliability import SilhouetteRecall
 from hmt_ros.tracking.selection import choose_hypotheses, heads_of_classes
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from hmt_ros.tracking.weighting import (
     at_least,
-    cost_of_room,
     inherited_log_weights,
+    lasting_errors,
     normalised,
     weigh,
 )
 
-# How far the usual energy follows that of the last image.
-USUAL_GAIN = 0.1
 # Number of images from one reversal that is proposed to the next.
 REVERSED_EVERY = 3
 # How often the shape is fitted to the first image.
 FIRST_FITS = 3
 # Number of the heaviest modes that the shape is estimated from.
 SHAPED = 4
-
-
-@dataclass(frozen=True, eq=False)
-class Optimised:
-    """Hypotheses at their optima.
-
-    Attributes:
-        hypotheses: N of them; their poses are where they started from.
-        minima: N rows; Hessians are those of the Gaussian posterior.
-    """
-
-    hypotheses: Hypotheses
-    minima: Minimum
-
-    def __getitem__(self, rows: Index) -> Optimised:
-        return Optimised(self.hypotheses[rows], self.minima[rows])
-
-    def joined(self, other: Optimised) -> Optimised:
-        """These and others."""
-        return Optimised(self.hypotheses.joined(other.hypotheses), self.minima.joined(other.minima))
 
 
 class MixtureFilter:
@@ -119,7 +98,7 @@ class MixtureFilter:
         self.shape = ShapeEstimate(body)
         self.recall = SilhouetteRecall(len(body.skeleton.parents))
         self._observed: tuple[Observation, Observation] | None = None
-        self._usual_energy = np.inf
+        self._usual = UsualEnergy(settings.energy_rise)
         self._outline_costs = np.empty((0, 0))
         self._bad_images = 0
         self._images = 0
@@ -271,7 +250,7 @@ class MixtureFilter:
         if s.reversal_probability > 0:
             if self._images % REVERSED_EVERY == 0:
                 proposals.insert(0, Reversals(posterior, s.reversal_probability))
-            if base.value.min() > self._usual_energy + 2.0 * s.energy_rise:
+            if base.value.min() > self._usual.value + 2.0 * s.energy_rise:
                 proposals.insert(0, Headings(posterior, 1e-3))
         if expected is not None:
             elsewhere = PredictedPoses(self.body, expected, s.prediction_probability)
@@ -281,10 +260,11 @@ class MixtureFilter:
         )
         for more in others:
             candidates = candidates.joined(more)
-        optimised = self._optimise(candidates, states, precisions, observation)
+        search = Search(posterior, observation, states, precisions)
+        optimised = search.optimise(candidates)
         if self._proposal.iterated:
-            optimised = self._search_again(optimised, states, precisions, observation)
-        self._learn_usual_energy(float(optimised.minima.value.min()))
+            optimised = search.search_again(optimised, self._proposal, self._usual.value, self._rng)
+        self._usual.update(float(optimised.minima.value.min()))
         hypotheses, solved = optimised.hypotheses, optimised.minima
         before = None
         if s.reweighting == 'bhattacharyya':
@@ -314,95 +294,10 @@ class MixtureFilter:
         self._bad_images = self._bad_images + 1 if self.misfit > self.settings.lost_misfit else 0
 
     def likelihood_mixture(self, modes: Modes, observation: Observation) -> GaussianMixture:
-        """The modes of the likelihood alone, without what was known from the images before.
-
-        Around each mode of the posterior the energy of the image and of the body's prior is a
-        parabola; its minimum and curvature make a component, its depth the weight.
-        """
-        body, poses = self.body, modes.poses
-        observation = self._believed(observation)
-        fit = self._posterior.fit(poses, observation)
-        gradient, hessian = fit.energy.derivatives()
-        free = ~resting(poses, gradient, body.lower, body.upper)
-        covariances = free_covariances(hessian, free)
-        step = -np.einsum('kij,kj->ki', covariances, np.where(free, gradient, 0.0))
-        limit = 3.0 * np.sqrt(np.einsum('kii->ki', modes.covariances))
-        step = np.clip(step, -limit, limit)
-        means = np.clip(poses + step, body.lower, body.upper)
-        if observation.evidence:
-            covariances = self._posterior.covariances(fit, free)
-        nothing = np.zeros(len(poses))
-        weights = np.exp(normalised(weigh(nothing, fit.energy.value, self.beta)))
-        return GaussianMixture(weights, means, covariances).sorted()
+        """The modes of the likelihood alone, without what was known from the images before."""
+        return likelihood_modes(modes, self._posterior, self._believed(observation))
 
     # The steps.
-
-    def _optimise(
-        self,
-        hypotheses: Hypotheses,
-        states: PredictedStates,
-        precisions: Array,
-        observation: Observation,
-    ) -> Optimised:
-        # Each has a precision of its own, where it jumped a lower one.
-        own = states.precisions_of(hypotheses.ancestors, hypotheses.jumped, precisions)
-        term = self._posterior.given(observation, hypotheses, own)
-        solved = self._posterior.minimise(term, hypotheses.poses, self.settings.iterations)
-        hessian = self._posterior.gaussian_hessians(solved, hypotheses, own)
-        room = cost_of_room(hessian, own, precisions[hypotheses.ancestors], hypotheses.jumped)
-        return Optimised(hypotheses, replace(solved, value=solved.value + room, hessian=hessian))
-
-    def _search_again(
-        self,
-        optimised: Optimised,
-        states: PredictedStates,
-        precisions: Array,
-        observation: Observation,
-    ) -> Optimised:
-        """Further rounds of jumps, while the least energy is unusually high."""
-        for _ in range(self.settings.rounds - 1):
-            if optimised.minima.value.min() < self._usual_energy + self.settings.energy_rise:
-                break
-            around = self._sources_around(optimised, states, precisions, observation)
-            more = self._proposal.propose(
-                around.minima, around.hypotheses, states.searched, observation, self._rng
-            )
-            optimised = optimised.joined(self._optimise(more, states, precisions, observation))
-        return optimised
-
-    def _sources_around(
-        self,
-        optimised: Optimised,
-        states: PredictedStates,
-        precisions: Array,
-        observation: Observation,
-    ) -> Optimised:
-        """What a further round of jumps starts from: the best optima, and samples near the best.
-
-        Jumps change limbs; a trunk that was predicted badly needs covariance-scaled samples.
-        """
-        s, h = self.settings, optimised.hypotheses
-        order = np.argsort(optimised.minima.value, kind='stable')
-        best = order[: max(s.max_hypotheses // 2, 1)]
-        lead = best[:1]
-        drawn = covariance_scaled_samples(
-            self.body, optimised.minima.x[lead], states.searched[h.ancestors[lead]], s.samples,
-            s.sample_scale, self._rng,
-        )[0]  # fmt: skip
-        rows = np.full(len(drawn), h.texture_rows[lead[0]])
-        value = self._posterior.values(drawn, observation, h.textures, rows)
-        drawn = drawn[np.argsort(value, kind='stable')[: s.max_hypotheses]]
-        n = len(drawn)
-        sampled = Hypotheses(
-            drawn,
-            np.full(n, h.log_weights[lead[0]] + np.log(s.jump_probability)),
-            np.full(n, h.ancestors[lead[0]]),
-            drawn,
-            np.ones(drawn.shape, dtype=np.bool_),
-            h.textures,
-            rows[:n],
-        )
-        return optimised[best].joined(self._optimise(sampled, states, precisions, observation))
 
     def _weigh_and_select(
         self,
@@ -421,93 +316,49 @@ class MixtureFilter:
             before: the prediction that modes inherit their weights from; None: from ancestors.
             excess: (K,) of the ancestors' energies over the least in the image before.
         """
-        s, solved = self.settings, optimised.minima
-        usable = np.flatnonzero(np.isfinite(solved.value))
-        if len(usable) == 0:
+        s = self.settings
+        optimised = optimised[np.flatnonzero(np.isfinite(optimised.minima.value))]
+        h, solved = optimised.hypotheses, optimised.minima
+        if len(h) == 0:
             raise ValueError('no hypothesis has a finite energy')
-        log_weights = weigh(
-            optimised.hypotheses.log_weights[usable], solved.value[usable], self.beta
-        )
+        log_weights = weigh(h.log_weights, solved.value, self.beta)
         if excess is not None:
-            # What a pose cost more than the best before, it costs for the same reason again.
-            lasting = excess[optimised.hypotheses.ancestors[usable]]
-            over = solved.value[usable] - solved.value[usable].min()
-            log_weights += self.beta * s.error_correlation * np.minimum(over, lasting)
+            log_weights += lasting_errors(
+                solved.value, excess[h.ancestors], self.beta, s.error_correlation
+            )
         if before is None and self.body.trunk_pairs:
-            log_weights = self._with_facing(optimised, usable, log_weights)
-        reference = solved.x[usable[np.argmax(log_weights)]]
-        classes = ambiguity_classes(self.body, solved.x[usable], reference)
+            followed = np.asarray(~h.jumped.all(1), dtype=np.bool_)
+            gamma = s.facing_gain * self.beta
+            log_weights = self._facing.weigh(
+                self.body, solved.x, solved.value, log_weights, followed, gamma
+            )
+        classes = ambiguity_classes(self.body, solved.x, solved.x[np.argmax(log_weights)])
         kept = choose_hypotheses(
-            relative_joints(self.body, solved.x[usable]),
+            relative_joints(self.body, solved.x),
             log_weights,
             s.max_hypotheses,
             same=s.hypothesis_merge_distance,
             first=heads_of_classes(classes, log_weights, s.reach, s.max_hypotheses // 2),
         )
-        rows = usable[kept.chosen]
-        weights = normalised(kept.log_weights)
-        filtered = free_covariances(solved.hessian[rows], solved.free[rows])
+        rows, weights = kept.chosen, normalised(kept.log_weights)
         if before is not None:
+            covariances = free_covariances(solved.hessian[rows], solved.free[rows])
             order = np.argsort(-weights, kind='stable')
             weights = normalised(
-                weights + inherited_log_weights(solved.x[rows], filtered, order, before)
+                weights + inherited_log_weights(solved.x[rows], covariances, order, before)
             )
         weights = at_least(weights, s.least_log_weight)
         order = np.argsort(-weights, kind='stable')
-        rows, filtered = rows[order], filtered[order]
-        poses = solved.x[rows]
-        fit = self._posterior.fit(poses, observation)
-        covariances = alone = filtered
-        if observation.evidence:
-            alone = covariances = self._posterior.covariances(fit, solved.free[rows])
-        if observation.evidence or observation.keypoints is not None:
-            covariances = covariances + self.shape.considered(
-                self._posterior.likelihood, observation, poses,
-                self._posterior.given_way(poses, observation)[1],
-            )  # fmt: skip
-        h = optimised.hypotheses[rows]
-        exchanges = self._posterior.exchanges
-        exchanges.update(
-            self._posterior.likelihood, observation, poses, self._posterior.exchanges_of(h)
+        selected, posterior = optimised[rows[order]], self._posterior
+        self._modes = modes = posterior_modes(
+            selected, weights[order], posterior, observation, self.shape, self.dynamics, states
         )
-        if states is None:
-            velocities = np.zeros_like(poses)
-            state_covariances = self.dynamics.states(filtered)
-        else:
-            found = filtered
-            if states.wandered.any() and observation.evidence:
-                # Errors of images last: what is propagated believes a share of them, too.
-                found = fused(states.covariances_of(h.ancestors, h.jumped), alone)
-            velocities, state_covariances = states.given(h.ancestors, h.jumped, poses, found)
-        self._modes = Modes(
-            poses=poses,
-            log_weights=weights[order],
-            ancestors=h.ancestors,
-            expected=h.expected,
-            jumped=h.jumped,
-            textures=self._posterior.textures(poses, observation),
-            texture_rows=np.arange(len(rows)),
-            velocities=velocities,
-            covariances=covariances,
-            filtered=filtered,
-            log_likelihoods=-fit.image_energy,
-            energies=solved.value[rows],
-            state_covariances=state_covariances,
-        )
-        self._outline_costs = fit.outline_costs
-        return float(solved.value[usable].min())
-
-    def _with_facing(self, optimised: Optimised, usable: Index, log_weights: Array) -> Array:
-        """Log weights (N,) of usable hypotheses with the odds of the two ways to face."""
-        odds, solved = self._facing, optimised.minima
-        poses = solved.x[usable]
-        back = odds.back(self.body, poses)
-        known = np.asarray(~optimised.hypotheses.jumped[usable].all(1), dtype=np.bool_)
-        gamma = self.settings.facing_gain * self._posterior.trust.inverse_temperature
-        odds.update(back, solved.value[usable], known, poses[0, :3], gamma)
-        log_weights = odds.shared(back, log_weights)
-        odds.follow(self.body, poses, log_weights, back)
-        return log_weights
+        posterior.exchanges.update(
+            posterior.likelihood, observation, modes.poses,
+            posterior.exchanges_of(selected.hypotheses),
+        )  # fmt: skip
+        self._outline_costs = posterior.fit(modes.poses, observation).outline_costs
+        return float(solved.value.min())
 
     def _stand(self, dt: float | None) -> None:
         """Takes in how the modes stand, dt after their ancestors, s; None: they have none."""
@@ -522,15 +373,6 @@ class MixtureFilter:
         self._posterior.stance = self.contacts.stance
 
     # What is learned.
-
-    def _learn_usual_energy(self, energy: float) -> None:
-        usual = self._usual_energy
-        if not np.isfinite(usual):
-            self._usual_energy = energy
-        else:
-            # What is unusual is not learned at once.
-            change = min(energy - usual, self.settings.energy_rise)
-            self._usual_energy = usual + USUAL_GAIN * change
 
     def _believed(self, observation: Observation) -> Observation:
         """An observation with what this track has learned of its cues."""

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.image.texture import Textures
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.mixture import GaussianMixture
 
 if TYPE_CHECKING:
@@ -64,6 +65,26 @@ class Hypotheses:
     @classmethod
     def _by_row(cls) -> list[str]:
         return [field.name for field in fields(cls) if field.name != 'textures']
+
+
+@dataclass(frozen=True, eq=False)
+class Optimised:
+    """Hypotheses at their optima.
+
+    Attributes:
+        hypotheses: N of them; their poses are where they started from.
+        minima: N rows; Hessians are those of the Gaussian posterior.
+    """
+
+    hypotheses: Hypotheses
+    minima: Minimum
+
+    def __getitem__(self, rows: Index) -> Optimised:
+        return Optimised(self.hypotheses[rows], self.minima[rows])
+
+    def joined(self, other: Optimised) -> Optimised:
+        """These and others."""
+        return Optimised(self.hypotheses.joined(other.hypotheses), self.minima.joined(other.minima))
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ from hmt_ros.image.background import BackgroundModel, Silhouette, one_person
 from hmt_ros.image.observation import Box
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.rendering.renderer import render_silhouettes
+from hmt_ros.tracking.camera_motion import SHIFTED, CameraPose
 
 # Least share of the person that is foreground before a background without the person.
 LEAST_FOREGROUND = 0.35
@@ -52,6 +53,7 @@ class Silhouettes:
         self.share = np.nan
         self.doubted = False
         self._learning = background.frames == 0
+        self._seen_from: CameraPose | None = None
 
     @property
     def known(self) -> str:
@@ -65,6 +67,14 @@ class Silhouettes:
         """Begins anew without a background: the camera sees another scene."""
         self.background = BackgroundModel(self.background.settings)
         self.share, self.doubted, self._learning = np.nan, False, True
+
+    def see_from(self, pose: CameraPose, camera: Camera) -> None:
+        """Takes the pose of the camera at an image; from another view the scene is another."""
+        if self._seen_from is None:
+            self._seen_from = pose
+        elif pose.shift(self._seen_from, camera) > SHIFTED:
+            self.forget()
+            self._seen_from = pose
 
     def learn(self, image: Image, mask: Mask | None) -> None:
         """Learns the background from an image before the track, unless a mask shows somebody."""

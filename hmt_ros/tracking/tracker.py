@@ -19,33 +19,31 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.background import BackgroundModel
-from hmt_ros.image.observation import Box, Observation, observe
+from hmt_ros.image.observation import Box, Observation
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.beginning import (
     Arrival,
     Beginning,
     Source,
-    beginning_given,
-    beginning_seen,
+    Starts,
     poses_to_search,
-    time_to_first,
     time_to_next,
 )
-from hmt_ros.tracking.camera_motion import SHIFTED, CameraPath, CameraPose
+from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
 from hmt_ros.tracking.facing import Track
 from hmt_ros.tracking.gravity import Gravity
 from hmt_ros.tracking.ground import Ground, GroundEstimator, KnownGround, unit_vector
 from hmt_ros.tracking.hypotheses import Modes
 from hmt_ros.tracking.initialisation import check_box
+from hmt_ros.tracking.observer import Observer
 from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.prediction import expected_poses
 from hmt_ros.tracking.presence import Presence, View
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
-from hmt_ros.tracking.silhouettes import Silhouettes, region_of
+from hmt_ros.tracking.silhouettes import Silhouettes
 from hmt_ros.tracking.subject import Subject
 
 # The person may be where modes say that have at least this log weight, nats; the sign is changed.
@@ -99,25 +97,22 @@ class Tracker:
         self.model = body
         self.camera = camera
         self.silhouettes = Silhouettes(background or BackgroundModel())
+        self._observer = Observer(camera, self.settings.likelihood, self.silhouettes)
         self.evaluations = 0
         self.track_id = 0
         self.started_from: Source | None = None
         self._seed = seed
-        self._start: Subject | GaussianMixture | None = None
-        self._box: Box | None = None
+        self._starts = Starts(body, camera)
         self._extra = tuple(extra)
         self._ground = GroundEstimator(known_ground)
         self._track = self._new_track(body)
         self._point = PointEstimate()
         self._presence = Presence(self.settings.absence_time)
-        self._arrival = Arrival()
-        self._last_image: Image | None = None
         self._last_stamp: int | None = None
         self._followed: int | None = None
         self._camera_path = CameraPath()
         self._camera_pose: CameraPose | None = None
         self._newer_gravity: KnownGround | None = None
-        self._scene_pose: CameraPose | None = None
 
     def reset(
         self, start: Subject | GaussianMixture | None = None, *, box: Box | None = None
@@ -142,8 +137,8 @@ class Tracker:
         if box is not None:
             check_box(box, self.camera)
         if start is not None:
-            self._start = start
-        self._box = box
+            self._starts.given = start
+        self._starts.box = box
         self._drop_track()
         self._presence = Presence(self.settings.absence_time)
         self._last_stamp = None
@@ -196,7 +191,10 @@ class Tracker:
         self._move_camera(stamp)
         known = self.background.frames > 0 and not self.silhouettes.doubted
         self._ground.still = self._camera_path.known or (known and not self._ground.turning)
-        view = self._view(image, keypoints, mask, nobody_predicted)
+        near = self.modes.poses if self._track.begun and not self._track.lost else None
+        view = self._observer.view(
+            image, keypoints, mask, self.body, near, nobody_predicted=nobody_predicted
+        )
         found = self._take(view, stamp, prediction, masked=mask is not None)
         self._last_stamp = stamp
         return found
@@ -305,13 +303,8 @@ class Tracker:
         newer, self._newer_gravity = self._newer_gravity, None
         if newer is not None and newer.up is not None:
             self._ground.set_gravity(newer.up, newer.camera_height)
-        if pose is None:
-            return
-        if self._scene_pose is None:
-            self._scene_pose = pose
-        elif pose.shift(self._scene_pose, self.camera) > SHIFTED:
-            self.silhouettes.forget()
-            self._scene_pose = pose
+        if pose is not None:
+            self.silhouettes.see_from(pose, self.camera)
 
     @property
     def _gravity(self) -> Gravity | None:
@@ -327,8 +320,8 @@ class Tracker:
         self._track = self._new_track(self.body)
         self._point = PointEstimate()
         self._ground.reset()
-        self._arrival = Arrival()
-        self._last_image, self._followed = None, None
+        self._starts.arrival = Arrival()
+        self._observer.last_image, self._followed = None, None
 
     def _take(
         self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool
@@ -358,7 +351,7 @@ class Tracker:
             resting = min(self.contacts.values(), default=RESTING)
             self._ground.update(self.body, self.modes, resting, dt)
         self._point.update(self.body, self.modes.poses, np.exp(self.modes.log_weights), dt)
-        self._last_image, self._followed = view.image, stamp
+        self._observer.last_image, self._followed = view.image, stamp
         self.evaluations = self._track.evaluations
         return self.posterior, self._track.likelihood_mixture(observation)
 
@@ -366,15 +359,24 @@ class Tracker:
         self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool
     ) -> Observation | None:
         """Starts a track, if it starts at this image; returns what it was started with."""
-        if self._presence.absent and self._box is None:
-            if not self._arrival.lasts(stamp, time_to_next(view, prediction)):
+        if self._presence.absent and self._starts.box is None:
+            if not self._starts.arrival.lasts(stamp, time_to_next(view, prediction)):
                 return None
             observation = self._observe(view, None)
-            self._begin_next(observation, stamp, prediction)
+            poses = self._poses_to_search(observation, prediction)
+            assert poses is not None
+            near = replace(
+                observation, magnification=self.camera.magnification(float(np.median(poses[:, 2])))
+            )
+            arrived = Beginning(Source.ARRIVAL, self.body, poses, both_ways=True)
+            self._begin(near, arrived, stamp)
         else:
-            beginning = self._beginning(view, stamp, prediction, masked=masked)
+            beginning = self._starts.first(
+                view, stamp, self.body, self._gravity, prediction,
+                lambda: self._observe(view, None), masked=masked,
+            )  # fmt: skip
             if beginning is None:
-                if not self._arrival.somebody:
+                if not self._starts.arrival.somebody:
                     self.silhouettes.learn(view.image, view.silhouette if masked else None)
                 return None
             if not masked:
@@ -388,28 +390,10 @@ class Tracker:
                 observation = self._observe(view, beginning.best[0])
                 self._begin(observation, beginning, stamp)
         self.track_id += 1
-        self._box = None
+        self._starts.box = None
         self._presence = Presence(self.settings.absence_time)
         self._is_seen(view, stamp)
         return observation
-
-    def _beginning(
-        self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool
-    ) -> Beginning | None:
-        """What a track starts from at an image; None: it does not start there."""
-        start, box, gravity = self._start, self._box, self._gravity
-        if start is not None and box is None:
-            if isinstance(start, Subject) and stamp < start.stamp_ns:
-                return None
-            return beginning_given(start, self.model, self.body, self.camera, gravity)
-        if box is None:
-            wanted = time_to_first(view, self.model, prediction, masked=masked)
-            if not self._arrival.lasts(stamp, wanted):
-                return None
-        return beginning_seen(
-            view, self.model, self.camera, gravity, prediction, box,
-            lambda: self._observe(view, None),
-        )  # fmt: skip
 
     def _expected(self, stamp: int) -> GaussianMixture:
         """The posterior of a time at which nothing is seen."""
@@ -420,17 +404,6 @@ class Tracker:
 
     def _is_seen(self, view: View, stamp: int) -> bool:
         return self._presence.sees(view, stamp, self.body, self.camera, self.modes.poses[0])
-
-    def _begin_next(
-        self, observation: Observation, stamp: int, prediction: PosePrediction | None
-    ) -> None:
-        """Starts a track of who has come into view."""
-        poses = self._poses_to_search(observation, prediction)
-        assert poses is not None
-        magnification = self.camera.magnification(float(np.median(poses[:, 2])))
-        observation = replace(observation, magnification=magnification)
-        self.started_from = Source.ARRIVAL
-        self._track.begin(self.body, poses, observation, stamp, both_ways=True)
 
     def _begin(self, observation: Observation, beginning: Beginning, stamp: int) -> None:
         """Starts the track."""
@@ -458,41 +431,6 @@ class Tracker:
         """See `poses_to_search`."""
         return poses_to_search(self.body, self.camera, observation, prediction, self._gravity)
 
-    def _view(
-        self,
-        image: Image,
-        keypoints: Keypoints | None,
-        mask: Mask | None,
-        nobody_predicted: bool,
-    ) -> View:
-        t = self.settings.likelihood
-        found, changed = None, 0.0
-        if t.containment.weight > 0 or t.coverage.weight > 0:
-            found = self.silhouettes.silhouette(image, mask, self._region())
-            changed = 0.0 if found is None or mask is not None else self.background.changed
-        foreground, unsure = (None, None) if found is None else found
-        return View(image, foreground, changed, keypoints, nobody_predicted, unsure)
-
     def _observe(self, view: View, pose: Array | None) -> Observation:
         """What an image says of a person who is about at a pose (d,), if it is known."""
-        t = self.settings.likelihood
-        textured = any(getattr(t, term.name).weight > 0 for term in TERMS if term.needs_texture)
-        wanted = {'containment', 'coverage'}
-        wanted |= {term.name for term in TERMS if getattr(t, term.name).weight > 0}
-        wanted |= {'intensity'} if textured else set()  # the textures hold it
-        keypoints = view.keypoints
-        if keypoints is not None and not keypoints.seen.any():
-            keypoints = None
-        believed = view.silhouette if self._track.believes_silhouettes else None
-        found = observe(
-            view.image, believed, keypoints,
-            last_image=self._last_image, wanted=wanted, unsure=view.unsure,
-        )  # fmt: skip
-        magnification = 0.0 if pose is None else self.camera.magnification(float(pose[2]))
-        return replace(found, foreground=view.silhouette, magnification=magnification)
-
-    def _region(self) -> Box | None:
-        """Where the person can be in the next image; None: anywhere."""
-        if not self._track.begun or self._track.lost:
-            return None
-        return region_of(self.body, self.camera, self.modes.poses)
+        return self._observer.observation(view, pose, believed=self._track.believes_silhouettes)

@@ -31,7 +31,7 @@ REWEIGHTINGS = ('ancestry', 'bhattacharyya')
 
 
 def weigh(log_priors: Array, energies: Array, beta: float) -> Array:
-    """Log weights (N,), equation (1), not normalised.
+    """Log weights (N,), equation (1), not normalised, as if errors did not last.
 
     Args:
         log_priors: (N,) log p(ancestor) + log p(jumps).
@@ -39,6 +39,21 @@ def weigh(log_priors: Array, energies: Array, beta: float) -> Array:
         beta: inverse temperature.
     """
     return log_priors - beta * energies
+
+
+def lasting_errors(energies: Array, excess: Array, beta: float, correlation: float) -> Array:
+    """What errors that last give back to log weights (N,): beta rho min(e, e_ancestor).
+
+    What a pose cost more than the best in the image before, it costs for the same reason again.
+
+    Args:
+        energies: (N,) nats.
+        excess: (N,) e_ancestor, of the ancestors' energies over the least in the image before.
+        beta: inverse temperature.
+        correlation: rho of the errors of two images in a row.
+    """
+    over = energies - energies.min()
+    return np.asarray(beta * correlation * np.minimum(over, excess), dtype=np.float64)
 
 
 def cost_of_room(hessians: Array, own: Array, usual: Array, jumped: Mask) -> Array:

@@ -1,0 +1,112 @@
+"""Gaussians around optima: the modes of the posterior, and those of the likelihood alone.
+
+    filtered     H^-1                                      as if errors did not last
+    covariance   (H_other + information H_image)^-1 + J P J'
+    state        N(pose, velocity) conditioned on where the pose was found; see `motion_states`
+
+H is the Gauss-Newton Hessian of the energy at an optimum. Errors of images last, so of H_image only
+the share `information` is believed (`trust`), and what is not known of the shape is not known of
+the pose: J P J' (`shape_estimation`). A variable that rests on its limit hardly varies.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hmt_ros.image.observation import Observation
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.bounded_newton import resting
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
+from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.hypotheses import Modes, Optimised
+from hmt_ros.tracking.motion_states import PredictedStates, fused
+from hmt_ros.tracking.posterior import Posterior, free_covariances
+from hmt_ros.tracking.shape_estimation import ShapeEstimate
+from hmt_ros.tracking.weighting import normalised, weigh
+
+
+def posterior_modes(
+    selected: Optimised,
+    log_weights: Array,
+    posterior: Posterior,
+    observation: Observation,
+    shape: ShapeEstimate,
+    dynamics: LinearGaussianDynamics,
+    states: PredictedStates | None,
+) -> Modes:
+    """The modes of the posterior.
+
+    Args:
+        selected: K hypotheses at their optima, heaviest first.
+        log_weights: (K,) normalised.
+        posterior: of the image.
+        observation: of the image.
+        shape: of the person, as far as it is known.
+        dynamics: how modes move by themselves.
+        states: of the ancestors, predicted; None: the modes begin, at rest.
+    """
+    h, solved = selected.hypotheses, selected.minima
+    poses = solved.x
+    filtered = free_covariances(solved.hessian, solved.free)
+    fit = posterior.fit(poses, observation)
+    covariances = alone = filtered
+    if observation.evidence:
+        alone = covariances = posterior.covariances(fit, solved.free)
+    if observation.evidence or observation.keypoints is not None:
+        covariances = covariances + shape.considered(
+            posterior.likelihood, observation, poses, posterior.given_way(poses, observation)[1]
+        )
+    if states is None:
+        velocities = np.zeros_like(poses)
+        state_covariances = dynamics.states(filtered)
+    else:
+        found = filtered
+        if states.wandered.any() and observation.evidence:
+            # Errors of images last: what is propagated believes a share of them, too.
+            found = fused(states.covariances_of(h.ancestors, h.jumped), alone)
+        velocities, state_covariances = states.given(h.ancestors, h.jumped, poses, found)
+    return Modes(
+        poses=poses,
+        log_weights=log_weights,
+        ancestors=h.ancestors,
+        expected=h.expected,
+        jumped=h.jumped,
+        textures=posterior.textures(poses, observation),
+        texture_rows=np.arange(len(poses)),
+        velocities=velocities,
+        covariances=covariances,
+        filtered=filtered,
+        log_likelihoods=-fit.image_energy,
+        energies=solved.value,
+        state_covariances=state_covariances,
+    )
+
+
+def likelihood_modes(
+    modes: Modes, posterior: Posterior, observation: Observation
+) -> GaussianMixture:
+    """The modes of the likelihood alone, without what was known from the images before.
+
+    Around each mode of the posterior the energy of the image and of the body's prior is a
+    parabola; its minimum and curvature make a component, its depth the weight.
+
+    Args:
+        modes: of the posterior, K.
+        posterior: of the image.
+        observation: of the image.
+    """
+    body, poses = posterior.body, modes.poses
+    fit = posterior.fit(poses, observation)
+    gradient, hessian = fit.energy.derivatives()
+    free = ~resting(poses, gradient, body.lower, body.upper)
+    covariances = free_covariances(hessian, free)
+    step = -np.einsum('kij,kj->ki', covariances, np.where(free, gradient, 0.0))
+    limit = 3.0 * np.sqrt(np.einsum('kii->ki', modes.covariances))
+    step = np.clip(step, -limit, limit)
+    means = np.clip(poses + step, body.lower, body.upper)
+    if observation.evidence:
+        covariances = posterior.covariances(fit, free)
+    nothing = np.zeros(len(poses))
+    beta = posterior.trust.inverse_temperature
+    weights = np.exp(normalised(weigh(nothing, fit.energy.value, beta)))
+    return GaussianMixture(weights, means, covariances).sorted()

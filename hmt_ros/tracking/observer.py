@@ -1,0 +1,95 @@
+"""What a tracker takes from an image: a view of whoever is there, and what it says of the person.
+
+    view          silhouette near where the person can be, keypoints      before a pose is known
+    observation   evidence of every term of the likelihood that counts    near a pose
+
+A view is what presence and starts are decided by. The observation is made of it when it is known
+where the person is and whether the silhouettes of this track are believed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.image.likelihood import LikelihoodSettings
+from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.image.terms.registry import TERMS
+from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.tracking.presence import View
+from hmt_ros.tracking.silhouettes import Silhouettes, region_of
+
+
+class Observer:
+    """Takes from images what the terms of a likelihood need.
+
+    Args:
+        camera: that takes the images.
+        settings: of the likelihood; terms of weight 0 need nothing.
+        silhouettes: where those of the images come from.
+
+    Attributes:
+        last_image: (H, W, 3) that the optical flow starts from; None: there is no flow.
+    """
+
+    def __init__(
+        self, camera: Camera, settings: LikelihoodSettings, silhouettes: Silhouettes
+    ) -> None:
+        self.last_image: Image | None = None
+        self._camera = camera
+        self._settings = settings
+        self._silhouettes = silhouettes
+
+    def view(
+        self,
+        image: Image,
+        keypoints: Keypoints | None,
+        mask: Mask | None,
+        body: Body,
+        poses: Array | None,
+        *,
+        nobody_predicted: bool,
+    ) -> View:
+        """What an image may show of a person.
+
+        Args:
+            image: (H, W, 3) BGR uint8.
+            keypoints: of a detector, if any.
+            mask: (H, W) of a segmenter, if any.
+            body: of the person.
+            poses: (K, d) in the image before; None: the person may be anywhere.
+            nobody_predicted: whether a predictor saw nobody.
+        """
+        s = self._settings
+        found, changed = None, 0.0
+        if s.containment.weight > 0 or s.coverage.weight > 0:
+            region = None if poses is None else region_of(body, self._camera, poses)
+            found = self._silhouettes.silhouette(image, mask, region)
+            if found is not None and mask is None:
+                changed = self._silhouettes.background.changed
+        foreground, unsure = (None, None) if found is None else found
+        return View(image, foreground, changed, keypoints, nobody_predicted, unsure)
+
+    def observation(self, view: View, pose: Array | None, *, believed: bool) -> Observation:
+        """What an image says of a person.
+
+        Args:
+            view: what it shows.
+            pose: (d,) that the person is about at; None: unknown.
+            believed: whether the silhouette is.
+        """
+        weighed = [term for term in TERMS if getattr(self._settings, term.name).weight > 0]
+        wanted = {'containment', 'coverage'} | {term.name for term in weighed}
+        if any(term.needs_texture for term in weighed):
+            wanted.add('intensity')  # the textures hold it
+        keypoints = view.keypoints
+        if keypoints is not None and not keypoints.seen.any():
+            keypoints = None
+        found = observe(
+            view.image, view.silhouette if believed else None, keypoints,
+            last_image=self.last_image, wanted=wanted, unsure=view.unsure,
+        )  # fmt: skip
+        magnification = 0.0 if pose is None else self._camera.magnification(float(pose[2]))
+        return replace(found, foreground=view.silhouette, magnification=magnification)
