@@ -234,6 +234,7 @@ def test_messages_beyond_the_limit_are_not_even_read(running, small_camera, monk
     assert {one.source: one.largest for one in wanted} == {
         'camera_info': 2**24,
         'keypoints': 2**24,
+        'keypoints_3d': 2**24,
         'mask': 2**26 + 2**16,
         'mask/compressed': 2**26 + 2**16,
         'pose_prediction': 2**24,
