@@ -1,4 +1,4 @@
-"""track-video: from a video to a report: import-video, subject, replay and report in one command.
+"""track-video: from a video to a report: import-video, replay and report in one command.
 
 track-video walk.mp4 -o walk --fov 60 --keypoints walk.json
 """
@@ -24,9 +24,12 @@ VIDEO, SUBJECT, TRACKED, REPORT = 'video', 'subject.yaml', 'tracked', 'report'
 EPILOG = """\
 DIR gets
   video/              the bag that import-video writes, see import-video --help
-  subject.yaml        the start of the track, if there are keypoints, see subject --help
+  subject.yaml        the start of the track, with --stature only, see subject --help
   tracked/            the bag that replay writes, see replay --help
   report/report.html  the page that report writes, for a browser
+
+The track starts from the keypoints that were imported, or without any from a prediction. --subject
+names a subject file instead, and --stature writes one from the keypoints of an image.
 
 examples:
   track-video walk.mp4 -o walk --fov 60 --keypoints walk.json
@@ -47,7 +50,11 @@ def _parser() -> CommandParser:
     )
     add_video_arguments(parser)
     parser.add_output('DIR', 'result', 'folder for the bags and the report')
-    parser.add_argument(
+    start = parser.add_mutually_exclusive_group()
+    start.add_argument(
+        '--subject', type=Path, metavar='FILE', help='subject file to start from, see replay'
+    )
+    start.add_argument(
         '--stature', type=number(0.3, 3), help='stature of the person, m (default: not known)'
     )
     parser.add_argument(
@@ -72,6 +79,9 @@ def _track(arguments: argparse.Namespace) -> int:
     with_keypoints = arguments.keypoints is not None or arguments.detector is not None
     if stature is not None and not with_keypoints:
         raise ValueError('--stature goes with --keypoints or --detector')
+    for given in (arguments.subject, arguments.background):
+        if given is not None and not given.is_file():
+            raise ValueError(f'{given}: no such file')
     taken = [x for x in (VIDEO, SUBJECT, TRACKED, REPORT) if (folder / x).exists()]
     if taken and not overwrite:
         raise ValueError(f'{folder / taken[0]} exists; give another name, or --overwrite')
@@ -79,14 +89,14 @@ def _track(arguments: argparse.Namespace) -> int:
     video, start = folder / VIDEO, folder / SUBJECT
     imported = import_video(ImportOptions.of(arguments, video), tell)
     say(f'{video}: {imported}')
-    if with_keypoints:
+    if stature is not None:
         seen = find_start(video, load_body('human37'))
         start.write_text(subject_text(seen, stature=stature), encoding='utf-8')
         say(f'{start}: {len(seen.joints.names)} joints at {seen.stamp_ns} ns')
     options = ReplayOptions(
         overwrite=overwrite,
         quiet=quiet,
-        subject=start if with_keypoints else None,
+        subject=arguments.subject if stature is None else start,
         background=arguments.background,
         seed=arguments.seed,
         settings=arguments.settings,

@@ -6,6 +6,8 @@ import pytest
 from hmt_ros.app import track_video
 from hmt_ros.app.bag_scores import score_bag
 from hmt_ros.app.truth import read_truth
+from hmt_ros.body import load_body
+from hmt_ros.tracking import read_subject
 
 
 def run(folder, *options):
@@ -19,8 +21,8 @@ def keypoints(folder):
 
 def test_from_video_to_report(walk_video, tmp_path, capsys):
     out = tmp_path / 'walk'
-    assert run(walk_video, '-o', str(out), *keypoints(walk_video), '--stature', '1.75') == 0
-    assert sorted(x.name for x in out.iterdir()) == ['report', 'subject.yaml', 'tracked', 'video']
+    assert run(walk_video, '-o', str(out), *keypoints(walk_video)) == 0
+    assert sorted(x.name for x in out.iterdir()) == ['report', 'tracked', 'video']
     assert (out / 'report' / 'report.html').stat().st_size > 100_000
     truth = read_truth(walk_video / 'rendered' / 'truth.npz')
     scored = score_bag(out / 'tracked', truth, topics=['pose_mixture'])['pose_mixture']
@@ -33,10 +35,30 @@ def test_from_video_to_report(walk_video, tmp_path, capsys):
     assert line == f'track-video: {out}/video exists; give another name, or --overwrite'
 
 
+def test_a_stature_and_a_subject_file(walk_video, tmp_path, monkeypatch):
+    """A stature makes a subject file from keypoints; one that is given is used as it is."""
+    used = []
+
+    def replay_bag(source, target, options, tell):
+        used.append(options.subject)
+        raise ValueError('enough')
+
+    monkeypatch.setattr(track_video, 'replay_bag', replay_bag)
+    out = tmp_path / 'walk'
+    assert run(walk_video, '-o', str(out), *keypoints(walk_video), '--stature', '1.75') == 1
+    written = out / 'subject.yaml'
+    assert read_subject(written, load_body('human37')).stature == 1.75
+    assert run(walk_video, '-o', str(tmp_path / 'given'), '--subject', str(written)) == 1
+    assert used == [written, written]
+    assert [x.name for x in (tmp_path / 'given').iterdir()] == ['video']
+
+
 @pytest.mark.parametrize(
     ('options', 'message'),
     [
         (['--stature', '1.7'], '--stature goes with --keypoints or --detector'),
+        (['--subject', 'nothing.yaml'], 'nothing.yaml: no such file'),
+        (['--subject', 'a.yaml', '--stature', '1.7'], '--stature: not allowed with argument'),
         (['--keypoints', 'nothing.json'], 'nothing.json: no such file'),
         (['--camera', 'camera.yaml'], '--camera: not allowed with argument --fov'),
     ],
