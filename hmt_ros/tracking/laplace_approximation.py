@@ -50,10 +50,11 @@ def posterior_modes(
     filtered = free_covariances(solved.hessian, solved.free)
     fit = posterior.fit(poses, observation)
     covariances = alone = filtered
-    if observation.evidence:
-        alone = covariances = posterior.covariances(fit, solved.free)
-    if observation.evidence or observation.keypoints is not None:
-        covariances = covariances + shape.considered(
+    images = bool(observation.evidence)
+    measured = images or observation.keypoints is not None
+    if measured:
+        alone = posterior.covariances(fit, solved.free, keypoints_alone=not images)
+        covariances = alone + shape.considered(
             posterior.likelihood, observation, poses, posterior.given_way(poses, observation)[1]
         )
     if states is None:
@@ -61,7 +62,7 @@ def posterior_modes(
         state_covariances = dynamics.states(filtered)
     else:
         found = filtered
-        if states.wandered.any() and observation.evidence:
+        if states.wandered.any() and measured:
             # Errors of images last: what is propagated believes a share of them, too.
             found = fused(states.covariances_of(h.ancestors, h.jumped), alone)
         velocities, state_covariances = states.given(h.ancestors, h.jumped, poses, found)
@@ -105,7 +106,7 @@ def likelihood_modes(
     step = np.clip(step, -limit, limit)
     means = np.clip(poses + step, body.lower, body.upper)
     if observation.evidence:
-        covariances = posterior.covariances(fit, free)
+        covariances = posterior.covariances(fit, free, keypoints_alone=False)
     nothing = np.zeros(len(poses))
     beta = posterior.trust.inverse_temperature
     weights = np.exp(normalised(weigh(nothing, fit.energy.value, beta)))

@@ -44,6 +44,10 @@ if TYPE_CHECKING:
     from hmt_ros.tracking.settings import TrackerSettings
 
 
+# Share of the curvature of keypoints that is believed where there is nothing else: errors of the
+# same landmark correlate by 0.86 from image to image, and n such images hold the information of
+# n (1 - 0.86) / (1 + 0.86) independent ones (see `trust`).
+KEYPOINT_SHARE = 0.075
 # Largest standard deviation of a mode: where an image shows nothing, rad or m.
 WIDEST = 2.0
 # Standard deviation of a variable that rests on its limit, rad or m: 3 degrees.
@@ -58,12 +62,14 @@ class ImageFit:
         energy: with the priors of the body.
         image_energy: (K,) of the image and the keypoints alone.
         image_hessian: (K, d, d) of the image terms alone, keypoints apart.
+        keypoint_hessian: (K, d, d) of the keypoints alone.
         outline_costs: (K, M) of the samples of the silhouette's outline.
     """
 
     energy: Energy
     image_energy: Array
     image_hessian: Array
+    keypoint_hessian: Array
     outline_costs: Array
 
 
@@ -220,16 +226,16 @@ class Posterior:
         frames, rows = forward(self.body.skeleton, poses), np.arange(len(poses))
         image = self.likelihood.energies(frames, observation)
         assert image.hessian is not None
-        _, *keypoints = self.likelihood.seen(observation)
-        seen = add_energies(
-            [
-                Energy(image.value, image.gradient, image.hessian),
-                *(term.energy(frames, rows) for term in keypoints),
-            ]
-        )
+        _, *terms = self.likelihood.seen(observation)
+        keypoints = [term.energy(frames, rows) for term in terms]
+        seen = add_energies([Energy(image.value, image.gradient, image.hessian), *keypoints])
+        of_keypoints = np.zeros_like(image.hessian)
+        for one in keypoints:
+            of_keypoints += one.derivatives()[1]
         known = (*self.likelihood.priors, *self.known)
         priors = [term.energy(frames, rows) for term in known]
-        fit = ImageFit(add_energies([seen, *priors]), seen.value, image.hessian, image.costs)
+        energy = add_energies([seen, *priors])
+        fit = ImageFit(energy, seen.value, image.hessian, of_keypoints, image.costs)
         self._last_fit = (poses, observation, fit)
         return fit
 
@@ -246,16 +252,24 @@ class Posterior:
         both = free[:, :, None] & free[:, None, :]
         return gradient * free, np.where(both, free_covariances(hessian, free), 0.0)
 
-    def covariances(self, fit: ImageFit, free: Mask) -> Array:
+    def covariances(self, fit: ImageFit, free: Mask, *, keypoints_alone: bool) -> Array:
         """Covariances (K, d, d) that an image alone leaves, on the free variables (K, d).
 
         Of the image only a share is believed: shapes, shadows and clothes differ from the model's
         in much the same way in image after image, and such errors do not average out, over pixels
-        or over time.
+        or over time. Nor do those of keypoints, but beside an image, which errs in other ways, they
+        count.
+
+        Args:
+            fit: of the poses.
+            free: (K, d) variables that do not rest on a limit.
+            keypoints_alone: whether there is nothing but keypoints.
         """
         _, hessian = fit.energy.derivatives()
-        disbelief = 1.0 - self.trust.information
-        return free_covariances(hessian - disbelief * fit.image_hessian, free)
+        disbelieved = (1.0 - self.trust.information) * fit.image_hessian
+        if keypoints_alone:
+            disbelieved = (1.0 - KEYPOINT_SHARE) * fit.keypoint_hessian
+        return free_covariances(hessian - disbelieved, free)
 
     def textures(self, poses: Array, observation: Observation) -> Textures | None:
         """What an image shows on the surfaces of poses (K, d)."""

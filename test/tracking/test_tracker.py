@@ -425,6 +425,16 @@ def test_surprising_images_are_searched_again(human32, started, black, motion, k
     assert evaluations[3, 3] > 1.5 * evaluations[1, 3]
 
 
+def test_keypoints_alone_leave_more_open_than_their_sum_says(follow):
+    """Their errors last from image to image: images are no independent witnesses."""
+    tracker, mixtures, _ = follow(6)
+    modes = tracker.modes
+    published, independent = (
+        np.trace(x, axis1=1, axis2=2) for x in (mixtures[-1][0].covariances, modes.filtered)
+    )
+    assert (published > 1.5 * independent).all()
+
+
 def test_who_jumps_is_found_where_the_keypoints_are(human32, started, black, motion, keypoints_of):
     tracker, errors = started(), []
     for i in range(6):
