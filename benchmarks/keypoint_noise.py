@@ -181,7 +181,7 @@ def _slopes(
     for keypoints, pose, exchange in zip(found, poses, exchanges, strict=True):
         if exchange != 0:
             continue
-        slopes = _term(body, clip, keypoints, pose)._slopes
+        slopes = _term(body, clip, keypoints, pose).measured.slopes
         columns = forward(body.skeleton, pose[None]).by_pose()[0][0]
         own = slopes.segments[:, 0]
         directions = np.einsum('bci,bc->bi', columns[own], slopes.directions[:, 0])
