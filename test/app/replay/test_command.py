@@ -19,6 +19,7 @@ from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.tracking import Status
 from hmt_ros.tracking.ground import Ground
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
+from msg_tools.bags.contents import absolute_name
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.images import decode_image, image_message
@@ -39,12 +40,13 @@ def recorded():
     found, last = [], None
     with BagReader(REACH) as bag:
         for stored in bag.messages():
-            if stored.topic == 'image/compressed':
+            name = stored.topic.removeprefix('/')
+            if name == 'image/compressed':
                 last = stored.log_time_ns
-                if sum(topic == stored.topic for topic, _, _ in found) == IMAGES:
+                if sum(topic == name for topic, _, _ in found) == IMAGES:
                     break
-            if stored.topic != 'body':
-                found.append((stored.topic, stored.log_time_ns, stored.message))
+            if name != 'body':
+                found.append((name, stored.log_time_ns, stored.message))
     return [entry for entry in found if last is not None and entry[1] < last]
 
 
@@ -56,10 +58,12 @@ def write(folder, entries):
 
 
 def read(folder):
+    """Messages of a bag by the names of their topics, all of which are absolute."""
     found = {}
     with BagReader(folder) as bag:
         for stored in bag.messages():
             found.setdefault(stored.topic, []).append(stored)
+    assert all(topic.startswith('/') for topic in found)
     return found
 
 
@@ -140,29 +144,33 @@ def replayed(short, tmp_path_factory):
 def test_topics(replayed, entries):
     found = read(replayed)
     stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
-    assert {topic: len(messages) for topic, messages in found.items()} == {
+    counts = {
         **dict.fromkeys(STARTS, 1),
         'ground_truth': IMAGES,
         **{topic: IMAGES for topic in (*TOPICS, *SMOOTHED_TOPICS) if topic not in STARTS},
     }
+    assert {topic: len(messages) for topic, messages in found.items()} == {
+        absolute_name(topic): count for topic, count in counts.items()
+    }
     for topic, published in {**TOPICS, **SMOOTHED_TOPICS}.items():
-        assert {stored.msgtype for stored in found[topic]} == {published.msgtype}
+        messages = found[absolute_name(topic)]
+        assert {stored.msgtype for stored in messages} == {published.msgtype}
         if topic not in STARTS:
-            assert [stored.log_time_ns for stored in found[topic]] == stamps
+            assert [stored.log_time_ns for stored in messages] == stamps
     assert sorted(content(replayed)) == ['metadata.yaml', 'tracked.mcap']
 
 
 def test_mixtures_explain_the_images(replayed):
     found = read(replayed)
-    (body,) = (stored.message for stored in found['body'])
-    first = pose_mixture_of(found['pose_mixture'][0].message, body.dof_names, body.joint_names)
+    (body,) = (stored.message for stored in found['/body'])
+    first = pose_mixture_of(found['/pose_mixture'][0].message, body.dof_names, body.joint_names)
     body_joints = body_of(first, load_body('human37')).joint_positions
     for posterior, likelihood, truth, state, overlay in zip(
-        found['pose_mixture'],
-        found['likelihood_mixture'],
-        found['ground_truth'],
-        found['joint_states'],
-        found['overlay/compressed'],
+        found['/pose_mixture'],
+        found['/likelihood_mixture'],
+        found['/ground_truth'],
+        found['/joint_states'],
+        found['/overlay/compressed'],
         strict=True,
     ):
         mixture = pose_mixture_of(posterior.message, body.dof_names, body.joint_names)
@@ -191,10 +199,10 @@ def test_without_a_subject_a_prediction_starts_the_track(short, tmp_path, capsys
         in capsys.readouterr().err
     )
     found = read(out)
-    assert {len(found[topic]) for topic in ('pose_prediction', 'pose_mixture')} == {IMAGES}
-    predicted = pose_mixture_of(found['pose_prediction'][0].message)
+    assert {len(found[topic]) for topic in ('/pose_prediction', '/pose_mixture')} == {IMAGES}
+    predicted = pose_mixture_of(found['/pose_prediction'][0].message)
     assert predicted.kind == MixtureKind.PREDICTION
-    (body,) = (stored.message for stored in found['body'])
+    (body,) = (stored.message for stored in found['/body'])
     # The person is about as large as the model says; the first image says a little.
     model = load_predictor().body.segment_lengths
     assert dict(zip(body.segment_names, body.segment_lengths, strict=True)) == pytest.approx(
@@ -208,12 +216,12 @@ def test_without_a_subject_a_prediction_starts_the_track(short, tmp_path, capsys
 def test_predictions_beside_a_subject(still, short, tmp_path):
     out = tmp_path / 'out'
     assert main([str(short), '-o', str(out), *PERSON, '--bme', '--quiet']) == 0
-    assert len(read(out)['pose_prediction']) == IMAGES
+    assert len(read(out)['/pose_prediction']) == IMAGES
     assert [prediction is None for prediction in still[0].predictions] == [False] * IMAGES
 
 
 def test_ground_truth_is_copied(replayed, entries):
-    copied = [stored.message for stored in read(replayed)['ground_truth']]
+    copied = [stored.message for stored in read(replayed)['/ground_truth']]
     given = [message for topic, _, message in entries if topic == 'ground_truth']
     for one, other in zip(copied, given, strict=True):
         assert one.header == other.header
@@ -241,12 +249,12 @@ def test_images_are_copied_on_demand(still, short, tmp_path, entries):
     found = read(out)
     for topic in ('image/compressed', 'camera_info'):
         given = [(time, m.header) for name, time, m in entries if name == topic]
-        assert [(s.log_time_ns, s.message.header) for s in found[topic]] == given
+        assert [(s.log_time_ns, s.message.header) for s in found[f'/{topic}']] == given
     # What came out can be tracked again.
     assert main([str(out), '-o', str(tmp_path / 'again'), *SUBJECT, '--quiet']) == 0
     assert read(tmp_path / 'again').keys() == read(tmp_path / 'out').keys() - {
-        'image/compressed',
-        'camera_info',
+        '/image/compressed',
+        '/camera_info',
     }
 
 
@@ -293,7 +301,7 @@ def test_keypoints_of_the_bag_are_used(still, entries, tmp_path):
     options = [*SUBJECT, '--quiet', '-o']
     assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
     assert still[-1].keypoints == [('head', 'left_hip', 'right_hip'), ()]
-    assert len(read(tmp_path / 'out')['pose_mixture']) == IMAGES
+    assert len(read(tmp_path / 'out')['/pose_mixture']) == IMAGES
     assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_keypoints=false']) == 0
     assert still[-1].keypoints == [None] * IMAGES
 
@@ -358,7 +366,7 @@ def test_masks_of_the_bag_are_used(still, entries, tmp_path, topic):
     options = [*SUBJECT, '--quiet', '-o']
     assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
     assert still[-1].masks == [4000, None]
-    assert len(read(tmp_path / 'out')['pose_mixture']) == IMAGES
+    assert len(read(tmp_path / 'out')['/pose_mixture']) == IMAGES
     assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_mask=false']) == 0
     assert still[-1].masks == [None] * IMAGES
 
@@ -391,7 +399,7 @@ def test_topics_are_found_by_their_names(entries, tmp_path):
         found = recorded_input(bag)
         assert found.image.name == '/cam/image_raw/compressed'
         assert found.camera_info.name == '/cam/camera_info'
-        assert found.ground_truth.name == 'ground_truth'
+        assert found.ground_truth.name == '/ground_truth'
         assert (found.keypoints, found.transport) == (None, 'compressed')
     several = write(tmp_path / 'several', renamed(entries, names) + renamed(entries, others))
     with BagReader(several) as bag:
@@ -406,8 +414,8 @@ def test_topics_are_found_by_their_names(entries, tmp_path):
         assert found.camera_info.name == '/cam/camera_info'
     usual = write(tmp_path / 'usual', renamed(entries, others) + entries)
     with BagReader(usual) as bag:
-        assert recorded_input(bag).image.name == 'image/compressed'
-        assert recorded_input(bag).camera_info.name == 'camera_info'
+        assert recorded_input(bag).image.name == '/image/compressed'
+        assert recorded_input(bag).camera_info.name == '/camera_info'
 
 
 def test_learned_background_needs_images_before_the_track(still, short, tmp_path, entries):
@@ -417,7 +425,7 @@ def test_learned_background_needs_images_before_the_track(still, short, tmp_path
     subject.write_text(text.replace(str(stamps[0]), str(stamps[1])))
     out = tmp_path / 'out'
     assert main([str(short), '-o', str(out), '--subject', str(subject), '--quiet']) == 0
-    assert [stored.log_time_ns for stored in read(out)['pose_mixture']] == stamps[1:]
+    assert [stored.log_time_ns for stored in read(out)['/pose_mixture']] == stamps[1:]
 
 
 def test_nothing_is_overwritten_unasked(still, short, tmp_path, capsys):

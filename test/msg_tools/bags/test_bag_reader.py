@@ -70,18 +70,18 @@ def write_metadata(folder: Path, names: list[str]) -> None:
 def test_reads_what_the_writer_wrote(small_bag: Path) -> None:
     with BagReader(small_bag) as bag:
         assert {name: topic.message_count for name, topic in bag.topics.items()} == {
-            'note': 1,
-            'text': 26,
-            'image/compressed': 13,
+            '/note': 1,
+            '/text': 26,
+            '/image/compressed': 13,
         }
-        assert bag.topics['note'].msgtype == STRING
+        assert bag.topic('note').msgtype == STRING
         assert bag.message_count() == 40
         assert bag.message_count(['/text', 'note']) == 27
         assert (bag.start_ns, bag.end_ns) == (10**18, 10**18 + 38 * 10**8)
         stored = list(bag.messages(['text']))
         assert [message.message.data for message in stored[:2]] == ['text 1', 'text 2']
         assert stored[0].message is stored[0].message
-        assert all(message.topic == 'text' and message.msgtype == STRING for message in stored)
+        assert all(message.topic == '/text' and message.msgtype == STRING for message in stored)
         # Again, and as a single file.
         assert [m.log_time_ns for m in bag.messages(['text'])] == [m.log_time_ns for m in stored]
     assert values(small_bag / 'small.mcap', ['text']) == values(small_bag, ['text'])
@@ -161,7 +161,7 @@ def test_compressed_file_that_was_cut(tmp_path: Path, small_bag: Path) -> None:
     path.write_bytes(content[: len(content) // 2])
     with BagReader(path) as bag:
         stream = bag.messages()
-        assert next(stream).topic == 'note'
+        assert next(stream).topic == '/note'
         with pytest.raises(BagError, match=r'cut\.mcap\.zstd breaks off'):
             list(stream)
 
