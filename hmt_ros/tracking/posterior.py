@@ -242,11 +242,10 @@ class Posterior:
     def log_likelihoods(self, poses: Array, observation: Observation) -> Array:
         """log p(image | pose) of poses (K, d), (K,), nats up to a constant of the image."""
         frames, rows = forward(self.body.skeleton, poses), np.arange(len(poses))
-        energies = self.likelihood.energies(frames, observation, derivatives=False).value
-        _, *terms = self.likelihood.seen(observation)
-        for term in terms:
-            energies = energies + term.energy(frames, rows, derivatives=Derivatives.NONE).value
-        return -np.asarray(energies)
+        energies = np.zeros(len(poses))
+        for term in self.likelihood.seen(observation):
+            energies += term.energy(frames, rows, derivatives=Derivatives.NONE).value
+        return -energies
 
     def given_way(self, poses: Array, observation: Observation) -> tuple[Array, Array]:
         """How poses (K, d) give way when something else changes, without what was expected.

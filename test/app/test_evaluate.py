@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hmt_ros.app import progress
 from hmt_ros.app.evaluate import main
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS, ground_truth
 from hmt_ros.body import load_body
@@ -123,6 +124,15 @@ def test_numbers_are_those_of_the_library(capsys, bag, body, poses, mixtures, tr
     assert list(found['by_joint']) == list(EVALUATED_JOINTS)
     for joint, values in wanted['by_joint'].items():
         assert found['by_joint'][joint] == pytest.approx(values)
+
+
+def test_progress_leaves_stdout_to_the_numbers(capsys, bag, truth_file, monkeypatch):
+    wanted = report(capsys, bag, '--truth', truth_file)
+    monkeypatch.setattr(progress, 'INTERVAL', 1e-4)
+    code, out, errors = run(capsys, bag, '--truth', truth_file, '--json')
+    assert (code, json.loads(out)) == (0, wanted)
+    assert errors[-1].startswith(f'evaluate: {FRAMES + 1} messages in ')
+    assert run(capsys, bag, '--truth', truth_file, '--json', '--quiet') == (0, out, [])
 
 
 def test_truth_from_the_bag_itself_and_from_another_bag(capsys, bag, truth_file):
@@ -324,6 +334,8 @@ def test_every_topic_gets_a_row_and_one_can_be_chosen(
     assert without_names(likelihood) == without_names(smoothed)
     one = report(capsys, path, '--truth', truth_file, '--topic', '/p/smoothed_pose_mixture')
     assert list(one['topics']) == ['/p/smoothed_pose_mixture']
+    # A relative name does, where one namespace has it.
+    assert one == report(capsys, path, '--truth', truth_file, '--topic', 'smoothed_pose_mixture')
     code, out, _ = run(capsys, path, '--truth', truth_file)
     assert code == 0
     assert sum(line.startswith('/p/') for line in out.splitlines()) == 3

@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from hmt_ros.app.replay.command import main
 from hmt_ros.app.replay.inputs import recorded_input
@@ -188,6 +190,82 @@ def test_mixtures_explain_the_images(replayed):
         errors = errors - (joints[order] - joints[order][:1])
         assert np.linalg.norm(errors, axis=2).mean(1).min() < 0.15
         assert decode_image(overlay.message).shape == (360, 480, 3)
+
+
+def test_log_likelihoods_of_both_mixtures_are_known(replayed):
+    found = read(replayed)
+    for topic in ('/pose_mixture', '/likelihood_mixture'):
+        for stored in found[topic]:
+            values = [component.log_likelihood for component in stored.message.components]
+            assert np.isfinite(values).all(), topic
+
+
+def test_results_in_a_namespace(still, entries, tmp_path, capsys):
+    """Inputs keep their names; those in the namespace are preferred to those in the root."""
+    place = '/humans/bodies/anna'
+    keypoints = MESSAGES.create(
+        'hmt_msgs/msg/Keypoints2D',
+        header=entries[0][2].header,
+        names=['nose'],
+        u=np.array([9.0], np.float32),
+        v=np.array([9.0], np.float32),
+    )
+    names = ('keypoints', f'{place}/keypoints', '/detector/keypoints')
+    extra = [(name, entries[0][1], keypoints) for name in names]
+    bag = write(tmp_path / 'bag', [*extra, *entries])
+    results = {
+        f'{place}/{topic}' if topic != '/tf' else '/tf' for topic in (*TOPICS, *SMOOTHED_TOPICS)
+    }
+    command = [str(bag), *PERSON, '--quiet', '-o']
+    for name, given in (('absolute', place), ('slash', 'humans/bodies/anna/')):
+        out = tmp_path / name
+        assert main([*command, str(out), '--namespace', given]) == 0
+        assert read(out).keys() == {*results, '/ground_truth', f'{place}/keypoints'}
+    chosen = tmp_path / 'chosen'
+    arguments = ['--namespace', place, '--keypoints-topic', '/detector/keypoints']
+    assert main([*command, str(chosen), *arguments]) == 0
+    assert read(chosen).keys() == {*results, '/ground_truth', '/detector/keypoints'}
+    assert main([*command, str(tmp_path / 'root')]) == 0
+    assert '/keypoints' in read(tmp_path / 'root')
+    capsys.readouterr()
+    for wrong in ('/humans/7', 'a b', '/a//b'):
+        assert main([*command, str(tmp_path / 'wrong'), '--namespace', wrong]) == 1
+        line = capsys.readouterr().err
+        assert 'wanted a namespace such as /humans/bodies/anna' in line
+        assert repr(wrong) in line
+    assert main([*command, str(tmp_path / 'wrong'), '--mask-topic', 'keypoints']) == 1
+    assert 'wanted CompressedImage or Image' in capsys.readouterr().err.replace(
+        'Image or CompressedImage', 'CompressedImage or Image'
+    )
+
+
+def test_bag_with_relative_names(still, entries, short, tmp_path):
+    """Bags of earlier versions are read as before."""
+    old = tmp_path / 'old.mcap'
+    relative_names(short / 'short.mcap', old)
+    with BagReader(old) as bag:
+        assert set(bag.topics) == {'image/compressed', 'camera_info', 'ground_truth'}
+    for source, name in ((old, 'a'), (short, 'b')):
+        assert main([str(source), '-o', str(tmp_path / name / 'out'), *SUBJECT, '--quiet']) == 0
+    assert content(tmp_path / 'a' / 'out') == content(tmp_path / 'b' / 'out')
+
+
+def relative_names(source, target):
+    """Copies an MCAP file; names of topics lose their slash."""
+    with source.open('rb') as file, target.open('wb') as copy:
+        writer = Writer(copy)
+        writer.start(profile='ros2')
+        channels = {}
+        for schema, channel, message in make_reader(file).iter_messages():
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic[1:], 'cdr', known, channel.metadata
+                )
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time
+            )
+        writer.finish()
 
 
 def test_without_a_subject_a_prediction_starts_the_track(short, tmp_path, capsys):

@@ -235,6 +235,21 @@ def test_big_endian_messages(tmp_path: Path, messages: RosbagsMessages) -> None:
         assert stored.message.position.tolist() == [1.5, -2.0]
 
 
+def test_relative_names_mean_topics_in_a_namespace(
+    tmp_path: Path, messages: RosbagsMessages
+) -> None:
+    with BagWriter(tmp_path / 'bag') as writer:
+        for topic in ('/p/body', '/p/note', '/q/note'):
+            writer.write(topic, 1, messages.create(STRING, data=topic))
+    with BagReader(tmp_path / 'bag') as bag:
+        assert [m.message.data for m in bag.messages(['body', 'q/note'])] == ['/p/body', '/q/note']
+        with pytest.raises(BagError, match='several topics note: name one of /p/note, /q/note'):
+            bag.topic('note')
+        for absolute in ('/body', '/note'):
+            with pytest.raises(BagError, match=f'has no topic {absolute}; it has /p/body, '):
+                bag.topic(absolute)
+
+
 def test_find_topic(tmp_path: Path, messages: RosbagsMessages) -> None:
     path = tmp_path / 'bag'
     with BagWriter(path) as writer:
