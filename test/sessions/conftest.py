@@ -41,6 +41,7 @@ class StubTracker:
         self.silhouettes = SimpleNamespace(doubted=False, share=0.9, known='known')
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.track_id, self.started_from = 0, None
+        self.log_likelihoods = np.array([-1.5, -2.5])
         self.known_ground = known_ground
         up = np.array([0.0, -1.0, 0.0]) if known_ground.up is None else known_ground.up
         self.ground = Ground(up, 0.1, known_ground.camera_height, 0.02)
