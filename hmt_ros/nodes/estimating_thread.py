@@ -157,7 +157,7 @@ class EstimatingThread:
         log_error: Callable[[str], None],
     ) -> None:
         self._session = session
-        self._inputs: Mapping[str, SubscribedTopic] = {one.source: one for one in inputs}
+        self._inputs: dict[str, SubscribedTopic] = {one.source: one for one in inputs}
         limits = {one.source: one.waiting for one in self._inputs.values()}
         # Of several requests to start anew the last counts.
         limits[_RESTART] = 1
@@ -168,6 +168,11 @@ class EstimatingThread:
         self._latencies: deque[float] = deque(maxlen=1000)
         self._thread = threading.Thread(target=self._work, name='estimate', daemon=True)
         self._thread.start()
+
+    def listen(self, one: SubscribedTopic) -> None:
+        """Adds a topic that messages come from."""
+        self.queue.limit(one.source, one.waiting)
+        self._inputs[one.source] = one
 
     def put(self, source: str, data: bytes, arrival: float) -> None:
         """Adds a message."""
