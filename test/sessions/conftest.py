@@ -12,7 +12,7 @@ import pytest
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions import bme_session, track_start
+from hmt_ros.sessions import bme_session, camera_session, track_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
 from hmt_ros.tracking.beginning import Source
 from hmt_ros.tracking.ground import Ground
@@ -325,3 +325,9 @@ class Likelihoods:
 @pytest.fixture(scope='session')
 def likelihoods():
     return Likelihoods()
+
+
+@pytest.fixture
+def few_wait(monkeypatch):
+    """Only `queue_size` images may wait for other inputs."""
+    monkeypatch.setattr(camera_session, 'MOST_INCOMPLETE', 1)
