@@ -59,7 +59,7 @@ from hmt_ros.tracking.ground import KnownGround
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.headers import SECOND_NS, time_ns
-from msg_tools.messages.pose_mixtures import pose_mixture_of
+from msg_tools.messages.pose_mixtures import TrackState, pose_mixture_of
 
 __all__ = [
     'CAMERA_INFO',
@@ -105,6 +105,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         p = parameters
         self.frames = CameraFrames(p.gravity_frame, p.fixed_frame, floor=p.floor_in_gravity_frame)
         self._tracker: Tracker | None = None
+        self._tracks = 0
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
         self._keypoints = KeypointInputs(self._log)
@@ -138,11 +139,15 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             super()._take(source, message, stamp)
 
     def _forget(self) -> None:
+        if self._tracker is not None:
+            self._tracks = self._tracker.track_id
         self._tracker = None
         self._shown_body = None
 
     def _forget_inputs(self, stamp: int) -> None:
         super()._forget_inputs(stamp)
+        # Where time begins again, so do the numbers of the tracks.
+        self._tracker, self._tracks = None, 0
         self._keypoints.clear()
         self._predictions.clear()
         self.frames.forget_after(stamp)
@@ -236,6 +241,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             if self._tracker is None:
                 known = self.frames.known_ground(self.start.parameters.known_ground)
                 self._tracker = self.start.tracker(camera, known)
+                self._tracker.track_id = self._tracks
             elif self.frames.newest:
                 seen = self.frames.known_ground(KnownGround())
                 assert seen.up is not None
@@ -318,6 +324,10 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             ground=tracker.ground,
             contacts=tracker.contacts,
             starts=starts,
+            state=TrackState.LOST if tracker.status is Status.LOST else TrackState.TRACKING,
+            track_id=tracker.track_id,
+            identities=tracker.modes.identities,
+            velocities=tracker.velocities,
         )
         presentation = Presentation(
             tracker.settings.max_hypotheses,
@@ -345,6 +355,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         nobody_messages(
             self._messages,
             tracker.body,
+            tracker.track_id,
             tracker.settings.max_hypotheses,
             waiting.stamp_ns,
             waiting.frame_id,
@@ -370,7 +381,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             evaluations=0 if tracker is None else tracker.evaluations,
             background='unknown' if silhouettes is None else silhouettes.known,
             doubted=silhouettes is not None and silhouettes.doubted,
-            track_id=0 if self._tracker is None else self._tracker.track_id,
+            track_id=self._tracks if self._tracker is None else self._tracker.track_id,
             started_from='' if source is None else source.value,
         )
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.image.observation import Observation
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import resting
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
@@ -33,6 +33,7 @@ def posterior_modes(
     shape: ShapeEstimate,
     dynamics: LinearGaussianDynamics,
     states: PredictedStates | None,
+    identities: Index,
 ) -> Modes:
     """The modes of the posterior.
 
@@ -44,6 +45,7 @@ def posterior_modes(
         shape: of the person, as far as it is known.
         dynamics: how modes move by themselves.
         states: of the ancestors, predicted; None: the modes begin, at rest.
+        identities: (K,) of the modes.
     """
     h, solved = selected.hypotheses, selected.minima
     poses = solved.x
@@ -82,6 +84,7 @@ def posterior_modes(
         log_likelihoods=-fit.image_energy,
         energies=solved.value,
         state_covariances=state_covariances,
+        identities=identities,
     )
 
 

@@ -67,7 +67,15 @@ class StubTracker:
 
     @property
     def modes(self):
-        return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]))
+        identities = np.array([len(self.seen), 77])
+        return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]), identities=identities)
+
+    @property
+    def velocities(self):
+        """To the right, from the second image on."""
+        moving = np.zeros((2, self.body.dimension))
+        moving[:, 0] = [1.5, 0.0]
+        return moving if len(self.seen) > 1 else None
 
     @property
     def point_estimate(self):

@@ -14,9 +14,10 @@ from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.tracking import Status
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
-from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.pose_mixtures import MixtureKind, TrackState, pose_mixture_of
 from test.sessions.conftest import JOINTS, Likelihoods
 
 MIXTURES = ['pose_mixture', 'likelihood_mixture']
@@ -55,6 +56,70 @@ def test_images_become_messages_in_their_order(session, outputs, small_camera):
     assert (one.state.status, one.state.modes, one.state.wants) == ('tracking', 2, '')
     assert np.isclose(one.state.entropy, -(0.75 * np.log(0.75) + 0.25 * np.log(0.25)))
     assert (one.state.misfit, one.state.evaluations) == (0.125, 7)
+
+
+def mixtures_of(outputs, topic='pose_mixture'):
+    """Contents of the mixtures on a topic."""
+    data = [output.data for output in outputs if output.topic == topic]
+    return [pose_mixture_of(deserialise(each, TOPICS[topic].msgtype)) for each in data]
+
+
+def test_mixtures_tell_state_track_and_identities(session, outputs, small_camera, stub_tracker):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.take(IMAGE, small_camera.image(1))
+    stub_tracker.empty.add(small_camera.stamp(2))
+    one.take(IMAGE, small_camera.image(2))
+    states = [TrackState.TRACKING, TrackState.TRACKING, TrackState.NOBODY]
+    for topic in MIXTURES:
+        found = mixtures_of(outputs, topic)
+        assert [content.state for content in found] == states
+        assert [content.track_id for content in found] == [1, 1, 1]
+    ids = [content.identities.tolist() for content in mixtures_of(outputs)]
+    assert ids == [[1, 77], [2, 77], []]
+    likelihoods = mixtures_of(outputs, 'likelihood_mixture')
+    assert [content.identities.tolist() for content in likelihoods] == [[0, 0], [0, 0], []]
+
+
+def test_joints_have_covariances_and_velocities(session, outputs, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.take(IMAGE, small_camera.image(1))
+    first, second = mixtures_of(outputs)
+    # Nothing is known of motion in the first image.
+    assert first.joint_velocities is None
+    assert np.allclose(second.joint_velocities[0], [1.5, 0.0, 0.0])
+    assert np.allclose(second.joint_velocities[1], 0.0)
+    for content in (first, second, *mixtures_of(outputs, 'likelihood_mixture')):
+        assert np.linalg.eigvalsh(content.joint_covariances).min() > 0
+
+
+def test_a_lost_track_is_told(session, outputs, small_camera, stub_tracker, monkeypatch):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+
+    def step(tracker, *inputs, **more):
+        found = usual(tracker, *inputs, **more)
+        tracker.status = Status.LOST
+        return found
+
+    usual = stub_tracker.step
+    monkeypatch.setattr(stub_tracker, 'step', step)
+    one.take(IMAGE, small_camera.image(0))
+    assert [content.state for content in mixtures_of(outputs)] == [TrackState.LOST]
+
+
+def test_a_reset_starts_a_new_track(session, outputs, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.restart()
+    assert one.state.track_id == 1
+    one.take(IMAGE, small_camera.image(1))
+    assert [content.track_id for content in mixtures_of(outputs)] == [1, 2]
+    assert one.state.track_id == 2
 
 
 def test_same_messages_same_bytes(session, outputs, small_camera):
