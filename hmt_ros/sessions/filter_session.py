@@ -176,7 +176,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     def _prediction_in(self, message: Any) -> PosePrediction | Status | None:
         """The mixture and its body, see `body_of`; `NOBODY`: was seen; None: not to be used."""
         if len(message.components) == 0:
-            return Status.NOBODY
+            # A predictor that leaves the image to the track has seen neither somebody nor nobody.
+            return None if message.state == TrackState.TRACKING else Status.NOBODY
         try:
             content = pose_mixture_of(message)
             return PosePrediction(content.mixture, body_of(content, self.start.body))
