@@ -12,7 +12,7 @@ import pytest
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions import bme_session, track_start
+from hmt_ros.sessions import bme_session, camera_session, track_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
 from hmt_ros.tracking.beginning import Source
 from hmt_ros.tracking.ground import Ground
@@ -356,3 +356,9 @@ def hri_msgs(tmp_path_factory):
     for name, text in HRI_MSGS.items():
         (folder / f'{name}.msg').write_text(text)
     register_definitions('hri_msgs', folder)
+
+
+@pytest.fixture
+def few_wait(monkeypatch):
+    """Only `queue_size` images may wait for other inputs."""
+    monkeypatch.setattr(camera_session, 'MOST_INCOMPLETE', 1)
