@@ -223,6 +223,15 @@ def test_a_failed_build_of_messages_says_what_to_do(install_messages: Any, tmp_p
     assert len(install_messages.calls) == 1
 
 
+def test_without_a_ros_environment_nothing_is_built(
+    install_messages: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv('AMENT_PREFIX_PATH')
+    with pytest.raises(SystemExit, match=r'source /opt/ros/jazzy/setup\.bash'):
+        install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
+    assert install_messages.calls == []
+
+
 def test_only_an_installation_into_ros_builds_messages(
     install_messages: Any, tmp_path: Path
 ) -> None:
