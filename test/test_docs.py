@@ -65,6 +65,7 @@ FOREIGN = {
     'sed',
     'git',
     'docker',
+    'rosdoc2',
     'sphinx-build',
     'install/hmt_ros/lib/hmt_ros/filter_node',
 }
