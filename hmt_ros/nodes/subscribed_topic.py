@@ -51,6 +51,12 @@ class SubscribedTopic(NamedTuple):
     largest: int = LARGEST_MESSAGE
     waiting: int = SMALL_QUEUE
 
+    @property
+    def opens_with_header(self) -> bool:
+        """Whether messages of the type begin with a std_msgs/Header."""
+        first = next(iter(message_class(self.msgtype).get_fields_and_field_types().values()), '')
+        return bool(first == 'std_msgs/Header')
+
 
 MASK_TOPICS = (
     SubscribedTopic(

@@ -131,6 +131,11 @@ class HandlingLog:
         self.counts['skipped'] += 1
         self.fault(kind, text)
 
+    def drop(self, text: str) -> None:
+        """Reports a message that is not estimated from because the node is late; no fault of it."""
+        self.counts['dropped'] += 1
+        self._told.append(one_line(text))
+
     def count_dropped(self, messages: int) -> None:
         """Counts messages that were dropped before they came here."""
         self.counts['received'] += messages

@@ -12,7 +12,7 @@ import pytest
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions import bme_session, track_start
+from hmt_ros.sessions import bme_session, camera_session, track_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
 from hmt_ros.tracking.beginning import Source
 from hmt_ros.tracking.ground import Ground
@@ -42,6 +42,7 @@ class StubTracker:
         self.silhouettes = SimpleNamespace(doubted=False, share=0.9, known='known')
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.track_id, self.started_from = 0, None
+        self.log_likelihoods = np.array([-1.5, -2.5])
         self.known_ground = known_ground
         up = np.array([0.0, -1.0, 0.0]) if known_ground.up is None else known_ground.up
         self.ground = Ground(up, 0.1, known_ground.camera_height, 0.02)
@@ -68,7 +69,15 @@ class StubTracker:
 
     @property
     def modes(self):
-        return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]))
+        identities = np.array([len(self.seen), 77])
+        return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]), identities=identities)
+
+    @property
+    def velocities(self):
+        """To the right, from the second image on."""
+        moving = np.zeros((2, self.body.dimension))
+        moving[:, 0] = [1.5, 0.0]
+        return moving if len(self.seen) > 1 else None
 
     @property
     def point_estimate(self):
@@ -347,3 +356,9 @@ def hri_msgs(tmp_path_factory):
     for name, text in HRI_MSGS.items():
         (folder / f'{name}.msg').write_text(text)
     register_definitions('hri_msgs', folder)
+
+
+@pytest.fixture
+def few_wait(monkeypatch):
+    """Only `queue_size` images may wait for other inputs."""
+    monkeypatch.setattr(camera_session, 'MOST_INCOMPLETE', 1)
