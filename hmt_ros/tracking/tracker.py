@@ -290,6 +290,15 @@ class Tracker:
         return self._point.pose
 
     @property
+    def velocities(self) -> Array | None:
+        """Velocities (K, d) of the present modes, per second; None: unknown.
+
+        They are unknown in the first image of a track, and where poses walk randomly.
+        """
+        velocities = self.modes.velocities
+        return velocities if velocities.any() else None
+
+    @property
     def posterior(self) -> GaussianMixture:
         """The present posterior."""
         return self.modes.mixture(1.0 - self.settings.error_correlation)
