@@ -21,6 +21,7 @@ from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import Scores
 from hmt_ros.sessions import (
     bme_session,
+    hri_session,
     keypoints_adapter_session,
     keypoints_session,
     smoothed_messages,
@@ -29,6 +30,7 @@ from hmt_ros.sessions import (
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import declared_parameters
 from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
@@ -51,6 +53,11 @@ NODES = {
     'bme_node': (BmeParameters(), bme_session.TOPICS),
     'keypoints_node': (KeypointsParameters(), keypoints_session.TOPICS),
     'keypoints_adapter_node': (KeypointsAdapterParameters(), keypoints_adapter_session.TOPICS),
+    'hri_node': (
+        HriParameters(),
+        hri_session.TOPICS
+        | {hri_session.body_topic('<id>', name): x for name, x in hri_session.BODY_TOPICS.items()},
+    ),
 }
 # Programs that are not part of this repository.
 FOREIGN = {
