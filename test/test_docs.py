@@ -290,7 +290,7 @@ def test_every_page_is_in_the_contents():
     lines = [line for tree in trees for line in tree.splitlines()]
     listed = [line for line in lines if line and not line.startswith(':')]
     pages = {page.stem for page in (ROOT / 'docs').glob('*.md')} - {'index'}
-    assert sorted(listed) == sorted(pages)
+    assert sorted(listed) == sorted(pages), 'list every page once in docs/index.md'
 
 
 def test_rosdoc2_finds_the_pages():
