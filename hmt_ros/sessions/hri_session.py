@@ -202,7 +202,6 @@ class HriSession(Session[HriParameters, HriState]):
             while len(self._images) > _IMAGES:
                 del self._images[next(iter(self._images))]
         else:
-            self._log.counts['received'] += 1
             self._take_mixture(source.removeprefix(mixture_source('')), message, stamp)
 
     def _take_camera_info(self, message: Any, stamp: int) -> None:
