@@ -179,7 +179,7 @@ class EstimatingThread:
     ) -> None:
         self._session = session
         session.interrupted = self._is_interrupted
-        self._inputs: Mapping[str, SubscribedTopic] = {one.source: one for one in inputs}
+        self._inputs: dict[str, SubscribedTopic] = {one.source: one for one in inputs}
         self._stamped = {one.source for one in self._inputs.values() if one.opens_with_header}
         limits = {one.source: one.waiting for one in self._inputs.values()}
         # Of several requests to start anew the last counts.
@@ -192,6 +192,13 @@ class EstimatingThread:
         self._arrivals: dict[int, float] = {}
         self._thread = threading.Thread(target=self._work, name='estimate', daemon=True)
         self._thread.start()
+
+    def listen(self, one: SubscribedTopic) -> None:
+        """Adds a topic that messages come from."""
+        self.queue.limit(one.source, one.waiting)
+        self._inputs[one.source] = one
+        if one.opens_with_header:
+            self._stamped.add(one.source)
 
     def put(self, source: str, data: bytes, arrival: float) -> None:
         """Adds a message."""

@@ -321,6 +321,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             posterior=posterior,
             likelihood=likelihood,
             log_likelihoods=tracker.modes.log_likelihoods,
+            likelihood_values=tracker.log_likelihoods,
             point=tracker.point_estimate,
             ground=tracker.ground,
             contacts=tracker.contacts,

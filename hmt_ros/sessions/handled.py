@@ -50,6 +50,9 @@ class Fault(Enum):
     NEW_BODY = 'new body'
     MIXTURE_KIND = 'kind of mixture'
     GAP = 'gap'
+    HUMAN = 'reference model'
+    NO_IMAGE = 'no image'
+    OTHER_CAMERA = 'other camera'
 
 
 class Output(NamedTuple):

@@ -90,7 +90,7 @@ def posterior_modes(
 
 def likelihood_modes(
     modes: Modes, posterior: Posterior, observation: Observation
-) -> GaussianMixture:
+) -> tuple[GaussianMixture, Array]:
     """The modes of the likelihood alone, without what was known from the images before.
 
     Around each mode of the posterior the energy of the image and of the body's prior is a
@@ -100,6 +100,10 @@ def likelihood_modes(
         modes: of the posterior, K.
         posterior: of the image.
         observation: of the image.
+
+    Returns:
+        The mixture, heaviest component first, and the log likelihoods (K,) of the image at its
+        means.
     """
     body, poses = posterior.body, modes.poses
     fit = posterior.fit(poses, observation)
@@ -115,4 +119,5 @@ def likelihood_modes(
     nothing = np.zeros(len(poses))
     beta = posterior.trust.inverse_temperature
     weights = np.exp(normalised(weigh(nothing, fit.energy.value, beta)))
-    return GaussianMixture(weights, means, covariances).sorted()
+    mixture = GaussianMixture(weights, means, covariances).sorted()
+    return mixture, posterior.log_likelihoods(mixture.means, observation)
