@@ -110,6 +110,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._shown_frames: tuple[str, str] | None = None
         self._keypoints = KeypointInputs(self._log)
         self._predictions: StampedInputs[PosePrediction | Status] = StampedInputs()
+        # Of an image that was left out since the last estimate.
+        self._late_prediction: PosePrediction | None = None
         self.state = self._present_state()
 
     def restart(self, start: TrackStart | None = None) -> None:
@@ -150,6 +152,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._tracker, self._tracks = None, 0
         self._keypoints.clear()
         self._predictions.clear()
+        self._late_prediction = None
         self.frames.forget_after(stamp)
 
     def _stamp_of(self, source: str, message: Any) -> int:
@@ -211,6 +214,18 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             self._frame_of(waiting), waiting.stamp_ns, timeout
         )
 
+    def _leave_out(self, stamp: int) -> None:
+        # A person moves little until the next image: the prediction is a hypothesis there, too.
+        found = self._predictions.take(stamp)
+        if isinstance(found, PosePrediction):
+            self._late_prediction = found
+
+    def _prediction_of(self, stamp: int) -> PosePrediction | Status | None:
+        """What was predicted from an image or, without that, from one left out before it."""
+        found = self._predictions.take(stamp)
+        late, self._late_prediction = self._late_prediction, None
+        return late if found is None else found
+
     def _missing_input(self, stamp: int) -> Fault:
         return self._missing_here(stamp) or super()._missing_input(stamp)
 
@@ -235,7 +250,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         keypoints = None
         if p.use_keypoints:
             keypoints = self._keypoints.take(stamp, p, self.start.body)
-        prediction = self._predictions.take(stamp) if p.use_predictions else None
+        prediction = self._prediction_of(stamp) if p.use_predictions else None
         starts = self._tracker is None or self._tracker.status is Status.WAITING
         try:
             self._look_at_frames(waiting)
