@@ -94,7 +94,8 @@ class StandingStill:
     def modes(self):
         return self
 
-    log_likelihoods = np.zeros(1)
+    log_likelihoods, identities = np.zeros(1), np.ones(1, np.int64)
+    velocities = None
 
     @property
     def point_estimate(self):
