@@ -161,7 +161,7 @@ def test_mixtures_explain_the_images(replayed):
         found['pose_mixture'],
         found['likelihood_mixture'],
         found['ground_truth'],
-        found['joint_states'],
+        found['human_joint_states'],
         found['overlay/compressed'],
         strict=True,
     ):
