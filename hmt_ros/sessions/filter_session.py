@@ -130,13 +130,10 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     def _take(self, source: str, message: Any, stamp: int) -> None:
         if source == KEYPOINTS:
             self._keypoints.put(message, stamp, self.parameters, self.start.body)
-            self._estimate_what_is_ready()
         elif source == KEYPOINTS_3D:
             self._keypoints.put_3d(message, stamp)
-            self._estimate_what_is_ready()
         elif source == PREDICTION:
             self._predictions.put(stamp, self._prediction_in(message))
-            self._estimate_what_is_ready()
         elif source in TRANSFORMS:
             self._take_transforms(message, static=source == TF_STATIC)
         else:
@@ -166,7 +163,6 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             return
         for text in self.frames.take(message, static=static):
             self._log.note(Fault.TRANSFORM, text)
-        self._estimate_what_is_ready()
 
     def _start_anew(self) -> None:
         try:
@@ -181,7 +177,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     def _prediction_in(self, message: Any) -> PosePrediction | Status | None:
         """The mixture and its body, see `body_of`; `NOBODY`: was seen; None: not to be used."""
         if len(message.components) == 0:
-            return Status.NOBODY
+            # A predictor that leaves the image to the track has seen neither somebody nor nobody.
+            return None if message.state == TrackState.TRACKING else Status.NOBODY
         try:
             content = pose_mixture_of(message)
             return PosePrediction(content.mixture, body_of(content, self.start.body))
@@ -189,22 +186,30 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             self._log.fault(Fault.PREDICTION, f'pose_prediction: {error}')
             return None
 
-    def _is_ready(self, stamp: int) -> bool:
+    def _waits_for_inputs(self) -> bool:
+        p = self.parameters
         return (
-            super()._is_ready(stamp)
-            and self._missing_here(stamp) is None
-            and self._has_transforms()
+            super()._waits_for_inputs()
+            or p.use_keypoints
+            or p.use_predictions
+            or self.frames.wanted
         )
 
-    def _has_transforms(self) -> bool:
-        """Whether the oldest image need not wait for transforms."""
-        p, oldest = self.parameters, self._waiting[0]
-        if not self.frames.wanted or len(self._waiting) > p.queue_size:
+    def _is_ready(self, waiting: WaitingImage) -> bool:
+        return (
+            super()._is_ready(waiting)
+            and self._missing_here(waiting.stamp_ns) is None
+            and self._has_transforms(waiting)
+        )
+
+    def _has_transforms(self, waiting: WaitingImage) -> bool:
+        """Whether an image need not wait for transforms."""
+        if not self.frames.wanted or len(self._waiting) > self.most_waiting:
             return True
-        timeout = p.input_timeout * SECOND_NS
+        timeout = self.parameters.input_timeout * SECOND_NS
         assert self._newest is not None
-        return self._newest - oldest.stamp_ns > timeout or self.frames.is_settled(
-            self._frame_of(oldest), oldest.stamp_ns, timeout
+        return self._newest - waiting.stamp_ns > timeout or self.frames.is_settled(
+            self._frame_of(waiting), waiting.stamp_ns, timeout
         )
 
     def _missing_input(self, stamp: int) -> Fault:
@@ -329,6 +334,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             posterior=posterior,
             likelihood=likelihood,
             log_likelihoods=tracker.modes.log_likelihoods,
+            likelihood_values=tracker.log_likelihoods,
             point=tracker.point_estimate,
             ground=tracker.ground,
             contacts=tracker.contacts,

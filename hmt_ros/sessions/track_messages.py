@@ -67,6 +67,7 @@ class TrackedImage:
         body, camera: of the track.
         posterior, likelihood: mixtures over poses, heaviest first.
         log_likelihoods: (K,) of the image at the means of the posterior.
+        likelihood_values: (L,) the same at the means of the likelihood.
         point: (d,) the point estimate, for those who want one pose.
         ground: gravity and the floor, as far as they are known.
         contacts: probabilities that the feet stand on the floor, by name.
@@ -89,6 +90,7 @@ class TrackedImage:
     posterior: GaussianMixture
     likelihood: GaussianMixture
     log_likelihoods: Array
+    likelihood_values: Array
     point: Array
     ground: Ground
     contacts: Mapping[str, float]
@@ -278,6 +280,7 @@ def _mixtures(track: TrackedImage, joints: Array) -> tuple[PoseMixture, PoseMixt
             frame,
             state=track.state,
             track_id=track.track_id,
+            log_likelihoods=track.likelihood_values,
         ),
     )
 

@@ -303,8 +303,10 @@ class MixtureFilter:
         )  # fmt: skip
         self._bad_images = self._bad_images + 1 if self.misfit > self.settings.lost_misfit else 0
 
-    def likelihood_mixture(self, modes: Modes, observation: Observation) -> GaussianMixture:
-        """The modes of the likelihood alone, without what was known from the images before."""
+    def likelihood_mixture(
+        self, modes: Modes, observation: Observation
+    ) -> tuple[GaussianMixture, Array]:
+        """See `likelihood_modes`."""
         return likelihood_modes(modes, self._posterior, self._believed(observation))
 
     # The steps.

@@ -55,7 +55,9 @@ def posterior_modes(
     images = bool(observation.evidence)
     measured = images or observation.keypoints is not None
     if measured:
-        alone = posterior.covariances(fit, solved.free, keypoints_alone=not images)
+        # In the first image no error of keypoints has lasted yet: their noise holds all of it.
+        if images or states is not None:
+            alone = posterior.covariances(fit, solved.free, keypoints_alone=not images)
         covariances = alone + shape.considered(
             posterior.likelihood, observation, poses, posterior.given_way(poses, observation)[1]
         )
@@ -88,7 +90,7 @@ def posterior_modes(
 
 def likelihood_modes(
     modes: Modes, posterior: Posterior, observation: Observation
-) -> GaussianMixture:
+) -> tuple[GaussianMixture, Array]:
     """The modes of the likelihood alone, without what was known from the images before.
 
     Around each mode of the posterior the energy of the image and of the body's prior is a
@@ -98,6 +100,10 @@ def likelihood_modes(
         modes: of the posterior, K.
         posterior: of the image.
         observation: of the image.
+
+    Returns:
+        The mixture, heaviest component first, and the log likelihoods (K,) of the image at its
+        means.
     """
     body, poses = posterior.body, modes.poses
     fit = posterior.fit(poses, observation)
@@ -113,4 +119,5 @@ def likelihood_modes(
     nothing = np.zeros(len(poses))
     beta = posterior.trust.inverse_temperature
     weights = np.exp(normalised(weigh(nothing, fit.energy.value, beta)))
-    return GaussianMixture(weights, means, covariances).sorted()
+    mixture = GaussianMixture(weights, means, covariances).sorted()
+    return mixture, posterior.log_likelihoods(mixture.means, observation)

@@ -166,6 +166,7 @@ def test_images_wait_for_the_camera(session, outputs, small_camera):
     assert [stamp for topic, stamp in handled.published if topic == 'markers'] == tracked(outputs)
 
 
+@pytest.mark.usefixtures('few_wait')
 def test_oldest_images_that_wait_are_dropped(session, outputs, small_camera):
     one = session(queue_size=2)
     handled = [one.take(IMAGE, small_camera.image(index)) for index in range(5)]
@@ -178,6 +179,7 @@ def test_oldest_images_that_wait_are_dropped(session, outputs, small_camera):
     assert one.state.faults['camera_info'] == 3
 
 
+@pytest.mark.usefixtures('few_wait')
 def test_uncalibrated_camera_is_told_once(session, outputs, small_camera):
     one = session(queue_size=1)
     handled = []
@@ -553,6 +555,7 @@ def test_images_wait_for_masks(session, small_camera, stub_tracker, outputs):
     assert one.state.faults == {'no mask': 2, 'mask without an image': 1}
 
 
+@pytest.mark.usefixtures('few_wait')
 def test_images_wait_for_masks_and_keypoints(session, small_camera, stub_tracker, outputs):
     one = session(use_mask=True, use_keypoints=True, queue_size=2, input_timeout=60.0)
     one.take(CAMERA_INFO, small_camera.info())
@@ -564,7 +567,7 @@ def test_images_wait_for_masks_and_keypoints(session, small_camera, stub_tracker
     one.take(KEYPOINTS, small_camera.keypoints(3))
     faults = [one.take(IMAGE, small_camera.image(index)).faults for index in (1, 2, 3)]
     assert faults[:2] == [(), ()]
-    assert 'no mask of its stamp has come, and queue_size is 2' in faults[2][0]
+    assert 'no mask of its stamp has come, and 2 newer images wait' in faults[2][0]
 
 
 def broken(message):
@@ -661,6 +664,7 @@ def test_predictions_start_a_track(session, small_camera, likelihoods, stub_trac
     assert stub_tracker.made[0].nobody_predicted == [False, True]
 
 
+@pytest.mark.usefixtures('few_wait')
 def test_images_wait_for_predictions(session, small_camera, likelihoods, outputs):
     one = session(use_predictions=True, input_timeout=0.15, queue_size=2)
     one.take(CAMERA_INFO, small_camera.info())
@@ -672,7 +676,7 @@ def test_images_wait_for_predictions(session, small_camera, likelihoods, outputs
     one.parameters = replace(one.parameters, input_timeout=60.0)
     handled = one.take(IMAGE, small_camera.image(3))
     (fault,) = handled.faults
-    assert 'no pose_prediction of its stamp has come, and queue_size is 2' in fault
+    assert 'no pose_prediction of its stamp has come, and 2 newer images wait' in fault
     one.take(PREDICTION, likelihoods.message(3))
     assert tracked(outputs)[1:] == [small_camera.stamp(i) for i in (2, 3)]
 
