@@ -94,7 +94,7 @@ class StandingStill:
     def modes(self):
         return self
 
-    log_likelihoods = np.zeros(1)
+    log_likelihoods, identities, velocities = np.zeros(1), np.ones(1, dtype=int), None
 
     @property
     def point_estimate(self):
