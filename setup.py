@@ -27,24 +27,24 @@ class Install(install):
         super().finalize_options()
 
     def run(self) -> None:
-        """Install hmt_ros, then hmt_msgs."""
-        super().run()
+        """Install hmt_msgs, then hmt_ros."""
         prefix = Path(self.install_base)
         if in_colcon(prefix) or (self.prefix_is_given and 'AMENT_PREFIX_PATH' in os.environ):
             build_base = Path(self.get_finalized_command('build').build_base)
             install_messages(build_base / MESSAGES, prefix, str(self.root or ''))
+        super().run()
 
 
 class Develop(develop):
     """``develop``, and the messages with it, for ``colcon build --symlink-install``."""
 
     def run(self) -> None:
-        """Install hmt_ros, then hmt_msgs."""
-        super().run()
+        """Install hmt_msgs, then hmt_ros."""
         prefix = Path(self.prefix or sys.prefix)
         if in_colcon(prefix):
             build_base = Path(self.get_finalized_command('build').build_base)
             install_messages(build_base / MESSAGES, prefix, '')
+        super().run()
 
 
 def in_colcon(prefix: Path) -> bool:
@@ -65,6 +65,11 @@ def install_messages(build: Path, prefix: Path, root: str) -> None:
     built_before = (build / 'CMakeCache.txt').is_file()
     if not built_before and messages_are_there():
         return
+    if not os.environ.get('AMENT_PREFIX_PATH'):
+        raise SystemExit(
+            f'{MESSAGES}: no ROS environment, AMENT_PREFIX_PATH is not set. Run "source '
+            '/opt/ros/jazzy/setup.bash" and then the same command'
+        )
     environment = dict(os.environ, DESTDIR=root)
     # What colcon adds for setup.py moves sys.prefix, which CMake would ask for.
     folders = environment.get('PYTHONPATH', '').split(os.pathsep)

@@ -52,6 +52,7 @@ class Fault(Enum):
     GAP = 'gap'
     HUMAN = 'reference model'
     NO_IMAGE = 'no image'
+    OTHER_CAMERA = 'other camera'
 
 
 class Output(NamedTuple):

@@ -681,6 +681,19 @@ def test_images_wait_for_predictions(session, small_camera, likelihoods, outputs
     assert tracked(outputs)[1:] == [small_camera.stamp(i) for i in (2, 3)]
 
 
+def test_image_that_is_left_to_the_track_neither_waits_nor_says_nobody(
+    session, small_camera, likelihoods, stub_tracker
+):
+    one = session(use_predictions=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    left = likelihoods.nobody(0)
+    left.state = int(TrackState.TRACKING)
+    one.take(PREDICTION, left)
+    assert stub_tracker.made[0].predictions == [None]
+    assert stub_tracker.made[0].nobody_predicted == [False]
+
+
 def test_predictions_are_not_used_unless_asked_for(session, small_camera, likelihoods, outputs):
     one = session(subject_file='')
     one.take(CAMERA_INFO, small_camera.info())

@@ -318,6 +318,15 @@ def test_an_image_that_has_not_come_is_told(session, outputs, people, small_came
     assert quiet.take(P1, people(0)).warnings == ()
 
 
+def test_another_camera_is_told(session, outputs, people, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info(0, frame_id='left'))
+    handled = one.take(P1, people(0))
+    assert 'of p1 are in the frame lens, camera_info is that of left' in handled.warnings[0]
+    assert not any(o.topic.endswith(('roi', 'skeleton2d', 'cropped')) for o in outputs)
+    assert tracked(outputs) == [['p1_1']]
+
+
 def test_what_can_not_be_used_is_told(session, outputs, people, small_camera):
     one = session()
     one.take(CAMERA_INFO, small_camera.uncalibrated())
