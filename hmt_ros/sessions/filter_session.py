@@ -42,6 +42,7 @@ from hmt_ros.sessions.camera_session import (
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_state import IN_BACKGROUND, FilterState
+from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D, KeypointInputs
 from hmt_ros.sessions.session import everything
@@ -105,7 +106,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         p = parameters
         self.frames = CameraFrames(p.gravity_frame, p.fixed_frame, floor=p.floor_in_gravity_frame)
         self._tracker: Tracker | None = None
-        self._tracks = 0
+        self._tracks, self._turn = 0, 0.0
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
         self._keypoints = KeypointInputs(self._log)
@@ -144,7 +145,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if self._tracker is not None:
             self._tracks = self._tracker.track_id
         self._tracker = None
-        self._shown_body = None
+        self._shown_body, self._turn = None, 0.0
 
     def _forget_inputs(self, stamp: int) -> None:
         super()._forget_inputs(stamp)
@@ -327,6 +328,18 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if starts:
             self._shown_body = tracker.body
         frame = waiting.frame_id
+        fixed = None
+        if p.publish_in_fixed_frame:
+            if self.frames.pose is None:
+                self._log.skip(
+                    Fault.NO_CAMERA_POSE,
+                    f'the image of {waiting.stamp_ns} ns is tracked, but not published: its place '
+                    f'in fixed_frame {p.fixed_frame!r} is unknown',
+                )
+                return
+            fixed = FixedFrame(p.fixed_frame, self.frames.pose, self._turn)
+            self._turn = fixed.turn_of(tracker.body, posterior.means[0])
+        known = self.frames.known_ground(self.start.parameters.known_ground)
         track = TrackedImage(
             image=waiting.image,
             stamp_ns=waiting.stamp_ns,
@@ -345,6 +358,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             track_id=tracker.track_id,
             identities=tracker.modes.identities,
             velocities=tracker.velocities,
+            up=known.up,
+            fixed=fixed,
         )
         presentation = Presentation(
             tracker.settings.max_hypotheses,
@@ -375,7 +390,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             tracker.track_id,
             tracker.settings.max_hypotheses,
             waiting.stamp_ns,
-            waiting.frame_id,
+            f'{p.fixed_frame}_optical' if p.publish_in_fixed_frame else waiting.frame_id,
             waiting.image if p.overlay_modes else None,
             p.overlay_quality,
             self._wanted,

@@ -142,7 +142,7 @@ def _play(
     def check(handled: Handled) -> None:
         behind.check()
         # A pose_mixture may say that nobody is in view.
-        result.tracked += sum(topic == 'joint_states' for topic, _ in handled.published)
+        result.tracked += sum(topic == 'human_joint_states' for topic, _ in handled.published)
         if handled.faults:
             result.last_fault = handled.faults[-1]
             if not options.keep_going:
