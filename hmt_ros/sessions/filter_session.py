@@ -29,7 +29,9 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body, Camera
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
@@ -226,12 +228,29 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if p.use_keypoints:
             keypoints = self._keypoints.take(stamp, p, self.start.body)
         prediction = self._predictions.take(stamp) if p.use_predictions else None
+        self._follow(waiting, camera, keypoints, prediction)
+
+    def _new_tracker(self, camera: Camera) -> Tracker:
+        return self.start.tracker(camera, self._known_ground())
+
+    def _known_ground(self) -> KnownGround:
+        return self.frames.known_ground(self.start.parameters.known_ground)
+
+    def _follow(
+        self,
+        waiting: WaitingImage,
+        camera: Camera,
+        keypoints: Keypoints | None,
+        prediction: PosePrediction | Status | None,
+        others: Mask | None = None,
+    ) -> None:
+        """Takes an image with its inputs; see `Tracker.step`."""
+        stamp = waiting.stamp_ns
         starts = self._tracker is None or self._tracker.status is Status.WAITING
         try:
             self._look_at_frames(waiting)
             if self._tracker is None:
-                known = self.frames.known_ground(self.start.parameters.known_ground)
-                self._tracker = self.start.tracker(camera, known)
+                self._tracker = self._new_tracker(camera)
             elif self.frames.newest:
                 seen = self.frames.known_ground(KnownGround())
                 assert seen.up is not None
@@ -246,6 +265,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 prediction if isinstance(prediction, PosePrediction) else None,
                 waiting.mask,
                 nobody_predicted=prediction is Status.NOBODY,
+                others=others,
             )
             if trusted and self._tracker.silhouettes.doubted:
                 self._report_background(self._tracker.silhouettes.share, stamp)

@@ -137,11 +137,14 @@ def outline(window: ImageWindow, count: int = OUTLINE_POINTS) -> Outline | None:
     # The outline lies half a pixel outside the last pixels of the silhouette.
     pixels = pixels[good]
     beliefs = np.ones(len(pixels))
-    if window.unsure is not None:
+    if window.unsure is not None or window.others is not None:
         column, row = np.round(pixels + BESIDE * normals).astype(int).T
         column = np.clip(column, 0, mask.shape[1] - 1)
         row = np.clip(row, 0, mask.shape[0] - 1)
-        beliefs[window.unsure[row, column] > 0] = UNSURE
+        if window.unsure is not None:
+            beliefs[window.unsure[row, column] > 0] = UNSURE
+        if window.others is not None:
+            beliefs[window.others[row, column] > 0] = 0.0
     pixels = pixels + 0.5 * normals + np.array([window.left, window.top])
     return Outline(pixels, normals, beliefs)
 
