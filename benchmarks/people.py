@@ -45,12 +45,16 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--seeds', type=int, default=SEEDS, help=f'number of seeds ({SEEDS})')
     parser.add_argument('--keep', type=Path, help='folder in which the bags stay')
     arguments = parser.parse_args(argv)
-    seeds = range(QUICK if arguments.quick else arguments.seeds)
+    seeds = QUICK if arguments.quick else arguments.seeds
+    return show(measure(seeds, arguments.keep), as_text, as_json=arguments.json)
+
+
+def measure(seeds: int = SEEDS, keep: Path | None = None) -> dict[str, Any]:
+    """Scores of the crossings of some seeds; the bags stay in a folder, if one is given."""
     with tempfile.TemporaryDirectory() as folder:
-        place = arguments.keep or Path(folder)
-        rows = [one_crossing(seed, place) for seed in told('people', seeds)]
-    result = {'machine': description(), 'crossings': rows}
-    return show(result, text_of, as_json=arguments.json)
+        place = keep or Path(folder)
+        rows = [one_crossing(seed, place) for seed in told('people', range(seeds))]
+    return {'machine': description(), 'crossings': rows}
 
 
 def one_crossing(seed: int, folder: Path) -> dict[str, Any]:
@@ -139,7 +143,7 @@ def _error(truth: Truth, names: tuple[str, ...], joints: Joints, stamps: list[in
     return float(np.mean(errors)) if errors else float('nan')
 
 
-def text_of(result: dict[str, Any]) -> str:
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """What was measured, as a table."""
     rows = result['crossings']
     columns = [name for name in rows[0] if name.endswith('mm')]
@@ -149,8 +153,8 @@ def text_of(result: dict[str, Any]) -> str:
         for row in rows
     ]  # fmt: skip
     kept = sum(row['kept'] for row in rows)
-    shown = table([['seed', 'kept', 'tracks', *columns], *lines])
-    return f'{shown}\n\n{kept} of {len(rows)} crossings\n\n{result["machine"]}'
+    shown = table([['seed', 'kept', 'tracks', *columns], *lines], markdown=markdown)
+    return f'{shown}\n\nBoth keep their tracks in {kept} of {len(rows)} crossings.'
 
 
 if __name__ == '__main__':

@@ -85,7 +85,10 @@ def observe(
     if silhouette is not None and silhouette.shape != image.shape[:2]:
         raise ValueError(f'silhouette {silhouette.shape} for an image {image.shape[:2]}')
     known = silhouette if silhouette is not None and silhouette.any() else None
-    box = window if known is None else _box(known)
+    box = window
+    if known is not None:
+        # Somebody may be anywhere behind the others.
+        box = _box(known if others is None else known | others)
     left, top, right, bottom = _grown(box, MARGIN, image.shape)
     rows, columns = slice(top, bottom), slice(left, right)
     mask = None

@@ -32,17 +32,20 @@ class InstalledAdapterSession(KeypointsAdapterSession):
         publish: Callable[[Output], None],
         wanted: Callable[[str], bool] = everything,
     ) -> None:
-        make_readable(parameters.source)
+        make_readable(parameters.source, SOURCES[parameters.source])
         super().__init__(parameters, publish, wanted)
 
 
-def make_readable(source: str) -> None:
+def make_readable(source: str, msgtype: str) -> None:
     """Reads the definitions of the messages of a source, as they are installed.
+
+    Args:
+        source: value of the parameter, for messages.
+        msgtype: for example 'yolo_msgs/msg/DetectionArray'.
 
     Raises:
         ValueError: their package is not installed.
     """
-    msgtype = SOURCES[source]
     package = msgtype.partition('/')[0]
     try:
         message_class(msgtype)

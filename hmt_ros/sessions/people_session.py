@@ -32,7 +32,7 @@ from hmt_ros.sessions.camera_session import IMAGE, CameraSession, StampedInputs,
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.people_inputs import Found, PeopleInputs
 from hmt_ros.sessions.people_parameters import PeopleParameters
-from hmt_ros.sessions.person_session import BODIES, PersonSession
+from hmt_ros.sessions.person_session import BODIES, PersonSession, person_of
 from hmt_ros.sessions.session import PublishedTopic, SessionState, everything
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.track_start import prepare_start
@@ -57,8 +57,7 @@ def published_topic(topic: str) -> PublishedTopic:
     """What is published on a topic of the node or of a person."""
     if topic in PeopleSession.TOPICS:
         return PeopleSession.TOPICS[topic]
-    name = topic.removeprefix(f'{BODIES}/')
-    return TOPICS[topic if name == topic else name.partition('/')[2]]
+    return TOPICS[topic.removeprefix(f'{BODIES}/{person_of(topic)}/')]
 
 
 @dataclass(frozen=True)
@@ -67,10 +66,12 @@ class PeopleState(SessionState):
 
     Attributes:
         people: identities of those who are tracked.
+        followed: identities of those who are tracked, or about to be.
         detected: number of people in the last detections.
     """
 
     people: tuple[str, ...] = ()
+    followed: tuple[str, ...] = ()
     detected: int = 0
 
     def summary(self) -> str:
@@ -107,7 +108,10 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
     """
 
     # Each person has those of `track_messages` besides, with the prefix of `person_session`.
-    TOPICS: ClassVar[Mapping[str, PublishedTopic]] = {PEOPLE: PublishedTopic(PEOPLE_2D)}
+    TOPICS: ClassVar[Mapping[str, PublishedTopic]] = {
+        PEOPLE: PublishedTopic(PEOPLE_2D),
+        '/tf': TOPICS['/tf'],
+    }
     DONE = 'tracked'
     ESTIMATE = 'every track'
     CHECKED = ('background_file', 'body_model')
@@ -406,9 +410,12 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
     # State.
 
     def _present_state(self) -> PeopleState:
-        people = tuple(person.name for person in self._people if person.session.begun)
         return PeopleState(
-            *self._status_and_wants(), **self._totals(), people=people, detected=self._detected
+            *self._status_and_wants(),
+            **self._totals(),
+            people=tuple(person.name for person in self._people if person.session.begun),
+            followed=tuple(person.name for person in self._people),
+            detected=self._detected,
         )
 
     def _status(self) -> tuple[str, str]:

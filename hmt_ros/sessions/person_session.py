@@ -36,6 +36,12 @@ def topic_of(person: str, topic: str) -> str:
     return topic if topic.startswith('/') else f'{BODIES}/{person}/{topic}'
 
 
+def person_of(topic: str) -> str:
+    """The person whose topic this is; '' where it is that of all."""
+    name = topic.removeprefix(f'{BODIES}/')
+    return '' if name == topic else name.partition('/')[0]
+
+
 class PersonSession(FilterSession):
     """Tracks one of several people; see `Session`.
 
@@ -69,6 +75,9 @@ class PersonSession(FilterSession):
             lambda topic: wanted(topic_of(person, topic)),
         )
         self.restart(start)
+        for topic in self.TOPICS:
+            # Who publishes opens them now, and not with the first message, which would be lost.
+            self._wanted(topic)
         self.frames = frames
         self._log = log
         self._background = background

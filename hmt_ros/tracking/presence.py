@@ -19,8 +19,8 @@ M are the pixels that the model covers and nobody else, and F those of the silho
 clothes have the colours of the room only a part of M is foreground: usual is what this track has
 seen so far, with time constant `MEMORY`. Colours are asked where the silhouette can not be used: m
 and n are the means of p(M | colour), the ratio of two histograms, over M and over its surroundings;
-inside and outside are usual values of m and n. When they are alike the colours say nothing. Colours are
-learned slowly and from clear images, or else they would become those of the room.
+inside and outside are usual values of m and n. When they are alike the colours say nothing. Colours
+are learned slowly and from clear images, or else they would become those of the room.
 """
 
 from __future__ import annotations
