@@ -93,7 +93,7 @@ def test_hidden_textures_cost_what_is_usual(human32, camera, pose, seen):
 
 
 def test_a_silhouette_without_others(human32, camera, pose, seen):
-    image, mask, others = seen
+    image, _, others = seen
     empty = np.rint(SCENE.background(camera)).astype(np.uint8)
     model = BackgroundModel.from_image(empty)
     whole, part = model.split(image).foreground, model.split(image, None, others).foreground

@@ -13,7 +13,7 @@ FRAME = 100_000_000
 
 
 def sighting(column, row=100.0, shape=SHAPE, seen=4):
-    pixels = shape + [column, row]
+    pixels = shape + np.array([column, row])
     corners = np.stack([pixels.min(0), pixels.max(0)])
     confidences = np.where(np.arange(4) < seen, 0.9, 0.0)
     keypoints = Keypoints(NAMES, pixels, np.tile(np.eye(2), (4, 1, 1)), confidences)

@@ -97,7 +97,10 @@ def distance_map(window: ImageWindow) -> ImageMap | None:
     if signed is None or widest is None:
         return None
     # What may be a shadow or the person forbids nothing.
-    if widest is not signed:
+    if window.others is not None:
+        # Behind others the person may reach beyond the image.
+        signed = np.minimum(signed, widest)
+    elif widest is not signed:
         signed = np.minimum(signed, np.maximum(widest, 0.0))
     return window.as_map(signed[None])
 
