@@ -13,7 +13,6 @@ from typing import Any
 from hmt_msgs.srv import Reset
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
-from hmt_ros.nodes.keypoints_adapter_node import make_readable
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
@@ -25,6 +24,7 @@ from hmt_ros.nodes.subscribed_topic import (
     SubscribedTopic,
     image_topic,
     message_class,
+    read_installed_messages,
 )
 from hmt_ros.sessions.handled import Output
 from hmt_ros.sessions.people_parameters import SOURCES, PeopleParameters
@@ -51,7 +51,8 @@ class InstalledPeopleSession(PeopleSession):
         publish: Callable[[Output], None],
         wanted: Callable[[str], bool] = everything,
     ) -> None:
-        make_readable(parameters.source, SOURCES[parameters.source])
+        msgtype = SOURCES[parameters.source]
+        read_installed_messages(msgtype, f'source {parameters.source}')
         super().__init__(parameters, publish, wanted)
 
 

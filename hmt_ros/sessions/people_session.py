@@ -179,12 +179,10 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         if source == DETECTIONS:
             people = self._inputs.people(message, stamp, self.parameters.keypoint_sigma_px)
             self._detections.put(stamp, people)
-            self._estimate_what_is_ready()
         elif source in TRANSFORMS:
             if self.frames.wanted:
                 for text in self.frames.take(message, static=source == TF_STATIC):
                     self._log.note(Fault.TRANSFORM, text)
-                self._estimate_what_is_ready()
         else:
             super()._take(source, message, stamp)
 
@@ -197,21 +195,15 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         self._detections.clear()
         self.frames.forget_after(stamp)
 
-    def _is_ready(self, stamp: int) -> bool:
-        return (
-            super()._is_ready(stamp)
-            and self._has(self._detections, stamp, self.parameters.input_timeout)
-            and self._has_transforms()
-        )
+    def _waits_for_inputs(self) -> bool:
+        return True
 
-    def _has_transforms(self) -> bool:
-        p, oldest = self.parameters, self._waiting[0]
-        if not self.frames.wanted or len(self._waiting) > p.queue_size:
-            return True
-        timeout = p.input_timeout * SECOND_NS
-        assert self._newest is not None
-        return self._newest - oldest.stamp_ns > timeout or self.frames.is_settled(
-            self._frame_of(oldest), oldest.stamp_ns, timeout
+    def _is_ready(self, waiting: WaitingImage) -> bool:
+        timeout = self.parameters.input_timeout
+        return (
+            super()._is_ready(waiting)
+            and self._has(self._detections, waiting.stamp_ns, timeout)
+            and self._has_transforms(self.frames, waiting)
         )
 
     def _missing_input(self, stamp: int) -> Fault:
@@ -225,6 +217,8 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
         stamp = waiting.stamp_ns
         for each in self._detections.before(stamp):
+            if each in self._dropped:
+                continue
             self._log.note(
                 Fault.LONE_DETECTIONS,
                 f'detections of {each} ns belong to no image, or come too late: wanted the stamp '

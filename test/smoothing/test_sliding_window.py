@@ -57,6 +57,22 @@ def test_final_marginals_are_those_given_what_the_lag_saw(modes, walk, exact):
         assert divergence(marginals[t], pose.mixture) < 0.1
 
 
+@pytest.mark.parametrize('moving', [True, False])
+def test_velocities_of_final_poses(walk, moving):
+    """A point moves by (2, -1) a second; a state with a velocity takes it to rest at first."""
+    chosen = FAST if moving else walk
+    places = np.array([2.0, -1.0]) * np.arange(8)[:, None]
+    mixtures = [GaussianMixture([1.0], [place], [1e-4 * np.eye(2)]) for place in places]
+    _, final = run(SlidingWindow(MixtureSmoother(chosen), fixed_lag=3), mixtures)
+    for t, pose in enumerate(final):
+        tolerance = 0.8 * 0.4**t if moving else 0.0
+        np.testing.assert_allclose(pose.velocities, [[2.0, -1.0]], atol=0.02 + tolerance)
+        assert pose.identities == (0,)
+    # Of one pose alone nothing is known.
+    _, (alone,) = run(SlidingWindow(MixtureSmoother(walk), fixed_lag=3), mixtures[:1])
+    assert alone.velocities is None
+
+
 def test_a_window_that_is_not_full_is_the_whole_sequence(modes, walk):
     mixtures = modes(3.0, times=4)
     window = SlidingWindow(MixtureSmoother(walk, max_trajectories=12), fixed_lag=10)
@@ -148,3 +164,45 @@ def test_bad_input_leaves_the_window_as_it_was(modes, walk):
     assert window.step(6, mixtures[1]).trajectories.times == 2
     with pytest.raises(ValueError, match='fixed_lag'):
         SlidingWindow(MixtureSmoother(walk), fixed_lag=-1)
+
+
+@pytest.mark.parametrize(
+    ('interval', 'lags'), [(0.1, {0.4}), (0.2, {0.6}), (0.25, {0.5}), (0.5, {0.5}), (0.9, {0.0})]
+)
+def test_rare_poses_are_final_before_they_are_old(modes, interval, lags):
+    window = SlidingWindow(MixtureSmoother(FAST), fixed_lag=4, longest_lag=0.7)
+    step = round(interval * 1e9)
+    found = set()
+    final = []
+    for t, mixture in enumerate(modes(2.0, times=9)):
+        update = window.step(t * step, mixture)
+        assert len(window.stamps_ns) <= 5
+        final += update.final
+        if t > 4:
+            found |= {round((t * step - pose.stamp_ns) * 1e-9, 3) for pose in update.final}
+    # At 0.9 s the one before is already too old when the next comes, and is told at once then.
+    assert found == (lags if interval < 0.7 else {0.9})
+    final += window.finish()
+    assert [pose.stamp_ns for pose in final] == [t * step for t in range(9)]
+
+
+def test_after_a_gap_all_old_poses_are_final(modes, walk):
+    mixtures = modes(2.0, times=6)
+    window = SlidingWindow(MixtureSmoother(walk), fixed_lag=9, longest_lag=0.7)
+    for t in range(4):
+        assert window.step(t * 10**8, mixtures[t]).final == ()
+    update = window.step(5 * 10**9, mixtures[4])
+    assert [pose.stamp_ns for pose in update.final] == [t * 10**8 for t in range(4)]
+    assert window.step(5 * 10**9 + 10**8, mixtures[5]).final == ()
+    assert window.stamps_ns == (5 * 10**9, 5 * 10**9 + 10**8)
+    assert [pose.stamp_ns for pose in window.finish()] == [5 * 10**9, 5 * 10**9 + 10**8]
+
+
+def test_a_limit_that_is_not_reached_changes_nothing(modes):
+    mixtures = modes(2.0, times=9)
+    runs = [
+        run(SlidingWindow(MixtureSmoother(FAST), fixed_lag=3, longest_lag=limit), mixtures, 10**8)
+        for limit in (0.3, np.inf)
+    ]
+    for one, other in zip(*(final for _, final in runs), strict=True):
+        assert np.array_equal(one.mixture.means, other.mixture.means)
