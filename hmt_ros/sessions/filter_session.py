@@ -29,7 +29,9 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body, Camera
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
@@ -202,17 +204,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         return (
             super()._is_ready(waiting)
             and self._missing_here(waiting.stamp_ns) is None
-            and self._has_transforms(waiting)
-        )
-
-    def _has_transforms(self, waiting: WaitingImage) -> bool:
-        """Whether an image need not wait for transforms."""
-        if not self.frames.wanted or len(self._waiting) > self.most_waiting:
-            return True
-        timeout = self.parameters.input_timeout * SECOND_NS
-        assert self._newest is not None
-        return self._newest - waiting.stamp_ns > timeout or self.frames.is_settled(
-            self._frame_of(waiting), waiting.stamp_ns, timeout
+            and self._has_transforms(self.frames, waiting)
         )
 
     def _leave_out(self, stamp: int) -> None:
@@ -252,12 +244,29 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if p.use_keypoints:
             keypoints = self._keypoints.take(stamp, p, self.start.body)
         prediction = self._prediction_of(stamp) if p.use_predictions else None
+        self._follow(waiting, camera, keypoints, prediction)
+
+    def _new_tracker(self, camera: Camera) -> Tracker:
+        return self.start.tracker(camera, self._known_ground())
+
+    def _known_ground(self) -> KnownGround:
+        return self.frames.known_ground(self.start.parameters.known_ground)
+
+    def _follow(
+        self,
+        waiting: WaitingImage,
+        camera: Camera,
+        keypoints: Keypoints | None,
+        prediction: PosePrediction | Status | None,
+        others: Mask | None = None,
+    ) -> None:
+        """Takes an image with its inputs; see `Tracker.step`."""
+        stamp = waiting.stamp_ns
         starts = self._tracker is None or self._tracker.status is Status.WAITING
         try:
             self._look_at_frames(waiting)
             if self._tracker is None:
-                known = self.frames.known_ground(self.start.parameters.known_ground)
-                self._tracker = self.start.tracker(camera, known)
+                self._tracker = self._new_tracker(camera)
                 self._tracker.track_id = self._tracks
             elif self.frames.newest:
                 seen = self.frames.known_ground(KnownGround())
@@ -273,6 +282,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 prediction if isinstance(prediction, PosePrediction) else None,
                 waiting.mask,
                 nobody_predicted=prediction is Status.NOBODY,
+                others=others,
             )
             if trusted and self._tracker.silhouettes.doubted:
                 self._report_background(self._tracker.silhouettes.share, stamp)

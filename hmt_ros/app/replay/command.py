@@ -96,6 +96,12 @@ def _parser() -> CommandParser:
         'a damaged bag as far as possible (default: stop there)',
     )
     parser.add_argument(
+        '--people',
+        action='store_true',
+        help='track several people, found by the detections in the bag, each into topics '
+        'humans/bodies/<id>/...; without smoother and BME',
+    )
+    parser.add_argument(
         '--scheduler',
         metavar='ADDRESS',
         help='replay many bags through Dask: address of a scheduler, or local for all cores of '
