@@ -178,6 +178,7 @@ setup(
             'filter_node = hmt_ros.nodes.filter_node:main',
             'smoother_node = hmt_ros.nodes.smoother_node:main',
             'bme_node = hmt_ros.nodes.bme_node:main',
+            'people_node = hmt_ros.nodes.people_node:main',
             'track-video = hmt_ros.app.track_video:main',
             'import-video = hmt_ros.app.import_video.command:main',
             'subject = hmt_ros.app.subject:main',

@@ -181,7 +181,7 @@ def test_video_of_the_readme(workplace, walk_video, capsys):
 
 
 def test_subject_file_of_the_page_on_bags():
-    (text,) = (code for code, _ in blocks(ROOT / 'docs' / 'bags.md', 'yaml'))
+    text, *_ = (code for code, _ in blocks(ROOT / 'docs' / 'bags.md', 'yaml'))
     subject = parse_subject(yaml.safe_load(text), load_body('human37'))
     assert len(subject.keypoints.names) == 14
     assert subject.stature == 1.7

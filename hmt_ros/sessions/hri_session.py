@@ -72,6 +72,8 @@ FINISH = 'finish'  # what `finish` calls the end of the stream
 _KEPT = 0.5
 # Change of a length above which a body is described anew, m.
 _RESHAPED = 0.005
+# People of whom no body is tracked who are remembered, for the numbers of their tracks.
+_REMEMBERED = 1000
 # A filter that is further behind drops images itself.
 _IMAGES = 20
 
@@ -202,7 +204,6 @@ class HriSession(Session[HriParameters, HriState]):
             while len(self._images) > _IMAGES:
                 del self._images[next(iter(self._images))]
         else:
-            self._log.counts['received'] += 1
             self._take_mixture(source.removeprefix(mixture_source('')), message, stamp)
 
     def _take_camera_info(self, message: Any, stamp: int) -> None:
@@ -230,7 +231,7 @@ class HriSession(Session[HriParameters, HriState]):
             return
         if order is Order.JUMP:
             self.restart()
-        person = self._people.setdefault(namespace, _Person(_name_in(namespace)))
+        person = self._person_in(namespace)
         if self._camera is None:
             self._now = stamp
         person.newest, person.heard = stamp, self._now
@@ -249,6 +250,14 @@ class HriSession(Session[HriParameters, HriState]):
         if not person.tracked:
             self._tell_tracked(stamp)
         self._log.counts['converted'] += 1
+
+    def _person_in(self, namespace: str) -> _Person:
+        if namespace not in self._people:
+            gone = [name for name, person in self._people.items() if not person.identity]
+            for name in gone[: max(len(gone) - _REMEMBERED + 1, 0)]:
+                del self._people[name]
+            self._people[namespace] = _Person(_name_in(namespace))
+        return self._people[namespace]
 
     # Outputs.
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from hmt_ros.body import Camera
 from hmt_ros.body.reference_human import REFERENCE_JOINTS
 from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.sessions import hri_session
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.hri_parameters import HriParameters
@@ -123,6 +124,17 @@ def test_several_people(session, outputs, people):
     assert tracked(outputs)[-1] == ['lab_anna_3', 'p1_1', 'p2_4']
     one.take(P2, people(1, 4, TrackState.NOBODY))
     assert tracked(outputs)[-1] == ['lab_anna_3', 'p1_1']
+
+
+def test_people_who_are_gone_are_forgotten(session, outputs, people, monkeypatch):
+    monkeypatch.setattr(hri_session, '_REMEMBERED', 3)
+    one = session()
+    one.take(P1, people(0))
+    gone = people(0, 1, TrackState.NOBODY)
+    for number in range(10):
+        one.take(mixture_source(f'/humans/bodies/n{number}'), gone)
+    assert len(one._people) == 4
+    assert one.identities == {'p1_1'}
 
 
 def test_who_is_silent_is_not_tracked(session, outputs, people, small_camera):
