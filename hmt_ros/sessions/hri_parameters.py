@@ -44,6 +44,8 @@ class HriParameters(NodeParameters):
             only leans, and the shoulders have a fixed place on it.
         longest_silence: Time without a mixture after which a body is not tracked any more, by the
             stamps of camera_info, s.
+        queue_size: Maximum number of mixtures that wait; when the node is late the oldest are
+            dropped.
     """
 
     namespaces: str = parameter_field('', NEXT_CONFIGURE)
@@ -53,6 +55,7 @@ class HriParameters(NodeParameters):
     publish_links: bool = parameter_field(True, AT_ONCE)
     added_joints: bool = parameter_field(True, AT_ONCE)
     longest_silence: float = parameter_field(2.0, AT_ONCE, (0.1, 3600.0))
+    queue_size: int = parameter_field(5, AT_ONCE, (1, 1000))
 
     def __post_init__(self) -> None:
         if self.image_transport not in TRANSPORTS:
