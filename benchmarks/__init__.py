@@ -18,6 +18,7 @@ BENCHMARKS = {
     'live': 'the nodes at the images of a camera that does not wait for them',
     'motion_prior': 'how well the motion prior predicts motions of other people',
     'nodes': 'images at the rate of a camera, through DDS',
+    'people': 'two people cross: are they told apart afterwards?',
     'smoothing': 'exactness, speed and peers of the smoother',
     'soak': 'nodes and files under load and fault',
     'tracking': 'accuracy, calibration and speed of the tracker on clips with known truth',

@@ -22,7 +22,15 @@ from test.sessions.conftest import JOINTS, Likelihoods
 
 MIXTURES = ['pose_mixture', 'likelihood_mixture']
 STARTS = ['body', 'human_description']
-ONE_IMAGE = [*MIXTURES, 'ground', 'joint_states', '/tf', 'markers', 'overlay/compressed']
+ONE_IMAGE = [
+    *MIXTURES,
+    'person_pose',
+    'ground',
+    'human_joint_states',
+    '/tf',
+    'markers',
+    'overlay/compressed',
+]
 
 
 @pytest.fixture
@@ -341,7 +349,7 @@ def test_nobody_in_view_is_told_once(session, outputs, small_camera, stub_tracke
 
 
 def test_an_empty_view_that_nobody_wants_to_see(session, outputs, small_camera, stub_tracker):
-    one = session(wanted=lambda topic: topic == 'joint_states')
+    one = session(wanted=lambda topic: topic == 'human_joint_states')
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
     stub_tracker.empty.add(small_camera.stamp(1))
@@ -930,7 +938,9 @@ def test_switches_of_the_outputs(session, small_camera, outputs):
     one = session(overlay_modes=0, publish_tf=False)
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
-    assert [o.topic for o in outputs] == [*STARTS, *MIXTURES, 'ground', 'joint_states', 'markers']
+    assert [o.topic for o in outputs] == [
+        topic for topic in [*STARTS, *ONE_IMAGE] if topic not in ('/tf', 'overlay/compressed')
+    ]
 
 
 def test_urdf_comes_again_with_other_frames(session, small_camera, outputs):
@@ -948,7 +958,7 @@ def test_urdf_comes_again_with_other_frames(session, small_camera, outputs):
     ]
     links = [ET.fromstring(text).findall('link')[:2] for text in texts]
     assert [[link.attrib['name'] for link in pair] for pair in links] == [
-        ['lens', 'pelvis.root_tx'],
+        ['lens', 'human/pelvis.root_tx'],
         ['lens', 'anna/pelvis.root_tx'],
         ['other', 'anna/pelvis.root_tx'],
     ]
