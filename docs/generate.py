@@ -26,6 +26,7 @@ PAGES = {
     'hri_node': 'nodes.md',
     'bags': 'bags.md',
     'nodes': 'nodes.md',
+    'live': 'nodes.md',
     'soak': 'robustness.md',
     'flips': 'flips.md',
     'kernels': 'likelihood.md',

@@ -50,7 +50,7 @@ BLOCK = re.compile(r'^(<!-- run -->\n)?```(\w+)\n(.*?)^```$', re.MULTILINE | re.
 NODES = {
     'filter_node': (FilterParameters(), track_messages.TOPICS),
     'smoother_node': (SmootherParameters(), smoothed_messages.TOPICS),
-    'bme_node': (BmeParameters(), bme_session.TOPICS),
+    'bme_node': (BmeParameters(), bme_session.BmeSession.TOPICS),
     'keypoints_node': (KeypointsParameters(), keypoints_session.TOPICS),
     'keypoints_adapter_node': (KeypointsAdapterParameters(), keypoints_adapter_session.TOPICS),
     'hri_node': (
