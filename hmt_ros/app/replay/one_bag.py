@@ -98,10 +98,10 @@ def replay_bag(
             with WriteBehind() as behind:
                 write = partial(behind.call, out.write_serialised)
                 with (
-                    way(parameters, write) as track,
                     show_progress(
                         str(target), 'images', recorded.image.message_count, quiet=hidden
                     ) as bar,
+                    way(parameters, write) as track,
                 ):
                     result = _play(options, bag, recorded, track, out, behind, bar, tell)
             if not result.tracked:
