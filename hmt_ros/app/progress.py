@@ -11,6 +11,7 @@ stdout is left to results.
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable
@@ -111,7 +112,7 @@ def show_progress(
         total: number of units of the whole; None if unknown.
         quiet: whether nothing is shown.
     """
-    if quiet or sys.stderr.isatty():
+    if quiet or _is_wide_terminal():
         # One bar below another is removed at its end.
         return tqdm(desc=what, unit=f' {unit}', total=total, disable=quiet, leave=None)
     return ProgressLines(what, unit, total)
@@ -135,6 +136,14 @@ def with_progress(
 def tell_user(command: str, text: str) -> None:
     """Prints a line for the user on stderr, above the bar of `show_progress`."""
     tqdm.write(f'{command}: {text}', file=sys.stderr)
+
+
+def _is_wide_terminal() -> bool:
+    """Whether stderr is a terminal with room for a bar; some of containers have no columns."""
+    try:
+        return sys.stderr.isatty() and os.get_terminal_size(sys.stderr.fileno()).columns > 0
+    except (OSError, ValueError):
+        return False
 
 
 def _duration(seconds: float) -> str:

@@ -1,8 +1,11 @@
 """Progress of commands: a bar on a terminal, lines elsewhere, stdout left to results."""
 
 import io
+import os
 import queue
+import select
 import sys
+import time
 
 import pytest
 
@@ -90,13 +93,21 @@ def test_an_error_ends_the_lines(clock):
     assert not shown._thread.is_alive()
 
 
-def test_bar_on_a_terminal(monkeypatch):
-    terminal = io.StringIO()
-    terminal.isatty = lambda: True
-    monkeypatch.setattr(sys, 'stderr', terminal)
-    assert list(with_progress('abc', 'reading', 'motions', 3)) == ['a', 'b', 'c']
-    assert 'reading: 100%' in terminal.getvalue()
-    assert '3/3' in terminal.getvalue()
+@pytest.mark.parametrize('columns', [100, 0])
+def test_bar_on_a_terminal_that_has_room(monkeypatch, columns):
+    monkeypatch.setattr(progress, 'INTERVAL', 1e-3)
+    monkeypatch.setattr(os, 'get_terminal_size', lambda _: os.terminal_size((columns, 24)))
+    reading, writing = os.openpty()
+    with os.fdopen(writing, 'w', encoding='utf-8') as terminal:
+        monkeypatch.setattr(sys, 'stderr', terminal)
+        items = [time.sleep(0.02) or x for x in with_progress('abc', 'reading', 'motions', 3)]
+        shown = ''
+        while select.select([reading], [], [], 0)[0]:
+            shown += os.read(reading, 65536).decode()
+    os.close(reading)
+    assert items == ['a', 'b', 'c']
+    assert ('reading: 100%' in shown) == (columns > 0)
+    assert ('reading: 3 motions in 00:00' in shown) == (columns == 0)
 
 
 def test_quiet_shows_nothing(capsys, monkeypatch):
