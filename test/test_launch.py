@@ -27,6 +27,7 @@ from hmt_ros.sessions import bme_session, keypoints_session, smoothed_messages, 
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import values_of, with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.parameter_file import read_parameter_file
@@ -173,6 +174,21 @@ def test_nodes_that_find_keypoints(actions):
     assert f'{NAMESPACE}/detections' in allowed['keypoints_adapter_node']['subscribe']
 
 
+def test_rep_155(actions):
+    made = actions(hri='true', image_transport='compressed', bag='walk')
+    assert list(made) == ['filter_node', 'smoother_node', 'bme_node', 'hri_node', 'bag']
+    bridge = made['hri_node']
+    assert bridge['namespace'] == NAMESPACE
+    assert dict(bridge['remappings'])['camera_info'] == '/camera/camera_info'
+    own = parameters(bridge)
+    assert own.pop('use_sim_time') is True
+    settings = with_values(HriParameters(), own)
+    # All people that there are.
+    assert (settings.named, settings.image_transport) == ((), 'compressed')
+    elsewhere = parameters(actions(hri='true', namespace='/lab/anna')['hri_node'])
+    assert elsewhere['namespaces'] == '/lab/anna'
+
+
 def test_room_for_raw_images(actions, monkeypatch):
     for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'):
         monkeypatch.delenv(name, raising=False)
@@ -269,6 +285,7 @@ def test_what_is_not_installed_is_told_before_a_node_starts(actions, description
     names = description['actions_of'].__globals__
     monkeypatch.setitem(names, 'get_package_share_directory', directory)
     for missing, argument, value in (
+        ('hri_msgs', 'hri', 'true'),
         ('tf2_ros', 'rviz', 'true'),
         ('tf2_ros', 'camera_frame', 'lens'),
         ('rviz2', 'rviz', 'true'),
@@ -590,7 +607,7 @@ def test_images_of_the_camera_become_a_person_in_the_namespace(started):
         started.wait_until_active(name)
     node, arrived = started.node, {}
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    for topic in ('human_description', 'joint_states', '/tf', 'pose_prediction', 'markers'):
+    for topic in ('human_description', 'human_joint_states', '/tf', 'pose_prediction', 'markers'):
         package, _, kind = TOPICS[topic].msgtype.split('/')
 
         def keep(message, topic=topic):
@@ -626,7 +643,7 @@ def test_images_of_the_camera_become_a_person_in_the_namespace(started):
     assert {t.child_frame_id for t in arrived['/tf'].transforms} == set(links[1:])
     assert all(link.startswith('body_p1/') for link in links[1:])
     movable = {one.attrib['name'] for one in robot.findall('joint') if one.get('type') != 'fixed'}
-    assert set(arrived['joint_states'].name) == movable
+    assert set(arrived['human_joint_states'].name) == movable
     assert len(arrived['pose_prediction'].components) > 0
 
 
