@@ -74,6 +74,8 @@ def test_without_a_total_or_anything_to_count(clock):
     shown.update(3)
     clock.now = 6.0
     assert shown.line() == '3 messages, 0.5 a second, 00:06 so far'
+    shown.total = 2_000_000
+    assert shown.line().startswith('3 of 2000000 messages, ')
     shown.total = 2  # fewer than there were: not believed
     assert shown.line() == '3 messages, 0.5 a second, 00:06 so far'
     assert lines(clock, '').line() == '00:00 so far'
@@ -87,10 +89,13 @@ def test_a_short_command_prints_nothing(clock):
 
 
 def test_an_error_ends_the_lines(clock):
+    """The line about the error is the last."""
     shown = lines(clock)
     with pytest.raises(ValueError, match='bad'), shown:
+        clock.pass_to(10.0)
         raise ValueError('bad')
     assert not shown._thread.is_alive()
+    assert shown._file.getvalue() == 'out: 0 of 120 images, 00:10 so far\n'
 
 
 @pytest.mark.parametrize('columns', [100, 0])
