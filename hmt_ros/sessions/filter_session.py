@@ -29,7 +29,9 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body, Camera
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
@@ -111,6 +113,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._shown_frames: tuple[str, str] | None = None
         self._keypoints = KeypointInputs(self._log)
         self._predictions: StampedInputs[PosePrediction | Status] = StampedInputs()
+        # Of an image that was left out since the last estimate.
+        self._late_prediction: PosePrediction | None = None
         self.state = self._present_state()
 
     def restart(self, start: TrackStart | None = None) -> None:
@@ -151,6 +155,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._tracker, self._tracks = None, 0
         self._keypoints.clear()
         self._predictions.clear()
+        self._late_prediction = None
         self.frames.forget_after(stamp)
 
     def _stamp_of(self, source: str, message: Any) -> int:
@@ -199,18 +204,20 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         return (
             super()._is_ready(waiting)
             and self._missing_here(waiting.stamp_ns) is None
-            and self._has_transforms(waiting)
+            and self._has_transforms(self.frames, waiting)
         )
 
-    def _has_transforms(self, waiting: WaitingImage) -> bool:
-        """Whether an image need not wait for transforms."""
-        if not self.frames.wanted or len(self._waiting) > self.most_waiting:
-            return True
-        timeout = self.parameters.input_timeout * SECOND_NS
-        assert self._newest is not None
-        return self._newest - waiting.stamp_ns > timeout or self.frames.is_settled(
-            self._frame_of(waiting), waiting.stamp_ns, timeout
-        )
+    def _leave_out(self, stamp: int) -> None:
+        # A person moves little until the next image: the prediction is a hypothesis there, too.
+        found = self._predictions.take(stamp)
+        if isinstance(found, PosePrediction):
+            self._late_prediction = found
+
+    def _prediction_of(self, stamp: int) -> PosePrediction | Status | None:
+        """What was predicted from an image or, without that, from one left out before it."""
+        found = self._predictions.take(stamp)
+        late, self._late_prediction = self._late_prediction, None
+        return late if found is None else found
 
     def _missing_input(self, stamp: int) -> Fault:
         return self._missing_here(stamp) or super()._missing_input(stamp)
@@ -236,13 +243,30 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         keypoints = None
         if p.use_keypoints:
             keypoints = self._keypoints.take(stamp, p, self.start.body)
-        prediction = self._predictions.take(stamp) if p.use_predictions else None
+        prediction = self._prediction_of(stamp) if p.use_predictions else None
+        self._follow(waiting, camera, keypoints, prediction)
+
+    def _new_tracker(self, camera: Camera) -> Tracker:
+        return self.start.tracker(camera, self._known_ground())
+
+    def _known_ground(self) -> KnownGround:
+        return self.frames.known_ground(self.start.parameters.known_ground)
+
+    def _follow(
+        self,
+        waiting: WaitingImage,
+        camera: Camera,
+        keypoints: Keypoints | None,
+        prediction: PosePrediction | Status | None,
+        others: Mask | None = None,
+    ) -> None:
+        """Takes an image with its inputs; see `Tracker.step`."""
+        stamp = waiting.stamp_ns
         starts = self._tracker is None or self._tracker.status is Status.WAITING
         try:
             self._look_at_frames(waiting)
             if self._tracker is None:
-                known = self.frames.known_ground(self.start.parameters.known_ground)
-                self._tracker = self.start.tracker(camera, known)
+                self._tracker = self._new_tracker(camera)
                 self._tracker.track_id = self._tracks
             elif self.frames.newest:
                 seen = self.frames.known_ground(KnownGround())
@@ -258,6 +282,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 prediction if isinstance(prediction, PosePrediction) else None,
                 waiting.mask,
                 nobody_predicted=prediction is Status.NOBODY,
+                others=others,
             )
             if trusted and self._tracker.silhouettes.doubted:
                 self._report_background(self._tracker.silhouettes.share, stamp)
