@@ -24,6 +24,7 @@ PAGES = {
     'keypoints_node': 'nodes.md',
     'keypoints_adapter_node': 'nodes.md',
     'hri_node': 'nodes.md',
+    'people_adapter_node': 'nodes.md',
     'bags': 'bags.md',
     'nodes': 'nodes.md',
     'live': 'nodes.md',
@@ -87,6 +88,7 @@ def parameter_table(node: str) -> str:
     from hmt_ros.sessions.hri_parameters import HriParameters
     from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
     from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+    from hmt_ros.sessions.people_adapter_parameters import PeopleAdapterParameters
     from hmt_ros.sessions.smoother_parameters import SmootherParameters
 
     settings = {
@@ -96,6 +98,7 @@ def parameter_table(node: str) -> str:
         'keypoints_node': KeypointsParameters(),
         'keypoints_adapter_node': KeypointsAdapterParameters(),
         'hri_node': HriParameters(),
+        'people_adapter_node': PeopleAdapterParameters(),
     }
     lines = ['| parameter | default | range | takes effect | what |', '|---|---|---|---|---|']
     for parameter in declared_parameters(settings[node]):
