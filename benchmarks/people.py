@@ -82,7 +82,7 @@ def tracks_in(bag: Path) -> dict[str, tuple[tuple[str, ...], Joints]]:
         for stored in read.messages(topics):
             content = pose_mixture_of(stored.message)
             if len(content.weights):
-                name = stored.topic.removeprefix(f'{BODIES}/').removesuffix('/pose_mixture')
+                name = stored.topic.removeprefix(f'/{BODIES}/').removesuffix('/pose_mixture')
                 _, joints = result.setdefault(name, (content.joint_names, {}))
                 joints[content.stamp_ns] = content.joint_positions
     return result
