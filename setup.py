@@ -71,6 +71,9 @@ def install_messages(build: Path, prefix: Path, root: str) -> None:
             '/opt/ros/jazzy/setup.bash" and then the same command'
         )
     environment = dict(os.environ, DESTDIR=root)
+    # As colcon does for a package of CMake: all processors, unless the user says how many.
+    if 'MAKEFLAGS' not in environment:
+        environment.setdefault('CMAKE_BUILD_PARALLEL_LEVEL', str(os.cpu_count() or 1))
     # What colcon adds for setup.py moves sys.prefix, which CMake would ask for.
     folders = environment.get('PYTHONPATH', '').split(os.pathsep)
     ours = ('prefix_override', 'colcon_distutils_commands')
@@ -81,7 +84,7 @@ def install_messages(build: Path, prefix: Path, root: str) -> None:
     settings += shlex.split(os.environ.get('CMAKE_ARGS', ''))
     steps = [
         ['cmake', '-S', str(ROOT / 'msg_tools' / MESSAGES), '-B', str(build), *settings],
-        ['cmake', '--build', str(build), '--parallel', str(os.cpu_count() or 1)],
+        ['cmake', '--build', str(build)],
         ['cmake', '--install', str(build)],
     ]
     for step in steps:

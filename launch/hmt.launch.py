@@ -36,6 +36,8 @@ OPTICAL, UPRIGHT = 'camera_optical_frame', 'camera_upright'
 # Rotation from (x right, y down, z forward) to (x forward, y left, z up).
 TURN = {'qx': 0.5, 'qy': -0.5, 'qz': 0.5, 'qw': 0.5}
 TRUTH = {'true': True, 'false': False}
+# Interval between two predictions of bme_node while filter_node tracks the person, s.
+TRACKED_INTERVAL = 0.2
 # Environment variables that name a file with settings of Fast DDS.
 PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 
@@ -178,7 +180,12 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
             'frame_prefix': f'{_frame(namespace)}/',
         },
         'smoother_node': common,
-        'bme_node': {**camera, **_named(given, 'model_file')},
+        'bme_node': {
+            **camera,
+            **_named(given, 'model_file'),
+            # While the person is tracked the filter needs the processor more.
+            'tracked_interval': TRACKED_INTERVAL if 'filter_node' in names else 0.0,
+        },
         'keypoints_node': {**common, 'image_transport': transport},
         'keypoints_adapter_node': {**common, 'source': given['detections_source']},
         PEOPLE: {

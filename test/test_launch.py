@@ -622,7 +622,7 @@ def test_images_of_the_camera_become_a_person_in_the_namespace(started):
         started.wait_until_active(name)
     node, arrived = started.node, {}
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    for topic in ('human_description', 'joint_states', '/tf', 'pose_prediction', 'markers'):
+    for topic in ('human_description', 'human_joint_states', '/tf', 'pose_prediction', 'markers'):
         package, _, kind = TOPICS[topic].msgtype.split('/')
 
         def keep(message, topic=topic):
@@ -658,7 +658,7 @@ def test_images_of_the_camera_become_a_person_in_the_namespace(started):
     assert {t.child_frame_id for t in arrived['/tf'].transforms} == set(links[1:])
     assert all(link.startswith('body_p1/') for link in links[1:])
     movable = {one.attrib['name'] for one in robot.findall('joint') if one.get('type') != 'fixed'}
-    assert set(arrived['joint_states'].name) == movable
+    assert set(arrived['human_joint_states'].name) == movable
     assert len(arrived['pose_prediction'].components) > 0
 
 

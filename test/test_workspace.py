@@ -215,6 +215,27 @@ def test_cmake_does_not_see_the_prefix_that_colcon_gives_to_setup_py(
     assert environment['DESTDIR'] == '/root'
 
 
+@pytest.mark.parametrize(
+    ('name', 'value', 'level'),
+    [('MAKEFLAGS', '-j1', None), ('CMAKE_BUILD_PARALLEL_LEVEL', '3', '3'), (None, '', 'all')],
+)
+def test_messages_are_built_by_as_many_processes_as_the_user_wants(
+    install_messages: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str | None,
+    value: str,
+    level: str | None,
+) -> None:
+    for other in ('MAKEFLAGS', 'CMAKE_BUILD_PARALLEL_LEVEL'):
+        monkeypatch.delenv(other, raising=False)
+    if name is not None:
+        monkeypatch.setenv(name, value)
+    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
+    wanted = str(os.cpu_count()) if level == 'all' else level
+    assert install_messages.calls[1][1].get('CMAKE_BUILD_PARALLEL_LEVEL') == wanted
+
+
 def test_a_failed_build_of_messages_says_what_to_do(install_messages: Any, tmp_path: Path) -> None:
     install_messages.codes.append(1)
     with pytest.raises(SystemExit, match='rosdep install') as raised:

@@ -239,6 +239,10 @@ class CameraSession(Session[CameraParameters, State]):
             stamp = self._waiting.popleft().stamp_ns
             self._dropped.append(stamp)
             self._log.drop(self._late(stamp))
+            self._leave_out(stamp)
+
+    def _leave_out(self, stamp: int) -> None:
+        """Takes the inputs of an image that is dropped although they have come."""
 
     def _drop_incomplete_images(self) -> None:
         most = max(self.parameters.queue_size, MOST_INCOMPLETE)

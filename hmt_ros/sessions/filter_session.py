@@ -44,6 +44,7 @@ from hmt_ros.sessions.camera_session import (
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_state import IN_BACKGROUND, FilterState
+from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D, KeypointInputs
 from hmt_ros.sessions.session import everything
@@ -107,11 +108,13 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         p = parameters
         self.frames = CameraFrames(p.gravity_frame, p.fixed_frame, floor=p.floor_in_gravity_frame)
         self._tracker: Tracker | None = None
-        self._tracks = 0
+        self._tracks, self._turn = 0, 0.0
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
         self._keypoints = KeypointInputs(self._log)
         self._predictions: StampedInputs[PosePrediction | Status] = StampedInputs()
+        # Of an image that was left out since the last estimate.
+        self._late_prediction: PosePrediction | None = None
         self.state = self._present_state()
 
     def restart(self, start: TrackStart | None = None) -> None:
@@ -144,7 +147,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if self._tracker is not None:
             self._tracks = self._tracker.track_id
         self._tracker = None
-        self._shown_body = None
+        self._shown_body, self._turn = None, 0.0
 
     def _forget_inputs(self, stamp: int) -> None:
         super()._forget_inputs(stamp)
@@ -152,6 +155,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._tracker, self._tracks = None, 0
         self._keypoints.clear()
         self._predictions.clear()
+        self._late_prediction = None
         self.frames.forget_after(stamp)
 
     def _stamp_of(self, source: str, message: Any) -> int:
@@ -203,6 +207,18 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             and self._has_transforms(self.frames, waiting)
         )
 
+    def _leave_out(self, stamp: int) -> None:
+        # A person moves little until the next image: the prediction is a hypothesis there, too.
+        found = self._predictions.take(stamp)
+        if isinstance(found, PosePrediction):
+            self._late_prediction = found
+
+    def _prediction_of(self, stamp: int) -> PosePrediction | Status | None:
+        """What was predicted from an image or, without that, from one left out before it."""
+        found = self._predictions.take(stamp)
+        late, self._late_prediction = self._late_prediction, None
+        return late if found is None else found
+
     def _missing_input(self, stamp: int) -> Fault:
         return self._missing_here(stamp) or super()._missing_input(stamp)
 
@@ -227,7 +243,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         keypoints = None
         if p.use_keypoints:
             keypoints = self._keypoints.take(stamp, p, self.start.body)
-        prediction = self._predictions.take(stamp) if p.use_predictions else None
+        prediction = self._prediction_of(stamp) if p.use_predictions else None
         self._follow(waiting, camera, keypoints, prediction)
 
     def _new_tracker(self, camera: Camera) -> Tracker:
@@ -322,6 +338,18 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if starts:
             self._shown_body = tracker.body
         frame = waiting.frame_id
+        fixed = None
+        if p.publish_in_fixed_frame:
+            if self.frames.pose is None:
+                self._log.skip(
+                    Fault.NO_CAMERA_POSE,
+                    f'the image of {waiting.stamp_ns} ns is tracked, but not published: its place '
+                    f'in fixed_frame {p.fixed_frame!r} is unknown',
+                )
+                return
+            fixed = FixedFrame(p.fixed_frame, self.frames.pose, self._turn)
+            self._turn = fixed.turn_of(tracker.body, posterior.means[0])
+        known = self.frames.known_ground(self.start.parameters.known_ground)
         track = TrackedImage(
             image=waiting.image,
             stamp_ns=waiting.stamp_ns,
@@ -340,6 +368,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             track_id=tracker.track_id,
             identities=tracker.modes.identities,
             velocities=tracker.velocities,
+            up=known.up,
+            fixed=fixed,
         )
         presentation = Presentation(
             tracker.settings.max_hypotheses,
@@ -370,7 +400,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             tracker.track_id,
             tracker.settings.max_hypotheses,
             waiting.stamp_ns,
-            waiting.frame_id,
+            f'{p.fixed_frame}_optical' if p.publish_in_fixed_frame else waiting.frame_id,
             waiting.image if p.overlay_modes else None,
             p.overlay_quality,
             self._wanted,

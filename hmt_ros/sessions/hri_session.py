@@ -4,7 +4,7 @@ The rules:
 
 - A track of a person is a body. Its identity is the name of the person, the namespace without
   /humans/bodies/, and the number of the track: p1_2 is the second track in /humans/bodies/p1. A
-  person who was lost and is found again by a new track is a new body, as the REP wants it.
+  person who is found again by a new track is a new body; no identity is used twice.
 - /humans/bodies/tracked lists the bodies that are tracked. A body that the filter calls lost is not
   in the list until the same track goes on; it ends with the track, with a mixture without
   components, and `longest_silence` after its last mixture.
@@ -72,6 +72,8 @@ FINISH = 'finish'  # what `finish` calls the end of the stream
 _KEPT = 0.5
 # Change of a length above which a body is described anew, m.
 _RESHAPED = 0.005
+# People of whom no body is tracked who are remembered, for the numbers of their tracks.
+_REMEMBERED = 1000
 # A filter that is further behind drops images itself.
 _IMAGES = 20
 
@@ -99,7 +101,8 @@ class _Person:
         name: of the person.
         identity: of the body; '' while there is none.
         tracked: whether the body is neither lost nor silent.
-        tracks: number of the newest track.
+        track: number of its track; 0: it has none.
+        bodies: number in the newest identity.
         newest: stamp of the newest mixture, ns.
         heard: time at which it came, by the stamps of camera_info, ns.
         mode: identity of the mode that is shown; 0: none.
@@ -110,7 +113,8 @@ class _Person:
     name: str
     identity: str = ''
     tracked: bool = False
-    tracks: int = 0
+    track: int = 0
+    bodies: int = 0
     newest: int | None = None
     heard: int = 0
     mode: int = 0
@@ -121,14 +125,18 @@ class _Person:
         """The track has ended."""
         self.identity, self.tracked = '', False
 
+    def goes_on(self, track: int) -> bool:
+        """Whether the body of the last mixture is that of a track; 0: it has no number."""
+        return bool(self.identity) and track == self.track
+
     def begin(self, track: int) -> None:
-        """A track goes on, or another one begins; 0: it has no number."""
-        if not track:
-            track = self.tracks if self.identity else self.tracks + 1
-        identity = f'{self.name}_{track}'
-        if identity != self.identity:
+        """A track goes on, or another one begins, whose number is larger than those before."""
+        if not self.goes_on(track):
+            # A filter that was started again counts from 1 again.
+            self.bodies = max(track, self.bodies + 1)
+            self.identity = f'{self.name}_{self.bodies}'
             self.mode, self.angles, self.described = 0, {}, ()
-        self.identity, self.tracked, self.tracks = identity, True, track
+        self.track, self.tracked = track, True
 
 
 @dataclass(frozen=True)
@@ -182,14 +190,17 @@ class HriSession(Session[HriParameters, HriState]):
     def finish(self) -> Handled:
         """Tells that nobody is tracked any more."""
         self._log.begin()
-        if any(person.tracked for person in self._people.values()):
-            self._people.clear()
-            self._tell_tracked(self._now)
+        tracked = bool(self._tracked())
         self.restart()
+        if tracked:
+            self._tell_tracked(self._now)
         return self._handled(FINISH, self._now)
 
     def _forget(self) -> None:
-        self._people.clear()
+        # The numbers of their bodies are not given again.
+        for person in self._people.values():
+            person.end()
+            person.newest = None
         self._images.clear()
 
     # Inputs.
@@ -202,7 +213,6 @@ class HriSession(Session[HriParameters, HriState]):
             while len(self._images) > _IMAGES:
                 del self._images[next(iter(self._images))]
         else:
-            self._log.counts['received'] += 1
             self._take_mixture(source.removeprefix(mixture_source('')), message, stamp)
 
     def _take_camera_info(self, message: Any, stamp: int) -> None:
@@ -230,7 +240,7 @@ class HriSession(Session[HriParameters, HriState]):
             return
         if order is Order.JUMP:
             self.restart()
-        person = self._people.setdefault(namespace, _Person(_name_in(namespace)))
+        person = self._person_in(namespace)
         if self._camera is None:
             self._now = stamp
         person.newest, person.heard = stamp, self._now
@@ -250,6 +260,14 @@ class HriSession(Session[HriParameters, HriState]):
             self._tell_tracked(stamp)
         self._log.counts['converted'] += 1
 
+    def _person_in(self, namespace: str) -> _Person:
+        if namespace not in self._people:
+            gone = [name for name, person in self._people.items() if not person.identity]
+            for name in gone[: max(len(gone) - _REMEMBERED + 1, 0)]:
+                del self._people[name]
+            self._people[namespace] = _Person(_name_in(namespace))
+        return self._people[namespace]
+
     # Outputs.
 
     def _tell_tracked(self, stamp: int) -> None:
@@ -265,8 +283,8 @@ class HriSession(Session[HriParameters, HriState]):
             ValueError: joint positions that are those of no person.
         """
         p, stamp = self.parameters, content.stamp_ns
-        shown = _shown_mode(content, person.mode if content.track_id == person.tracks else 0)
-        before = person.angles
+        shown = _shown_mode(content, person.mode if person.goes_on(content.track_id) else 0)
+        before = person.angles if person.goes_on(content.track_id) else None
         human = fit_reference_human(
             content.joint_names, content.joint_positions[shown], before, additions=p.added_joints
         )

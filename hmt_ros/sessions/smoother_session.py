@@ -30,6 +30,7 @@ import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.session import Order, Session, SessionState, everything
@@ -292,8 +293,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         kind = closed_form if p.method == 'paths' else MixtureSmoother
         return kind(
             p.dynamics.of(body),
-            body.lower,
-            body.upper,
+            *_limits(body),
             p.max_trajectories,
             through_modes=p.through_modes,
             error_correlation=p.error_correlation,
@@ -377,6 +377,13 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
     except OSError as error:
         text = error_line(error)
         raise ValueError(f'{text}; body_model names it, or a file with it') from error
+
+
+def _limits(body: Body) -> tuple[Array, Array]:
+    """Limits (d,) of poses in any frame: the place of the root has none."""
+    lower, upper = body.lower.copy(), body.upper.copy()
+    lower[:3], upper[:3] = -np.inf, np.inf
+    return lower, upper
 
 
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:

@@ -11,8 +11,11 @@ from scipy.spatial.transform import Rotation
 from hmt_ros.body import Camera
 from hmt_ros.body.reference_human import REFERENCE_JOINTS
 from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.sessions import hri_session
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.hri_session import (
     FRAMES,
@@ -115,6 +118,40 @@ def test_tracks_without_a_number_are_counted(session, outputs, people):
     assert tracked(outputs) == [['body_1'], ['body_1'], [], ['body_2']]
 
 
+def test_no_identity_is_used_twice(session, outputs, people):
+    """A filter that was started again counts its tracks from 1 again."""
+    one = session()
+    one.take(P1, people(0, 3))
+    one.take(P1, people(1, 3, TrackState.NOBODY))
+    one.take(P1, people(2, 1))
+    one.take(P1, people(3, 1))
+    one.take(P1, people(4, 2))
+    assert tracked(outputs) == [['p1_3'], [], ['p1_4'], ['p1_4'], ['p1_5']]
+
+
+def test_what_the_filter_publishes_is_a_body(
+    session, outputs, small_camera, stub_tracker, subject_file
+):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    parameters = with_values(FilterParameters(), {'subject_file': str(subject_file)})
+
+    def forward(output):
+        if output.topic == 'pose_mixture':
+            one.take(P1, deserialise(output.data, 'hmt_msgs/msg/PoseMixture'))
+
+    tracks = FilterSession(parameters, forward)
+    tracks.take(CAMERA_INFO, small_camera.info())
+    stub_tracker.empty.add(small_camera.stamp(2))
+    for index in range(3):
+        one.take(IMAGE, small_camera.image(index))
+        tracks.take(IMAGE, small_camera.image(index))
+    assert tracked(outputs) == [['p1_1'], ['p1_1'], []]
+    for name in ('roi', 'skeleton2d', 'cropped', 'joint_states'):
+        stamps = [o.stamp_ns for o in outputs if o.topic == body_topic('p1_1', name)]
+        assert stamps == [small_camera.stamp(i) for i in (0, 1)]
+
+
 def test_several_people(session, outputs, people):
     one = session()
     one.take(P2, people(0, 4))
@@ -123,6 +160,17 @@ def test_several_people(session, outputs, people):
     assert tracked(outputs)[-1] == ['lab_anna_3', 'p1_1', 'p2_4']
     one.take(P2, people(1, 4, TrackState.NOBODY))
     assert tracked(outputs)[-1] == ['lab_anna_3', 'p1_1']
+
+
+def test_people_who_are_gone_are_forgotten(session, outputs, people, monkeypatch):
+    monkeypatch.setattr(hri_session, '_REMEMBERED', 3)
+    one = session()
+    one.take(P1, people(0))
+    gone = people(0, 1, TrackState.NOBODY)
+    for number in range(10):
+        one.take(mixture_source(f'/humans/bodies/n{number}'), gone)
+    assert len(one._people) == 4
+    assert one.identities == {'p1_1'}
 
 
 def test_who_is_silent_is_not_tracked(session, outputs, people, small_camera):
@@ -352,7 +400,8 @@ def test_time_that_jumps_back(session, outputs, people):
     one.take(P2, people(9))
     one.take(P1, people(9))
     one.take(P1, people(0))
-    assert tracked(outputs)[-1] == ['p1_1']
+    # Another body, as the track before has ended.
+    assert tracked(outputs)[-1] == ['p1_2']
 
 
 def test_the_same_messages_give_the_same_bytes(session, outputs, people, small_camera):

@@ -159,7 +159,7 @@ def _play(
         behind.check()
         # A pose_mixture may say that nobody is in view; several people may be.
         result.tracked += len(
-            {stamp for topic, stamp in handled.published if topic.endswith('joint_states')}
+            {stamp for topic, stamp in handled.published if topic.endswith('human_joint_states')}
         )
         if handled.faults:
             result.last_fault = handled.faults[-1]

@@ -136,7 +136,7 @@ def test_same_of_a_person_who_leaves_and_returns(tmp_path, capsys):
         # The person is there in 0 to 2 and from 8 on; who comes is watched for 0.2 s.
         assert [index for index, _ in found] == [0, 1, 2, 3, 4, 5, 11, 12]
         assert [index for index, count in found if count == 0] == [5]
-    for topic in ('joint_states', '/tf'):
+    for topic in ('human_joint_states', '/tf'):
         assert len(messages(offline, topic)) == 7
     assert [stamps.index(stamp) for stamp, _ in messages(offline, 'markers')][5] == 5
     assert content(offline) == content(live)
