@@ -118,7 +118,7 @@ def test_two_people_have_topics_of_their_own(session, outputs, small_camera):
     assert [text.partition(':')[0] for text in told] == ['p1', 'p2']
     topics = {output.topic for output in outputs}
     for name in ('p1', 'p2'):
-        for topic in ('body', 'pose_mixture', 'joint_states', 'markers'):
+        for topic in ('body', 'pose_mixture', 'human_joint_states', 'markers'):
             assert f'humans/bodies/{name}/{topic}' in topics
     assert '/tf' in topics
     assert published_topic('humans/bodies/p1/overlay/compressed').msgtype.endswith('ssedImage')
