@@ -25,6 +25,7 @@ PAGES = {
     'keypoints_adapter_node': 'nodes.md',
     'hri_node': 'nodes.md',
     'people_adapter_node': 'nodes.md',
+    'people_node': 'nodes.md',
     'bags': 'bags.md',
     'nodes': 'nodes.md',
     'live': 'nodes.md',
@@ -34,6 +35,7 @@ PAGES = {
     'contour_noise': 'likelihood.md',
     'keypoint_noise': 'keypoints.md',
     'motion_prior': 'motion_prior.md',
+    'people': 'people.md',
     'kjs': 'sampling.md',
     'smoothing': 'smoothing.md',
     'experts': 'experts.md',
@@ -89,6 +91,7 @@ def parameter_table(node: str) -> str:
     from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
     from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
     from hmt_ros.sessions.people_adapter_parameters import PeopleAdapterParameters
+    from hmt_ros.sessions.people_parameters import PeopleParameters
     from hmt_ros.sessions.smoother_parameters import SmootherParameters
 
     settings = {
@@ -99,6 +102,7 @@ def parameter_table(node: str) -> str:
         'keypoints_adapter_node': KeypointsAdapterParameters(),
         'hri_node': HriParameters(),
         'people_adapter_node': PeopleAdapterParameters(),
+        'people_node': PeopleParameters(),
     }
     lines = ['| parameter | default | range | takes effect | what |', '|---|---|---|---|---|']
     for parameter in declared_parameters(settings[node]):

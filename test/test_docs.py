@@ -25,6 +25,7 @@ from hmt_ros.sessions import (
     keypoints_adapter_session,
     keypoints_session,
     people_adapter_session,
+    people_session,
     smoothed_messages,
     track_messages,
 )
@@ -35,6 +36,7 @@ from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.people_adapter_parameters import PeopleAdapterParameters
+from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.tracking.subject import parse_subject
 from msg_tools import typestore
@@ -56,6 +58,7 @@ NODES = {
     'keypoints_node': (KeypointsParameters(), keypoints_session.TOPICS),
     'keypoints_adapter_node': (KeypointsAdapterParameters(), keypoints_adapter_session.TOPICS),
     'people_adapter_node': (PeopleAdapterParameters(), people_adapter_session.TOPICS),
+    'people_node': (PeopleParameters(), people_session.PeopleSession.TOPICS),
     'hri_node': (
         HriParameters(),
         hri_session.TOPICS
