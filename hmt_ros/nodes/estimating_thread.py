@@ -166,6 +166,7 @@ class EstimatingThread:
         self._tell, self._tell_change = tell, tell_change
         self._inner_faults, self._log_error = inner_faults, log_error
         self._latencies: deque[float] = deque(maxlen=1000)
+        self._durations: deque[float] = deque(maxlen=1000)
         self._thread = threading.Thread(target=self._work, name='estimate', daemon=True)
         self._thread.start()
 
@@ -186,6 +187,10 @@ class EstimatingThread:
     def take_latencies(self) -> list[float]:
         """Times from the arrival of messages to their estimates, s, since the last call."""
         return [self._latencies.popleft() for _ in range(len(self._latencies))]
+
+    def take_durations(self) -> list[float]:
+        """Times that estimates took by themselves, s, since the last call."""
+        return [self._durations.popleft() for _ in range(len(self._durations))]
 
     def stop(self, timeout: float | None = None) -> bool:
         """Ends the thread after the present message; drops what waits, except a restart.
@@ -220,7 +225,7 @@ class EstimatingThread:
                 self._tell_change()
 
     def _handle(self, waiting: Waiting) -> None:
-        session = self._session
+        session, began = self._session, time.monotonic()
         session.count_dropped(waiting.dropped)
         done = session.state.counts[session.DONE]
         if waiting.source == _RESTART:
@@ -238,5 +243,7 @@ class EstimatingThread:
         else:
             handled = session.take(waiting.source, message)
         if session.state.counts[session.DONE] > done:
-            self._latencies.append(time.monotonic() - waiting.arrival)
+            now = time.monotonic()
+            self._latencies.append(now - waiting.arrival)
+            self._durations.append(now - began)
         self._tell(handled)

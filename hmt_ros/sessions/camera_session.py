@@ -18,9 +18,10 @@ from hmt_ros.body import Camera
 from hmt_ros.inference.arrays import Image, Mask
 from hmt_ros.sessions.declared_parameters import CameraNodeParameters
 from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.session import Order, Session, State, everything
+from hmt_ros.sessions.named_frames import NamedFrames
+from hmt_ros.sessions.session import NeededInput, Order, Session, State, everything
 from msg_tools.files.bounded_file import read_bytes
-from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
+from msg_tools.messages.camera_info import CameraInfoError, UncalibratedError, camera_from_info
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.images import ImageError, decode_image, decode_mask, decode_picture
 
@@ -28,6 +29,13 @@ CAMERA_INFO, IMAGE = 'camera_info', 'image'
 MASK, COMPRESSED_MASK = 'mask', 'mask/compressed'
 MASKS = (MASK, COMPRESSED_MASK)
 FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a frame
+# What an image waits for, by the fault that it would be.
+_HELD_UP = {
+    Fault.NO_MASK: 'a mask',
+    Fault.NO_KEYPOINTS: 'keypoints',
+    Fault.NO_KEYPOINTS_3D: 'keypoints_3d',
+    Fault.NO_PREDICTION: 'a pose_prediction',
+}
 
 T = TypeVar('T')
 CameraParameters = TypeVar('CameraParameters', bound=CameraNodeParameters)
@@ -68,9 +76,20 @@ class CameraSession(Session[CameraParameters, State]):
         super().__init__(parameters, publish, wanted)
         self._camera: Camera | None = None
         self._frame = ''
+        self._frames = NamedFrames(IMAGE, CAMERA_INFO)
+        self._uncalibrated = ''
         self._waiting: deque[WaitingImage] = deque()
         self._newest: int | None = None
         self._masks: StampedInputs[Mask] = StampedInputs(_REMEMBERED_MASKS)
+
+    def needed_inputs(self) -> list[NeededInput]:
+        """What has to come at present; may be called by any thread."""
+        needed = super().needed_inputs()
+        if self._camera is None and not self._uncalibrated:
+            needed.append(NeededInput((CAMERA_INFO,)))
+        if self.parameters.use_mask:
+            needed.append(NeededInput(MASKS, with_each=True))
+        return needed
 
     @abstractmethod
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
@@ -112,11 +131,15 @@ class CameraSession(Session[CameraParameters, State]):
         self._estimate_what_is_ready()
 
     def _take_camera_info(self, message: Any) -> None:
+        self._see_frame(CAMERA_INFO, message)
         try:
             camera = camera_from_info(message)
         except CameraInfoError as error:
-            self._log.fault(Fault.CAMERA_INFO, str(error))
+            text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
+            self._uncalibrated = text if self._camera is None else ''
+            self._log.fault(Fault.CAMERA_INFO, text)
             return
+        self._uncalibrated = ''
         self._frame = str(message.header.frame_id)
         known, self._camera = self._camera, camera
         if known is not None and camera != known:
@@ -124,7 +147,13 @@ class CameraSession(Session[CameraParameters, State]):
             self._log.note(Fault.CALIBRATION, text)
             self._start_anew()
 
+    def _see_frame(self, source: str, message: Any) -> None:
+        """Warns of a camera whose messages do not agree on its frame, once for each frame."""
+        for text in self._frames.see(source, str(message.header.frame_id), self._on_topic):
+            self._log.note(Fault.FRAME, text, warn=True)
+
     def _take_image(self, message: Any, stamp: int) -> None:
+        self._see_frame(IMAGE, message)
         order = self._order(stamp, self._newest)
         if order is Order.SKIPPED:
             return
@@ -193,17 +222,18 @@ class CameraSession(Session[CameraParameters, State]):
             self._estimate_next(self._camera)
         while len(self._waiting) > self.parameters.queue_size:
             stamp = self._waiting.popleft().stamp_ns
-            self._log.counts['dropped'] += 1
             if self._camera is None:
                 # An uncalibrated camera_info has been reported already.
-                self._log.fault(
+                self._log.drop(
                     Fault.CAMERA_INFO,
+                    'a calibrated camera_info',
                     f'image of {stamp} ns is dropped: it waited for a calibrated camera_info',
                 )
             else:
                 kind = self._missing_input(stamp)
-                self._log.fault(
+                self._log.drop(
                     kind,
+                    _HELD_UP[kind],
                     f'image of {stamp} ns is dropped: {kind.value} of its stamp has come, and '
                     f'queue_size is {self.parameters.queue_size}',
                 )
@@ -227,8 +257,17 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _status_and_wants(self) -> tuple[str, str]:
         if self._camera is None:
-            return 'no camera', 'a calibrated camera_info'
+            why = f'; {self._uncalibrated}' if self._uncalibrated else ''
+            return 'no camera', f'a calibrated camera_info{why}'
         return self._status()
+
+
+def camera_info_fault(error: CameraInfoError, source: str) -> str:
+    """What is wrong with a camera_info, and what to do."""
+    text = f'{source}{str(error).removeprefix("camera info")}'
+    if isinstance(error, UncalibratedError):
+        return f'{text}; calibrate the camera, and let its driver publish the result'
+    return text
 
 
 class StampedInputs(Generic[T]):

@@ -44,7 +44,7 @@ from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_state import IN_BACKGROUND, FilterState
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D, KeypointInputs
-from hmt_ros.sessions.session import everything
+from hmt_ros.sessions.session import NeededInput, everything
 from hmt_ros.sessions.track_messages import (
     TOPICS,
     Presentation,
@@ -122,6 +122,19 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         """
         self.start = prepare_start(self.parameters) if start is None else start
         super().restart()
+
+    def needed_inputs(self) -> list[NeededInput]:
+        """What has to come at present; may be called by any thread."""
+        p, frames, needed = self.parameters, self.frames, super().needed_inputs()
+        wanted = (
+            (p.use_keypoints, KEYPOINTS),
+            (p.use_keypoints_3d, KEYPOINTS_3D),
+            (p.use_predictions, PREDICTION),
+        )
+        needed += [NeededInput((name,), with_each=True) for used, name in wanted if used]
+        if frames.wanted and not frames.heard:
+            needed.append(NeededInput(TRANSFORMS))
+        return needed
 
     # Inputs.
 
@@ -226,7 +239,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if p.use_keypoints:
             keypoints = self._keypoints.take(stamp, p, self.start.body)
         prediction = self._predictions.take(stamp) if p.use_predictions else None
-        starts = self._tracker is None or self._tracker.status is Status.WAITING
+        before = Status.WAITING if self._tracker is None else self._tracker.status
+        starts = before is Status.WAITING
         try:
             self._look_at_frames(waiting)
             if self._tracker is None:
@@ -249,8 +263,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             )
             if trusted and self._tracker.silhouettes.doubted:
                 self._report_background(self._tracker.silhouettes.share, stamp)
-            if starts and posterior is not None:
-                self._report_start(self._tracker, stamp)
+            self._report_change(before, self._tracker, stamp)
             if posterior is not None and likelihood is not None:
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
             elif len(self._weights):
@@ -277,10 +290,28 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             'give background_file, or begin with the empty scene',
         )
 
+    def _report_change(self, before: Status, tracker: Tracker, stamp_ns: int) -> None:
+        """Tells of start, loss, recovery and end of a track, each once."""
+        now, track = tracker.status, f'track {tracker.track_id}'
+        if now is before:
+            return
+        at = f'at the image of {stamp_ns} ns'
+        if now is Status.NOBODY:
+            self._log.tell(f'nobody in view {at}: {track} ends, another starts when somebody comes')
+        elif before is Status.LOST:
+            self._log.tell(f'{track} is found again {at}')
+        elif before is not Status.TRACKING:
+            self._report_start(tracker, stamp_ns)
+        if now is Status.LOST:
+            text = f'{track} is lost {at}: no mode explains {tracker.misfit:.0%} of what is seen'
+            self._log.note(Fault.LOST, f'{text}; it is searched for', warn=True)
+
     def _report_start(self, tracker: Tracker, stamp_ns: int) -> None:
         initial, source = self.start.initial, tracker.started_from
-        if initial is None and source is not None:
-            self._log.tell(f'the track starts from {source.value} at the image of {stamp_ns} ns')
+        origin = 'what was given' if source is None else source.value
+        self._log.tell(
+            f'track {tracker.track_id} starts from {origin} at the image of {stamp_ns} ns'
+        )
         if isinstance(initial, Subject) and stamp_ns - initial.stamp_ns > _SAME_MOMENT_NS:
             age = (stamp_ns - initial.stamp_ns) / SECOND_NS
             self._log.note(

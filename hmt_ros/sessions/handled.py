@@ -50,6 +50,9 @@ class Fault(Enum):
     NEW_BODY = 'new body'
     MIXTURE_KIND = 'kind of mixture'
     GAP = 'gap'
+    FRAME = 'frame_id'
+    LOST = 'loss of the track'
+    CAMERA_MOVED = 'camera moved'
 
 
 class Output(NamedTuple):
@@ -74,8 +77,10 @@ class Handled:
         source: where it came from.
         stamp_ns: of the message.
         faults: why it, or something that waited for it, could not be used; empty if it was used.
-        warnings: for the log: the first fault of each kind, and where an estimate starts.
+        warnings: for the log: the first fault of each kind.
         published: (topic, stamp) of all messages that were published, in their order.
+        events: for the log, and no faults: start and end of a track, say; in a message they follow
+            the warnings.
     """
 
     source: str
@@ -83,6 +88,7 @@ class Handled:
     faults: tuple[str, ...]
     warnings: tuple[str, ...]
     published: tuple[tuple[str, int], ...]
+    events: tuple[str, ...] = ()
 
 
 class HandlingLog:
@@ -93,18 +99,21 @@ class HandlingLog:
             'dropped' and what the session counts.
         faults: number by kind.
         last_fault: the newest; '' before the first.
+        held_up: what the last dropped message waited for here; '' if it was dropped before.
     """
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self.faults: Counter[str] = Counter()
         self.last_fault = ''
+        self.held_up = ''
         self.begin()
 
     def begin(self) -> None:
         """Starts the report on the next message."""
         self._told: list[str] = []
         self._warned: list[str] = []
+        self._events: list[str] = []
         self._published: list[tuple[str, int]] = []
 
     def fault(self, kind: Fault | MessageFault, text: str) -> None:
@@ -121,7 +130,7 @@ class HandlingLog:
 
     def tell(self, text: str) -> None:
         """Logs something that is no fault."""
-        self._warned.append(one_line(text))
+        self._events.append(one_line(text))
 
     def skip(self, kind: Fault | MessageFault, text: str) -> None:
         """Reports a message that was to be estimated from and can not be used."""
@@ -132,6 +141,19 @@ class HandlingLog:
         """Counts messages that were dropped before they came here."""
         self.counts['received'] += messages
         self.counts['dropped'] += messages
+        self.held_up = ''
+
+    def drop(self, kind: Fault, held_up: str, text: str) -> None:
+        """Reports a message that waited here and is dropped.
+
+        Args:
+            kind: of the fault.
+            held_up: what it waited for.
+            text: of the fault.
+        """
+        self.counts['dropped'] += 1
+        self.held_up = held_up
+        self.fault(kind, text)
 
     def published(self, topic: str, stamp_ns: int) -> None:
         """Reports a message that was published."""
@@ -140,7 +162,12 @@ class HandlingLog:
     def handled(self, source: str, stamp_ns: int) -> Handled:
         """The report on the present message."""
         return Handled(
-            source, stamp_ns, tuple(self._told), tuple(self._warned), tuple(self._published)
+            source,
+            stamp_ns,
+            tuple(self._told),
+            tuple(self._warned),
+            tuple(self._published),
+            tuple(self._events),
         )
 
 
@@ -151,7 +178,7 @@ def handled_message(messages: MessageFactory, handled: Handled) -> Any:
         source=handled.source,
         stamp=time_message(messages, handled.stamp_ns),
         faults=list(handled.faults),
-        warnings=list(handled.warnings),
+        warnings=[*handled.warnings, *handled.events],
         published_topics=[topic for topic, _ in handled.published],
         published_stamps=[time_message(messages, stamp) for _, stamp in handled.published],
     )

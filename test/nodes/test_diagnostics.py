@@ -146,9 +146,11 @@ def test_lost_messages_are_in_the_diagnostics(running, small_camera):
 def test_silence_is_told(running, small_camera):
     running.send('camera_info', small_camera.info())
     running.send('image', small_camera.image(0))
-    running.node._last_arrival = time.monotonic() - 20
+    running.patience(3.0)
+    running.node._silent.arrived('image', time.monotonic() - 20)
     running.spin_until(
-        lambda: re.fullmatch(r'no images for 2\d s', running.diagnosis()[1]), 'a warning'
+        lambda: re.match(r'no images for 2\d s; nothing on /image ', running.diagnosis()[1]),
+        'a warning',
     )
     assert running.diagnosis()[0] == 1
     running.send('image', small_camera.image(1))
@@ -185,7 +187,8 @@ def test_status_line(running, small_camera):
     running.send('image', small_camera.image(0))
     for _ in range(3):
         period()
-    (line,) = status_lines(running)
+    start, line = status_lines(running)
+    assert start.startswith('track 1 starts from ')
     number = r'\d+\.\d'
     assert re.fullmatch(
         rf'tracking, 2 modes; {number} images a second, {number} tracked, latency \d+ ms', line
@@ -194,11 +197,11 @@ def test_status_line(running, small_camera):
     for index in range(1, 7):
         running.send('image', small_camera.image(index))
         period()
-    assert len(status_lines(running)) == 3
+    assert len(status_lines(running)) == 4
     assert running.set(status_interval=0) == (True, '')
     running.send('image', small_camera.image(7))
     period()
-    assert len(status_lines(running)) == 3
+    assert len(status_lines(running)) == 4
 
 
 def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):

@@ -182,7 +182,7 @@ def test_one_warning_for_each_kind_and_the_node_lives(running, small_camera, stu
     assert faults(running.send('image', small_camera.image(11))) == []
     assert stub_tracker.made[-1].masks[-1].sum() == 240
     wanted = (
-        'camera is not calibrated',
+        'camera_info on /camera_info has k[0] = 0: uncalibrated; calibrate the camera',
         'wanted stamps that increase',
         'with reset_on_time_jump the track would start anew',
         "encoding 'yuv9' is not known",
@@ -268,7 +268,11 @@ def test_node_without_its_subject_lives(world, subject_file, small_camera):
     one.node.start()
     assert one.state == 'unconfigured'
     one.spin_until(lambda: len(one.warnings()) == 1)
-    assert one.warnings() == [f'{missing}: can not be read (No such file or directory)']
+    assert one.warnings() == [
+        f'{missing}: can not be read (No such file or directory); set subject_file to a file that '
+        'can be used, then: ros2 lifecycle set /filter_node configure; ros2 lifecycle set '
+        '/filter_node activate'
+    ]
     assert one.diagnosis()[:2] == (2, one.warnings()[0])
     assert one.set(subject_file=str(subject_file)) == (True, '')
     assert one.change_state('configure')

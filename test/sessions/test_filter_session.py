@@ -112,7 +112,10 @@ def test_uncalibrated_camera_is_told_once(session, outputs, small_camera):
         handled.append(one.take(CAMERA_INFO, small_camera.uncalibrated(index)))
         handled.append(one.take(IMAGE, small_camera.image(index)))
     warnings = [text for h in handled for text in h.warnings]
-    assert warnings == ['camera info: the camera is not calibrated (K is zero)']
+    assert warnings == [
+        'camera_info has k[0] = 0: uncalibrated; calibrate the camera, and let its driver publish '
+        'the result'
+    ]
     # Three messages that are no calibration, and two images that waited in vain.
     assert one.state.faults == {'camera_info': 5}
     assert one.state.wants == 'a calibrated camera_info'
@@ -669,9 +672,9 @@ def test_what_a_track_starts_from_is_told(session, small_camera, likelihoods, st
     one = session(subject_file='', use_predictions=True)
     one.take(CAMERA_INFO, small_camera.info())
     one.take(PREDICTION, likelihoods.message(1, kind=MixtureKind.PREDICTION))
-    (text,) = one.take(IMAGE, small_camera.image(1)).warnings
+    (text,) = one.take(IMAGE, small_camera.image(1)).events
     stamp = small_camera.stamp(1)
-    assert text == f'the track starts from a pose prediction at the image of {stamp} ns'
+    assert text == f'track 1 starts from a pose prediction at the image of {stamp} ns'
     assert dict(one.state.values())['started from'] == 'a pose prediction'
     assert not one.state.faults
 
