@@ -53,7 +53,9 @@ def posterior_modes(
     images = bool(observation.evidence)
     measured = images or observation.keypoints is not None
     if measured:
-        alone = posterior.covariances(fit, solved.free, keypoints_alone=not images)
+        # In the first image no error of keypoints has lasted yet: their noise holds all of it.
+        if images or states is not None:
+            alone = posterior.covariances(fit, solved.free, keypoints_alone=not images)
         covariances = alone + shape.considered(
             posterior.likelihood, observation, poses, posterior.given_way(poses, observation)[1]
         )

@@ -96,6 +96,7 @@ def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixt
             'hmt_msgs/msg/TrajectoryComponent',
             weight=float(content.weights[m]),
             log_joint=float(content.log_joint[m]),
+            joint_positions=np.empty(0),
             inflation=float(content.inflation[m]),
             means=content.means[m].reshape(-1),
             marginal_covariances=np.empty(0) if covariances is None else covariances[m].reshape(-1),
@@ -107,6 +108,7 @@ def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixt
         header=header_message(messages, content.stamps_ns[-1], content.frame_id),
         body_model=content.body_model,
         dof_names=list(content.dof_names),
+        joint_names=[],
         stamps=[time_message(messages, stamp) for stamp in content.stamps_ns],
         # Before the first of all stamps there is none.
         final_until=time_message(messages, max(content.final_until_ns, EARLIEST_NS)),

@@ -360,7 +360,7 @@ _NOBODY = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 
 
 def _are_near(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Whether pixels (n, 2) lie in an image, or beside it by a quarter of its size at most."""
+    """Whether pixels (n, 2) lie within an image that is enlarged by a quarter of its size."""
     size = np.array([width, height])
     return np.all((pixels > -_NEAR * size) & (pixels < (1 + _NEAR) * size), axis=1)
 
