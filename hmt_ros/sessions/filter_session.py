@@ -41,7 +41,7 @@ from hmt_ros.sessions.camera_session import (
     WaitingImage,
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_state import IN_BACKGROUND, FilterState
+from hmt_ros.sessions.filter_state import FilterState
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D, KeypointInputs
 from hmt_ros.sessions.session import NeededInput, everything
@@ -52,9 +52,10 @@ from hmt_ros.sessions.track_messages import (
     nobody_messages,
     track_messages,
 )
+from hmt_ros.sessions.track_reports import TrackCondition, report_change
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
-from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker
+from hmt_ros.tracking import PosePrediction, Status, Tracker
 from hmt_ros.tracking.ground import KnownGround
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
@@ -77,8 +78,6 @@ PREDICTION = 'pose_prediction'
 
 # Change of a length above which a body is described anew, m.
 RESHAPED = 0.005
-# A person hardly moves meanwhile.
-_SAME_MOMENT_NS = SECOND_NS // 5
 
 
 class FilterSession(CameraSession[FilterParameters, FilterState]):
@@ -239,8 +238,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if p.use_keypoints:
             keypoints = self._keypoints.take(stamp, p, self.start.body)
         prediction = self._predictions.take(stamp) if p.use_predictions else None
-        before = Status.WAITING if self._tracker is None else self._tracker.status
-        starts = before is Status.WAITING
+        before = TrackCondition.of(self._tracker)
+        starts = before.status is Status.WAITING
         try:
             self._look_at_frames(waiting)
             if self._tracker is None:
@@ -252,7 +251,6 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 self._tracker.set_gravity(seen.up, seen.camera_height)
             if (pose := self.frames.pose) is not None:
                 self._tracker.set_camera(pose.translation, pose.rotation)
-            trusted = not self._tracker.silhouettes.doubted
             posterior, likelihood = self._tracker.step(
                 waiting.image,
                 stamp,
@@ -261,9 +259,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 waiting.mask,
                 nobody_predicted=prediction is Status.NOBODY,
             )
-            if trusted and self._tracker.silhouettes.doubted:
-                self._report_background(self._tracker.silhouettes.share, stamp)
-            self._report_change(before, self._tracker, stamp)
+            report_change(self._log, before, self._tracker, self.start.initial, stamp)
             if posterior is not None and likelihood is not None:
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
             elif len(self._weights):
@@ -281,43 +277,6 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         """Looks up what transforms tell of gravity and of the camera at an image."""
         for kind, text in self.frames.look(waiting.frame_id, waiting.stamp_ns):
             self._log.note(kind, text)
-
-    def _report_background(self, share: float, stamp_ns: int) -> None:
-        self._log.note(
-            Fault.BACKGROUND,
-            f'{IN_BACKGROUND}, of whom only {share:.0%} are foreground in the image of {stamp_ns} '
-            'ns: silhouettes are not used until the scene has been seen where the person is now; '
-            'give background_file, or begin with the empty scene',
-        )
-
-    def _report_change(self, before: Status, tracker: Tracker, stamp_ns: int) -> None:
-        """Tells of start, loss, recovery and end of a track, each once."""
-        now, track = tracker.status, f'track {tracker.track_id}'
-        if now is before:
-            return
-        at = f'at the image of {stamp_ns} ns'
-        if now is Status.NOBODY:
-            self._log.tell(f'nobody in view {at}: {track} ends, another starts when somebody comes')
-        elif before is Status.LOST:
-            self._log.tell(f'{track} is found again {at}')
-        elif before is not Status.TRACKING:
-            self._report_start(tracker, stamp_ns)
-        if now is Status.LOST:
-            text = f'{track} is lost {at}: no mode explains {tracker.misfit:.0%} of what is seen'
-            self._log.note(Fault.LOST, f'{text}; it is searched for', warn=True)
-
-    def _report_start(self, tracker: Tracker, stamp_ns: int) -> None:
-        initial, source = self.start.initial, tracker.started_from
-        origin = 'what was given' if source is None else source.value
-        self._log.tell(
-            f'track {tracker.track_id} starts from {origin} at the image of {stamp_ns} ns'
-        )
-        if isinstance(initial, Subject) and stamp_ns - initial.stamp_ns > _SAME_MOMENT_NS:
-            age = (stamp_ns - initial.stamp_ns) / SECOND_NS
-            self._log.note(
-                Fault.OLD_START,
-                f'the joints that start the track were seen {age:.1f} s before its first image',
-            )
 
     def _publish_track(
         self,
@@ -397,6 +356,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             evaluations=0 if tracker is None else tracker.evaluations,
             background='unknown' if silhouettes is None else silhouettes.known,
             doubted=silhouettes is not None and silhouettes.doubted,
+            moved=silhouettes is not None and silhouettes.watch.moved,
             track_id=0 if self._tracker is None else self._tracker.track_id,
             started_from='' if source is None else source.value,
         )

@@ -214,6 +214,7 @@ def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):
     events.incompatible_qos(SimpleNamespace(total_count_change=1, last_policy_kind=16))
     events = running.node._events.of_publisher('/tf')
     events.incompatible_qos(SimpleNamespace(total_count_change=1, last_policy_kind=2))
+    running.patience(0.0)
     page = (ROOT / 'docs' / 'nodes.md').read_text('utf-8')
     table = page.partition('## Diagnostics')[2].partition('| key |')[2]
     cells = [line.split('|')[1] for line in table.partition('\n\n')[0].splitlines()[2:]]
@@ -224,7 +225,7 @@ def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):
     }
     # What this node alone tells.
     own = {'misfit', 'evaluations of the likelihood'}
-    running.spin_until(lambda: 'messages lost of /image' in running.diagnosis()[2], 'all of it')
+    running.spin_until(lambda: 'nothing on /image' in running.diagnosis()[2], 'all of it')
     keys = running.diagnosis()[2].keys() - own
     assert [key for key in keys if not any(p.fullmatch(key) for p in patterns.values())] == []
     assert [key for key, p in patterns.items() if not any(map(p.fullmatch, keys))] == []

@@ -2,7 +2,6 @@
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -118,7 +117,7 @@ def test_uncalibrated_camera_is_told_once(session, outputs, small_camera):
     ]
     # Three messages that are no calibration, and two images that waited in vain.
     assert one.state.faults == {'camera_info': 5}
-    assert one.state.wants == 'a calibrated camera_info'
+    assert one.state.wants == f'a calibrated camera_info; {warnings[0]}'
     one.take(CAMERA_INFO, small_camera.info(3))
     one.take(CAMERA_INFO, small_camera.uncalibrated(3))
     one.take(IMAGE, small_camera.image(3))
@@ -550,7 +549,8 @@ def test_a_person_in_the_background_is_told(session, small_camera, stub_tracker)
     step = stub_tracker.step
 
     def doubts(self, *arguments, **named):
-        self.silhouettes = SimpleNamespace(doubted=True, share=0.123, known='forgotten')
+        self.silhouettes.doubted, self.silhouettes.share = True, 0.123
+        self.silhouettes.known = 'forgotten'
         return step(self, *arguments, **named)
 
     with pytest.MonkeyPatch.context() as patch:
