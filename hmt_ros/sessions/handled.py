@@ -53,6 +53,8 @@ class Fault(Enum):
     FRAME = 'frame_id'
     LOST = 'loss of the track'
     CAMERA_MOVED = 'camera moved'
+    HUMAN = 'reference model'
+    NO_IMAGE = 'no image'
 
 
 class Output(NamedTuple):
@@ -137,14 +139,20 @@ class HandlingLog:
         self.counts['skipped'] += 1
         self.fault(kind, text)
 
+    def drop(self, text: str) -> None:
+        """Reports a message that is not estimated from because the node is late; no fault of it."""
+        self.counts['dropped'] += 1
+        self.held_up = ''
+        self._told.append(one_line(text))
+
     def count_dropped(self, messages: int) -> None:
         """Counts messages that were dropped before they came here."""
         self.counts['received'] += messages
         self.counts['dropped'] += messages
         self.held_up = ''
 
-    def drop(self, kind: Fault, held_up: str, text: str) -> None:
-        """Reports a message that waited here and is dropped.
+    def give_up(self, kind: Fault, held_up: str, text: str) -> None:
+        """Reports a message that waited here in vain and is dropped.
 
         Args:
             kind: of the fault.

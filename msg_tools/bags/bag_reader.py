@@ -155,12 +155,22 @@ class BagReader(AbstractContextManager['BagReader']):
     def topic(self, name: str) -> Topic:
         """The topic of a name, with or without its leading slash.
 
+        A relative name that is not there means the topic of that name in a namespace, if only one
+        namespace has it.
+
         Raises:
-            BagError: there is none.
+            BagError: there is none, or several namespaces have it.
         """
         for candidate in (name, f'/{name}', name.removeprefix('/')):
             if candidate in self.topics:
                 return self.topics[candidate]
+        inside = [x for x in self.topics if not name.startswith('/') and x.endswith(f'/{name}')]
+        if len(inside) == 1:
+            return self.topics[inside[0]]
+        if inside:
+            raise BagError(
+                f'{self.path} has several topics {name}: name one of {", ".join(inside)}'
+            )
         self.raise_damage()
         raise BagError(f'{self.path} has no topic {name}; it has {self._topic_names()}')
 

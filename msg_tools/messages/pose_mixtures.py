@@ -159,18 +159,22 @@ class PoseMixture:
         log_likelihoods: Array | None = None,
         state: TrackState = TrackState.UNKNOWN,
         track_id: int = 0,
-        identities: NDArray[np.uint32] | None = None,
-        joint_covariances: Array | None = None,
-        joint_velocities: Array | None = None,
+        identities: NDArray[Any] | None = None,
+        velocities: Array | None = None,
     ) -> PoseMixture:
         """A mixture over the poses of a body at its present lengths.
+
+        Covariances and velocities of the joints are those of the poses by linearisation,
+
+            S_joint = J S J',    v_joint = J v,    J = d joint / d pose at the mean
 
         Args:
             body: the person.
             mixture: K Gaussians over its poses; None: nobody was seen.
             joint_positions: (K, J, 3) m, of the means; None: computed here.
-            kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities,
-                joint_covariances, joint_velocities: see the attributes.
+            kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities: see the
+                attributes.
+            velocities: (K, d) of the poses, per second; None: unknown.
 
         Raises:
             MessageError: shapes or values that a message must not have.
@@ -180,6 +184,10 @@ class PoseMixture:
             mixture = GaussianMixture(np.empty(0), np.empty((0, d)), np.empty((0, d, d)))
         if joint_positions is None:
             joint_positions = body.joint_positions(mixture.means)
+        jacobians = body.joint_jacobians(mixture.means)
+        joint_velocities = None
+        if velocities is not None:
+            joint_velocities = np.einsum('kjad,kd->kja', jacobians, velocities)
         return cls(
             weights=mixture.weights,
             means=mixture.means,
@@ -196,7 +204,7 @@ class PoseMixture:
             state=state,
             track_id=track_id,
             identities=identities,
-            joint_covariances=joint_covariances,
+            joint_covariances=_joint_covariances(jacobians, mixture.covariances),
             joint_velocities=joint_velocities,
         )
 
@@ -212,6 +220,14 @@ class PoseMixture:
         if self.covariances is None:
             raise MessageError('mixture has no covariances', MessageFault.COVARIANCES)
         return GaussianMixture(self.weights, self.means, self.covariances)
+
+
+def _joint_covariances(jacobians: Array, covariances: Array) -> Array:
+    """Covariances (K, J, 3, 3) of joints from Jacobians (K, J, 3, d) and those of the poses."""
+    k, joints, _, d = jacobians.shape
+    rows = (jacobians.reshape(k, 3 * joints, d) @ covariances).reshape(jacobians.shape)
+    result = rows @ jacobians.swapaxes(2, 3)
+    return 0.5 * (result + result.swapaxes(2, 3))
 
 
 def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 
+from hmt_ros.sessions.camera_session import MOST_INCOMPLETE
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import CAMERA_INFO, IMAGE, FilterSession
 from hmt_ros.sessions.filter_state import CAMERA_MOVED
@@ -90,20 +91,21 @@ def test_a_moved_camera_is_told_once(one, small_camera, stub_tracker):
 
 def test_what_a_dropped_image_waited_for_is_known(stub_tracker, subject_file, small_camera):
     parameters = FilterParameters(
-        subject_file=str(subject_file), use_keypoints=True, queue_size=1, input_timeout=60.0
+        subject_file=str(subject_file), use_keypoints=True, input_timeout=60.0
     )
     one = FilterSession(parameters, lambda output: None)
-    for index in range(2):
+    for index in range(MOST_INCOMPLETE + 1):
         one.take(IMAGE, small_camera.image(index))
     assert one.state.held_up == 'a calibrated camera_info'
     one.take(CAMERA_INFO, small_camera.info())
-    for index in range(2, 4):
+    first = MOST_INCOMPLETE + 1
+    for index in range(first, first + 2):
         one.take(IMAGE, small_camera.image(index))
     assert one.state.held_up == 'keypoints'
     # Computing alone is to blame for images that never came here.
     one.count_dropped(3)
     assert one.state.held_up == ''
-    assert one.state.counts['dropped'] == 6
+    assert one.state.counts['dropped'] == 1 + 2 + 3
 
 
 def test_what_is_needed_follows_the_parameters(stub_tracker, subject_file, small_camera):
