@@ -22,6 +22,7 @@ SILENCE, REPEAT = 3.0, 30.0
 _MOST_NAMED, _ALIKE = 3, 0.6
 _IMAGE, _COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 _SUFFIX = '/compressed'
+_OTHER = {_IMAGE: _COMPRESSED, _COMPRESSED: _IMAGE}
 
 
 class Publication(NamedTuple):
@@ -88,13 +89,12 @@ class SilentTopics:
         now = time.monotonic()
         newest = self._arrivals.get(self._pace, self._began)
         silent = [one for one in needed if self._is_silent(one, newest if one.with_each else now)]
-        published = self._published() if silent else []
         texts = {}
         for one in silent:
             wanted = [self._inputs[source] for source in one.sources if source in self._inputs]
             names = [self._node.resolve_topic_name(each.topic) for each in wanted]
             if wanted:
-                texts[' or '.join(names)] = why_silent(wanted, names, published)
+                texts[' or '.join(names)] = why_silent(wanted, names, self._like(wanted, names))
         self.texts = texts
         for topics, text in texts.items():
             before, at = self._warned.get(topics, ('', 0.0))
@@ -108,11 +108,15 @@ class SilentTopics:
         last = max(self._arrivals.get(source, self._began) for source in needed.sources)
         return now - last >= SILENCE
 
-    def _published(self) -> list[Publication]:
-        """Everything that other nodes publish."""
+    def _like(self, wanted: list[SubscribedTopic], names: list[str]) -> list[Publication]:
+        """What others publish on topics that are like some, by type or by name."""
         own = self._node.get_fully_qualified_name()
+        types = {one.msgtype for one in wanted}
+        types |= {_OTHER[each] for each in types & _OTHER.keys()}
         found = []
-        for topic, _ in self._node.get_topic_names_and_types():
+        for topic, kinds in self._node.get_topic_names_and_types():
+            if not types & set(kinds) and all(_likeness(topic, x) < _ALIKE for x in names):
+                continue
             for info in self._node.get_publishers_info_by_topic(topic):
                 by = f'{info.node_namespace.rstrip("/")}/{info.node_name}'
                 if by != own:
@@ -165,9 +169,6 @@ def _instead(wanted: SubscribedTopic, name: str, published: list[Publication]) -
     verb = 'is' if len(found) == 1 else 'are'
     named = ', '.join(f'{topic} ({_short(kinds[topic])})' for topic in found)
     return f'there {verb} {named}{_remedy(wanted, found[0], kinds[found[0]])}'
-
-
-_OTHER = {_IMAGE: _COMPRESSED, _COMPRESSED: _IMAGE}
 
 
 def _other_transport(wanted: SubscribedTopic, name: str, kinds: Mapping[str, str]) -> str:

@@ -36,15 +36,18 @@ from hmt_ros.experts.pose_predictor import SHIPPED, PosePredictor, Prediction, l
 from hmt_ros.experts.root_placement import SIZE_SPREAD
 from hmt_ros.experts.training_set import RATE
 from hmt_ros.image.background import BackgroundModel, one_person
+from hmt_ros.image.scene_watch import SceneWatch
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
+    CAMERA_MOVED,
     FRAME_ID,
     IMAGE,
     CameraSession,
     WaitingImage,
+    camera_moved_fault,
     check_size,
     read_picture,
 )
@@ -84,15 +87,21 @@ class BmeState(SessionState):
         modes: components of the last prediction.
         height: of the last silhouette, px.
         support: 0 to 1, how far the silhouette is like those of the training set.
+        moved: whether the camera has moved since the background was taken.
     """
 
     modes: int = 0
     height: int = 0
     support: float = math.nan
+    moved: bool = False
 
     def summary(self) -> str:
         """The present estimate in a few words."""
         return f'{self.modes} modes'
+
+    def trouble(self) -> str:
+        """Whether the background is of no use."""
+        return CAMERA_MOVED if self.moved else ''
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
@@ -135,6 +144,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if parameters.background_file:
             self._given = read_picture(parameters.background_file)
             self._background = BackgroundModel.from_image(self._given, parameters.background)
+        self._watch = SceneWatch()
         # OpenCV's model computes in memory of its own.
         self._background_in_use = threading.Lock()
         self._previous: _Previous | None = None
@@ -204,6 +214,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 self._background.learn(waiting.image)
             return None
         background = p.background
+        if given is None:
+            self._watch_scene(waiting)
         mask = self._silhouette(waiting.image) if given is None else one_person(given, background)
         self._height = _height(mask)
         if self._height < p.least_height:
@@ -216,6 +228,15 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         for text in found.place.remarks:
             self._log.note(Fault.SILHOUETTE, f'image of {waiting.stamp_ns} ns: {text}')
         return found.mixture
+
+    def _watch_scene(self, waiting: WaitingImage) -> None:
+        still = not self._watch.moved
+        with self._background_in_use:
+            self._watch.look(waiting.image, self._background)
+        if still and self._watch.moved:
+            remedy = 'configure the node anew'
+            text = camera_moved_fault(self._watch.shift, waiting.stamp_ns, remedy)
+            self._log.note(Fault.CAMERA_MOVED, text, warn=True)
 
     def _one_step_before(self, stamp_ns: int) -> GaussianMixture | None:
         """The poses one step of the dynamics before an image, as far as they are known."""
@@ -303,6 +324,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             modes=len(self._weights),
             height=self._height,
             support=self._support,
+            moved=self._watch.moved,
         )
 
     def _status(self) -> tuple[str, str]:

@@ -11,6 +11,7 @@ zero says that nobody was seen.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
@@ -31,6 +32,7 @@ from msg_tools.messages.images import ImageError, decode_image, decode_mask, dec
 CAMERA_INFO, IMAGE = 'camera_info', 'image'
 MASK, COMPRESSED_MASK = 'mask', 'mask/compressed'
 MASKS = (MASK, COMPRESSED_MASK)
+CAMERA_MOVED = 'the camera has moved since the background was taken'
 FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a frame
 
 T = TypeVar('T')
@@ -302,6 +304,21 @@ def camera_info_fault(error: CameraInfoError, source: str) -> str:
     if isinstance(error, UncalibratedError):
         return f'{text}; calibrate the camera, and let its driver publish the result'
     return text
+
+
+def camera_moved_fault(shift: float, stamp_ns: int, remedy: str) -> str:
+    """Where the scene is after the camera has moved, and what to do.
+
+    Args:
+        shift: of the scene, px; NaN: unknown.
+        stamp_ns: of the image.
+        remedy: how a new background is taken.
+    """
+    far = 'elsewhere' if math.isnan(shift) else f'{shift:.0f} px away'
+    return (
+        f'{CAMERA_MOVED}: at the image of {stamp_ns} ns the scene is {far}; fix the camera, take '
+        f'background_file anew, or let the background be learned, and {remedy}'
+    )
 
 
 class StampedInputs(Generic[T]):

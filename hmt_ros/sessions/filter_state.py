@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hmt_ros.body import Body
+from hmt_ros.sessions.camera_session import CAMERA_MOVED
 from hmt_ros.sessions.session import SessionState
 from hmt_ros.tracking import Status
 
 IN_BACKGROUND = 'the background was learned with the person in it'
-CAMERA_MOVED = 'the camera has moved since the background was taken'
 
 
 @dataclass(frozen=True)

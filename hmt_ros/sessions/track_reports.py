@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions.filter_state import CAMERA_MOVED, IN_BACKGROUND
+from hmt_ros.sessions.camera_session import camera_moved_fault
+from hmt_ros.sessions.filter_state import IN_BACKGROUND
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from hmt_ros.tracking import Status, Subject, Tracker
 from msg_tools.messages.headers import SECOND_NS
@@ -53,7 +53,7 @@ def report_change(
         initial: what the track was given to start from.
         stamp_ns: of the image.
     """
-    now, at = TrackCondition.of(tracker), f'at the image of {stamp_ns} ns'
+    now = TrackCondition.of(tracker)
     if now.doubted and not before.doubted:
         log.note(
             Fault.BACKGROUND,
@@ -62,15 +62,9 @@ def report_change(
             'the person is now; give background_file, or begin with the empty scene',
         )
     if now.moved and not before.moved:
-        shift = tracker.silhouettes.watch.shift
-        far = 'elsewhere' if math.isnan(shift) else f'{shift:.0f} px away'
-        log.note(
-            Fault.CAMERA_MOVED,
-            f'{CAMERA_MOVED}: {at} the scene is {far}; fix the camera, take background_file anew, '
-            'or let the background be learned, and call ~/reset; a camera that is to move needs '
-            'fixed_frame or use_mask',
-            warn=True,
-        )
+        remedy = 'call ~/reset; a camera that is to move needs fixed_frame or use_mask'
+        text = camera_moved_fault(tracker.silhouettes.watch.shift, stamp_ns, remedy)
+        log.note(Fault.CAMERA_MOVED, text, warn=True)
     if now.status is not before.status:
         _report_status(log, before.status, tracker, initial, stamp_ns)
 
