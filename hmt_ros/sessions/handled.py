@@ -81,8 +81,8 @@ class Handled:
         faults: why it, or something that waited for it, could not be used; empty if it was used.
         warnings: for the log: the first fault of each kind.
         published: (topic, stamp) of all messages that were published, in their order.
-        events: for the log, and no faults: start and end of a track, say; in a message they follow
-            the warnings.
+        events: for the log of a node, and no faults: start and end of a track, say; not in the
+            message.
     """
 
     source: str
@@ -186,7 +186,7 @@ def handled_message(messages: MessageFactory, handled: Handled) -> Any:
         source=handled.source,
         stamp=time_message(messages, handled.stamp_ns),
         faults=list(handled.faults),
-        warnings=[*handled.warnings, *handled.events],
+        warnings=list(handled.warnings),
         published_topics=[topic for topic, _ in handled.published],
         published_stamps=[time_message(messages, stamp) for _, stamp in handled.published],
     )

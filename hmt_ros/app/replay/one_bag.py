@@ -149,7 +149,7 @@ def _play(
                 raise ValueError(
                     f'{bag.path}: {handled.faults[0]} (--keep-going skips such messages)'
                 )
-        for text in (*handled.warnings, *(() if options.quiet else handled.events)):
+        for text in handled.warnings:
             tell(f'{bag.path}: {text}')
 
     messages = recorded.messages(bag)

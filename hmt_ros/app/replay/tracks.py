@@ -219,5 +219,4 @@ def _together(one: Handled | None, other: Handled) -> Handled:
         one.faults + other.faults,
         one.warnings + other.warnings,
         one.published + other.published,
-        one.events + other.events,
     )

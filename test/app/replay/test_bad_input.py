@@ -342,12 +342,15 @@ def test_going_on_nevertheless(tmp_path, capsys):
     streams = capsys.readouterr()
     assert streams.out == f'{out}: 2 of 6 images tracked\n'
     told = streams.err.splitlines()
-    assert len(told) == 5
-    for text, part in zip(
-        told,
-        ('uncalibrated', 'track 1 starts', 'breaks off', 'stamps that increase', 'bag.mcap'),
-        strict=True,
-    ):
+    wanted = (
+        'uncalibrated',
+        'camera_info has messages of the frames',
+        'breaks off',
+        'image has messages of the frames',
+        'stamps that increase',
+        'bag.mcap',
+    )
+    for text, part in zip(told, wanted, strict=True):
         assert text.startswith('replay: ')
         assert part in text
     with BagReader(out) as reader:

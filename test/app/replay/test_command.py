@@ -84,7 +84,9 @@ class StandingStill:
         self.track_id, self.started_from = 1, None
         self.keypoints, self.positions, self.predictions, self.masks = [], [], [], []
         self.ground, self.contacts = Ground(np.array([0.0, -1.0, 0.0]), 0.3, None, np.inf), {}
-        self.silhouettes = SimpleNamespace(doubted=False, known='known')
+        self.silhouettes = SimpleNamespace(
+            doubted=False, known='known', watch=SimpleNamespace(moved=False, shift=0.0)
+        )
         StandingStill.made.append(self)
 
     def reset(self, start, *, box=None):
@@ -94,7 +96,8 @@ class StandingStill:
     def modes(self):
         return self
 
-    log_likelihoods = np.zeros(1)
+    log_likelihoods, identities = np.zeros(1), np.ones(1, np.int64)
+    velocities = None
 
     @property
     def point_estimate(self):
