@@ -62,6 +62,7 @@ def observe(
     last_image: Image | None = None,
     wanted: Collection[str] | None = None,
     unsure: Mask | None = None,
+    others: Mask | None = None,
 ) -> Observation:
     """The evidence that an image gives to the terms of the likelihood.
 
@@ -74,6 +75,7 @@ def observe(
         last_image: the image before, of the same size, for the optical flow.
         wanted: names of terms; None: all.
         unsure: (H, W) pixels that may belong to the silhouette; None: none.
+        others: (H, W) pixels that somebody else covers; None: none.
 
     Raises:
         ValueError: shapes that contradict each other.
@@ -83,7 +85,10 @@ def observe(
     if silhouette is not None and silhouette.shape != image.shape[:2]:
         raise ValueError(f'silhouette {silhouette.shape} for an image {image.shape[:2]}')
     known = silhouette if silhouette is not None and silhouette.any() else None
-    box = window if known is None else _box(known)
+    box = window
+    if known is not None:
+        # Somebody may be anywhere behind the others.
+        box = _box(known if others is None else known | others)
     left, top, right, bottom = _grown(box, MARGIN, image.shape)
     rows, columns = slice(top, bottom), slice(left, right)
     mask = None
@@ -92,9 +97,12 @@ def observe(
     doubtful = None
     if known is not None and unsure is not None:
         doubtful = np.ascontiguousarray(unsure[rows, columns]).view(np.uint8)
+    hidden = None
+    if others is not None:
+        hidden = np.ascontiguousarray(others[rows, columns]).view(np.uint8)
     before = None if last_image is None else np.ascontiguousarray(last_image[rows, columns])
     part = ImageWindow(
-        np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful
+        np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful, hidden
     )
     evidence = {
         term.name: found

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from rclpy.node import Node
 
 from hmt_ros.nodes.subscribed_topic import SubscribedTopic
-from hmt_ros.sessions.session import NeededInput
+from hmt_ros.sessions.session import NeededInput, kind_of
 
 # Time without a message after which a topic is silent, and between two warnings of one text, s.
 SILENCE, REPEAT = 3.0, 30.0
@@ -82,7 +82,7 @@ class SilentTopics:
 
     def arrived(self, source: str, now: float) -> None:
         """Takes note of a message."""
-        self._arrivals[source] = now
+        self._arrivals[source] = self._arrivals[kind_of(source)] = now
 
     def look(self, needed: Iterable[NeededInput]) -> None:
         """Looks for silent topics among those that are needed, and warns of them."""

@@ -36,7 +36,6 @@ from hmt_ros.experts.pose_predictor import SHIPPED, PosePredictor, Prediction, l
 from hmt_ros.experts.root_placement import SIZE_SPREAD
 from hmt_ros.experts.training_set import RATE
 from hmt_ros.image.background import BackgroundModel, one_person
-from hmt_ros.image.scene_watch import SceneWatch
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.bme_parameters import BmeParameters
@@ -47,7 +46,6 @@ from hmt_ros.sessions.camera_session import (
     IMAGE,
     CameraSession,
     WaitingImage,
-    camera_moved_fault,
     check_size,
     read_picture,
 )
@@ -144,7 +142,6 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if parameters.background_file:
             self._given = read_picture(parameters.background_file)
             self._background = BackgroundModel.from_image(self._given, parameters.background)
-        self._watch = SceneWatch()
         # OpenCV's model computes in memory of its own.
         self._background_in_use = threading.Lock()
         self._previous: _Previous | None = None
@@ -230,13 +227,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         return found.mixture
 
     def _watch_scene(self, waiting: WaitingImage) -> None:
-        still = not self._watch.moved
         with self._background_in_use:
-            self._watch.look(waiting.image, self._background)
-        if still and self._watch.moved:
-            remedy = 'configure the node anew'
-            text = camera_moved_fault(self._watch.shift, waiting.stamp_ns, remedy)
-            self._log.note(Fault.CAMERA_MOVED, text, warn=True)
+            self._look_at_scene(waiting, self._background, 'configure the node anew')
 
     def _one_step_before(self, stamp_ns: int) -> GaussianMixture | None:
         """The poses one step of the dynamics before an image, as far as they are known."""

@@ -19,7 +19,10 @@ from itertools import takewhile
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from hmt_ros.body import Camera
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.scene_watch import SceneWatch
 from hmt_ros.inference.arrays import Image, Mask
+from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.declared_parameters import CameraNodeParameters
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.named_frames import NamedFrames
@@ -78,6 +81,7 @@ class CameraSession(Session[CameraParameters, State]):
         self._frame = ''
         self._frames = NamedFrames(IMAGE, CAMERA_INFO)
         self._uncalibrated = ''
+        self._watch = SceneWatch()
         self._waiting: deque[WaitingImage] = deque()
         self._newest: int | None = None
         self._masks: StampedInputs[Mask] = StampedInputs(_REMEMBERED_MASKS)
@@ -139,6 +143,16 @@ class CameraSession(Session[CameraParameters, State]):
         """Whether an image need not wait any longer for an input."""
         assert self._newest is not None
         return inputs.is_settled(stamp) or self._newest - stamp > timeout * SECOND_NS
+
+    def _has_transforms(self, frames: CameraFrames, waiting: WaitingImage) -> bool:
+        """Whether an image need not wait for transforms to frames."""
+        if not frames.wanted or len(self._waiting) > self.most_waiting:
+            return True
+        timeout = self.parameters.input_timeout * SECOND_NS
+        assert self._newest is not None
+        return self._newest - waiting.stamp_ns > timeout or frames.is_settled(
+            self._frame_of(waiting), waiting.stamp_ns, timeout
+        )
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
         if source == CAMERA_INFO:
@@ -231,6 +245,16 @@ class CameraSession(Session[CameraParameters, State]):
         )
         return None
 
+    def _look_at_scene(
+        self, waiting: WaitingImage, background: BackgroundModel, remedy: str
+    ) -> None:
+        """Warns once when the camera has moved; see `camera_moved_fault` for the remedy."""
+        before = self._watch.moved
+        self._watch.look(waiting.image, background)
+        if self._watch.moved and not before:
+            text = camera_moved_fault(self._watch.shift, waiting.stamp_ns, remedy)
+            self._log.note(Fault.CAMERA_MOVED, text, warn=True)
+
     def _start_anew(self) -> None:
         self.restart()
 
@@ -252,6 +276,10 @@ class CameraSession(Session[CameraParameters, State]):
             stamp = self._waiting.popleft().stamp_ns
             self._dropped.append(stamp)
             self._log.drop(self._late(stamp))
+            self._leave_out(stamp)
+
+    def _leave_out(self, stamp: int) -> None:
+        """Takes the inputs of an image that is dropped although they have come."""
 
     def _drop_incomplete_images(self) -> None:
         most = max(self.parameters.queue_size, MOST_INCOMPLETE)

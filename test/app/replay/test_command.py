@@ -96,8 +96,7 @@ class StandingStill:
     def modes(self):
         return self
 
-    log_likelihoods, identities = np.zeros(1), np.ones(1, np.int64)
-    velocities = None
+    log_likelihoods, identities, velocities = np.zeros(1), np.ones(1, dtype=int), None
 
     @property
     def point_estimate(self):
@@ -174,7 +173,7 @@ def test_mixtures_explain_the_images(replayed):
         found['/pose_mixture'],
         found['/likelihood_mixture'],
         found['/ground_truth'],
-        found['/joint_states'],
+        found['/human_joint_states'],
         found['/overlay/compressed'],
         strict=True,
     ):
