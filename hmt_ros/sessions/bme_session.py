@@ -44,6 +44,7 @@ from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
+    CAMERA_MOVED,
     FRAME_ID,
     IMAGE,
     CameraSession,
@@ -89,15 +90,21 @@ class BmeState(SessionState):
         modes: components of the last prediction.
         height: of the last silhouette, px.
         support: 0 to 1, how far the silhouette is like those of the training set.
+        moved: whether the camera has moved since the background was taken.
     """
 
     modes: int = 0
     height: int = 0
     support: float = math.nan
+    moved: bool = False
 
     def summary(self) -> str:
         """The present estimate in a few words."""
         return f'{self.modes} modes'
+
+    def trouble(self) -> str:
+        """Whether the background is of no use."""
+        return CAMERA_MOVED if self.moved else ''
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
@@ -220,6 +227,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 self._publish_silhouette(np.zeros(waiting.image.shape[:2], np.bool_), waiting)
             return None
         if given is None:
+            self._watch_scene(waiting)
             mask = self._silhouette(waiting.image)
             self._publish_silhouette(mask, waiting)
         else:
@@ -235,6 +243,10 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         for text in found.place.remarks:
             self._log.note(Fault.SILHOUETTE, f'image of {waiting.stamp_ns} ns: {text}')
         return found.mixture
+
+    def _watch_scene(self, waiting: WaitingImage) -> None:
+        with self._background_in_use:
+            self._look_at_scene(waiting, self._background, 'configure the node anew')
 
     def _one_step_before(self, stamp_ns: int) -> GaussianMixture | None:
         """The poses one step of the dynamics before an image, as far as they are known."""
@@ -328,6 +340,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             modes=len(self._weights),
             height=self._height,
             support=self._support,
+            moved=self._watch.moved,
         )
 
     def _status(self) -> tuple[str, str]:

@@ -289,6 +289,27 @@ def test_model_file_that_can_not_be(background_file, tmp_path):
             BmeSession(parameters, lambda output: None)
 
 
+def test_a_moved_camera_is_told_once(session, somebody):
+    """A pillar and the edge of a wall, which the background has 8 px further left."""
+    wall = np.full((48, 64, 3), 90, np.uint8)
+    wall[:, 40:] = 160
+    wall[30:, :] = 40
+    one = session(background_file='', background_images=3)
+    one.take(CAMERA_INFO, somebody.info())
+    told = []
+    for index in range(60):
+        picture = np.roll(wall, 8, axis=1) if index >= 20 else wall
+        message = image_message(somebody.messages, picture, somebody.stamp(index), 'lens')
+        texts = one.take(IMAGE, message).warnings
+        told.append([text for text in texts if 'camera' in text])
+    (first,) = (index for index, texts in enumerate(told) if texts)
+    assert 30 <= first <= 50
+    (text,) = told[first]
+    assert text.startswith('the camera has moved since the background was taken: at the image of')
+    assert text.endswith('or let the background be learned, and configure the node anew')
+    assert one.state.trouble() == 'the camera has moved since the background was taken'
+
+
 def track(likelihoods, index, state=TrackState.TRACKING):
     message = (
         likelihoods.nobody(index) if state == TrackState.NOBODY else likelihoods.message(index)

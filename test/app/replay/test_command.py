@@ -84,7 +84,9 @@ class StandingStill:
         self.track_id, self.started_from = 1, None
         self.keypoints, self.positions, self.predictions, self.masks = [], [], [], []
         self.ground, self.contacts = Ground(np.array([0.0, -1.0, 0.0]), 0.3, None, np.inf), {}
-        self.silhouettes = SimpleNamespace(doubted=False, known='known')
+        self.silhouettes = SimpleNamespace(
+            doubted=False, known='known', watch=SimpleNamespace(moved=False, shift=0.0)
+        )
         StandingStill.made.append(self)
 
     def reset(self, start, *, box=None):
