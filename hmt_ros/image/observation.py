@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.image_term import ImageWindow
@@ -62,6 +63,7 @@ def observe(
     last_image: Image | None = None,
     wanted: Collection[str] | None = None,
     unsure: Mask | None = None,
+    depth: NDArray[np.floating] | None = None,
 ) -> Observation:
     """The evidence that an image gives to the terms of the likelihood.
 
@@ -74,6 +76,8 @@ def observe(
         last_image: the image before, of the same size, for the optical flow.
         wanted: names of terms; None: all.
         unsure: (H, W) pixels that may belong to the silhouette; None: none.
+        depth: (H, W) depth along the axis of the camera, m; None: unknown. 0, NaN and what is out
+            of range says nothing.
 
     Raises:
         ValueError: shapes that contradict each other.
@@ -82,6 +86,8 @@ def observe(
         raise ValueError(f'image must be (H, W, 3) uint8, saw {image.shape} {image.dtype}')
     if silhouette is not None and silhouette.shape != image.shape[:2]:
         raise ValueError(f'silhouette {silhouette.shape} for an image {image.shape[:2]}')
+    if depth is not None and depth.shape != image.shape[:2]:
+        raise ValueError(f'depth {depth.shape} for an image {image.shape[:2]}')
     known = silhouette if silhouette is not None and silhouette.any() else None
     box = window if known is None else _box(known)
     left, top, right, bottom = _grown(box, MARGIN, image.shape)
@@ -94,8 +100,9 @@ def observe(
         doubtful = np.ascontiguousarray(unsure[rows, columns]).view(np.uint8)
     before = None if last_image is None else np.ascontiguousarray(last_image[rows, columns])
     part = ImageWindow(
-        np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful
-    )
+        np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful,
+        None if depth is None else depth[rows, columns],
+    )  # fmt: skip
     evidence = {
         term.name: found
         for term in TERMS

@@ -11,6 +11,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.image.likelihood import LikelihoodSettings
@@ -51,6 +54,7 @@ class Observer:
         poses: Array | None,
         *,
         nobody_predicted: bool,
+        depth: NDArray[np.floating] | None = None,
     ) -> View:
         """What an image may show of a person.
 
@@ -61,6 +65,7 @@ class Observer:
             body: of the person.
             poses: (K, d) in the image before; None: the person may be anywhere.
             nobody_predicted: whether a predictor saw nobody.
+            depth: (H, W) of a depth camera, m, if any.
         """
         s = self._settings
         found, changed = None, 0.0
@@ -70,7 +75,7 @@ class Observer:
             if found is not None and mask is None:
                 changed = self._silhouettes.background.changed
         foreground, unsure = (None, None) if found is None else found
-        return View(image, foreground, changed, keypoints, nobody_predicted, unsure)
+        return View(image, foreground, changed, keypoints, nobody_predicted, unsure, depth)
 
     def observation(self, view: View, pose: Array | None, *, believed: bool) -> Observation:
         """What an image says of a person.
@@ -90,6 +95,7 @@ class Observer:
         found = observe(
             view.image, view.silhouette if believed else None, keypoints,
             last_image=self.last_image, wanted=wanted, unsure=view.unsure,
+            depth=view.depth,
         )  # fmt: skip
         magnification = 0.0 if pose is None else self._camera.magnification(float(pose[2]))
         return replace(found, foreground=view.silhouette, magnification=magnification)

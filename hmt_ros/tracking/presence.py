@@ -86,6 +86,7 @@ class View(NamedTuple):
         keypoints: of a detector; without any that was seen: it saw nobody. None: no detector.
         nobody_predicted: whether a predictor saw nobody.
         unsure: (H, W) what may be the person or a shadow; None: nothing.
+        depth: (H, W) depth along the axis of the camera, m; None: unknown.
     """
 
     image: Image
@@ -94,6 +95,7 @@ class View(NamedTuple):
     keypoints: Keypoints | None = None
     nobody_predicted: bool = False
     unsure: Mask | None = None
+    depth: NDArray[np.floating] | None = None
 
 
 class Presence:

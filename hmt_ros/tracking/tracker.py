@@ -13,7 +13,7 @@ from dataclasses import replace
 from enum import Enum
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
@@ -153,6 +153,7 @@ class Tracker:
         mask: Mask | None = None,
         *,
         nobody_predicted: bool = False,
+        depth: NDArray[np.floating] | None = None,
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """Takes the next image.
 
@@ -168,6 +169,8 @@ class Tracker:
             mask: (H, W) where a segmenter sees the person, which replaces background subtraction;
                 all false: it sees nobody; None: unknown.
             nobody_predicted: whether that regression saw nobody in this image.
+            depth: (H, W) depth of what each pixel shows, along the axis of the camera, m; 0, NaN and
+                what is out of range says nothing. None: unknown.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses,
@@ -175,7 +178,7 @@ class Tracker:
             the first or because nobody is in view.
 
         Raises:
-            ValueError: an image or a mask of another size, a stamp that does not increase, or a
+            ValueError: an image, a mask or a depth image of another size, a stamp that does not increase, or a
                 prediction of a body with other degrees of freedom.
         """
         if prediction is not None:
@@ -185,6 +188,8 @@ class Tracker:
             raise ValueError(f'the camera gives images of {size}, saw {image.shape[:2]}')
         if mask is not None and mask.shape != size:
             raise ValueError(f'the camera gives images of {size}, saw a mask of {mask.shape}')
+        if depth is not None and depth.shape != size:
+            raise ValueError(f'the camera gives images of {size}, saw depths of {depth.shape}')
         if self._last_stamp is not None and stamp <= self._last_stamp:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
         self.evaluations = 0
@@ -193,8 +198,9 @@ class Tracker:
         self._ground.still = self._camera_path.known or (known and not self._ground.turning)
         near = self.modes.poses if self._track.begun and not self._track.lost else None
         view = self._observer.view(
-            image, keypoints, mask, self.body, near, nobody_predicted=nobody_predicted
-        )
+            image, keypoints, mask, self.body, near,
+            nobody_predicted=nobody_predicted, depth=depth,
+        )  # fmt: skip
         found = self._take(view, stamp, prediction, masked=mask is not None)
         self._last_stamp = stamp
         return found
