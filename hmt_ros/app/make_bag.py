@@ -141,6 +141,11 @@ def _parser() -> CommandParser:
         help='draw the shadow of the person on the floor (default: yes)',
     )
     camera.add_argument(
+        '--depth',
+        action='store_true',
+        help='add depth images with the noise and the holes of a sensor, registered to the images',
+    )
+    camera.add_argument(
         '--jpeg-quality',
         type=whole_number(1, 100),
         default=90,
@@ -180,6 +185,7 @@ def _make_bag(arguments: argparse.Namespace) -> int:
             camera,
             scene,
             quality=arguments.jpeg_quality,
+            with_depth=arguments.depth,
             progress=not arguments.quiet,
         )
     return 0

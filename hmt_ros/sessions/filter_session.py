@@ -7,7 +7,8 @@ order give the same bytes. The rules, besides those of `CameraSession`:
   `reset_on_time_jump`.
 - With `use_keypoints` an image waits for keypoints of exactly its stamp, for keypoints of a later
   stamp, or for an image that is `input_timeout` younger; with `use_keypoints_3d` for keypoints_3d,
-  and with `use_predictions` for a pose_prediction, in the same way. Of several of one stamp the
+  with `use_depth` for a depth image, and with `use_predictions` for a pose_prediction, in the same
+  way. Of several of one stamp the
   last counts; keypoints without names, and mixtures without components, say that nobody was seen.
 - With `gravity_frame` or `fixed_frame` an image waits for the transforms of its stamp, or for an
   image or a transform that is `input_timeout` younger, and never so long that it would be
@@ -40,6 +41,7 @@ from hmt_ros.sessions.camera_session import (
     StampedInputs,
     WaitingImage,
 )
+from hmt_ros.sessions.depth_inputs import DEPTH, DepthInputs
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_state import IN_BACKGROUND, FilterState
 from hmt_ros.sessions.handled import Fault, Output
@@ -64,6 +66,7 @@ from msg_tools.messages.pose_mixtures import pose_mixture_of
 __all__ = [
     'CAMERA_INFO',
     'COMPRESSED_MASK',
+    'DEPTH',
     'IMAGE',
     'KEYPOINTS',
     'KEYPOINTS_3D',
@@ -108,6 +111,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
         self._keypoints = KeypointInputs(self._log)
+        self._depths = DepthInputs(self._log)
         self._predictions: StampedInputs[PosePrediction | Status] = StampedInputs()
         self.state = self._present_state()
 
@@ -132,6 +136,10 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         elif source == KEYPOINTS_3D:
             self._keypoints.put_3d(message, stamp)
             self._estimate_what_is_ready()
+        elif source == DEPTH:
+            if self.parameters.use_depth:
+                self._depths.put(message, stamp)
+                self._estimate_what_is_ready()
         elif source == PREDICTION:
             self._predictions.put(stamp, self._prediction_in(message))
             self._estimate_what_is_ready()
@@ -147,6 +155,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     def _forget_inputs(self, stamp: int) -> None:
         super()._forget_inputs(stamp)
         self._keypoints.clear()
+        self._depths.images.clear()
         self._predictions.clear()
         self.frames.forget_after(stamp)
 
@@ -210,6 +219,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         wanted = (
             (p.use_keypoints, self._keypoints.plane, Fault.NO_KEYPOINTS),
             (p.use_keypoints_3d, self._keypoints.space, Fault.NO_KEYPOINTS_3D),
+            (p.use_depth, self._depths.images, Fault.NO_DEPTH),
             (p.use_predictions, self._predictions, Fault.NO_PREDICTION),
         )
         for used, inputs, fault in wanted:
@@ -226,6 +236,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if p.use_keypoints:
             keypoints = self._keypoints.take(stamp, p, self.start.body)
         prediction = self._predictions.take(stamp) if p.use_predictions else None
+        depth = self._depths.take(waiting.image, stamp) if p.use_depth else None
         starts = self._tracker is None or self._tracker.status is Status.WAITING
         try:
             self._look_at_frames(waiting)
@@ -246,6 +257,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 prediction if isinstance(prediction, PosePrediction) else None,
                 waiting.mask,
                 nobody_predicted=prediction is Status.NOBODY,
+                depth=depth,
             )
             if trusted and self._tracker.silhouettes.doubted:
                 self._report_background(self._tracker.silhouettes.share, stamp)

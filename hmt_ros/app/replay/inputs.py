@@ -1,4 +1,4 @@
-"""The input of the filter in a bag: images, calibration, masks, keypoints, transforms."""
+"""The input of the filter in a bag: images, calibration, masks, depth, keypoints, transforms."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
-from hmt_ros.sessions.filter_session import KEYPOINTS, KEYPOINTS_3D
+from hmt_ros.sessions.filter_session import DEPTH, KEYPOINTS, KEYPOINTS_3D
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools import BagError, BagMessage, BagReader, Topic
 from msg_tools.messages import keypoints
@@ -28,6 +28,7 @@ class RecordedInput:
         image: topic of the images.
         camera_info: topic of their calibration.
         mask: topic of masks of the person; None if the bag has none.
+        depth: topic of depth images; None if the bag has none.
         keypoints: topic of 2D keypoints; None if the bag has none.
         keypoints_3d: topic of their positions in space; None if the bag has none.
         ground_truth: topic of the ground truth; None if the bag has none.
@@ -38,6 +39,7 @@ class RecordedInput:
     image: Topic
     camera_info: Topic
     mask: Topic | None
+    depth: Topic | None
     keypoints: Topic | None
     keypoints_3d: Topic | None
     ground_truth: Topic | None
@@ -58,6 +60,8 @@ class RecordedInput:
         if self.mask is not None:
             raw = self.mask.msgtype == RAW
             sources[self.mask.name] = MASK if raw else COMPRESSED_MASK
+        if self.depth is not None:
+            sources[self.depth.name] = DEPTH
         if self.keypoints is not None:
             sources[self.keypoints.name] = KEYPOINTS
         if self.keypoints_3d is not None:
@@ -76,7 +80,8 @@ def recorded_input(
 
     Images come from `image/compressed`, else from `image`, else from the only topic of images.
     Calibration comes from `camera_info` beside the images, else from the only topic of its type.
-    Masks come from `mask`, else from `mask/compressed`, transforms from `/tf` and `/tf_static`.
+    Masks come from `mask`, else from `mask/compressed`, depths from `depth`, transforms from `/tf`
+    and `/tf_static`.
 
     Args:
         bag: an open bag.
@@ -91,6 +96,7 @@ def recorded_input(
         image,
         _camera_info_topic(bag, image, camera_info_topic),
         _named(bag, MASK, (RAW,)) or _named(bag, COMPRESSED_MASK, (COMPRESSED,)),
+        _named(bag, DEPTH, (RAW,)),
         _named(bag, KEYPOINTS, (keypoints.KEYPOINTS_2D,)),
         _named(bag, KEYPOINTS_3D, (keypoints.KEYPOINTS_3D,)),
         _named(bag, GROUND_TRUTH, (POSE_MIXTURE,)),
@@ -106,7 +112,7 @@ def _image_topic(bag: BagReader, name: str | None) -> Topic:
         topic = _named(bag, usual, kinds)
         if topic is not None:
             return topic
-    return _the_only(bag, kinds, '--image-topic', besides=MASKS)
+    return _the_only(bag, kinds, '--image-topic', besides=(*MASKS, DEPTH))
 
 
 def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:

@@ -135,6 +135,7 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
     has_depth = recorded.keypoints_3d is not None and values['use_keypoints'] is True
     values.setdefault('use_keypoints_3d', has_depth)
     values.setdefault('use_mask', recorded.mask is not None)
+    values.setdefault('use_depth', recorded.depth is not None)
     values['image_transport'] = recorded.transport
     return with_values(FilterParameters(), values)
 
