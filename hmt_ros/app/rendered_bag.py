@@ -1,9 +1,9 @@
 """Rendered bags: images of a moving person, with ground truth, as a bag and files beside it.
 
 The bag has the topics `image/compressed`, `camera_info`, `ground_truth` (hmt_msgs/PoseMixture) and
-`body` (hmt_msgs/Body, latched), and `depth` (sensor_msgs/Image, 16UC1) on request. Its folder also has the files that replay and evaluate need:
-`background.png` (the empty scene), `subject.yaml` (joints as clicked in the first image) and
-`truth.npz` (joints, pixels and silhouettes).
+`body` (hmt_msgs/Body, latched), and `depth` (sensor_msgs/Image, 16UC1) on request. Its folder also
+has the files that replay and evaluate need: `background.png` (the empty scene), `subject.yaml`
+(joints as clicked in the first image) and `truth.npz` (joints, pixels and silhouettes).
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ class Scene:
         return _empty_place(self, camera)[0]
 
     def depth(self, camera: Camera) -> Array:
-        """Depth (H, W) of the empty place along the axis of the camera, m; inf: nothing is there."""
+        """Depth (H, W) of the empty place along the axis of the camera, m; inf: nothing."""
         return _empty_depth(self, camera)
 
     def floor(self, camera: Camera) -> Picture:

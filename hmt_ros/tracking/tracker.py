@@ -169,8 +169,8 @@ class Tracker:
             mask: (H, W) where a segmenter sees the person, which replaces background subtraction;
                 all false: it sees nobody; None: unknown.
             nobody_predicted: whether that regression saw nobody in this image.
-            depth: (H, W) depth of what each pixel shows, along the axis of the camera, m; 0, NaN and
-                what is out of range says nothing. None: unknown.
+            depth: (H, W) depth of what each pixel shows, along the axis of the camera, m; 0, NaN
+                and what is out of range says nothing. None: unknown.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses,
@@ -178,8 +178,8 @@ class Tracker:
             the first or because nobody is in view.
 
         Raises:
-            ValueError: an image, a mask or a depth image of another size, a stamp that does not increase, or a
-                prediction of a body with other degrees of freedom.
+            ValueError: an image, mask or depth of another size, a stamp that does not increase, or
+                a prediction of a body with other degrees of freedom.
         """
         if prediction is not None:
             prediction.seen_as(self.body)

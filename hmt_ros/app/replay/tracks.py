@@ -18,7 +18,13 @@ from hmt_ros.app.replay.player import Player
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_session import BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
-from hmt_ros.sessions.filter_session import DEPTH, KEYPOINTS, KEYPOINTS_3D, PREDICTION, FilterSession
+from hmt_ros.sessions.filter_session import (
+    DEPTH,
+    KEYPOINTS,
+    KEYPOINTS_3D,
+    PREDICTION,
+    FilterSession,
+)
 from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
