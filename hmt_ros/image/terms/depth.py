@@ -8,7 +8,7 @@ camera. D is the depth image, registered to the colour image, z the depth of the
 the axis of the camera, m. The error of a sensor that triangulates grows with the square of the
 distance [Khoshelham and Elberink, Sensors 2012]; that of the flesh, `noise`, is one along the
 normal of the surface, which the ray meets at the angle a. The gradient is that of points that stay
-on the skin.
+on the skin, with their deviations.
 
 Where nothing was measured a point costs as much as one that errs by its deviation, whatever the
 pose. What lies before a point, or far behind it, costs at most what the kernel allows.
