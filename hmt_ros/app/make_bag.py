@@ -181,7 +181,7 @@ def _make_bag(arguments: argparse.Namespace) -> int:
     with new_bag_folder(arguments.output, overwrite=arguments.overwrite) as folder:
         write_bag(
             folder,
-            _take(options, viewpoint),
+            motion_of(options, viewpoint),
             camera,
             scene,
             quality=arguments.jpeg_quality,
@@ -197,7 +197,12 @@ def _camera(size: tuple[int, int], fov: float) -> Camera:
     return Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
-def _take(options: MotionOptions, viewpoint: Viewpoint) -> Take:
+def motion_of(options: MotionOptions, viewpoint: Viewpoint) -> Take:
+    """The motion that options choose, before a camera.
+
+    Raises:
+        ValueError: options that do not go together, or a file that can not be used.
+    """
     body = load_body(options.body)
     missing = sorted(set(MEASURED) - set(body.segment_lengths))
     if missing or not body.shapes:

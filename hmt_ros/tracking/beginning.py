@@ -316,8 +316,8 @@ def beginning_seen(
     outline = observed().outline
     if outline is None:
         return None
-    poses = moved_to_depth(model, camera, poses_from_outline(model, camera, outline), depths)
-    return Beginning(Source.MASK, model, poses, both_ways=True)
+    outlined = moved_to_depth(model, camera, poses_from_outline(model, camera, outline), depths)
+    return Beginning(Source.MASK, model, outlined, both_ways=True)
 
 
 def _mixture_at(

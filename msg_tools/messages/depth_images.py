@@ -18,8 +18,8 @@ from msg_tools.messages.message_types import MessageFactory
 
 Depth = NDArray[np.float32]
 
-# Encoding: dtype and what one unit of it is, m. Some drivers name 16UC1 after the picture.
-_ENCODINGS = {'16UC1': ('u2', 0.001), 'mono16': ('u2', 0.001), '32FC1': ('f4', 1.0)}
+# Encoding: dtype and how many of its units are a metre. Some drivers say mono16 for 16UC1.
+_ENCODINGS = {'16UC1': ('u2', 1000), 'mono16': ('u2', 1000), '32FC1': ('f4', 1)}
 
 
 def decode_depth(message: Any) -> Depth:
@@ -31,7 +31,7 @@ def decode_depth(message: Any) -> Depth:
     encoding = str(message.encoding)
     if encoding not in _ENCODINGS:
         raise ImageError(f'depth has encoding {encoding!r}, wanted 16UC1 in mm or 32FC1 in m')
-    kind, unit = _ENCODINGS[encoding]
+    kind, units = _ENCODINGS[encoding]
     height, width, step = int(message.height), int(message.width), int(message.step)
     dtype = np.dtype(kind).newbyteorder('>' if message.is_bigendian else '<')
     row_bytes = width * dtype.itemsize
@@ -44,8 +44,8 @@ def decode_depth(message: Any) -> Depth:
             f'{row_bytes} for {width} {encoding}'
         )
     rows = np.ascontiguousarray(data.reshape(height, step)[:, :row_bytes])
-    result: Depth = rows.view(dtype).astype(np.float32)
-    return result if unit == 1.0 else result * np.float32(unit)
+    result: Depth = rows.view(dtype).astype(np.float32) / np.float32(units)
+    return result
 
 
 def depth_message(
