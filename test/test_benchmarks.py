@@ -273,7 +273,7 @@ def test_command_line(capsys, tmp_path):
     assert 'tracking' in capsys.readouterr().out
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
-        "benchmarks: no 'flops', wanted one of bags, contour_noise, experts, flips, "
+        "benchmarks: no 'flops', wanted one of bags, contour_noise, depth, experts, flips, "
         'keypoint_noise, kernels, kjs, motion_prior, nodes, smoothing, soak, tracking, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
