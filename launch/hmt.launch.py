@@ -59,6 +59,7 @@ ARGUMENTS = (
     ('detections', 'detections', 'topic of another detector, for keypoints_adapter_node'),
     ('detections_source', 'skeleton2d', "their type: 'skeleton2d', 'yolo' or 'floats'"),
     ('mask', '', 'topic of the masks of a segmenter, without /compressed; empty: none'),
+    ('depth', '', 'topic of depth images that are registered to the images; empty: none'),
     (
         'gravity_frame',
         '',
@@ -138,6 +139,9 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
     if mask:
         remappings += [('mask', mask), ('mask/compressed', f'{mask}/compressed')]
 
+    if given['depth']:
+        remappings.append(('depth', given['depth']))
+
     common = {'use_sim_time': sim_time, 'autostart': _truth(given, 'autostart')}
     camera = {
         **common,
@@ -152,6 +156,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
             **_named(given, 'gravity_frame'),
             **_named(given, 'fixed_frame'),
             'use_predictions': 'bme_node' in names,
+            'use_depth': bool(given['depth']),
             'use_keypoints': bool(given['keypoints']) or any(name in names for name in DETECTORS),
             **({'use_keypoints_3d': True} if 'keypoints_node' in names else {}),
             'frame_prefix': f'{_frame(namespace)}/',

@@ -42,6 +42,8 @@ from hmt_ros.tracking.subject import Subject
 # Standard deviation of a length that was measured on the person, and of the stature, which also has
 # a skull and a heel that are not the model's, m.
 MEASURED, STATURE_MEASURED = 0.01, 0.02
+# A stature this many standard deviations from the usual one is not believed.
+MOST_UNUSUAL = 4.0
 HEADINGS = 8
 LEAST_SQUARES = TermSettings(1.0, 1.0, np.inf)
 # Axis of the camera, along which depths are measured.
@@ -94,6 +96,11 @@ def start_from_keypoints(
     measured = joint_depths(body, keypoints, depths)
     fits = _fit_with_lengths(body, camera, keypoints, upright, measured)
     best = np.argsort(fits.value, kind='stable')[:3]
+    if len(measured.depths) and not _is_a_stature(body, fits.x[best[0], body.dimension :]):
+        # Depths of something else, or in another unit.
+        depths, measured = None, joint_depths(body, keypoints, None)
+        fits = _fit_with_lengths(body, camera, keypoints, upright, measured)
+        best = np.argsort(fits.value, kind='stable')[:3]
     if not np.isfinite(fits.value[best[0]]):
         raise ValueError('no pose of the body explains the keypoints: are they in the image?')
     weights = np.exp(-(fits.value[best] - fits.value[best[0]]))
@@ -206,6 +213,14 @@ def _sized(body: Body, subject: Subject) -> Body:
         sigma.append(STATURE_MEASURED)
     covariance = held(body.length_covariance, np.concatenate(rows), sigma)
     return replace(body, length_covariance=covariance)
+
+
+def _is_a_stature(body: Body, lengths: Array) -> bool:
+    """Whether a person of a body's kind may have lengths (L,)."""
+    rates = body.stature_rates
+    change = float(rates @ (lengths - body.skeleton.lengths))
+    sigma = float(np.sqrt(rates @ body.length_covariance @ rates))
+    return abs(change) <= MOST_UNUSUAL * np.hypot(sigma, STATURE_MEASURED)
 
 
 def _fit_with_lengths(

@@ -94,6 +94,18 @@ def test_a_start_without_measured_depth_is_the_start_without_depth(tall, camera,
     assert np.allclose(one.poses[0], other.poses[0], atol=0.02)
 
 
+@pytest.mark.parametrize('wall', [0.5, 1.0, 9.0])
+def test_depth_of_something_else_does_not_spoil_a_start(tall, camera, keypoints_of, wall):
+    """A person of the size that such a depth says does not exist."""
+    body, poses, _, depths, _ = tall
+    model, seen = load_body('human37'), subject_of(keypoints_of(body, poses[0], 1.0))
+    plain = start_from_keypoints(model, camera, seen)
+    flat = depths_of(np.full_like(depths[0], wall))
+    spoilt = start_from_keypoints(model, camera, seen, depths=flat)
+    assert np.array_equal(spoilt.poses, plain.poses)
+    assert spoilt.body.stature == plain.body.stature
+
+
 def test_poses_move_along_their_rays(tall, camera):
     body, poses, _, depths, _ = tall
     wrong = np.tile(poses[0], (3, 1))

@@ -23,7 +23,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import mark_visibility, project
+from hmt_ros.image.surface import mark_visibility, project, signed_power
 from hmt_ros.image.terms.image_term import (
     ImageTerm,
     ImageWindow,
@@ -37,6 +37,7 @@ from hmt_ros.image.terms.residuals import add_residual, geman_mcclure
 NEAREST, FURTHEST = 0.2, 20.0
 # Angle around a ring between what faces the camera and a point, rad.
 ASIDE = np.pi / 4
+COS, SIN = float(np.cos(ASIDE)), float(np.sin(ASIDE))
 # Points whose normal is further from the ray than this are not compared, as a cosine.
 LEAST_COSINE = 0.3
 # Neighbouring depths that differ by more, as a share of the depth, lie on two surfaces.
@@ -126,20 +127,23 @@ def trace_front(flesh, wanted, lens, columns, origins, parts, points, cosines, n
         kx, ky = flesh.ring_slopes[r, 0], flesh.ring_slopes[r, 1]
         lx, ly = flesh.ring_leans[r, 0], flesh.ring_leans[r, 1]
         e = flesh.ring_exponents[r]
-        facing = np.arctan2(-(uy - uz * ly) / ry, -(ux - uz * lx) / rx)
+        fx, fy = -(ux - uz * lx) / rx, -(uy - uz * ly) / ry
+        size = max(np.sqrt(fx * fx + fy * fy), 1e-12)
+        fx, fy = fx / size, fy / size
         for side in range(2):
             i = r + side * rings
             parts[i] = part
             valid[i] = False
             if not wanted[part]:
                 continue
-            angle = facing - ASIDE if side == 0 else facing + ASIDE
-            c, sn = np.cos(angle), np.sin(angle)
-            ax, ay = abs(c), abs(sn)
-            px = cx + rx * np.sign(c) * ax**e
-            py = cy + ry * np.sign(sn) * ay**e
-            nx = np.sign(c) * ax ** (2.0 - e) / rx
-            ny = np.sign(sn) * ay ** (2.0 - e) / ry
+            turn = -SIN if side == 0 else SIN
+            c, sn = fx * COS - fy * turn, fy * COS + fx * turn
+            outline_x, outline_y, lateral_x, lateral_y = c, sn, c, sn
+            if e != 1.0:
+                outline_x, outline_y = signed_power(c, e), signed_power(sn, e)
+                lateral_x, lateral_y = signed_power(c, 2.0 - e), signed_power(sn, 2.0 - e)
+            px, py = cx + rx * outline_x, cy + ry * outline_y
+            nx, ny = lateral_x / rx, lateral_y / ry
             nz = -(kx * c * c + ky * sn * sn) - (nx * lx + ny * ly)
             p0 = o0 + x0 * px + y0 * py + z0 * cz
             p1 = o1 + x1 * px + y1 * py + z1 * cz
