@@ -1,9 +1,16 @@
+import os
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 from setuptools import find_packages, setup
+from setuptools.command.develop import develop
+from setuptools.command.install import install
 
 ROOT = Path(__file__).resolve().parent
 PACKAGE = 'hmt_ros'
+MESSAGES = 'hmt_msgs'
 
 
 def files(folder: str, pattern: str) -> list[str]:
@@ -11,11 +18,101 @@ def files(folder: str, pattern: str) -> list[str]:
     return sorted(str(path.relative_to(ROOT)) for path in (ROOT / folder).glob(pattern))
 
 
+class Install(install):
+    """``install``, and the messages with it; into the prefix that colcon or bloom gives."""
+
+    def finalize_options(self) -> None:
+        """Note whether a prefix was given, before the default replaces none."""
+        self.prefix_is_given = self.prefix is not None
+        super().finalize_options()
+
+    def run(self) -> None:
+        """Install hmt_ros, then hmt_msgs."""
+        super().run()
+        prefix = Path(self.install_base)
+        if in_colcon(prefix) or (self.prefix_is_given and 'AMENT_PREFIX_PATH' in os.environ):
+            build_base = Path(self.get_finalized_command('build').build_base)
+            install_messages(build_base / MESSAGES, prefix, str(self.root or ''))
+
+
+class Develop(develop):
+    """``develop``, and the messages with it, for ``colcon build --symlink-install``."""
+
+    def run(self) -> None:
+        """Install hmt_ros, then hmt_msgs."""
+        super().run()
+        prefix = Path(self.prefix or sys.prefix)
+        if in_colcon(prefix):
+            build_base = Path(self.get_finalized_command('build').build_base)
+            install_messages(build_base / MESSAGES, prefix, '')
+
+
+def in_colcon(prefix: Path) -> bool:
+    """Whether colcon installs into this folder, alone or together with other packages."""
+    return any((x / '.colcon_install_layout').is_file() for x in (prefix, prefix.parent))
+
+
+def install_messages(build: Path, prefix: Path, root: str) -> None:
+    """Build and install hmt_msgs, unless the ROS environment has it with the same definitions.
+
+    colcon and bloom do not look for packages inside a package, so that they find hmt_ros only.
+
+    Args:
+        build: Folder for the files of CMake.
+        prefix: Folder of the installation, as it is called when the package is in use.
+        root: Folder that stands for ``/`` while a Debian package is made; empty for none.
+    """
+    built_before = (build / 'CMakeCache.txt').is_file()
+    if not built_before and messages_are_there():
+        return
+    environment = dict(os.environ, DESTDIR=root)
+    # What colcon adds for setup.py moves sys.prefix, which CMake would ask for.
+    folders = environment.get('PYTHONPATH', '').split(os.pathsep)
+    ours = ('prefix_override', 'colcon_distutils_commands')
+    environment['PYTHONPATH'] = os.pathsep.join(x for x in folders if Path(x).name not in ours)
+    ros = [os.environ.get(x, '') for x in ('AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH')]
+    environment['CMAKE_PREFIX_PATH'] = os.pathsep.join(filter(None, ros))
+    settings = [f'-DCMAKE_INSTALL_PREFIX={prefix}', '-DBUILD_TESTING=OFF']
+    settings += shlex.split(os.environ.get('CMAKE_ARGS', ''))
+    steps = [
+        ['cmake', '-S', str(ROOT / 'msg_tools' / MESSAGES), '-B', str(build), *settings],
+        ['cmake', '--build', str(build), '--parallel', str(os.cpu_count() or 1)],
+        ['cmake', '--install', str(build)],
+    ]
+    for step in steps:
+        try:
+            done = subprocess.run(step, env=environment, check=False)
+        except FileNotFoundError:
+            raise SystemExit(f'{MESSAGES}: no cmake in PATH. Try: sudo apt install cmake') from None
+        if done.returncode != 0:
+            raise SystemExit(
+                f'{MESSAGES} could not be built, see above: "{shlex.join(step)}" ended with '
+                f'{done.returncode}. Was /opt/ros/jazzy/setup.bash sourced, and "rosdep install '
+                '--from-paths src" run?'
+            )
+
+
+def messages_are_there() -> bool:
+    """Whether the first hmt_msgs of the ROS environment has the definitions of this repository."""
+    prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
+    shares = [Path(prefix, 'share', MESSAGES) for prefix in prefixes if prefix]
+    share = next((path for path in shares if path.is_dir()), None)
+    own = ROOT / 'msg_tools' / MESSAGES
+    definitions = [*own.glob('msg/*.msg'), *own.glob('srv/*.srv'), own / 'package.xml']
+    return share is not None and all(
+        (share / path.relative_to(own)).is_file()
+        and (share / path.relative_to(own)).read_bytes() == path.read_bytes()
+        for path in definitions
+    )
+
+
 setup(
     name=PACKAGE,
     version='0.1.0',
     description='Monocular 3D human motion tracking with mixtures, for ROS 2',
     license='Apache-2.0',
+    author='hmt_ros contributors',
+    url='https://example.com/hmt_ros',  # stands for a public address, as in package.xml
     maintainer='hmt_ros maintainers',
     maintainer_email='hmt-ros@example.com',
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*', 'msg_tools', 'msg_tools.*']),
@@ -67,6 +164,7 @@ setup(
         'mediapipe': ['mediapipe==0.10.21'],
     },
     zip_safe=False,
+    cmdclass={'install': Install, 'develop': Develop},
     entry_points={
         'console_scripts': [
             'filter_node = hmt_ros.nodes.filter_node:main',
@@ -77,6 +175,7 @@ setup(
             'subject = hmt_ros.app.subject:main',
             'keypoints_node = hmt_ros.nodes.keypoints_node:main',
             'keypoints_adapter_node = hmt_ros.nodes.keypoints_adapter_node:main',
+            'hri_node = hmt_ros.nodes.hri_node:main',
             'replay = hmt_ros.app.replay.command:main',
             'recover = hmt_ros.app.recover:main',
             'make-bag = hmt_ros.app.make_bag:main',

@@ -137,11 +137,36 @@ def find_clips(folder: Path | None, *, moving: bool = False) -> tuple[list[Path]
     """
     if folder is not None:
         return _clips_in(folder, moving), str(folder)
-    shared = Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video'
+    shared = development_folder()
     if shared.is_dir():
         return _clips_in(shared, moving), 'development clips'
     source = f'bags/ of the repository, as {shared.resolve()} is absent'
     return _clips_in(ROOT / 'bags', moving), source
+
+
+def development_folder() -> Path:
+    """Where the development clips are, if they are there."""
+    return Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video'
+
+
+def with_file(names: Sequence[str], clips: Path | None, file: str) -> list[Path]:
+    """Folders of clips that a benchmark can not do without.
+
+    Args:
+        names: of the clips.
+        clips: folder that holds them; None: the development clips.
+        file: that each must have.
+
+    Raises:
+        FileNotFoundError: a clip is not there, or lacks the file.
+    """
+    folder = clips or development_folder()
+    lacking = [name for name in names if not (folder / name / file).is_file()]
+    if lacking:
+        raise FileNotFoundError(
+            f'{folder} lacks {file} of {", ".join(lacking)} (set HMT_SHARED, or --clips)'
+        )
+    return [folder / name for name in names]
 
 
 def _clips_in(folder: Path, moving: bool) -> list[Path]:

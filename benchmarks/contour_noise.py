@@ -9,7 +9,6 @@ and behind, and correlations along the contour. `-o` writes `hmt_ros/image/conto
 
 from __future__ import annotations
 
-import os
 import sys
 import textwrap
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.clips import ROOT, read_clip, table
+from benchmarks.clips import read_clip, table, with_file
 from benchmarks.command import benchmark_parser, show, told
 from benchmarks.machine import description
 from benchmarks.numpy_contour import occluding_contour
@@ -265,12 +264,9 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
         FileNotFoundError: a clip is not there.
         ValueError: a clip that can not be used.
     """
-    folder = clips or Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video'
     wanted = CLIPS[:QUICK] if quick else CLIPS
-    lacking = [name for name in wanted if not (folder / name / 'truth.npz').is_file()]
-    if lacking:
-        raise FileNotFoundError(f'{folder} lacks {", ".join(lacking)} (set HMT_SHARED, or --clips)')
-    known = [posed(folder / name) for name in told('contour_noise', wanted)]
+    folders = with_file(wanted, clips, 'truth.npz')
+    known = [posed(folder) for folder in told('contour_noise', folders)]
     growth = fitted_growth(known)
     found = joined(
         [contour_distances(grown(x.body, growth), x.camera, x.poses, x.masks) for x in known]

@@ -10,7 +10,6 @@ bones that the detector lifts; how often it takes left for right. What was made 
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.clips import ROOT, SCHEME, Clip, read_clip, read_detections, table
+from benchmarks.clips import SCHEME, Clip, read_clip, read_detections, table, with_file
 from benchmarks.command import benchmark_parser, show, told
 from benchmarks.machine import description
 from benchmarks.tracking_oracle import STARTS, best_poses, with_true_lengths
@@ -181,7 +180,7 @@ def _slopes(
     for keypoints, pose, exchange in zip(found, poses, exchanges, strict=True):
         if exchange != 0:
             continue
-        slopes = _term(body, clip, keypoints, pose)._slopes
+        slopes = _term(body, clip, keypoints, pose).measured.slopes
         columns = forward(body.skeleton, pose[None]).by_pose()[0][0]
         own = slopes.segments[:, 0]
         directions = np.einsum('bci,bc->bi', columns[own], slopes.directions[:, 0])
@@ -288,12 +287,9 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
         FileNotFoundError: a clip is not there.
         ValueError: a clip that can not be used.
     """
-    folder = clips or Path(os.environ.get('HMT_SHARED', ROOT / '..' / 'shared')) / 'video'
     wanted = CLIPS[:QUICK] if quick else CLIPS
-    lacking = [x for x in wanted if not (folder / x / 'keypoints_mediapipe.npz').is_file()]
-    if lacking:
-        raise FileNotFoundError(f'{folder} lacks {", ".join(lacking)} (set HMT_SHARED, or --clips)')
-    found = [measured(folder / name) for name in told('keypoint_noise', wanted)]
+    folders = with_file(wanted, clips, 'keypoints_mediapipe.npz')
+    found = [measured(folder) for folder in told('keypoint_noise', folders)]
     return {'machine': description(), 'clips': list(wanted), **summary(found)}
 
 

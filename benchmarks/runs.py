@@ -16,19 +16,19 @@ import zipfile
 import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from benchmarks.clips import ROOT, Clip, at_size, read_clip, read_detections, resized
+from benchmarks.tracker_changes import changed
 from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import (
     EVALUATED_JOINTS,
@@ -121,49 +121,6 @@ class Record:
     true: NDArray[np.float64]
     contact: NDArray[np.bool_]
     views: NDArray[np.float64]
-
-
-def changed(changes: Sequence[tuple[str, Any]]) -> TrackerSettings:
-    """Settings with those that are named by their path, such as `likelihood.edges.weight`.
-
-    Raises:
-        ValueError: there is no such setting, or it does not take the value.
-    """
-    settings: Any = TrackerSettings()
-    for path, value in changes:
-        settings = _with_value(settings, path.split('.'), value, path)
-    result: TrackerSettings = settings
-    return result
-
-
-def _with_value(settings: Any, names: list[str], value: Any, path: str) -> Any:
-    known = [field.name for field in fields(settings)] if is_dataclass(settings) else []
-    if names[0] not in known:
-        raise ValueError(f'no setting {path!r}: {names[0]!r} is none of {", ".join(known)}')
-    own = getattr(settings, names[0])
-    if names[1:]:
-        return replace(settings, **{names[0]: _with_value(own, names[1:], value, path)})
-    if isinstance(own, float) and isinstance(value, int):
-        value = float(value)
-    if not isinstance(value, type(own)):
-        raise ValueError(f'{path} is a {type(own).__name__}, saw {value!r}')
-    return replace(settings, **{names[0]: value})
-
-
-def parsed_changes(words: Sequence[str]) -> tuple[tuple[str, Any], ...]:
-    """Changes from words such as `max_hypotheses=4`.
-
-    Raises:
-        ValueError: a word of another form, or no such setting.
-    """
-    result = []
-    for word in words:
-        name, equals, value = word.partition('=')
-        if not equals:
-            raise ValueError(f'wanted SETTING=VALUE, saw {word!r}')
-        result.append((name, yaml.safe_load(value)))
-    changed(result)
-    return tuple(result)
 
 
 def keypoints_only(settings: TrackerSettings) -> TrackerSettings:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from hmt_ros.app import make_bag
+from hmt_ros.app import make_bag, progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.image.keypoint_schemes import schemes
 from msg_tools import BagReader
@@ -25,6 +25,8 @@ from msg_tools.messages.images import decode_image
 # Speed is no property of a result: a busy machine must not fail a test.
 settings.register_profile('hmt_ros', deadline=None, derandomize=True)
 settings.load_profile('hmt_ros')
+# Nor must it print lines of progress where a test expects the lines of a command.
+progress.INTERVAL = 3600.0
 
 _domain_reservation = pytest.StashKey[socket.socket]()
 

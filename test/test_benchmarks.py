@@ -257,7 +257,7 @@ def test_the_file_of_contour_noise_is_that_which_is_read(body, tmp_path):
 def test_without_the_clips_contour_noise_is_skipped(tmp_path, capsys):
     assert contour_noise.main(['--clips', str(tmp_path)]) == 0
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f'contour_noise: skipped, {tmp_path} lacks walk, charleston')
+    assert line.startswith(f'contour_noise: skipped, {tmp_path} lacks truth.npz of walk')
 
 
 def test_tables():

@@ -37,11 +37,16 @@ def pose_mixture() -> Any:
     mixture.dof_names = [f'dof_{i}' for i in range(DOF)]
     mixture.joint_names = ['pelvis', 'left_knee']
     mixture.kind = PoseMixture.SMOOTHED
+    mixture.state = PoseMixture.STATE_LOST
+    mixture.track_id = 12
     for weight, log_likelihood in ((0.75, -12.5), (0.25, math.nan)):
         component = PoseComponent(weight=weight, log_likelihood=log_likelihood)
         component.mean = rng.normal(size=DOF).tolist()
         component.covariance = rng.normal(size=DOF * DOF).tolist()
+        component.id = 3
         component.degrees_of_freedom = 4.0
+        component.joint_covariances = rng.normal(size=2 * 9).tolist()
+        component.joint_velocities = rng.normal(size=2 * 3).tolist()
         component.joint_positions = [Point(x=x, y=y, z=z) for x, y, z in rng.normal(size=(2, 3))]
         mixture.components.append(component)
     return mixture

@@ -69,6 +69,16 @@ def score_bag(
         return {name: track.finish() for name, track in found.items()}
 
 
+def message_count(path: Path, topics: Iterable[str] = ()) -> int:
+    """Number of messages that `score_bag` reads.
+
+    Raises:
+        ValueError: see `chosen_topics`.
+    """
+    with BagReader(path) as bag:
+        return bag.message_count({*body_topics(bag), *chosen_topics(bag, topics)})
+
+
 def chosen_topics(bag: BagReader, wanted: Iterable[str]) -> list[str]:
     """Topics of a bag with mixtures other than ground truth: the wanted ones, or all.
 

@@ -82,7 +82,7 @@ def _demonstrate(arguments: argparse.Namespace) -> int:
 
 
 def _modes(shown: Content) -> str:
-    (layer,) = (layer for layer in shown.mixtures.layers if layer.topic == 'pose_mixture')
+    (layer,) = (layer for layer in shown.mixtures.layers if layer.kind == 'posterior')
     moments = layer.mixtures.values()
     modes = np.mean([len(moment.weights) for moment in moments])
     heaviest = np.mean([moment.weights[0] for moment in moments])

@@ -8,10 +8,9 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from tqdm import tqdm
-
-from hmt_ros.app.bag_scores import score_bag
+from hmt_ros.app.bag_scores import message_count, score_bag
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
+from hmt_ros.app.progress import show_progress
 from hmt_ros.app.truth import read_truth, recorded_truth
 from hmt_ros.evaluation.pose_scores import MODEL_SIGMA
 from hmt_ros.evaluation.track_scores import TrackScores, Truth
@@ -74,8 +73,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     truth = recorded_truth(bag) if arguments.truth is None else read_truth(arguments.truth)
     if truth is None:
         raise ValueError(f'{bag} has no ground truth: name a .npz file or a bag with --truth')
-    # None: shown where stderr is a terminal.
-    with tqdm(unit='message', desc='evaluate', disable=arguments.quiet or None) as bar:
+    total = message_count(bag, arguments.topics)
+    with show_progress('evaluate', 'messages', total, quiet=arguments.quiet) as bar:
         found = score_bag(
             bag,
             truth,

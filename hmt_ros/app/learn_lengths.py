@@ -16,6 +16,7 @@ import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.learn_prior import people_in
+from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.body import load_body
 from hmt_ros.experts.training_set import motion_files
 from hmt_ros.motion.length_learning import (
@@ -61,14 +62,14 @@ def _learn(arguments: argparse.Namespace) -> int:
     usual, owners = usual_spread(body), people_in(arguments.people)
     paths = [x for one in arguments.files for x in (motion_files(one) if one.is_dir() else [one])]
     people, rows = [], []
-    for path in paths:
+    for path in with_progress(paths, 'reading', 'motions', len(paths)):
         try:
             motion = read_motion(path)
             motion = motion.part(0, None, max(len(motion.poses) // FRAMES, 1))
             lengths = body_from_motion(motion, body).skeleton.lengths
             relative_lengths(body, lengths[None])
         except (ValueError, OSError, np.linalg.LinAlgError) as error:
-            print(f'learn-lengths: skipped {path.name}: {error_line(error)}', file=sys.stderr)
+            tell_user('learn-lengths', f'skipped {path.name}: {error_line(error)}')
             continue
         people.append(owners.get(path.stem) or '_'.join(path.stem.split('_')[:2]))
         rows.append(lengths)

@@ -12,9 +12,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from tqdm import tqdm
-
 from hmt_ros.app.command_line import CommandParser, run_command
+from hmt_ros.app.progress import show_progress, tell_user, with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.model_file import write_arrays
 from hmt_ros.experts.training_set import (
@@ -98,15 +97,15 @@ def _learn(options: LearningOptions) -> int:
         raise ValueError(f'there is no folder {output.parent} for {output.name}')
     body = load_body(options.body)
     paths = _chosen(options)
-    hidden = True if options.quiet else None
-    read = [
-        _sequence(path, body) for path in tqdm(paths, 'reading', unit=' motions', disable=hidden)
-    ]
+    quiet = options.quiet
+    shown = with_progress(paths, 'reading', 'motions', len(paths), quiet=quiet)
+    read = [_sequence(path, body) for path in shown]
     sequences = [one for one in read if one is not None]
     if not sequences:
         raise ValueError(f'none of the {len(paths)} motions can be used')
     card = _card(sequences, options.acknowledgement)
-    model = learned_motion(body, [one.poses for one in sequences], RATE, card)
+    with show_progress('learning', quiet=quiet):
+        model = learned_motion(body, [one.poses for one in sequences], RATE, card)
     write_arrays(output, model.arrays())
     if not options.quiet:
         skipped = len(paths) - len(sequences)
@@ -142,7 +141,7 @@ def _sequence(path: Path, body: Body) -> PoseSequence | None:
             raise ValueError(f'{fps:g} frames per second, wanted a multiple of {RATE:g}')
         return recorded_sequence(path, body)
     except (ValueError, OSError, ArithmeticError) as error:
-        tqdm.write(f'learn-motion: skipped {path.name}: {error_line(error)}', file=sys.stderr)
+        tell_user('learn-motion', f'skipped {path.name}: {error_line(error)}')
         return None
 
 

@@ -14,9 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
+from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.model_file import write_arrays
 from hmt_ros.experts.prior_learning import (
@@ -105,7 +105,7 @@ def _learn(arguments: argparse.Namespace) -> int:
     data = prior_data(body, sequences, people, settings)
 
     def bar(counts: Iterable[int], total: int) -> Iterable[int]:
-        return tqdm(counts, 'learning', total, unit=' mixtures', disable=True if quiet else None)
+        return with_progress(counts, 'learning', 'mixtures', total, quiet=quiet)
 
     card = {'source': arguments.source, 'method': _method(settings, data.people)}
     found = learned_prior(data, dofs, card, settings, bar)
@@ -148,13 +148,13 @@ def _motions(
     ]
     sequences, people = [], []
     left_out = set(without)
-    for path in tqdm(paths, 'reading', unit=' motions', disable=True if quiet else None):
+    for path in with_progress(paths, 'reading', 'motions', len(paths), quiet=quiet):
         if path.stem in left_out:
             continue
         try:
             sequences.append(recorded_sequence(path, body))
         except (ValueError, OSError, np.linalg.LinAlgError) as error:
-            tqdm.write(f'learn-prior: skipped {path.name}: {error_line(error)}', file=sys.stderr)
+            tell_user('learn-prior', f'skipped {path.name}: {error_line(error)}')
             continue
         people.append(owners.get(path.stem) or '_'.join(path.stem.split('_')[:2]))
     if not sequences:

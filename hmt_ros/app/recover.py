@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from hmt_ros.app.command_line import CommandParser, run_command
+from hmt_ros.app.progress import show_progress
 from msg_tools.bags.bag_recovery import recover_bag
 
 # Maximum number of lines about losses.
@@ -44,11 +45,18 @@ def _parser() -> CommandParser:
     parser.add_argument(
         '-o', '--output', type=Path, required=True, metavar='OUT', help='folder of the new bag'
     )
+    parser.add_argument('--quiet', action='store_true', help='show no progress')
     return parser
 
 
 def _recover(arguments: argparse.Namespace) -> int:
-    found = recover_bag(arguments.bag, arguments.output)
+    with show_progress(str(arguments.output), 'messages', quiet=arguments.quiet) as bar:
+
+        def saved(total: int | None) -> None:
+            bar.total = total
+            bar.update()
+
+        found = recover_bag(arguments.bag, arguments.output, saved)
     print(f'{arguments.output}: {found.messages} messages of {found.topics} topics saved')
     if found.lost_messages is None:
         print('lost: the bag does not tell how many messages')

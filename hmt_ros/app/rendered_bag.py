@@ -15,8 +15,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
+from hmt_ros.app.progress import show_progress
 from hmt_ros.body import Body, Camera
 from hmt_ros.inference.arrays import Array
 from hmt_ros.rendering.depth_sensor import sensed_depth
@@ -83,7 +83,7 @@ def write_bag(
         scene: surroundings of the person; its seed is also that of the clicks.
         quality: JPEG quality of the images, 1 to 100.
         with_depth: whether a depth camera sees the scene as well.
-        progress: whether to show a progress bar on stderr, if that is a terminal.
+        progress: whether to show progress on stderr.
 
     Raises:
         ValueError: the first image does not show the person.
@@ -94,11 +94,9 @@ def write_bag(
     subject = subject_text(take, camera, pixels[0], scene.seed)
     messages = RosbagsMessages()
     masks = np.empty((len(take.poses), camera.height, (camera.width + 7) // 8), dtype=np.uint8)
-    # None: shown where stderr is a terminal.
-    hidden = None if progress else True
     with (
         BagWriter(folder) as bag,
-        tqdm(total=len(take.poses), unit='image', desc=folder.name, disable=hidden) as bar,
+        show_progress(folder.name, 'images', len(take.poses), quiet=not progress) as bar,
     ):
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
         bag.write('body', START_NS, message_of_body(messages, take.body, START_NS, FRAME_ID))

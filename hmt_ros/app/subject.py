@@ -17,7 +17,7 @@ import numpy as np
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.replay.inputs import recorded_input
 from hmt_ros.body import Body, load_body
-from hmt_ros.image.keypoint_schemes import Scheme, landmark_called, recognised
+from hmt_ros.image.keypoint_schemes import landmarks_of
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools import BagReader
 from msg_tools.messages.headers import SECOND_NS, time_ns
@@ -181,32 +181,21 @@ def joints_of(keypoints: Keypoints | None, body: Body) -> Keypoints:
     empty = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
     if keypoints is None:
         return empty
-    scheme = recognised(keypoints.names)
+    names, known = keypoints.names, body.joint_names
     sure = keypoints.seen & (keypoints.confidences >= CONFIDENT)
     places: dict[str, list[int]] = {}
-    for i in np.flatnonzero(sure):
-        joint = _joint(keypoints.names[i], scheme, body)
-        if joint is not None:
-            places.setdefault(joint, []).append(int(i))
+    for i, mark in enumerate(landmarks_of(names, known)):
+        joint = names[i] if mark is None else mark.joint
+        stands_for_it = names[i] == joint or joint not in names
+        beside_it = mark is not None and joint == 'head' and mark.name != _CENTRE_OF_HEAD
+        if sure[i] and joint in known and stands_for_it and not beside_it:
+            places.setdefault(joint, []).append(i)
     if not places:
         return empty
     pixels = np.array([keypoints.pixels[i].mean(0) for i in places.values()])
     covariances = np.array([keypoints.covariances[i].mean(0) for i in places.values()])
     confidences = np.array([keypoints.confidences[i].mean() for i in places.values()])
     return Keypoints(tuple(places), pixels, covariances, confidences)
-
-
-def _joint(name: str, scheme: Scheme | None, body: Body) -> str | None:
-    """The joint of a body that a landmark stands for; None: it stands for none."""
-    if scheme is None and name in body.joint_names:
-        return name
-    landmark = landmark_called(name) if scheme is None else scheme.landmark(name)
-    if landmark is None or landmark.joint not in body.joint_names:
-        return None
-    joint = landmark.joint
-    if scheme is not None and name != joint and joint in scheme.names:
-        return None
-    return None if joint == 'head' and landmark.name != _CENTRE_OF_HEAD else joint
 
 
 def subject_text(seen: Seen, *, stature: float | None = None, sigma: float | None = None) -> str:

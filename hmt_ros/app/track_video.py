@@ -9,10 +9,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from tqdm import tqdm
-
 from hmt_ros.app.command_line import CommandParser, number, run_command
 from hmt_ros.app.import_video.command import ImportOptions, add_video_arguments, import_video
+from hmt_ros.app.progress import tell_user
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.app.report.command import ReportOptions, write_report
@@ -114,7 +113,7 @@ def _track(arguments: argparse.Namespace) -> int:
 
 def tell(text: str) -> None:
     """Prints a line for the user on stderr, above the progress bar."""
-    tqdm.write(f'track-video: {text}', file=sys.stderr)
+    tell_user('track-video', text)
 
 
 if __name__ == '__main__':

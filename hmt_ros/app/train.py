@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from tqdm import tqdm
 
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
+from hmt_ros.app.progress import show_progress, tell_user, with_progress
 from hmt_ros.app.training_report import write_report
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.predictor_learning import KINDS, described, learned_predictor, new_model
@@ -160,11 +160,13 @@ def _train(options: TrainingOptions) -> int:
         'activities': sorted(set(pairs.activities)),
     }
     _say(options, f'learning {options.model} from {len(pairs)} silhouettes')
-    predictor = learned_predictor(body, seen, model, dynamics, notes, options.seed)
+    with show_progress('learning', quiet=options.quiet):
+        predictor = learned_predictor(body, seen, model, dynamics, notes, options.seed)
     predictor.save(output)
     report = options.report or output.with_name(f'{output.stem}_report')
     report.mkdir(parents=True, exist_ok=True)
-    figures = write_report(report, body, sequences, pairs, training)
+    with show_progress('drawing', quiet=options.quiet):
+        figures = write_report(report, body, sequences, pairs, training)
     skips = f', {skipped} skipped' if skipped else ''
     _say(
         options, f'{output}: {len(sequences)} motions{skips}, {output.stat().st_size / 1e6:.1f} MB'
@@ -180,8 +182,7 @@ GROUPS, SILHOUETTES = 'groups', 'silhouettes'
 def _bars(quiet: bool) -> Callable[[str, str], Callable[[Iterable[Item], int], Iterable[Item]]]:
     def bar(what: str, unit: str) -> Callable[[Iterable[Item], int], Iterable[Item]]:
         def through(items: Iterable[Item], count: int) -> Iterable[Item]:
-            # None shows the bar where stderr is a terminal.
-            return tqdm(items, what, count, unit=f' {unit}', disable=True if quiet else None)
+            return with_progress(items, what, unit, count, quiet=quiet)
 
         return through
 
@@ -207,9 +208,7 @@ def _sequences(options: TrainingOptions, body: Body) -> tuple[list[PoseSequence]
             ]
     if options.mocap is not None:
         files = motion_files(options.mocap)
-        for path in tqdm(
-            files, 'reading', unit=' motions', disable=True if options.quiet else None
-        ):
+        for path in with_progress(files, 'reading', 'motions', len(files), quiet=options.quiet):
             sequence = _sequence_or_warning(path, body)
             if sequence is None:
                 skipped += 1
@@ -225,8 +224,7 @@ def _sequence_or_warning(path: Path, body: Body) -> PoseSequence | None:
     try:
         return recorded_sequence(path, body)
     except (ValueError, OSError, np.linalg.LinAlgError) as error:
-        text = error_line(error)
-        tqdm.write(f'train: skipped {path.name}: {text}', file=sys.stderr)
+        tell_user('train', f'skipped {path.name}: {error_line(error)}')
         return None
 
 

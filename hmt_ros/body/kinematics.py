@@ -138,14 +138,10 @@ def point_jacobians(frames: Frames, segments: Index, points: Array) -> Array:
     skeleton = frames.skeleton
     result = np.zeros((len(points), skeleton.dimension, 3, frames.count))
     moves = skeleton.moves[segments]
-    for j in range(skeleton.dimension):
-        where = np.flatnonzero(moves[:, j])
-        if not len(where):
-            continue
-        if skeleton.dof_is_rotation[j]:
-            result[where, j] = _cross(frames.axes[j], points[where] - frames.dof_origins[j])
-        else:
-            result[where, j] = frames.axes[j]
+    point, dof = np.nonzero(moves & skeleton.dof_is_rotation)
+    result[point, dof] = _cross(frames.axes[dof], points[point] - frames.dof_origins[dof])
+    point, dof = np.nonzero(moves & ~skeleton.dof_is_rotation)
+    result[point, dof] = frames.axes[dof]
     return result
 
 

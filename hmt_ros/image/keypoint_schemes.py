@@ -22,7 +22,6 @@ SIDES = ('right', 'left')
 MIRROR = np.array([-1.0, 1.0, 1.0])
 AUTO, JOINTS = 'auto', 'joints'
 LARGEST_FILE = 1_000_000  # bytes
-NOT_AT_A_JOINT = ''
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +141,26 @@ def recognised(names: Sequence[str]) -> Scheme | None:
     fitting = [x for x in schemes().values() if set(names) <= set(x.names)]
     found = min(fitting, key=lambda x: len(x.names), default=None)
     return found if 'nose' in names else None
+
+
+def landmarks_of(
+    names: Sequence[str], joints: Sequence[str], scheme: str = AUTO
+) -> list[Landmark | None]:
+    """What the names of keypoints mean; None: a joint of the body, or nothing that is known.
+
+    Args:
+        names: of the keypoints.
+        joints: of the body; outside schemes a name of one of them means this joint.
+        scheme: see `scheme_of`.
+
+    Raises:
+        ValueError: there is no such scheme.
+    """
+    found = scheme_of(names, scheme)
+    if found is not None:
+        return [found.landmark(name) for name in names]
+    own = names if scheme == JOINTS else joints
+    return [None if name in own else landmark_called(name) for name in names]
 
 
 def landmark_called(name: str) -> Landmark | None:

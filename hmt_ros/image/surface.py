@@ -261,6 +261,7 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
 
 @njit(cache=True, nogil=True, inline='always')
 def signed_power(x, exponent):  # type: ignore[no-untyped-def]
+    """sgn(x) |x|^exponent."""
     return np.sign(x) * np.abs(x) ** exponent
 
 

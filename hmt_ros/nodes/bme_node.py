@@ -15,11 +15,12 @@ from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
     CAMERA_INFO_TOPIC,
     MASK_TOPICS,
+    RELIABLE,
     SubscribedTopic,
     image_topic,
 )
 from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.bme_session import BmeSession
+from hmt_ros.sessions.bme_session import TRACK, BmeSession
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import serialise
 
@@ -37,6 +38,8 @@ class BmeNode(SessionNode[BmeSession, BmeParameters]):
 
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         yield CAMERA_INFO_TOPIC
+        if self._settings.tracked_interval > 0:
+            yield SubscribedTopic(TRACK, TRACK, 'hmt_msgs/msg/PoseMixture', RELIABLE)
         yield from MASK_TOPICS
         yield image_topic(self._settings.image_transport)
 

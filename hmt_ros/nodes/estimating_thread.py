@@ -1,6 +1,8 @@
 """The thread that estimates: it gives a session its messages in the order of their arrival.
 
-Messages wait in a bounded queue; when an estimate is late the oldest images are dropped.
+Messages wait in a bounded queue. After each estimate the session takes in all that has come
+meanwhile before it estimates again, so that a node that is late goes on with the newest image for
+which all other inputs are there. Older images are dropped; nothing else is.
 """
 
 from __future__ import annotations
@@ -17,8 +19,13 @@ from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.session import Session
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.headers import stamp_in
 
 _RESTART = 'restart'
+# Dropped images that are told of one by one, the newest; the others are only counted.
+_ANSWERED = 100
+# Arrivals of messages that are remembered until their estimates.
+_REMEMBERED = 1000
 
 
 class Waiting(NamedTuple):
@@ -28,13 +35,27 @@ class Waiting(NamedTuple):
         source: where it comes from.
         content: what it is.
         arrival: when it came, in seconds of a clock that does not jump.
-        dropped: images that were dropped since the last one was taken out.
+        stamp_ns: of its header; 0 where it has none.
     """
 
     source: str
     content: Any
     arrival: float
-    dropped: int
+    stamp_ns: int = 0
+
+
+class Arrived(NamedTuple):
+    """What has come since the last time.
+
+    Attributes:
+        waiting: in the order of arrival.
+        dropped: number of images that were dropped.
+        stamps_ns: of the newest of these.
+    """
+
+    waiting: tuple[Waiting, ...]
+    dropped: int = 0
+    stamps_ns: tuple[int, ...] = ()
 
 
 class InputQueue:
@@ -48,9 +69,10 @@ class InputQueue:
     def __init__(self, limits: Mapping[str, int], counted: str) -> None:
         self._limits = dict(limits)
         self._counted = counted
-        self._waiting: deque[tuple[str, Any, float]] = deque()
+        self._waiting: deque[Waiting] = deque()
         self._sizes: Counter[str] = Counter()
         self._dropped = 0
+        self._dropped_stamps: deque[int] = deque(maxlen=_ANSWERED)
         self._closed = False
         self._changed = threading.Condition()
 
@@ -59,43 +81,44 @@ class InputQueue:
         with self._changed:
             self._limits[source] = most
 
-    def put(self, source: str, content: Any, arrival: float) -> None:
+    def put(self, waiting: Waiting) -> None:
         """Adds something; drops the oldest of its source where there are too many."""
+        source = waiting.source
         with self._changed:
             if self._closed:
                 return
-            self._waiting.append((source, content, arrival))
+            self._waiting.append(waiting)
             self._sizes[source] += 1
             while self._sizes[source] > self._limits.get(source, self._sizes[source]):
-                index = next(i for i, item in enumerate(self._waiting) if item[0] == source)
+                index = next(i for i, item in enumerate(self._waiting) if item.source == source)
+                if source == self._counted:
+                    self._dropped += 1
+                    self._dropped_stamps.append(self._waiting[index].stamp_ns)
                 del self._waiting[index]
                 self._sizes[source] -= 1
-                self._dropped += source == self._counted
             self._changed.notify()
 
-    def get(self) -> Waiting | None:
-        """Waits for something and takes it out; None: the queue is closed."""
+    def get(self) -> Arrived | None:
+        """Waits for something and takes all out that is there; None: the queue is closed."""
         with self._changed:
             while not self._waiting and not self._closed:
                 self._changed.wait()
-            if self._closed:
-                return None
-            source, content, arrival = self._waiting.popleft()
-            self._sizes[source] -= 1
-            dropped, self._dropped = self._dropped, 0
-            return Waiting(source, content, arrival, dropped)
+            return None if self._closed else self._take_out()
 
-    def close(self) -> list[Waiting]:
+    def close(self) -> Arrived:
         """Ends every `get`; returns what waited."""
         with self._changed:
             self._closed = True
-            left = [Waiting(*waiting, dropped=0) for waiting in self._waiting]
-            if left:
-                left[0] = left[0]._replace(dropped=self._dropped)
-            self._waiting.clear()
-            self._sizes.clear()
             self._changed.notify_all()
-            return left
+            return self._take_out()
+
+    def _take_out(self) -> Arrived:
+        result = Arrived(tuple(self._waiting), self._dropped, tuple(self._dropped_stamps))
+        self._waiting.clear()
+        self._sizes.clear()
+        self._dropped = 0
+        self._dropped_stamps.clear()
+        return result
 
     def __len__(self) -> int:
         with self._changed:
@@ -135,7 +158,6 @@ class EstimatingThread:
     Args:
         session: used by this thread alone, until `stop` has returned True.
         inputs: where messages come from.
-        queue_size: maximum number of images or mixtures that wait.
         tell: takes the report on each message.
         tell_change: called when status or kinds of faults of the session have changed.
         inner_faults: counts errors that the session should not have raised.
@@ -149,7 +171,6 @@ class EstimatingThread:
         self,
         session: Session[Any, Any],
         inputs: Iterable[SubscribedTopic],
-        queue_size: int,
         *,
         tell: Callable[[Handled], None],
         tell_change: Callable[[], None],
@@ -157,31 +178,42 @@ class EstimatingThread:
         log_error: Callable[[str], None],
     ) -> None:
         self._session = session
-        self._inputs: Mapping[str, SubscribedTopic] = {one.source: one for one in inputs}
+        session.interrupted = self._is_interrupted
+        self._inputs: dict[str, SubscribedTopic] = {one.source: one for one in inputs}
+        self._stamped = {one.source for one in self._inputs.values() if one.opens_with_header}
         limits = {one.source: one.waiting for one in self._inputs.values()}
         # Of several requests to start anew the last counts.
         limits[_RESTART] = 1
-        limits[session.COUNTED] = queue_size
+        limits[session.COUNTED] = session.most_waiting
         self.queue = InputQueue(limits, counted=session.COUNTED)
         self._tell, self._tell_change = tell, tell_change
         self._inner_faults, self._log_error = inner_faults, log_error
         self._latencies: deque[float] = deque(maxlen=1000)
+        self._arrivals: dict[int, float] = {}
         self._thread = threading.Thread(target=self._work, name='estimate', daemon=True)
         self._thread.start()
+
+    def listen(self, one: SubscribedTopic) -> None:
+        """Adds a topic that messages come from."""
+        self.queue.limit(one.source, one.waiting)
+        self._inputs[one.source] = one
+        if one.opens_with_header:
+            self._stamped.add(one.source)
 
     def put(self, source: str, data: bytes, arrival: float) -> None:
         """Adds a message."""
         largest = self._inputs[source].largest
         content = data if len(data) <= largest else _TooLarge(len(data), largest)
-        self.queue.put(source, content, arrival)
+        stamp = stamp_in(data) if source in self._stamped else 0
+        self.queue.put(Waiting(source, content, arrival, stamp))
 
     def restart(self, action: Callable[[], None]) -> None:
         """Restarts the session by an action, after the messages that have come before."""
-        self.queue.put(_RESTART, action, time.monotonic())
+        self.queue.put(Waiting(_RESTART, action, time.monotonic()))
 
-    def limit(self, queue_size: int) -> None:
-        """Changes how many images or mixtures may wait."""
-        self.queue.limit(self._session.COUNTED, queue_size)
+    def take_limit(self) -> None:
+        """Takes from the session how many images or mixtures may wait."""
+        self.queue.limit(self._session.COUNTED, self._session.most_waiting)
 
     def take_latencies(self) -> list[float]:
         """Times from the arrival of messages to their estimates, s, since the last call."""
@@ -197,35 +229,51 @@ class EstimatingThread:
         self._thread.join(timeout)
         if self._thread.is_alive():
             return False
-        for waiting in left:
-            self._session.count_dropped(waiting.dropped + (waiting.source == self._session.COUNTED))
+        counted = sum(waiting.source == self._session.COUNTED for waiting in left.waiting)
+        self._session.count_dropped(left.dropped + counted)
+        for waiting in left.waiting:
             if waiting.source == _RESTART:
                 waiting.content()
         return True
 
+    def _is_interrupted(self) -> bool:
+        return bool(len(self.queue))
+
     def _work(self) -> None:
         session = self._session
-        while (waiting := self.queue.get()) is not None:
-            before = session.state
-            try:
-                self._handle(waiting)
-            except Exception as error:  # noqa: BLE001
-                # A fault of ours. What comes next may not suffer from it.
-                self._inner_faults.add(error)
-                self._log_error(''.join(traceback.format_exception(error)))
-                text = f'the node itself failed: {self._inner_faults.last}'
-                self._tell(session.break_off(waiting.source, text))
-            after = session.state
-            if (after.status, after.faults.keys()) != (before.status, before.faults.keys()):
-                self._tell_change()
+        while (arrived := self.queue.get()) is not None:
+            session.count_dropped(arrived.dropped - len(arrived.stamps_ns))
+            for stamp in arrived.stamps_ns:
+                self._tell(session.drop(stamp))
+            following = [waiting.source for waiting in arrived.waiting[1:]]
+            for waiting, after in zip(arrived.waiting, [*following, _RESTART], strict=True):
+                self._try_to_handle(waiting, more=after != _RESTART)
 
-    def _handle(self, waiting: Waiting) -> None:
+    def _try_to_handle(self, waiting: Waiting, *, more: bool) -> None:
         session = self._session
-        session.count_dropped(waiting.dropped)
-        done = session.state.counts[session.DONE]
+        before = session.state
+        try:
+            self._handle(waiting, more=more)
+        except Exception as error:  # noqa: BLE001
+            # A fault of ours. What comes next may not suffer from it.
+            self._inner_faults.add(error)
+            self._log_error(''.join(traceback.format_exception(error)))
+            text = f'the node itself failed: {self._inner_faults.last}'
+            self._tell(session.break_off(waiting.source, text))
+        after = session.state
+        if (after.status, after.faults.keys()) != (before.status, before.faults.keys()):
+            self._tell_change()
+
+    def _handle(self, waiting: Waiting, *, more: bool) -> None:
+        session = self._session
         if waiting.source == _RESTART:
             waiting.content()
             return
+        done = session.state.counts[session.DONE]
+        if waiting.source == session.COUNTED:
+            self._arrivals[waiting.stamp_ns] = waiting.arrival
+            if len(self._arrivals) > _REMEMBERED:
+                del self._arrivals[next(iter(self._arrivals))]
         try:
             if isinstance(waiting.content, _TooLarge):
                 raise ValueError(
@@ -234,9 +282,12 @@ class EstimatingThread:
             message = deserialise(waiting.content, self._inputs[waiting.source].msgtype)
         except Exception as error:  # noqa: BLE001
             # Bytes from outside meet generated code here, which does not say what it may raise.
-            handled = session.refuse(waiting.source, error_line(error))
+            handled = session.refuse(waiting.source, error_line(error), more=more)
         else:
-            handled = session.take(waiting.source, message)
+            handled = session.take(waiting.source, message, more=more)
         if session.state.counts[session.DONE] > done:
-            self._latencies.append(time.monotonic() - waiting.arrival)
+            # An image may have waited for this message, which came later.
+            newest = max((stamp for _, stamp in handled.published), default=0)
+            arrival = self._arrivals.get(newest, waiting.arrival)
+            self._latencies.append(time.monotonic() - arrival)
         self._tell(handled)

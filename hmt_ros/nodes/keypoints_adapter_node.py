@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any
-
-from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
-from hmt_ros.nodes.subscribed_topic import CAMERA_INFO_TOPIC, SubscribedTopic, message_class
+from hmt_ros.nodes.subscribed_topic import (
+    CAMERA_INFO_TOPIC,
+    SubscribedTopic,
+    read_installed_messages,
+)
 from hmt_ros.sessions.handled import Output
 from hmt_ros.sessions.keypoints_adapter_parameters import SOURCES, KeypointsAdapterParameters
 from hmt_ros.sessions.keypoints_adapter_session import DETECTIONS, KeypointsAdapterSession
 from hmt_ros.sessions.session import everything
-from msg_tools.messages.message_types import register_definitions
 
 
 class InstalledAdapterSession(KeypointsAdapterSession):
@@ -32,27 +32,9 @@ class InstalledAdapterSession(KeypointsAdapterSession):
         publish: Callable[[Output], None],
         wanted: Callable[[str], bool] = everything,
     ) -> None:
-        make_readable(parameters.source)
+        msgtype = SOURCES[parameters.source]
+        read_installed_messages(msgtype, f'source {parameters.source}')
         super().__init__(parameters, publish, wanted)
-
-
-def make_readable(source: str) -> None:
-    """Reads the definitions of the messages of a source, as they are installed.
-
-    Raises:
-        ValueError: their package is not installed.
-    """
-    msgtype = SOURCES[source]
-    package = msgtype.partition('/')[0]
-    try:
-        message_class(msgtype)
-        folder = Path(get_package_share_directory(package)) / 'msg'
-    except (ImportError, AttributeError, PackageNotFoundError) as error:
-        raise ValueError(
-            f'source {source} needs {msgtype.replace("/msg/", "/")}, but the package {package} is '
-            'not installed: install it, or build and source its workspace'
-        ) from error
-    register_definitions(package, folder)
 
 
 class KeypointsAdapterNode(SessionNode[KeypointsAdapterSession, KeypointsAdapterParameters]):

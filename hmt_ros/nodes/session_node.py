@@ -192,7 +192,6 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._thread = EstimatingThread(
             session,
             inputs,
-            self._settings.queue_size,
             tell=self._tell,
             tell_change=self._diagnose,
             inner_faults=self._inner_faults,
@@ -319,7 +318,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         if self._session is not None:
             self._session.parameters = settings
         if self._thread is not None:
-            self._thread.limit(settings.queue_size)
+            self._thread.take_limit()
         return SetParametersResult(successful=True)
 
     # Called by the thread that estimates.

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK
 from hmt_ros.sessions.depth_inputs import DEPTH
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS_TYPE
 from msg_tools.messages.images import MAX_PIXELS
+from msg_tools.messages.message_types import register_definitions
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 # For `~/handled`: who waits for an answer to each message must not miss those to a burst.
@@ -49,6 +52,12 @@ class SubscribedTopic(NamedTuple):
     qos: QoSProfile = qos_profile_sensor_data
     largest: int = LARGEST_MESSAGE
     waiting: int = SMALL_QUEUE
+
+    @property
+    def opens_with_header(self) -> bool:
+        """Whether messages of the type begin with a std_msgs/Header."""
+        first = next(iter(message_class(self.msgtype).get_fields_and_field_types().values()), '')
+        return bool(first == 'std_msgs/Header')
 
 
 MASK_TOPICS = (
@@ -92,3 +101,25 @@ def message_class(msgtype: str) -> Any:
     """The generated class of a message type."""
     package, _, name = msgtype.split('/')
     return getattr(import_module(f'{package}.msg'), name)
+
+
+def read_installed_messages(msgtype: str, needed_by: str) -> None:
+    """Reads the definitions of a package of messages, as it is installed.
+
+    Args:
+        msgtype: one of the messages.
+        needed_by: what needs it, for the error.
+
+    Raises:
+        ValueError: the package is not installed.
+    """
+    package = msgtype.partition('/')[0]
+    try:
+        message_class(msgtype)
+        folder = Path(get_package_share_directory(package)) / 'msg'
+    except (ImportError, AttributeError, PackageNotFoundError) as error:
+        raise ValueError(
+            f'{needed_by} needs {msgtype.replace("/msg/", "/")}, but the package {package} is '
+            'not installed: install it, or build and source its workspace'
+        ) from error
+    register_definitions(package, folder)

@@ -39,6 +39,8 @@ class BmeParameters(CameraNodeParameters):
         longest_interval: Maximum interval without a person after which the images before are still
             taken into account, s.
         max_hypotheses: Maximum number of components of a prediction.
+        tracked_interval: Interval between two predictions while the filter tracks the person, by
+            its topic pose_mixture and the stamps of the images, s; 0 predicts from every image.
         background: settings of the background subtraction.
     """
 
@@ -50,6 +52,7 @@ class BmeParameters(CameraNodeParameters):
     propagate: bool = parameter_field(False, AT_ONCE)
     longest_interval: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
     max_hypotheses: int = parameter_field(5, AT_ONCE, (1, 64))
+    tracked_interval: float = parameter_field(0.0, NEXT_CONFIGURE, (0.0, 3600.0))
     background: BackgroundSettings = field(
         default_factory=BackgroundSettings,
         metadata=nested_parameters(NEXT_CONFIGURE, BACKGROUND, 'background.'),

@@ -7,6 +7,10 @@ order give the same bytes. The rules, besides those of `CameraSession`:
   seen: the background is still being learned, or no silhouette has the height of a person.
 - With `use_mask` the mask of an image is its silhouette; an image whose mask shows somebody teaches
   no background.
+- With `tracked_interval` the track of the filter (`pose_mixture`) is heard. While it says that the
+  person is tracked, images within `tracked_interval` after the last prediction are not looked at.
+  What is then published has no components and the state of the track, so that who waits for a
+  prediction goes on: not looked at, which is not the same as nobody seen.
 - An image that is not younger than the one before is skipped, or is the first of a new sequence
   with `reset_on_time_jump`.
 - With `propagate` a prediction takes the one before into account, unless this is older than
@@ -37,6 +41,7 @@ from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
+    FRAME_ID,
     IMAGE,
     CameraSession,
     WaitingImage,
@@ -48,14 +53,22 @@ from hmt_ros.sessions.session import PublishedTopic, SessionState, everything
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import decode_image
-from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.pose_mixtures import (
+    MixtureKind,
+    PoseMixture,
+    TrackState,
+    pose_mixture_message,
+)
 
-__all__ = ['CAMERA_INFO', 'IMAGE', 'PREDICTION', 'TOPICS', 'BmeSession', 'BmeState']
+__all__ = ['CAMERA_INFO', 'IMAGE', 'PREDICTION', 'TOPICS', 'TRACK', 'BmeSession', 'BmeState']
 
 PREDICTION = 'pose_prediction'
+TRACK = 'pose_mixture'
 TOPICS = {PREDICTION: PublishedTopic('hmt_msgs/msg/PoseMixture')}
 
 
+# Time after which a track that is not heard of is not relied on any more.
+_SURE_NS = SECOND_NS
 # Relative standard deviation of the size of a person whose stature is known.
 _MEASURED_SPREAD = 0.02
 
@@ -64,7 +77,8 @@ _MEASURED_SPREAD = 0.02
 class BmeState(SessionState):
     """State of the prediction: its status is 'no camera', 'learning', 'nobody' or 'predicting'.
 
-    Of the counts 'predicted' are images with or without somebody, 'empty' those without.
+    Of the counts 'predicted' are images with or without somebody, 'empty' those without, and
+    'left' are images that were not looked at because the person is tracked.
 
     Attributes:
         modes: components of the last prediction.
@@ -84,6 +98,7 @@ class BmeState(SessionState):
         """Keys and values of the diagnostics."""
         return [
             ('images without a person', str(self.counts['empty'])),
+            ('images left to the track', str(self.counts['left'])),
             ('modes', str(self.modes)),
             ('entropy of the weights, nats', f'{self.entropy:.3f}'),
             ('height of the silhouette, px', str(self.height)),
@@ -123,6 +138,9 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         # OpenCV's model computes in memory of its own.
         self._background_in_use = threading.Lock()
         self._previous: _Previous | None = None
+        # Stamps of the last image that was looked at, and of the last one with a track.
+        self._looked: int | None = None
+        self._tracked: int | None = None
         self._height, self._support = 0, math.nan
         self._masked = False
         self.state = self._present_state()
@@ -130,8 +148,35 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
     def _forget(self) -> None:
         # What is known of the background stays.
         self._previous = None
+        self._looked = self._tracked = None
+
+    def _take(self, source: str, message: Any, stamp: int) -> None:
+        if source != TRACK:
+            super()._take(source, message, stamp)
+        elif self._tracked is None or stamp > self._tracked:
+            tracked = message.state == TrackState.TRACKING and len(message.components)
+            self._tracked = stamp if tracked else None
+
+    def _take_image(self, message: Any, stamp: int) -> None:
+        if not self._is_left_to_track(stamp):
+            super()._take_image(message, stamp)
+            return
+        self._newest = stamp
+        self._log.counts['left'] += 1
+        if self._wanted(PREDICTION):
+            frame = str(message.header.frame_id) or self._frame or FRAME_ID
+            made = self._message(None, stamp, frame, TrackState.TRACKING)
+            self._publish(PREDICTION, stamp, made)
+
+    def _is_left_to_track(self, stamp: int) -> bool:
+        """Whether an image need not be looked at, nor decoded."""
+        interval = self.parameters.tracked_interval * SECOND_NS
+        if self._waiting or self._looked is None or self._tracked is None or self._newest is None:
+            return False
+        return self._newest < stamp < self._looked + interval and stamp - self._tracked <= _SURE_NS
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
+        self._looked = waiting.stamp_ns
         try:
             mixture = self._mixture_of(waiting, camera)
         except (ValueError, ArithmeticError) as error:
@@ -198,9 +243,15 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         with self._background_in_use:
             return self._background.silhouette(image)
 
-    def _message(self, mixture: GaussianMixture | None, stamp: int, frame_id: str) -> Any:
+    def _message(
+        self,
+        mixture: GaussianMixture | None,
+        stamp: int,
+        frame_id: str,
+        state: TrackState = TrackState.UNKNOWN,
+    ) -> Any:
         content = PoseMixture.of_body(
-            self._predictor.body, mixture, MixtureKind.PREDICTION, stamp, frame_id
+            self._predictor.body, mixture, MixtureKind.PREDICTION, stamp, frame_id, state=state
         )
         return pose_mixture_message(self._messages, content)
 

@@ -1,10 +1,12 @@
 """Sessions that estimate from the images of one camera.
 
-Images are taken in the order of their stamps. They wait until a calibrated camera_info has come; at
-most `queue_size` wait, the oldest are dropped. With `use_mask` an image also waits for the mask of
-exactly its stamp, for a mask of a later stamp, or for an image that is `input_timeout` younger. A
-mask that can not be used counts as none; one without a pixel that is not zero says that nobody was
-seen.
+Images are taken in the order of their stamps. They wait until a calibrated camera_info has come,
+and for other inputs; at most `MOST_INCOMPLETE` wait, the oldest are dropped. A session is late
+where messages have come during an estimate while images waited for it: of the images that need not
+wait for anything else the newest `queue_size` are estimated from. With `use_mask` an image also
+waits for the mask of exactly its stamp, for a mask of a later stamp, or for an image that is
+`input_timeout` younger. A mask that can not be used counts as none; one without a pixel that is not
+zero says that nobody was seen.
 """
 
 from __future__ import annotations
@@ -12,12 +14,13 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
+from itertools import takewhile
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from hmt_ros.body import Camera
 from hmt_ros.inference.arrays import Image, Mask
 from hmt_ros.sessions.declared_parameters import CameraNodeParameters
-from hmt_ros.sessions.handled import Fault, Output
+from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.session import Order, Session, State, everything
 from msg_tools.files.bounded_file import read_bytes
 from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
@@ -32,6 +35,8 @@ FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a
 T = TypeVar('T')
 CameraParameters = TypeVar('CameraParameters', bound=CameraNodeParameters)
 
+# Images that may wait for other inputs: half a second of a usual camera.
+MOST_INCOMPLETE = 16
 # Inputs that `StampedInputs` remembers, and masks, which are large.
 _REMEMBERED, _REMEMBERED_MASKS = 256, 64
 _LARGEST_PICTURE_FILE = 2**28  # bytes
@@ -71,6 +76,11 @@ class CameraSession(Session[CameraParameters, State]):
         self._waiting: deque[WaitingImage] = deque()
         self._newest: int | None = None
         self._masks: StampedInputs[Mask] = StampedInputs(_REMEMBERED_MASKS)
+        # Images that have come since the last estimate; whether some were left when it was
+        # interrupted; and stamps of those that were dropped.
+        self._fresh = 0
+        self._left = False
+        self._dropped: deque[int] = deque(maxlen=_REMEMBERED)
 
     @abstractmethod
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
@@ -80,9 +90,24 @@ class CameraSession(Session[CameraParameters, State]):
     def _status(self) -> tuple[str, str]:
         """Status and wants of the state, once the camera is known."""
 
-    def _is_ready(self, stamp: int) -> bool:
+    @property
+    def most_waiting(self) -> int:
+        """See `Session`."""
+        size = self.parameters.queue_size
+        return max(size, MOST_INCOMPLETE) if self._waits_for_inputs() else size
+
+    def drop(self, stamp_ns: int) -> Handled:
+        """See `Session`."""
+        self._dropped.append(stamp_ns)
+        return super().drop(stamp_ns)
+
+    def _waits_for_inputs(self) -> bool:
+        """Whether images have to wait for other inputs than camera_info."""
+        return self.parameters.use_mask
+
+    def _is_ready(self, waiting: WaitingImage) -> bool:
         """Whether an image need not wait for anything but a camera_info."""
-        return self._has_mask(stamp)
+        return self._has_mask(waiting.stamp_ns)
 
     def _missing_input(self, stamp: int) -> Fault:
         """What an image is waiting for, besides a camera_info."""
@@ -109,7 +134,6 @@ class CameraSession(Session[CameraParameters, State]):
                 self._masks.put(stamp, self._mask_in(message, stamp))
         else:
             self._take_image(message, stamp)
-        self._estimate_what_is_ready()
 
     def _take_camera_info(self, message: Any) -> None:
         try:
@@ -142,7 +166,7 @@ class CameraSession(Session[CameraParameters, State]):
         except ImageError as error:
             self._log.skip(Fault.IMAGE, str(error))
             return
-        self._newest = stamp
+        self._newest, self._fresh = stamp, self._fresh + 1
         self._waiting.append(WaitingImage(image, stamp, str(message.header.frame_id)))
 
     def _mask_in(self, message: Any, stamp: int) -> Mask | None:
@@ -162,7 +186,7 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _mask_of(self, image: Image, stamp: int) -> Mask | None:
         """The mask of an image; None where there is none that fits."""
-        lone = self._masks.before(stamp)
+        lone = [each for each in self._masks.before(stamp) if each not in self._dropped]
         for each in lone:
             self._log.note(
                 Fault.LONE_MASK,
@@ -186,13 +210,30 @@ class CameraSession(Session[CameraParameters, State]):
     def _start_anew(self) -> None:
         self.restart()
 
-    def _estimate_what_is_ready(self) -> None:
-        while (
-            self._waiting and self._camera is not None and self._is_ready(self._waiting[0].stamp_ns)
-        ):
-            self._estimate_next(self._camera)
-        while len(self._waiting) > self.parameters.queue_size:
+    def _use_what_has_come(self) -> None:
+        late, self._fresh, self._left = self._left or self._fresh > 1, 0, False
+        if self._camera is not None:
+            if late:
+                self._leave_out_late_images()
+            while self._waiting and not self._left and self._is_ready(self._waiting[0]):
+                self._estimate_next(self._camera)
+                # What has come meanwhile decides which image is next.
+                self._left = bool(self._waiting) and self.interrupted()
+        self._drop_incomplete_images()
+
+    def _leave_out_late_images(self) -> None:
+        """Drops all but the newest of the images that need not wait."""
+        ready = sum(1 for _ in takewhile(self._is_ready, self._waiting))
+        for _ in range(ready - self.parameters.queue_size):
             stamp = self._waiting.popleft().stamp_ns
+            self._dropped.append(stamp)
+            self._log.drop(self._late(stamp))
+
+    def _drop_incomplete_images(self) -> None:
+        most = max(self.parameters.queue_size, MOST_INCOMPLETE)
+        while len(self._waiting) > most:
+            stamp = self._waiting.popleft().stamp_ns
+            self._dropped.append(stamp)
             self._log.counts['dropped'] += 1
             if self._camera is None:
                 # An uncalibrated camera_info has been reported already.
@@ -205,7 +246,7 @@ class CameraSession(Session[CameraParameters, State]):
                 self._log.fault(
                     kind,
                     f'image of {stamp} ns is dropped: {kind.value} of its stamp has come, and '
-                    f'queue_size is {self.parameters.queue_size}',
+                    f'{most} newer images wait',
                 )
 
     def _estimate_next(self, camera: Camera) -> None:

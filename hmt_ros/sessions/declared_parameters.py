@@ -101,8 +101,11 @@ class ImageNodeParameters(NodeParameters):
     Attributes:
         image_transport: Transport of the images, 'raw' (topic image) or 'compressed' (topic
             image/compressed).
+        queue_size: Maximum number of images that wait, together with all other inputs of their
+            stamps, while the node is late; the oldest are dropped, so that 1 leaves the newest.
     """
 
+    queue_size: int = parameter_field(1, AT_ONCE, (1, 1000))
     image_transport: str = parameter_field('raw', NEXT_CONFIGURE)
 
     def __post_init__(self) -> None:

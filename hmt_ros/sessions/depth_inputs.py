@@ -6,6 +6,7 @@ counts as none: the image goes on without it.
 
 from __future__ import annotations
 
+from collections.abc import Container
 from typing import Any
 
 import numpy as np
@@ -53,9 +54,19 @@ class DepthInputs:
             depth = None
         self.images.put(stamp_ns, depth)
 
-    def take(self, image: Image, stamp_ns: int) -> NDArray[np.float32] | None:
-        """The depths of an image; None where there are none that fit."""
+    def take(
+        self, image: Image, stamp_ns: int, dropped: Container[int] = ()
+    ) -> NDArray[np.float32] | None:
+        """The depths of an image; None where there are none that fit.
+
+        Args:
+            image: (H, W, 3).
+            stamp_ns: of the image.
+            dropped: stamps of images that were dropped, whose depth is not missed.
+        """
         for each in self.images.before(stamp_ns):
+            if each in dropped:
+                continue
             self._log.note(
                 Fault.LONE_DEPTH,
                 f'depth of {each} ns belongs to no image, or comes too late: wanted the stamp of '

@@ -61,7 +61,7 @@ from hmt_ros.tracking.ground import KnownGround
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.headers import SECOND_NS, time_ns
-from msg_tools.messages.pose_mixtures import pose_mixture_of
+from msg_tools.messages.pose_mixtures import TrackState, pose_mixture_of
 
 __all__ = [
     'CAMERA_INFO',
@@ -108,6 +108,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         p = parameters
         self.frames = CameraFrames(p.gravity_frame, p.fixed_frame, floor=p.floor_in_gravity_frame)
         self._tracker: Tracker | None = None
+        self._tracks = 0
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
         self._keypoints = KeypointInputs(self._log)
@@ -132,28 +133,28 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     def _take(self, source: str, message: Any, stamp: int) -> None:
         if source == KEYPOINTS:
             self._keypoints.put(message, stamp, self.parameters, self.start.body)
-            self._estimate_what_is_ready()
         elif source == KEYPOINTS_3D:
             self._keypoints.put_3d(message, stamp)
-            self._estimate_what_is_ready()
         elif source == DEPTH:
             if self.parameters.use_depth:
                 self._depths.put(message, stamp)
-                self._estimate_what_is_ready()
         elif source == PREDICTION:
             self._predictions.put(stamp, self._prediction_in(message))
-            self._estimate_what_is_ready()
         elif source in TRANSFORMS:
             self._take_transforms(message, static=source == TF_STATIC)
         else:
             super()._take(source, message, stamp)
 
     def _forget(self) -> None:
+        if self._tracker is not None:
+            self._tracks = self._tracker.track_id
         self._tracker = None
         self._shown_body = None
 
     def _forget_inputs(self, stamp: int) -> None:
         super()._forget_inputs(stamp)
+        # Where time begins again, so do the numbers of the tracks.
+        self._tracker, self._tracks = None, 0
         self._keypoints.clear()
         self._depths.images.clear()
         self._predictions.clear()
@@ -169,7 +170,6 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             return
         for text in self.frames.take(message, static=static):
             self._log.note(Fault.TRANSFORM, text)
-        self._estimate_what_is_ready()
 
     def _start_anew(self) -> None:
         try:
@@ -184,7 +184,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     def _prediction_in(self, message: Any) -> PosePrediction | Status | None:
         """The mixture and its body, see `body_of`; `NOBODY`: was seen; None: not to be used."""
         if len(message.components) == 0:
-            return Status.NOBODY
+            # A predictor that leaves the image to the track has seen neither somebody nor nobody.
+            return None if message.state == TrackState.TRACKING else Status.NOBODY
         try:
             content = pose_mixture_of(message)
             return PosePrediction(content.mixture, body_of(content, self.start.body))
@@ -192,22 +193,31 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             self._log.fault(Fault.PREDICTION, f'pose_prediction: {error}')
             return None
 
-    def _is_ready(self, stamp: int) -> bool:
+    def _waits_for_inputs(self) -> bool:
+        p = self.parameters
         return (
-            super()._is_ready(stamp)
-            and self._missing_here(stamp) is None
-            and self._has_transforms()
+            super()._waits_for_inputs()
+            or p.use_keypoints
+            or p.use_depth
+            or p.use_predictions
+            or self.frames.wanted
         )
 
-    def _has_transforms(self) -> bool:
-        """Whether the oldest image need not wait for transforms."""
-        p, oldest = self.parameters, self._waiting[0]
-        if not self.frames.wanted or len(self._waiting) > p.queue_size:
+    def _is_ready(self, waiting: WaitingImage) -> bool:
+        return (
+            super()._is_ready(waiting)
+            and self._missing_here(waiting.stamp_ns) is None
+            and self._has_transforms(waiting)
+        )
+
+    def _has_transforms(self, waiting: WaitingImage) -> bool:
+        """Whether an image need not wait for transforms."""
+        if not self.frames.wanted or len(self._waiting) > self.most_waiting:
             return True
-        timeout = p.input_timeout * SECOND_NS
+        timeout = self.parameters.input_timeout * SECOND_NS
         assert self._newest is not None
-        return self._newest - oldest.stamp_ns > timeout or self.frames.is_settled(
-            self._frame_of(oldest), oldest.stamp_ns, timeout
+        return self._newest - waiting.stamp_ns > timeout or self.frames.is_settled(
+            self._frame_of(waiting), waiting.stamp_ns, timeout
         )
 
     def _missing_input(self, stamp: int) -> Fault:
@@ -236,13 +246,16 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if p.use_keypoints:
             keypoints = self._keypoints.take(stamp, p, self.start.body)
         prediction = self._predictions.take(stamp) if p.use_predictions else None
-        depth = self._depths.take(waiting.image, stamp) if p.use_depth else None
+        depth = None
+        if p.use_depth:
+            depth = self._depths.take(waiting.image, stamp, self._dropped)
         starts = self._tracker is None or self._tracker.status is Status.WAITING
         try:
             self._look_at_frames(waiting)
             if self._tracker is None:
                 known = self.frames.known_ground(self.start.parameters.known_ground)
                 self._tracker = self.start.tracker(camera, known)
+                self._tracker.track_id = self._tracks
             elif self.frames.newest:
                 seen = self.frames.known_ground(KnownGround())
                 assert seen.up is not None
@@ -322,10 +335,15 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             posterior=posterior,
             likelihood=likelihood,
             log_likelihoods=tracker.modes.log_likelihoods,
+            likelihood_values=tracker.log_likelihoods,
             point=tracker.point_estimate,
             ground=tracker.ground,
             contacts=tracker.contacts,
             starts=starts,
+            state=TrackState.LOST if tracker.status is Status.LOST else TrackState.TRACKING,
+            track_id=tracker.track_id,
+            identities=tracker.modes.identities,
+            velocities=tracker.velocities,
         )
         presentation = Presentation(
             tracker.settings.max_hypotheses,
@@ -353,6 +371,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         nobody_messages(
             self._messages,
             tracker.body,
+            tracker.track_id,
             tracker.settings.max_hypotheses,
             waiting.stamp_ns,
             waiting.frame_id,
@@ -378,7 +397,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             evaluations=0 if tracker is None else tracker.evaluations,
             background='unknown' if silhouettes is None else silhouettes.known,
             doubted=silhouettes is not None and silhouettes.doubted,
-            track_id=0 if self._tracker is None else self._tracker.track_id,
+            track_id=self._tracks if self._tracker is None else self._tracker.track_id,
             started_from='' if source is None else source.value,
         )
 

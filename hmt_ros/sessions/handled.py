@@ -53,6 +53,8 @@ class Fault(Enum):
     NEW_BODY = 'new body'
     MIXTURE_KIND = 'kind of mixture'
     GAP = 'gap'
+    HUMAN = 'reference model'
+    NO_IMAGE = 'no image'
 
 
 class Output(NamedTuple):
@@ -130,6 +132,11 @@ class HandlingLog:
         """Reports a message that was to be estimated from and can not be used."""
         self.counts['skipped'] += 1
         self.fault(kind, text)
+
+    def drop(self, text: str) -> None:
+        """Reports a message that is not estimated from because the node is late; no fault of it."""
+        self.counts['dropped'] += 1
+        self._told.append(one_line(text))
 
     def count_dropped(self, messages: int) -> None:
         """Counts messages that were dropped before they came here."""

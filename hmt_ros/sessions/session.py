@@ -82,6 +82,11 @@ def everything(_topic: str) -> bool:
     return True
 
 
+def never() -> bool:
+    """Nothing comes while an estimate is made."""
+    return False
+
+
 Parameters = TypeVar('Parameters', bound=NodeParameters)
 State = TypeVar('State', bound=SessionState)
 
@@ -108,6 +113,7 @@ class Session(ABC, Generic[Parameters, State]):
         ESTIMATE: what starts anew when time jumps back.
         CHECKED: parameters whose values only a new session can check: names of files, say.
         parameters: a new value takes effect as `declared_parameters` says.
+        interrupted: whether messages have come during an estimate; a node sets it.
         state: replaced with every message.
     """
 
@@ -127,23 +133,32 @@ class Session(ABC, Generic[Parameters, State]):
         wanted: Callable[[str], bool] = everything,
     ) -> None:
         self.parameters = parameters
+        self.interrupted: Callable[[], bool] = never
         self._publish_output = publish
         self._wanted = wanted
         self._messages = RosbagsMessages()
         self._log = HandlingLog()
         self._weights = np.empty(0)
 
-    def take(self, source: str, message: Any) -> Handled:
+    @property
+    def most_waiting(self) -> int:
+        """Maximum number of messages to be estimated from that wait for an estimate."""
+        return self.parameters.queue_size
+
+    def take(self, source: str, message: Any, *, more: bool = False) -> Handled:
         """Handles a message.
 
         Args:
             source: a source that the module of the session names.
             message: of the type of the source, from `rosbags` or ROS.
+            more: whether another message has come already; what can wait is left until then.
         """
         self._log.begin()
         stamp = self._stamp_of(source, message)
         self._log.counts['received'] += source == self.COUNTED
         self._take(source, message, stamp)
+        if not more:
+            self._use_what_has_come()
         return self._handled(source, stamp)
 
     def restart(self) -> None:
@@ -152,11 +167,20 @@ class Session(ABC, Generic[Parameters, State]):
         self._weights = np.empty(0)
         self.state = self._present_state()
 
-    def refuse(self, source: str, text: str) -> Handled:
-        """Counts a message that could not be read."""
+    def refuse(self, source: str, text: str, *, more: bool = False) -> Handled:
+        """Counts a message that could not be read; `more` as for `take`."""
         self._log.begin()
         self._log.fault(Fault.MESSAGE, f'message of {source} can not be read: {text}')
+        if not more:
+            self._use_what_has_come()
         return self._handled(source, 0)
+
+    def drop(self, stamp_ns: int) -> Handled:
+        """Reports a message to be estimated from that was dropped before it came here."""
+        self._log.begin()
+        self._log.counts['received'] += 1
+        self._log.drop(self._late(stamp_ns))
+        return self._handled(self.COUNTED, stamp_ns)
 
     def break_off(self, source: str, text: str) -> Handled:
         """Counts an error of the session itself, and restarts the estimate."""
@@ -174,6 +198,13 @@ class Session(ABC, Generic[Parameters, State]):
     @abstractmethod
     def _take(self, source: str, message: Any, stamp: int) -> None:
         """Handles a message; `take` reports on it."""
+
+    def _use_what_has_come(self) -> None:
+        """Estimates from what `_take` has put aside."""
+
+    def _late(self, stamp_ns: int) -> str:
+        """Why a message is dropped."""
+        return f'{self.UNIT} of {stamp_ns} ns is dropped: newer ones came before its turn'
 
     @abstractmethod
     def _forget(self) -> None:

@@ -15,7 +15,12 @@ from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
 from msg_tools import MessageFactory
 from msg_tools.messages.markers import trajectory_markers
-from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.pose_mixtures import (
+    MixtureKind,
+    PoseMixture,
+    TrackState,
+    pose_mixture_message,
+)
 from msg_tools.messages.states import heaviest_joint_state
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture as TrajectoryContent
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
@@ -30,6 +35,7 @@ TOPICS = {
 TRACED = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
 # The heaviest trajectories that are drawn.
 DRAWN = 8
+_TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +44,13 @@ class SmoothedBody:
 
     Attributes:
         body: at its present lengths.
-        frame_id: optical frame of the camera.
+        frame_id: that the poses are in.
+        track_id: number of the track of the filter; 0: unknown.
     """
 
     body: Body
     frame_id: str
+    track_id: int = 0
 
 
 def trajectory_content(
@@ -58,6 +66,8 @@ def trajectory_content(
         dof_names=of.body.dof_names,
         frame_id=of.frame_id,
         segment_lengths=of.body.segment_lengths,
+        joint_names=of.body.joint_names,
+        joint_positions=_joints(found.means, of.body),
     )
 
 
@@ -87,14 +97,12 @@ def window_messages(
         assert found.stamps_ns is not None
         body = of.body
         chosen = np.argsort(-found.weights, kind='stable')[:DRAWN]
-        means = found.means[chosen]
-        joints = body.joint_positions(means.reshape(-1, body.dimension))
         names = body.joint_names
         publish(
             'trajectory_markers',
             trajectory_markers(
                 messages,
-                joints.reshape(*means.shape[:2], len(names), 3),
+                _joints(found.means[chosen], body),
                 names,
                 TRACED,
                 [(names[a], names[b]) for a, b in body.skeleton.bones],
@@ -111,6 +119,7 @@ def final_messages(
     pose: FinalPose,
     of: SmoothedBody,
     *,
+    state: TrackState,
     components: int,
     wanted: Callable[[str], bool],
     publish: Callable[[str, Any], None],
@@ -121,6 +130,7 @@ def final_messages(
         messages: factory.
         pose: its density.
         of: whose pose it is.
+        state: of the track at that time.
         components: maximum number of components of the message.
         wanted: whether a topic is to be made.
         publish: takes the topic and the message, one after the other.
@@ -137,6 +147,9 @@ def final_messages(
         MixtureKind.SMOOTHED,
         pose.stamp_ns,
         of.frame_id,
+        state=state,
+        track_id=of.track_id,
+        **_followed(pose, mixture),
     )
     if wanted('smoothed_pose_mixture'):
         publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
@@ -169,8 +182,38 @@ def nobody_messages(
         )
         publish('trajectory_markers', markers)
     if wanted('smoothed_pose_mixture'):
-        content = PoseMixture.of_body(body, None, MixtureKind.SMOOTHED, stamp_ns, frame)
+        content = PoseMixture.of_body(
+            body,
+            None,
+            MixtureKind.SMOOTHED,
+            stamp_ns,
+            frame,
+            state=TrackState.NOBODY,
+            track_id=of.track_id,
+        )
         publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
+
+
+def _followed(pose: FinalPose, reduced: GaussianMixture) -> dict[str, Array | None]:
+    """Identities and velocities of components: those of the trajectories that they stand for."""
+    densities = pose.mixture.component_log_densities(reduced.means)
+    stands_for = np.argmax(densities + np.log(np.maximum(pose.mixture.weights, _TINY)), axis=1)
+    identities = np.zeros(len(reduced))
+    taken: set[int] = set()
+    for k in np.argsort(-reduced.weights, kind='stable'):
+        # Of components that stand for one trajectory, the heaviest has its identity.
+        trajectory = int(stands_for[k])
+        if trajectory not in taken:
+            taken.add(trajectory)
+            identities[k] = 1 + pose.identities[trajectory]
+    velocities = None if pose.velocities is None else pose.velocities[stands_for]
+    return {'identities': identities, 'velocities': velocities}
+
+
+def _joints(means: Array, body: Body) -> Array:
+    """Joint positions (M, T, J, 3) of trajectories (M, T, d)."""
+    joints = body.joint_positions(means.reshape(-1, body.dimension))
+    return joints.reshape(*means.shape[:2], len(body.joint_names), 3)
 
 
 def _without_covariances(found: TrajectoryMixture) -> dict[str, Any]:

@@ -9,8 +9,9 @@ same order give the same bytes. The rules:
 - A mixture that is not younger than the one before is skipped, or starts a new window with
   `reset_on_time_jump`.
 - A mixture names its body and carries the segment lengths of the person; without lengths it is
-  about the model at its own lengths. Another body, lengths that jump or another frame are a new
-  track, and start a new window; lengths that change slowly are estimated better and better.
+  about the model at its own lengths. Another body, lengths that jump, another frame or another
+  track_id are a new track, and start a new window; lengths that change slowly are estimated better
+  and better.
 - A likelihood without components says that nobody is in view any more: the window ends, and a
   smoothed mixture without components and markers that remove those before go out.
 - The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
@@ -46,7 +47,12 @@ from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.message_error import MessageFault
-from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_of
+from msg_tools.messages.pose_mixtures import (
+    MixtureKind,
+    PoseMixture,
+    TrackState,
+    pose_mixture_of,
+)
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
 MIXTURE = 'likelihood_mixture'
@@ -131,6 +137,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._of: SmoothedBody | None = None
         self._resolved: tuple[Any, SmoothedBody] | None = None
         self._window: SlidingWindow | None = None
+        self._states: dict[int, TrackState] = {}
         self._newest: int | None = None
         self._nobody = False
         self._gaps, self._longest_gap = 0, 0.0
@@ -148,6 +155,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
 
     def _forget(self) -> None:
         self._window = None
+        self._states = {}
         self._newest = None
         self._nobody = False
         self.kept = KeptMixtures(self._of, ())
@@ -197,6 +205,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._end_window()
             return
         self._newest, self._nobody = stamp, False
+        self._states[stamp] = content.state
         self._log.counts['smoothed'] += 1
         self.kept = KeptMixtures(of, (*self.kept.items, (stamp, mixture))[-p.window_length :])
         self._weights = update.trajectories.weights
@@ -233,7 +242,13 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         Raises:
             MessageError: a body that is not known, or not the one that the parameters name.
         """
-        about = content.body_model, content.dof_names, content.segment_lengths, content.frame_id
+        about = (
+            content.body_model,
+            content.dof_names,
+            content.segment_lengths,
+            content.frame_id,
+            content.track_id,
+        )
         if self._window is not None and self._resolved is not None and self._resolved[0] == about:
             return self._resolved[1]
         chosen = self.parameters.body_model
@@ -242,7 +257,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             model = known_body(chosen) if chosen else known_body(content.body_model, named_body)
         except ValueError as error:
             raise MessageError(str(error), MessageFault.BODY) from error
-        of = SmoothedBody(body_of(content, model, any_name=bool(chosen)), content.frame_id)
+        body = body_of(content, model, any_name=bool(chosen))
+        of = SmoothedBody(body, content.frame_id, content.track_id)
         self._resolved = about, of
         return of
 
@@ -253,7 +269,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._of = of
             return
         if self._newest is not None:
-            text = 'mixtures are about another body: a new window begins'
+            text = 'mixtures are about another body or another track: a new window begins'
             self._log.note(Fault.NEW_BODY, text)
         self._end_window()
         self._of = of
@@ -290,6 +306,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._messages,
             pose,
             of,
+            state=self._states.pop(pose.stamp_ns),
             components=self.parameters.max_hypotheses,
             wanted=self._wanted,
             publish=lambda topic, made: self._publish(topic, pose.stamp_ns, made),
@@ -358,6 +375,8 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:
     """Whether two bodies are one person, whose lengths are estimated from image to image."""
     if (one.body.name, one.frame_id) != (other.body.name, other.frame_id):
+        return False
+    if 0 not in (one.track_id, other.track_id) and one.track_id != other.track_id:
         return False
     change = np.abs(one.body.skeleton.lengths - other.body.skeleton.lengths)
     return bool(change.max(initial=0.0) <= SAME_PERSON)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.tracking.ground import Ground
@@ -27,7 +27,12 @@ from msg_tools.messages.ground import GROUND, GroundState, ground_message
 from msg_tools.messages.ground_markers import ground_markers, removed_ground
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.markers import skeleton_markers
-from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.pose_mixtures import (
+    MixtureKind,
+    PoseMixture,
+    TrackState,
+    pose_mixture_message,
+)
 from msg_tools.messages.states import joint_state_message, transforms_message
 from msg_tools.messages.urdf import link_frames
 
@@ -56,10 +61,15 @@ class TrackedImage:
         body, camera: of the track.
         posterior, likelihood: mixtures over poses, heaviest first.
         log_likelihoods: (K,) of the image at the means of the posterior.
+        likelihood_values: (L,) the same at the means of the likelihood.
         point: (d,) the point estimate, for those who want one pose.
         ground: gravity and the floor, as far as they are known.
         contacts: probabilities that the feet stand on the floor, by name.
         starts: whether the body is a new one, with other lengths than the image before.
+        state: of the track.
+        track_id: number of the track.
+        identities: (K,) of the components of the posterior.
+        velocities: (K, d) of the components of the posterior, per second; None: unknown.
     """
 
     image: NDArray[np.uint8]
@@ -70,10 +80,15 @@ class TrackedImage:
     posterior: GaussianMixture
     likelihood: GaussianMixture
     log_likelihoods: Array
+    likelihood_values: Array
     point: Array
     ground: Ground
     contacts: Mapping[str, float]
     starts: bool
+    state: TrackState = TrackState.UNKNOWN
+    track_id: int = 0
+    identities: Index | None = None
+    velocities: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -128,9 +143,20 @@ def track_messages(
         frame,
         joint_positions=joints,
         log_likelihoods=track.log_likelihoods,
+        state=track.state,
+        track_id=track.track_id,
+        identities=track.identities,
+        velocities=track.velocities,
     )
     likelihood = PoseMixture.of_body(
-        track.body, track.likelihood, MixtureKind.LIKELIHOOD, stamp, frame
+        track.body,
+        track.likelihood,
+        MixtureKind.LIKELIHOOD,
+        stamp,
+        frame,
+        state=track.state,
+        track_id=track.track_id,
+        log_likelihoods=track.likelihood_values,
     )
     ground = _ground_state(track)
     if track.starts:
@@ -182,6 +208,7 @@ def track_messages(
 def nobody_messages(
     messages: MessageFactory,
     body: Body,
+    track_id: int,
     ranks: int,
     stamp_ns: int,
     frame_id: str,
@@ -195,6 +222,7 @@ def nobody_messages(
     Args:
         messages: factory.
         body: of the track.
+        track_id: its number.
         ranks: maximum number of modes of the track, whose markers are removed.
         stamp_ns, frame_id: of the image.
         image: (H, W, 3) BGR, shown without modes; None: no overlay.
@@ -204,7 +232,9 @@ def nobody_messages(
     kinds = {'pose_mixture': MixtureKind.POSTERIOR, 'likelihood_mixture': MixtureKind.LIKELIHOOD}
     for topic, kind in kinds.items():
         if wanted(topic):
-            content = PoseMixture.of_body(body, None, kind, stamp_ns, frame_id)
+            content = PoseMixture.of_body(
+                body, None, kind, stamp_ns, frame_id, state=TrackState.NOBODY, track_id=track_id
+            )
             publish(topic, pose_mixture_message(messages, content))
     if wanted('markers'):
         names = body.joint_names

@@ -43,10 +43,14 @@ class FinalPose:
     Attributes:
         stamp_ns: its time.
         mixture: its marginal, a component for each trajectory of the window.
+        velocities: (M, d) of the components, per second; None: unknown.
+        identities: (M,) of the trajectories.
     """
 
     stamp_ns: int
     mixture: GaussianMixture
+    velocities: Array | None
+    identities: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +133,7 @@ class SlidingWindow:
         final: tuple[FinalPose, ...] = ()
         if len(self._stamps) == self.fixed_lag + 1:
             found = replace(found, final_until_ns=self._stamps[0])
-            final = (FinalPose(self._stamps[0], found.marginal(0)),)
+            final = (_final_pose(found, 0),)
         self._last = found
         return WindowUpdate(found, final)
 
@@ -140,7 +144,7 @@ class SlidingWindow:
             return ()
         until = last.final_until_ns
         result = tuple(
-            FinalPose(stamp, last.marginal(t))
+            _final_pose(last, t)
             for t, stamp in enumerate(last.stamps_ns)
             if until is None or stamp > until
         )
@@ -195,6 +199,13 @@ class SlidingWindow:
             numbers[i] = self._next_identity
             self._next_identity += 1
         return tuple(int(number) for number in numbers)
+
+
+def _final_pose(found: TrajectoryMixture, t: int) -> FinalPose:
+    """The pose at index t."""
+    assert found.stamps_ns is not None
+    velocities = None if found.velocities is None else found.velocities[:, t]
+    return FinalPose(found.stamps_ns[t], found.marginal(t), velocities, found.identities)
 
 
 def first_state(mixture: GaussianMixture, dynamics: LinearGaussianDynamics) -> GaussianMixture:

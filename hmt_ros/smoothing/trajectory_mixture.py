@@ -110,6 +110,20 @@ class TrajectoryMixture:
             result[i] = scale**2 * factor.inverse_blocks()[0][:, :d, :d]
         return result
 
+    @cached_property
+    def velocities(self) -> Array | None:
+        """Velocities of the poses, (M, T, d) per second; None: unknown.
+
+        They are those of the states or, where a state is a pose alone, differences: of both
+        neighbours, at the ends of the one that there is.
+        """
+        if self.states.shape[2] == 2 * self.dimension:
+            return self.states[:, :, self.dimension :]
+        if self.stamps_ns is None or self.times < 2:
+            return None
+        seconds = (np.array(self.stamps_ns) - self.stamps_ns[0]) * 1e-9
+        return np.asarray(np.gradient(self.means, seconds, axis=1))
+
     def marginal(self, t: int) -> GaussianMixture:
         """The density of the pose at index t, a component for each trajectory."""
         return GaussianMixture(self.weights, self.means[:, t], self.marginal_covariances[:, t])

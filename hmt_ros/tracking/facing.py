@@ -106,8 +106,8 @@ class Track:
         modes = self._first.modes
         return modes if len(self._filters) == 1 else _joined(*self._filters)
 
-    def likelihood_mixture(self, observation: Observation) -> GaussianMixture:
-        """The modes of the likelihood alone."""
+    def likelihood_mixture(self, observation: Observation) -> tuple[GaussianMixture, Array]:
+        """The modes of the likelihood alone, and its log at their means; see `likelihood_modes`."""
         return self._first.likelihood_mixture(self.modes, observation)
 
     def begin(

@@ -18,7 +18,7 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
@@ -27,7 +27,14 @@ from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.contact import FootContacts
 from hmt_ros.tracking.facing_odds import FacingOdds
 from hmt_ros.tracking.ground import GroundEstimator
-from hmt_ros.tracking.hypotheses import Modes, Optimised, new_hypotheses, relative_joints
+from hmt_ros.tracking.hypotheses import (
+    Hypotheses,
+    Identities,
+    Modes,
+    Optimised,
+    new_hypotheses,
+    relative_joints,
+)
 from hmt_ros.tracking.laplace_approximation import likelihood_modes, posterior_modes
 from hmt_ros.tracking.loss import unexplained_share
 from hmt_ros.tracking.motion_states import PredictedStates
@@ -95,6 +102,7 @@ class MixtureFilter:
         self._seed = seed
         self._rng = np.random.default_rng(seed)
         self._modes: Modes | None = None
+        self._identities = Identities()
         self.shape = ShapeEstimate(body)
         self.recall = SilhouetteRecall(len(body.skeleton.parents))
         self._observed: tuple[Observation, Observation] | None = None
@@ -171,6 +179,7 @@ class MixtureFilter:
         self.shape = ShapeEstimate(body)
 
         def settle(starts: Array, iterations: int) -> Minimum:
+            self._identities.restart()
             term = self._posterior.around(observation, poses, precisions)
             solved = self._posterior.minimise(term, starts, iterations)
             self.hold(solved, log_weights, observation)
@@ -206,6 +215,7 @@ class MixtureFilter:
         extra, ground = self._posterior.extra, self._posterior.ground
         other = MixtureFilter(self.body, self.camera, self.settings, self._seed + 1, extra, ground)
         other.shape = deepcopy(self.shape)
+        other._identities = self._identities
         return other
 
     def absorb(self, modes: Modes, observation: Observation) -> None:
@@ -293,8 +303,10 @@ class MixtureFilter:
         )  # fmt: skip
         self._bad_images = self._bad_images + 1 if self.misfit > self.settings.lost_misfit else 0
 
-    def likelihood_mixture(self, modes: Modes, observation: Observation) -> GaussianMixture:
-        """The modes of the likelihood alone, without what was known from the images before."""
+    def likelihood_mixture(
+        self, modes: Modes, observation: Observation
+    ) -> tuple[GaussianMixture, Array]:
+        """See `likelihood_modes`."""
         return likelihood_modes(modes, self._posterior, self._believed(observation))
 
     # The steps.
@@ -351,14 +363,22 @@ class MixtureFilter:
         order = np.argsort(-weights, kind='stable')
         selected, posterior = optimised[rows[order]], self._posterior
         self._modes = modes = posterior_modes(
-            selected, weights[order], posterior, observation, self.shape, self.dynamics, states
-        )
+            selected, weights[order], posterior, observation, self.shape, self.dynamics, states,
+            self._identities_of(selected.hypotheses, anew=states is None),
+        )  # fmt: skip
         posterior.exchanges.update(
             posterior.likelihood, observation, modes.poses,
             posterior.exchanges_of(selected.hypotheses),
         )  # fmt: skip
         self._outline_costs = posterior.fit(modes.poses, observation).outline_costs
         return float(solved.value.min())
+
+    def _identities_of(self, selected: Hypotheses, *, anew: bool) -> Index:
+        """Identities of hypotheses that become modes, heaviest first."""
+        if anew:
+            return self._identities.new(len(selected))
+        before = self.modes.identities
+        return self._identities.inherited(before, selected.ancestors, selected.jumped)
 
     def _stand(self, dt: float | None) -> None:
         """Takes in how the modes stand, dt after their ancestors, s; None: they have none."""

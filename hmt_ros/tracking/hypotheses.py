@@ -100,6 +100,7 @@ class Modes(Hypotheses):
         state_covariances: (N, n, n) that are propagated, of poses and velocities. Of a random walk
             they are `filtered`; with velocities only a share of the images is believed, because
             their errors last.
+        identities: (N,) see `Identities`.
     """
 
     velocities: Array
@@ -108,6 +109,7 @@ class Modes(Hypotheses):
     log_likelihoods: Array
     energies: Array
     state_covariances: Array
+    identities: Index
 
     def mixture(self, share: float) -> GaussianMixture:
         """The modes as a mixture over poses.
@@ -119,6 +121,48 @@ class Modes(Hypotheses):
         log_weights = share * self.log_weights
         weights = np.exp(log_weights - np.logaddexp.reduce(log_weights))
         return GaussianMixture(weights, self.poses, self.covariances)
+
+
+class Identities:
+    """Numbers of the modes of a track, from 1 on, that last from image to image.
+
+    A mode keeps the number of its ancestor if it is the heaviest of the descendants that moved
+    there, or, where all of them have jumped with some limb, the heaviest of these. Every other
+    mode, and one that was placed anew as a whole, gets a number that no mode has had before.
+    """
+
+    def __init__(self) -> None:
+        self._last = 0
+
+    def restart(self) -> None:
+        """Counts from 1 again: a track begins."""
+        self._last = 0
+
+    def new(self, count: int) -> Index:
+        """Numbers (count,) that no mode has had."""
+        first, self._last = self._last + 1, self._last + count
+        return np.arange(first, self._last + 1)
+
+    def inherited(self, before: Index, ancestors: Index, jumped: NDArray[np.bool_]) -> Index:
+        """Numbers (N,) of the modes of an image, heaviest first.
+
+        Args:
+            before: (K,) of the modes of the image before.
+            ancestors: (N,) mode of that image that each comes from.
+            jumped: (N, d) degrees of freedom that did not move, but jumped.
+        """
+        heirs: dict[int, int] = {}
+        for candidates in (~jumped.any(1), ~jumped.all(1)):
+            taken = set(heirs)
+            for k in np.flatnonzero(candidates):
+                if int(ancestors[k]) not in taken:
+                    heirs.setdefault(int(ancestors[k]), int(k))
+        result = np.zeros(len(ancestors), dtype=np.intp)
+        for ancestor, heir in heirs.items():
+            result[heir] = before[ancestor]
+        fresh = np.flatnonzero(result == 0)
+        result[fresh] = self.new(len(fresh))
+        return result
 
 
 def new_hypotheses(poses: Array, log_weights: Array) -> Hypotheses:

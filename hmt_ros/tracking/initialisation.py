@@ -219,8 +219,8 @@ def _is_a_stature(body: Body, lengths: Array) -> bool:
     """Whether a person of a body's kind may have lengths (L,)."""
     rates = body.stature_rates
     change = float(rates @ (lengths - body.skeleton.lengths))
-    sigma = float(np.sqrt(rates @ body.length_covariance @ rates))
-    return abs(change) <= MOST_UNUSUAL * np.hypot(sigma, STATURE_MEASURED)
+    variance = float(rates @ body.length_covariance @ rates) + STATURE_MEASURED**2
+    return abs(change) <= MOST_UNUSUAL * variance**0.5
 
 
 def _fit_with_lengths(

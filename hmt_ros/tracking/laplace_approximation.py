@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.image.observation import Observation
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import resting
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
@@ -33,6 +33,7 @@ def posterior_modes(
     shape: ShapeEstimate,
     dynamics: LinearGaussianDynamics,
     states: PredictedStates | None,
+    identities: Index,
 ) -> Modes:
     """The modes of the posterior.
 
@@ -44,6 +45,7 @@ def posterior_modes(
         shape: of the person, as far as it is known.
         dynamics: how modes move by themselves.
         states: of the ancestors, predicted; None: the modes begin, at rest.
+        identities: (K,) of the modes.
     """
     h, solved = selected.hypotheses, selected.minima
     poses = solved.x
@@ -53,7 +55,9 @@ def posterior_modes(
     images = bool(observation.evidence)
     measured = images or observation.keypoints is not None
     if measured:
-        alone = posterior.covariances(fit, solved.free, keypoints_alone=not images)
+        # In the first image no error of keypoints has lasted yet: their noise holds all of it.
+        if images or states is not None:
+            alone = posterior.covariances(fit, solved.free, keypoints_alone=not images)
         covariances = alone + shape.considered(
             posterior.likelihood, observation, poses, posterior.given_way(poses, observation)[1]
         )
@@ -80,12 +84,13 @@ def posterior_modes(
         log_likelihoods=-fit.image_energy,
         energies=solved.value,
         state_covariances=state_covariances,
+        identities=identities,
     )
 
 
 def likelihood_modes(
     modes: Modes, posterior: Posterior, observation: Observation
-) -> GaussianMixture:
+) -> tuple[GaussianMixture, Array]:
     """The modes of the likelihood alone, without what was known from the images before.
 
     Around each mode of the posterior the energy of the image and of the body's prior is a
@@ -95,6 +100,10 @@ def likelihood_modes(
         modes: of the posterior, K.
         posterior: of the image.
         observation: of the image.
+
+    Returns:
+        The mixture, heaviest component first, and the log likelihoods (K,) of the image at its
+        means.
     """
     body, poses = posterior.body, modes.poses
     fit = posterior.fit(poses, observation)
@@ -110,4 +119,5 @@ def likelihood_modes(
     nothing = np.zeros(len(poses))
     beta = posterior.trust.inverse_temperature
     weights = np.exp(normalised(weigh(nothing, fit.energy.value, beta)))
-    return GaussianMixture(weights, means, covariances).sorted()
+    mixture = GaussianMixture(weights, means, covariances).sorted()
+    return mixture, posterior.log_likelihoods(mixture.means, observation)

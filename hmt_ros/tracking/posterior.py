@@ -239,6 +239,14 @@ class Posterior:
         self._last_fit = (poses, observation, fit)
         return fit
 
+    def log_likelihoods(self, poses: Array, observation: Observation) -> Array:
+        """log p(image | pose) of poses (K, d), (K,), nats up to a constant of the image."""
+        frames, rows = forward(self.body.skeleton, poses), np.arange(len(poses))
+        energies = np.zeros(len(poses))
+        for term in self.likelihood.seen(observation):
+            energies += term.energy(frames, rows, derivatives=Derivatives.NONE).value
+        return -energies
+
     def given_way(self, poses: Array, observation: Observation) -> tuple[Array, Array]:
         """How poses (K, d) give way when something else changes, without what was expected.
 

@@ -79,6 +79,8 @@ class Tracker:
         ground: the present estimate of gravity and of the floor.
         contacts: probabilities that the feet stand on the floor, by name.
         evaluations: of the likelihood in the last image.
+        log_likelihoods: (K,) of the last tracked image at the means of its likelihood mixture, nats
+            up to a constant of the image.
         track_id: number of the present track, or of the last one; 0 before the first.
         started_from: what that track began from; None before the first.
     """
@@ -99,6 +101,7 @@ class Tracker:
         self.silhouettes = Silhouettes(background or BackgroundModel())
         self._observer = Observer(camera, self.settings.likelihood, self.silhouettes)
         self.evaluations = 0
+        self.log_likelihoods: Array = np.empty(0)
         self.track_id = 0
         self.started_from: Source | None = None
         self._seed = seed
@@ -293,6 +296,15 @@ class Tracker:
         return self._point.pose
 
     @property
+    def velocities(self) -> Array | None:
+        """Velocities (K, d) of the present modes, per second; None: unknown.
+
+        They are unknown in the first image of a track, and where poses walk randomly.
+        """
+        velocities = self.modes.velocities
+        return velocities if velocities.any() else None
+
+    @property
     def posterior(self) -> GaussianMixture:
         """The present posterior."""
         return self.modes.mixture(1.0 - self.settings.error_correlation)
@@ -340,7 +352,7 @@ class Tracker:
                 return None, None
             if not seen and view.silhouette is not None:
                 # Nothing is there to fit modes to.
-                return self._expected(stamp), self._track.likelihood_mixture(Observation())
+                return self._expected(stamp), self._likelihood(Observation())
             observation = self._observe(view, self.modes.poses[0])
             self._follow(observation, stamp, prediction)
         else:
@@ -359,7 +371,11 @@ class Tracker:
         self._point.update(self.body, self.modes.poses, np.exp(self.modes.log_weights), dt)
         self._observer.last_image, self._followed = view.image, stamp
         self.evaluations = self._track.evaluations
-        return self.posterior, self._track.likelihood_mixture(observation)
+        return self.posterior, self._likelihood(observation)
+
+    def _likelihood(self, observation: Observation) -> GaussianMixture:
+        mixture, self.log_likelihoods = self._track.likelihood_mixture(observation)
+        return mixture
 
     def _start_track(
         self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool

@@ -36,9 +36,10 @@ from msg_tools.bags.decompression import (
 from msg_tools.bags.mcap_file import McapFile
 from msg_tools.bags.sqlite_file import SqliteFile
 from msg_tools.messages.cdr import deserialise
-from msg_tools.messages.message_types import typestore_of_definition
+from msg_tools.messages.message_types import RosbagsMessages, typestore_of_definition
 
 _NEVER = 2**64  # later than any log time
+_OURS = 'hmt_msgs/'
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,9 @@ class BagMessage:
     @cached_property
     def message(self) -> Any:
         """The message, with the fields of its type; arrays are read-only.
+
+        One of hmt_msgs that was recorded with an older definition has today's fields; the new ones
+        are zero or empty.
 
         Raises:
             BagError: its bytes are not what its type wants, or the type is not known.
@@ -151,12 +155,22 @@ class BagReader(AbstractContextManager['BagReader']):
     def topic(self, name: str) -> Topic:
         """The topic of a name, with or without its leading slash.
 
+        A relative name that is not there means the topic of that name in a namespace, if only one
+        namespace has it.
+
         Raises:
-            BagError: there is none.
+            BagError: there is none, or several namespaces have it.
         """
         for candidate in (name, f'/{name}', name.removeprefix('/')):
             if candidate in self.topics:
                 return self.topics[candidate]
+        inside = [x for x in self.topics if not name.startswith('/') and x.endswith(f'/{name}')]
+        if len(inside) == 1:
+            return self.topics[inside[0]]
+        if inside:
+            raise BagError(
+                f'{self.path} has several topics {name}: name one of {", ".join(inside)}'
+            )
         self.raise_damage()
         raise BagError(f'{self.path} has no topic {name}; it has {self._topic_names()}')
 
@@ -258,12 +272,20 @@ class BagReader(AbstractContextManager['BagReader']):
             # Bags with the compression mode "message". No CDR message starts like this.
             if data[:4] == ZSTD_MAGIC:
                 data = memoryview(decompress_zstd(data))
-            return deserialise(data, stored.msgtype, store)
+            message = deserialise(data, stored.msgtype, store)
+            return self._adopted(message) if stored.msgtype.startswith(_OURS) else message
         except Exception as error:
             # Bytes from outside meet generated code here, which does not say what it may raise.
             raise BagError(
                 f'{what} can not be read as {stored.msgtype or "unknown type"}: {reason(error)}'
             ) from error
+
+    def _adopted(self, message: Any) -> Any:
+        """A message of this project with all fields it has today; as it is if that can not be."""
+        try:
+            return RosbagsMessages().adopt(message)
+        except TypeError:
+            return message
 
     def _check_encoding(self, topic: str, encoding: str) -> None:
         if encoding != 'cdr':

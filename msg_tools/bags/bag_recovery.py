@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from msg_tools.bags.bag_metadata import (
     read_file_names,
     recorded_quality_of_service,
 )
-from msg_tools.bags.contents import BagError, Channel, reason
+from msg_tools.bags.contents import BagError, Channel, absolute_name, reason
 from msg_tools.bags.decompression import ZSTD_MAGIC, DecompressionError, decompress_file
 from msg_tools.bags.mcap_salvage import (
     Loss,
@@ -32,6 +32,8 @@ from msg_tools.bags.mcap_salvage import (
 
 # Written anew.
 _OWN_METADATA = 'rosbag2'
+# Encoding of the messages of ROS 2.
+_OF_ROS_2 = 'cdr'
 
 
 @dataclass(frozen=True)
@@ -53,13 +55,19 @@ class Recovery:
     losses: tuple[str, ...]
 
 
-def recover_bag(source: str | os.PathLike[str], target: str | os.PathLike[str]) -> Recovery:
+def recover_bag(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    progress: Callable[[int | None], object] = lambda total: None,
+) -> Recovery:
     """Writes a new bag with all that is whole in another.
 
     Args:
         source: folder, also without metadata.yaml; an .mcap file, also compressed with zstd; or the
             name of a bag whose writer was killed, so that only its hidden folder is there.
         target: folder of the new bag; nothing that is there is overwritten.
+        progress: called for each message that was saved, with the number of messages that the bag
+            had; None where it does not tell.
 
     Raises:
         BagError: there is nothing to be saved, the target is there, the disk is full; then nothing
@@ -75,12 +83,14 @@ def recover_bag(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
             channels: dict[Channel, int] = {}
             topics: set[str] = set()
             messages = 0
+            total = _announced(files)
             for file in files:
                 for saved in file.content():
                     _write(folder, channels, saved)
                     if isinstance(saved, SavedMessage):
                         messages += 1
                         topics.add(saved.channel.channel.topic)
+                        progress(total)
             for file in files:
                 losses += [_line(file, loss) for loss in file.losses]
             if not messages:
@@ -90,13 +100,19 @@ def recover_bag(source: str | os.PathLike[str], target: str | os.PathLike[str]) 
         except BaseException:
             folder.abort()
             raise
-        announced = [file.announced for file in files]
+        announced = _announced(files)
     lost = None
-    if None not in announced and len(losses) == sum(len(file.losses) for file in files):
-        lost = max(0, sum(count or 0 for count in announced) - messages)
+    if announced is not None and len(losses) == sum(len(file.losses) for file in files):
+        lost = max(0, announced - messages)
     elif not losses:
         lost = 0
     return Recovery(folder.path, messages, len(topics), lost, tuple(losses))
+
+
+def _announced(files: list[McapSalvage]) -> int | None:
+    """Number of messages that the files had when they were complete; None if one does not tell."""
+    counts = [file.announced for file in files if file.announced is not None]
+    return sum(counts) if len(counts) == len(files) else None
 
 
 def _profile(files: list[McapSalvage]) -> str:
@@ -125,10 +141,14 @@ def _write(folder: BagFolder, channels: dict[Channel, int], saved: Saved) -> Non
 
 
 def _key(folder: BagFolder, channels: dict[Channel, int], saved: SavedChannel) -> int:
-    key = channels.get(saved.channel)
+    channel = saved.channel
+    if channel.encoding == _OF_ROS_2:
+        # As rosbag2 records it; topics of other systems may have names of another kind.
+        channel = channel._replace(topic=absolute_name(channel.topic))
+    key = channels.get(channel)
     if key is None:
         offered = recorded_quality_of_service(saved.offered_qos)
-        key = channels[saved.channel] = folder.add_channel(saved.channel, offered, saved.type_hash)
+        key = channels[channel] = folder.add_channel(channel, offered, saved.type_hash)
     return key
 
 

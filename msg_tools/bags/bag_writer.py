@@ -1,7 +1,9 @@
 """Writes messages into a bag that rosbag2 plays, as a whole or not at all.
 
-Log time and publish time are both the stamp that the caller gives. `msg_tools.bags.bag_folder`
-describes what happens to a bag that is not completed.
+Topics have absolute names, because rosbag2 compares names as they are written: a relative name is
+in the namespace of the bag, as the one of a node is in the node's. Log time and publish time are
+both the stamp that the caller gives. `msg_tools.bags.bag_folder` describes what happens to a bag
+that is not completed.
 
     with BagWriter('out') as bag:
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
@@ -16,7 +18,7 @@ from typing import Any, NamedTuple
 
 from msg_tools.bags.bag_folder import BagFolder
 from msg_tools.bags.bag_metadata import quality_of_service
-from msg_tools.bags.contents import BagError, Channel, reason
+from msg_tools.bags.contents import BagError, Channel, absolute_name, reason
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.message_types import typestore
 
@@ -32,14 +34,18 @@ class BagWriter(AbstractContextManager['BagWriter']):
     Args:
         path: folder to write, `<name>`; the file in it is `<name>.mcap`.
         overwrite: replace a bag that is there. Anything else that is there is never touched.
+        namespace: of the topics with relative names, '/humans/bodies/p1' for example.
 
     Raises:
         BagError: the folder exists, can not be created or written.
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], *, overwrite: bool = False, namespace: str = ''
+    ) -> None:
         self._folder = BagFolder(path, overwrite=overwrite)
         self.path = self._folder.path
+        self._namespace = namespace
         self._topics: dict[str, _Topic] = {}
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -52,14 +58,14 @@ class BagWriter(AbstractContextManager['BagWriter']):
         """Announces a topic; one that is written without is not latched.
 
         Args:
-            name: of the topic.
+            name: of the topic, absolute or relative to the namespace.
             msgtype: for example 'hmt_msgs/msg/PoseMixture'.
             latched: offered as transient local, so that late subscribers get the last message.
 
         Raises:
             BagError: an unknown type, or the topic is there already.
         """
-        store = typestore()
+        store, name = typestore(), absolute_name(name, self._namespace)
         if msgtype not in store.fielddefs:
             raise BagError(f'{self.path}: topic {name} can not have the unknown type {msgtype!r}')
         if name in self._topics:
@@ -78,7 +84,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         Raises:
             BagError: the topic has another type, a field does not fit the type, the disk is full.
         """
-        msgtype = message.__msgtype__
+        msgtype, topic = message.__msgtype__, absolute_name(topic, self._namespace)
         if topic not in self._topics:
             self.add_topic(topic, msgtype)
         if self._topics[topic].msgtype != msgtype:
@@ -100,6 +106,7 @@ class BagWriter(AbstractContextManager['BagWriter']):
         Raises:
             BagError: no such topic, a stamp before 1970, the disk is full.
         """
+        topic = absolute_name(topic, self._namespace)
         known = self._topics.get(topic)
         if known is None:
             raise BagError(f'{self.path}: topic {topic} has not been added')

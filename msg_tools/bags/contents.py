@@ -42,6 +42,19 @@ class BagError(ValueError):
         super().__init__(' '.join(text.split()))
 
 
+def absolute_name(topic: str, namespace: str = '') -> str:
+    """Name of a topic as rosbag2 records and compares it: with its namespace and a leading slash.
+
+    Args:
+        topic: a relative name is in the namespace; an absolute one stays.
+        namespace: '/humans/bodies/p1' for example; '' for the root.
+    """
+    if topic.startswith('/'):
+        return topic
+    inside = namespace.strip('/')
+    return f'/{inside}/{topic}' if inside else f'/{topic}'
+
+
 def reason(error: BaseException) -> str:
     """The text of a library's exception as one line of at most 160 characters."""
     if isinstance(error, OSError) and error.strerror:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 from msg_tools.messages.message_types import MessageFactory
 
 SECOND_NS = 1_000_000_000
 EARLIEST_NS = -(2**31) * SECOND_NS  # that a message can tell
+_STAMP_AT, _STAMP_SIZE = 4, 8  # bytes of CDR
 
 
 def time_message(messages: MessageFactory, stamp_ns: int) -> Any:
@@ -19,6 +21,16 @@ def time_message(messages: MessageFactory, stamp_ns: int) -> Any:
 def time_ns(time: Any) -> int:
     """Time in ns of a builtin_interfaces/Time, `message.header.stamp` for example."""
     return int(time.sec) * SECOND_NS + int(time.nanosec)
+
+
+def stamp_in(data: bytes) -> int:
+    """Stamp, ns, of the header that opens a message of CDR bytes; 0 if they are too short."""
+    # Behind the encapsulation, whose second byte tells the order of bytes.
+    if len(data) < _STAMP_AT + _STAMP_SIZE:
+        return 0
+    order = '<' if data[1] & 1 else '>'
+    seconds, nanoseconds = struct.unpack_from(f'{order}iI', data, _STAMP_AT)
+    return int(seconds) * SECOND_NS + int(nanoseconds)
 
 
 def header_message(messages: MessageFactory, stamp_ns: int, frame_id: str) -> Any:

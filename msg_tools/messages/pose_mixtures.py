@@ -49,6 +49,15 @@ class MixtureKind(IntEnum):
     GROUND_TRUTH = 4
 
 
+class TrackState(IntEnum):
+    """What is known of the person in view; the constants of PoseMixture.msg."""
+
+    UNKNOWN = 0
+    TRACKING = 1
+    LOST = 2
+    NOBODY = 3
+
+
 @dataclass(frozen=True, eq=False)
 class PoseMixture:
     """The content of the message: K components over d degrees of freedom.
@@ -69,6 +78,12 @@ class PoseMixture:
             body is then the one of the Body topic, or the model at its own lengths.
         log_likelihoods: (K,) log p(image | mean) up to a constant; NaN: unknown. None: all unknown.
         degrees_of_freedom: (K,) of Student components; 0: Gaussian. None: all Gaussian.
+        state: of the track, see `TrackState`.
+        track_id: number of the track, from 1 on; 0: belongs to no track.
+        identities: (K,) of the components, which last from image to image within a track, from 1
+            on; 0: no identity. None: all without.
+        joint_covariances: (K, J, 3, 3) m^2, of the joint positions; None: unknown.
+        joint_velocities: (K, J, 3) m/s, in the frame of the header; None: unknown.
 
     Raises:
         MessageError: shapes or values that a message must not have.
@@ -87,17 +102,24 @@ class PoseMixture:
     segment_lengths: Mapping[str, float] = field(default_factory=dict)
     log_likelihoods: Array | None = None
     degrees_of_freedom: Array | None = None
+    state: TrackState = TrackState.UNKNOWN
+    track_id: int = 0
+    identities: NDArray[np.uint32] | None = None
+    joint_covariances: Array | None = None
+    joint_velocities: Array | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'mixture: dof_names'))
         object.__setattr__(self, 'joint_names', names_of(self.joint_names, 'mixture: joint_names'))
         check_lengths(self.segment_lengths, 'mixture')
-        components, d = len(self.weights), len(self.dof_names)
+        components, d, joints = len(self.weights), len(self.dof_names), len(self.joint_names)
         shapes = {
             'weights': (components,),
             'means': (components, d),
             'covariances': (components, d, d),
-            'joint_positions': (components, len(self.joint_names), 3),
+            'joint_positions': (components, joints, 3),
+            'joint_covariances': (components, joints, 3, 3),
+            'joint_velocities': (components, joints, 3),
             'log_likelihoods': (components,),
             'degrees_of_freedom': (components,),
         }
@@ -105,9 +127,20 @@ class PoseMixture:
             object.__setattr__(self, 'log_likelihoods', np.full(components, np.nan))
         if self.degrees_of_freedom is None:
             object.__setattr__(self, 'degrees_of_freedom', np.zeros(components))
-        freeze_arrays(self, shapes, 'mixture', optional=('covariances',))
+        identities = np.zeros(components) if self.identities is None else self.identities
+        identities = np.array(identities, dtype=np.uint32)
+        if identities.shape != (components,):
+            raise MessageError(
+                f'mixture: identities has shape {identities.shape}, wanted {(components,)}'
+            )
+        identities.setflags(write=False)
+        object.__setattr__(self, 'identities', identities)
+        optional = ('covariances', 'joint_covariances', 'joint_velocities')
+        freeze_arrays(self, shapes, 'mixture', optional=optional)
         check_finite(self.means, 'mixture: mean')
-        check_finite(self.joint_positions, 'mixture: joint_positions')
+        for name in ('joint_positions', 'joint_covariances', 'joint_velocities'):
+            if (values := getattr(self, name)) is not None:
+                check_finite(values, f'mixture: {name}')
         if components:
             check_weights(self.weights, 'mixture')
         if self.covariances is not None:
@@ -124,14 +157,24 @@ class PoseMixture:
         *,
         joint_positions: Array | None = None,
         log_likelihoods: Array | None = None,
+        state: TrackState = TrackState.UNKNOWN,
+        track_id: int = 0,
+        identities: NDArray[Any] | None = None,
+        velocities: Array | None = None,
     ) -> PoseMixture:
         """A mixture over the poses of a body at its present lengths.
+
+        Covariances and velocities of the joints are those of the poses by linearisation,
+
+            S_joint = J S J',    v_joint = J v,    J = d joint / d pose at the mean
 
         Args:
             body: the person.
             mixture: K Gaussians over its poses; None: nobody was seen.
-            kind, stamp_ns, frame_id, log_likelihoods: see the attributes.
             joint_positions: (K, J, 3) m, of the means; None: computed here.
+            kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities: see the
+                attributes.
+            velocities: (K, d) of the poses, per second; None: unknown.
 
         Raises:
             MessageError: shapes or values that a message must not have.
@@ -141,6 +184,10 @@ class PoseMixture:
             mixture = GaussianMixture(np.empty(0), np.empty((0, d)), np.empty((0, d, d)))
         if joint_positions is None:
             joint_positions = body.joint_positions(mixture.means)
+        jacobians = body.joint_jacobians(mixture.means)
+        joint_velocities = None
+        if velocities is not None:
+            joint_velocities = np.einsum('kjad,kd->kja', jacobians, velocities)
         return cls(
             weights=mixture.weights,
             means=mixture.means,
@@ -154,6 +201,11 @@ class PoseMixture:
             frame_id=frame_id,
             segment_lengths=body.segment_lengths,
             log_likelihoods=log_likelihoods,
+            state=state,
+            track_id=track_id,
+            identities=identities,
+            joint_covariances=_joint_covariances(jacobians, mixture.covariances),
+            joint_velocities=joint_velocities,
         )
 
     @cached_property
@@ -170,21 +222,31 @@ class PoseMixture:
         return GaussianMixture(self.weights, self.means, self.covariances)
 
 
+def _joint_covariances(jacobians: Array, covariances: Array) -> Array:
+    """Covariances (K, J, 3, 3) of joints from Jacobians (K, J, 3, d) and those of the poses."""
+    k, joints, _, d = jacobians.shape
+    rows = (jacobians.reshape(k, 3 * joints, d) @ covariances).reshape(jacobians.shape)
+    result = rows @ jacobians.swapaxes(2, 3)
+    return 0.5 * (result + result.swapaxes(2, 3))
+
+
 def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
     """hmt_msgs/PoseMixture; the components heaviest first, of equal weights in their order."""
     assert content.log_likelihoods is not None
     assert content.degrees_of_freedom is not None
+    assert content.identities is not None
     components = [
         messages.create(
             'hmt_msgs/msg/PoseComponent',
+            id=int(content.identities[k]),
             weight=float(content.weights[k]),
             mean=content.means[k],
-            covariance=np.empty(0)
-            if content.covariances is None
-            else content.covariances[k].reshape(-1),
+            covariance=_flat(content.covariances, k),
             log_likelihood=float(content.log_likelihoods[k]),
             degrees_of_freedom=float(content.degrees_of_freedom[k]),
             joint_positions=messages.points(content.joint_positions[k]),
+            joint_covariances=_flat(content.joint_covariances, k),
+            joint_velocities=_flat(content.joint_velocities, k),
         )
         for k in np.argsort(-content.weights, kind='stable')
     ]
@@ -195,10 +257,17 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
         dof_names=list(content.dof_names),
         joint_names=list(content.joint_names),
         kind=int(content.kind),
+        state=int(content.state),
+        track_id=content.track_id,
         components=components,
         segment_names=list(content.segment_lengths),
         segment_lengths=np.array(list(content.segment_lengths.values()), dtype=np.float64),
     )
+
+
+def _flat(values: Array | None, component: int) -> Array:
+    """Row-major values of a component; empty: unknown."""
+    return np.empty(0) if values is None else values[component].reshape(-1)
 
 
 def pose_mixture_of(
@@ -229,17 +298,10 @@ def pose_mixture_of(
             f'mixture has {len(components)} components, the limit is {MAX_COMPONENTS}'
         )
     n, d = len(components), len(names)
-    known = any(len(component.covariance) for component in components)
-    means, covariances, positions = [], [], []
+    means, positions = [], []
     for k, component in enumerate(components):
         what = f'mixture: component {k}'
         means.append(numbers(component.mean, (d,), f'{what}: mean'))
-        if known and len(component.covariance) == 0:
-            raise MessageError(
-                f'{what} has no covariance, others have one', MessageFault.COVARIANCES
-            )
-        if known:
-            covariances.append(numbers(component.covariance, (d, d), f'{what}: covariance'))
         points = component.joint_positions
         if len(points) != len(joints):
             raise MessageError(f'{what} has {len(points)} joint_positions, wanted {len(joints)}')
@@ -248,10 +310,14 @@ def pose_mixture_of(
         kind = MixtureKind(int(message.kind))
     except ValueError:
         raise MessageError(f'mixture has the kind {message.kind}, which is not known') from None
+    try:
+        state = TrackState(int(message.state))
+    except ValueError:
+        raise MessageError(f'mixture has the state {message.state}, which is not known') from None
     return PoseMixture(
         weights=np.array([component.weight for component in components]),
         means=np.reshape(means, (n, d)),
-        covariances=np.array(covariances) if known else None,
+        covariances=_optional(components, 'covariance', (d, d)),
         body_model=str(message.body_model),
         dof_names=names,
         joint_names=joints,
@@ -262,4 +328,24 @@ def pose_mixture_of(
         segment_lengths=lengths_of(message, 'mixture'),
         log_likelihoods=np.array([c.log_likelihood for c in components]),
         degrees_of_freedom=np.array([c.degrees_of_freedom for c in components]),
+        state=state,
+        track_id=int(message.track_id),
+        identities=np.array([c.id for c in components], dtype=np.uint32),
+        joint_covariances=_optional(components, 'joint_covariances', (len(joints), 3, 3)),
+        joint_velocities=_optional(components, 'joint_velocities', (len(joints), 3)),
+    )
+
+
+def _optional(components: Sequence[Any], name: str, shape: tuple[int, ...]) -> Array | None:
+    """A field (K, *shape) that all components have or none has; None: none."""
+    values = [getattr(component, name) for component in components]
+    if not any(len(value) for value in values):
+        return None
+    for k, value in enumerate(values):
+        if len(value) == 0:
+            raise MessageError(
+                f'mixture: component {k} has no {name}, others have one', MessageFault.COVARIANCES
+            )
+    return np.array(
+        [numbers(value, shape, f'mixture: component {k}: {name}') for k, value in enumerate(values)]
     )

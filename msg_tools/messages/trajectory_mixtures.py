@@ -46,6 +46,8 @@ class TrajectoryMixture:
         dof_names: (d,) order of the variables.
         frame_id: optical frame of the camera.
         segment_lengths: m, by name, as in `PoseMixture`; empty: unknown.
+        joint_names: (J,) order of the joints.
+        joint_positions: (M, T, J, 3) m, at the means; None: not computed.
 
     Raises:
         MessageError: shapes or values that a message must not have.
@@ -63,10 +65,14 @@ class TrajectoryMixture:
     dof_names: tuple[str, ...]
     frame_id: str
     segment_lengths: Mapping[str, float] = field(default_factory=dict)
+    joint_names: tuple[str, ...] = ()
+    joint_positions: Array | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'stamps_ns', tuple(int(stamp) for stamp in self.stamps_ns))
         object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'trajectories: dof_names'))
+        joints = names_of(self.joint_names, 'trajectories: joint_names')
+        object.__setattr__(self, 'joint_names', joints)
         check_lengths(self.segment_lengths, 'trajectories')
         m, t, d = len(self.weights), len(self.stamps_ns), len(self.dof_names)
         if m == 0 or t == 0:
@@ -78,19 +84,23 @@ class TrajectoryMixture:
             'log_joint': (m,),
             'inflation': (m,),
             'free_energy': (len(self.free_energy),),
+            'joint_positions': (m, t, len(joints), 3),
         }
-        freeze_arrays(self, shapes, 'trajectories', optional=('marginal_covariances',))
+        optional = ('marginal_covariances', 'joint_positions')
+        freeze_arrays(self, shapes, 'trajectories', optional=optional)
         if any(b <= a for a, b in zip(self.stamps_ns, self.stamps_ns[1:], strict=False)):
             raise MessageError('trajectories: stamps do not increase')
         check_weights(self.weights, 'trajectories')
         check_finite(self.means, 'trajectories: means')
+        if self.joint_positions is not None:
+            check_finite(self.joint_positions, 'trajectories: joint_positions')
         if self.marginal_covariances is not None:
             check_covariances(self.marginal_covariances, 'trajectories')
 
 
 def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixture) -> Any:
     """hmt_msgs/TrajectoryMixture; components heaviest first, of equal weights in their order."""
-    covariances = content.marginal_covariances
+    covariances, joints = content.marginal_covariances, content.joint_positions
     components = [
         messages.create(
             'hmt_msgs/msg/TrajectoryComponent',
@@ -99,6 +109,7 @@ def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixt
             inflation=float(content.inflation[m]),
             means=content.means[m].reshape(-1),
             marginal_covariances=np.empty(0) if covariances is None else covariances[m].reshape(-1),
+            joint_positions=np.empty(0) if joints is None else joints[m].reshape(-1),
         )
         for m in np.argsort(-content.weights, kind='stable')
     ]
@@ -107,6 +118,7 @@ def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixt
         header=header_message(messages, content.stamps_ns[-1], content.frame_id),
         body_model=content.body_model,
         dof_names=list(content.dof_names),
+        joint_names=list(content.joint_names),
         stamps=[time_message(messages, stamp) for stamp in content.stamps_ns],
         # Before the first of all stamps there is none.
         final_until=time_message(messages, max(content.final_until_ns, EARLIEST_NS)),
@@ -137,9 +149,7 @@ def trajectory_mixture_of(
     if not components:
         raise MessageError('trajectories: no components')
     t, d = len(message.stamps), len(names)
-    known = {bool(len(component.marginal_covariances)) for component in components}
-    if len(known) > 1:
-        raise MessageError('trajectories: some components have covariances, others have none')
+    joints = names_of(message.joint_names, 'trajectories: joint_names')
     return TrajectoryMixture(
         weights=np.array([component.weight for component in components]),
         means=np.array(
@@ -148,18 +158,7 @@ def trajectory_mixture_of(
                 for m, component in enumerate(components)
             ]
         ),
-        marginal_covariances=np.array(
-            [
-                numbers(
-                    component.marginal_covariances,
-                    (t, d, d),
-                    f'trajectories: component {m}: marginal_covariances',
-                )
-                for m, component in enumerate(components)
-            ]
-        )
-        if known == {True}
-        else None,
+        marginal_covariances=_optional(components, 'marginal_covariances', (t, d, d)),
         log_joint=np.array([component.log_joint for component in components]),
         inflation=np.array([component.inflation for component in components]),
         stamps_ns=tuple(time_ns(stamp) for stamp in message.stamps),
@@ -169,4 +168,20 @@ def trajectory_mixture_of(
         dof_names=names,
         frame_id=str(message.header.frame_id),
         segment_lengths=lengths_of(message, 'trajectories'),
+        joint_names=joints,
+        joint_positions=_optional(components, 'joint_positions', (t, len(joints), 3)),
+    )
+
+
+def _optional(components: Sequence[Any], name: str, shape: tuple[int, ...]) -> Array | None:
+    """A field (M, *shape) that all components have or none has; None: none."""
+    values = [getattr(component, name) for component in components]
+    known = {bool(len(value)) for value in values}
+    if len(known) > 1:
+        raise MessageError(f'trajectories: some components have {name}, others have none')
+    if known == {False}:
+        return None
+    what = 'trajectories: component'
+    return np.array(
+        [numbers(value, shape, f'{what} {m}: {name}') for m, value in enumerate(values)]
     )

@@ -187,7 +187,7 @@ def _add_segment(
         element = ET.SubElement(robot, 'link', name=link)
         if last:
             for point in np.reshape(np.asarray(segment.points, dtype=np.float64), (-1, 3)):
-                _add_rod(element, point, rod_radius)
+                add_rod(element, point, rod_radius)
         parent = link
 
 
@@ -264,7 +264,7 @@ def _joint(
         'joint', name=step.name if step else f'{segment}.mount', type=step.kind if step else 'fixed'
     )
     angles = np.zeros(3) if mount is None else roll_pitch_yaw(mount)
-    ET.SubElement(joint, 'origin', xyz=_text(offset), rpy=_text(angles))
+    ET.SubElement(joint, 'origin', xyz=xml_numbers(offset), rpy=xml_numbers(angles))
     ET.SubElement(joint, 'parent', link=parent)
     ET.SubElement(joint, 'child', link=child)
     if step is not None:
@@ -277,7 +277,8 @@ def _joint(
     return joint
 
 
-def _add_rod(link: ET.Element, end: Array, radius: float) -> None:
+def add_rod(link: ET.Element, end: Array, radius: float) -> None:
+    """Shows a rod in a link, from its origin to an end (3,), m; none where they are one point."""
     length = float(np.linalg.norm(end))
     if length < 1e-6:
         return
@@ -285,7 +286,7 @@ def _add_rod(link: ET.Element, end: Array, radius: float) -> None:
     x, y, z = (end / length).tolist()
     angles = [0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)]
     visual = ET.SubElement(link, 'visual')
-    ET.SubElement(visual, 'origin', xyz=_text(end / 2), rpy=_text(angles))
+    ET.SubElement(visual, 'origin', xyz=xml_numbers(end / 2), rpy=xml_numbers(angles))
     geometry = ET.SubElement(visual, 'geometry')
     ET.SubElement(geometry, 'cylinder', radius=repr(float(radius)), length=repr(length))
 
@@ -300,6 +301,7 @@ def roll_pitch_yaw(rotation: ArrayLike) -> Array:
     return np.array([roll, pitch, yaw])
 
 
-def _text(values: Iterable[float]) -> str:
+def xml_numbers(values: Iterable[float]) -> str:
+    """Numbers as the value of an attribute, without a loss."""
     # -0.0 would be another text for the same number.
     return ' '.join(repr(float(value) + 0.0) for value in values)

@@ -67,7 +67,7 @@ def test_it_leaves_a_bag_and_a_report(output):
 def test_it_tells_what_came_out(output):
     folder, _, printed = output
     lines = printed.splitlines()
-    (row,) = (line.split() for line in lines if line.startswith('pose_mixture'))
+    (row,) = (line.split() for line in lines if line.startswith('/pose_mixture'))
     assert row[1] == '5'
     assert float(row[4]) >= float(row[5])  # the heaviest is no better than the best
     for name in (*(f'report/{picture}' for picture in PICTURES), 'report/report.html', 'small'):
@@ -81,7 +81,7 @@ def made_up_track(source):
     for stamp, joints in truth.joints.items():
         shift = np.array([-0.1, 0.0, 0.2])[:, None, None] * [0, 0, 1]
         moments[stamp] = Moment(stamp, np.array([0.6, 0.3, 0.1]), joints + shift)
-    return Layer('pose_mixture', 'posterior', truth.frame_id, truth.joint_names, moments)
+    return Layer('/pose_mixture', 'posterior', truth.frame_id, truth.joint_names, moments)
 
 
 def test_the_same_track_gives_the_same_picture(source, truth, tmp_path):
@@ -98,7 +98,7 @@ def test_the_same_track_gives_the_same_picture(source, truth, tmp_path):
 
 def test_recorded_mixtures_are_read_heaviest_first(output):
     layers = read_mixtures(output[0] / 'small').layers
-    (track,) = (layer for layer in layers if layer.topic == 'pose_mixture')
+    (track,) = (layer for layer in layers if layer.topic == '/pose_mixture')
     assert len(track.mixtures) == 5
     for moment in track.mixtures.values():
         assert (np.diff(moment.weights) <= 0).all()

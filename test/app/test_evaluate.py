@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hmt_ros.app import progress
 from hmt_ros.app.evaluate import main
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS, ground_truth
 from hmt_ros.body import load_body
@@ -114,8 +115,8 @@ def test_numbers_are_those_of_the_library(capsys, bag, body, poses, mixtures, tr
     result = report(capsys, bag, '--truth', truth_file)
     truth = relative(body, body.joint_positions(poses))
     wanted = score(joint_mixtures(body, mixtures), truth, seed=0).summary()
-    assert list(result['topics']) == ['pose_mixture']
-    found = result['topics']['pose_mixture']
+    assert list(result['topics']) == ['/pose_mixture']
+    found = result['topics']['/pose_mixture']
     assert found['kind'] == 'posterior'
     assert (found['frames'], found['missing'], found['without_truth']) == (FRAMES, 0, 0)
     for key, value in without_names(wanted).items():
@@ -125,11 +126,20 @@ def test_numbers_are_those_of_the_library(capsys, bag, body, poses, mixtures, tr
         assert found['by_joint'][joint] == pytest.approx(values)
 
 
+def test_progress_leaves_stdout_to_the_numbers(capsys, bag, truth_file, monkeypatch):
+    wanted = report(capsys, bag, '--truth', truth_file)
+    monkeypatch.setattr(progress, 'INTERVAL', 1e-4)
+    code, out, errors = run(capsys, bag, '--truth', truth_file, '--json')
+    assert (code, json.loads(out)) == (0, wanted)
+    assert errors[-1].startswith(f'evaluate: {FRAMES + 1} messages in ')
+    assert run(capsys, bag, '--truth', truth_file, '--json', '--quiet') == (0, out, [])
+
+
 def test_truth_from_the_bag_itself_and_from_another_bag(capsys, bag, truth_file):
     from_file = report(capsys, bag, '--truth', truth_file)
     from_bag = report(capsys, bag)
     assert from_bag['topics'] == from_file['topics']
-    assert from_bag['truth'] == f'{bag} (ground_truth)'
+    assert from_bag['truth'] == f'{bag} (/ground_truth)'
     assert report(capsys, bag, '--truth', bag)['topics'] == from_file['topics']
 
 
@@ -138,7 +148,7 @@ def test_truth_without_pelvis_is_aligned_at_the_hips(capsys, tmp_path, bag, body
     joints = body.joint_positions(poses)[:, body.skeleton.joint_index(names)]
     path = tmp_path / 'truth.npz'
     np.savez(path, stamps=STAMPS, joint_names=names, joints=joints + 0.7)
-    found = report(capsys, bag, '--truth', path)['topics']['pose_mixture']
+    found = report(capsys, bag, '--truth', path)['topics']['/pose_mixture']
     where = [names.index(name) for name in EVALUATED_JOINTS]
     hips = [names.index('left_hip'), names.index('right_hip')]
     truth = joints[:, where] - joints[:, hips].mean(1, keepdims=True)
@@ -150,7 +160,7 @@ def test_truth_without_pelvis_is_aligned_at_the_hips(capsys, tmp_path, bag, body
 
 def test_model_sigma_and_seed(capsys, bag):
     usual, wide, seeded = (
-        report(capsys, bag, *more)['topics']['pose_mixture']
+        report(capsys, bag, *more)['topics']['/pose_mixture']
         for more in ((), ('--model-sigma', '0.2'), ('--seed', '5'))
     )
     assert wide['heaviest_mm'] == usual['heaviest_mm']
@@ -163,8 +173,8 @@ def test_table_for_people(capsys, bag, truth_file):
     code, out, errors = run(capsys, bag, '--truth', truth_file)
     assert (code, errors) == (0, [])
     lines = out.splitlines()
-    summary = report(capsys, bag, '--truth', truth_file)['topics']['pose_mixture']
-    (row,) = (line.split() for line in lines if line.startswith('pose_mixture'))
+    summary = report(capsys, bag, '--truth', truth_file)['topics']['/pose_mixture']
+    (row,) = (line.split() for line in lines if line.startswith('/pose_mixture'))
     assert row[1:7] == [
         str(FRAMES),
         '0',
@@ -180,7 +190,7 @@ def test_frames_without_mixture_and_mixtures_without_truth(capsys, tmp_path, bod
     truth = tmp_path / 'truth.npz'
     joints = body.joint_positions(poses)
     np.savez(truth, stamps=STAMPS[1:], joint_names=body.joint_names, joints=joints[1:])
-    found = report(capsys, path, '--truth', truth)['topics']['pose_mixture']
+    found = report(capsys, path, '--truth', truth)['topics']['/pose_mixture']
     assert (found['frames'], found['missing'], found['without_truth']) == (3, 2, 1)
 
 
@@ -191,20 +201,20 @@ def test_a_bag_without_body(capsys, tmp_path, body, mixtures, bag, truth_file):
         message.body_model = 'stranger'
         return message
 
-    wanted = report(capsys, bag, '--truth', truth_file)['topics']['pose_mixture']
+    wanted = report(capsys, bag, '--truth', truth_file)['topics']['/pose_mixture']
     path = write(tmp_path / 'known', body, mixtures, with_body=False)
-    found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+    found = report(capsys, path, '--truth', truth_file)['topics']['/pose_mixture']
     for name in ('best_mm', 'coverage_90', 'negative_log_likelihood'):
         assert found[name] == pytest.approx(wanted[name])
     path = write(tmp_path / 'unknown', body, mixtures, with_body=False, change=of_a_stranger)
-    found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+    found = report(capsys, path, '--truth', truth_file)['topics']['/pose_mixture']
     assert found['best_mm'] == pytest.approx(wanted['best_mm'])
     assert found['coverage_90'] is None
     assert found['negative_log_likelihood'] is None
     assert 'body' in found['note']
     code, out, _ = run(capsys, path, '--truth', truth_file)
     assert code == 0
-    assert out.splitlines()[-1].startswith('pose_mixture: its body is unknown')
+    assert out.splitlines()[-1].startswith('/pose_mixture: its body is unknown')
 
 
 def test_unknown_covariances(capsys, tmp_path, body, mixtures, truth_file):
@@ -214,7 +224,7 @@ def test_unknown_covariances(capsys, tmp_path, body, mixtures, truth_file):
         return message
 
     path = write(tmp_path / 'out', body, mixtures, change=forget)
-    found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+    found = report(capsys, path, '--truth', truth_file)['topics']['/pose_mixture']
     assert found['coverage_90'] is None
     assert found['best_mm'] > 0
 
@@ -230,7 +240,7 @@ def test_mixtures_carry_the_lengths(capsys, tmp_path, body, mixtures, truth_file
             message = mixture_message(body, mixture, stamp)
             message.components[0].joint_positions[5].x += 0.2 * torn
             bag.write('pose_mixture', stamp, message)
-    found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+    found = report(capsys, path, '--truth', truth_file)['topics']['/pose_mixture']
     note = 'joint positions are not those of the body human37 of the bag'
     assert found['note'] == (note if torn else '')
     assert (found['coverage_90'] is None) == torn
@@ -243,12 +253,12 @@ def without_lengths(message):
 
 def test_mixtures_without_lengths(capsys, tmp_path, body, mixtures, bag, truth_file):
     """They are about the body that the bag describes; without one only positions are compared."""
-    wanted = report(capsys, bag, '--truth', truth_file)['topics']['pose_mixture']
+    wanted = report(capsys, bag, '--truth', truth_file)['topics']['/pose_mixture']
     described = write(tmp_path / 'described', body, mixtures, change=without_lengths)
-    found = report(capsys, described, '--truth', truth_file)['topics']['pose_mixture']
+    found = report(capsys, described, '--truth', truth_file)['topics']['/pose_mixture']
     assert found == wanted
     bare = write(tmp_path / 'bare', body, mixtures, with_body=False, change=without_lengths)
-    found = report(capsys, bare, '--truth', truth_file)['topics']['pose_mixture']
+    found = report(capsys, bare, '--truth', truth_file)['topics']['/pose_mixture']
     assert found['best_mm'] == wanted['best_mm']
     assert found['coverage_90'] is None
 
@@ -261,7 +271,7 @@ def test_predictions_without_anybody_are_missing(capsys, tmp_path, body, mixture
             if i < 2:
                 message.components = []
             bag.write('pose_prediction', stamp, message)
-    found = report(capsys, path, '--truth', truth_file)['topics']['pose_prediction']
+    found = report(capsys, path, '--truth', truth_file)['topics']['/pose_prediction']
     assert (found['frames'], found['missing']) == (FRAMES - 2, 2)
     assert found['coverage_90'] is not None
 
@@ -280,7 +290,7 @@ def test_the_body_may_change_on_the_way(capsys, tmp_path, body, poses, truth_fil
                 mean = poses[t] + 0.01 * rng.normal(size=body.dimension)
                 mixture = GaussianMixture([1.0], mean[None], 0.001 * np.eye(body.dimension)[None])
                 bag.write('pose_mixture', STAMPS[t], mixture_message(own, mixture, STAMPS[t]))
-    found = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+    found = report(capsys, path, '--truth', truth_file)['topics']['/pose_mixture']
     assert found['note'] == ''
     assert found['frames'] == FRAMES
     assert 0 < found['coverage_90'] <= 1
@@ -294,10 +304,10 @@ def test_model_that_only_the_option_knows(capsys, tmp_path, body, mixtures, trut
         bag.write('body', START_NS, content)
         for stamp, mixture in zip(STAMPS, mixtures):
             bag.write('pose_mixture', stamp, mixture_message(body, mixture, stamp, name='my_body'))
-    unknown = report(capsys, path, '--truth', truth_file)['topics']['pose_mixture']
+    unknown = report(capsys, path, '--truth', truth_file)['topics']['/pose_mixture']
     assert unknown['coverage_90'] is None
     named = report(capsys, path, '--truth', truth_file, '--body', 'human37')['topics'][
-        'pose_mixture'
+        '/pose_mixture'
     ]
     assert named['coverage_90'] is not None
 
@@ -318,15 +328,17 @@ def test_every_topic_gets_a_row_and_one_can_be_chosen(
                 bag.write(topic, stamp, mixture_message(body, mixture, stamp, kind))
     result = report(capsys, path, '--truth', truth_file)['topics']
     assert {name: found['kind'] for name, found in result.items()} == {
-        topic: kind.name.lower() for topic, kind in kinds.items()
+        f'/{topic}': kind.name.lower() for topic, kind in kinds.items()
     }
     likelihood, smoothed = list(result.values())[1:]
     assert without_names(likelihood) == without_names(smoothed)
     one = report(capsys, path, '--truth', truth_file, '--topic', '/p/smoothed_pose_mixture')
-    assert list(one['topics']) == ['p/smoothed_pose_mixture']
+    assert list(one['topics']) == ['/p/smoothed_pose_mixture']
+    # A relative name does, where one namespace has it.
+    assert one == report(capsys, path, '--truth', truth_file, '--topic', 'smoothed_pose_mixture')
     code, out, _ = run(capsys, path, '--truth', truth_file)
     assert code == 0
-    assert sum(line.startswith('p/') for line in out.splitlines()) == 3
+    assert sum(line.startswith('/p/') for line in out.splitlines()) == 3
 
 
 @pytest.mark.parametrize('with_covariances', [True, False])
@@ -360,7 +372,7 @@ def test_marginals_of_trajectories(capsys, tmp_path, body, mixtures, truth_file,
         for stamp, mixture in zip(STAMPS, mixtures):
             bag.write('pose_mixture', stamp, mixture_message(body, mixture, stamp))
     topics = report(capsys, path, '--truth', truth_file)['topics']
-    found, wanted = topics['trajectory_mixture'], topics['pose_mixture']
+    found, wanted = topics['/trajectory_mixture'], topics['/pose_mixture']
     assert found['kind'] == 'trajectories'
     assert found['frames'] == FRAMES
     for key in ('heaviest_mm', 'best_mm', 'expected_mm'):
@@ -404,7 +416,7 @@ def test_truth_that_can_not_be_used(capsys, tmp_path, bag, body):
             joint_names=['pelvis', 'neck'],
             joints=good['joints'][:, :2],
         ),
-        'no stamp of pose_mixture': save(
+        'no stamp of /pose_mixture': save(
             tmp_path / 'g.npz', **{**good, 'stamps': good['stamps'] + 1}
         ),
         'wanted (19, 3)': save(tmp_path / 'h.npz', **{**good, 'joints': good['joints'][:, :5]}),
@@ -475,12 +487,12 @@ def test_feet_against_the_floor(tmp_path, body, mixtures, truth_file, capsys):
     np.savez(truth, **content)
     bag = write(tmp_path / 'bag', body, mixtures)
     assert main([str(bag), '--truth', str(truth), '--quiet', '--json']) == 0
-    found = json.loads(capsys.readouterr().out)['topics']['pose_mixture']['feet']
+    found = json.loads(capsys.readouterr().out)['topics']['/pose_mixture']['feet']
     assert found['fraction_below_floor'] == 1.0
     assert found['below_floor_mm'] > 300.0
     assert found['sliding_m_per_s'] > 0.0
     assert found['frames'] == FRAMES
     assert main([str(bag), '--truth', str(truth), '--quiet']) == 0
-    assert 'pose_mixture: standing ankles slide' in capsys.readouterr().out
+    assert '/pose_mixture: standing ankles slide' in capsys.readouterr().out
     assert main([str(bag), '--truth', str(truth_file), '--quiet', '--json']) == 0
-    assert 'feet' not in json.loads(capsys.readouterr().out)['topics']['pose_mixture']
+    assert 'feet' not in json.loads(capsys.readouterr().out)['topics']['/pose_mixture']

@@ -294,7 +294,7 @@ def test_bags_of_the_repository(tmp_path, content):
         pictures = []
         for folder in (made, kept):
             with BagReader(folder) as reader:
-                assert {t.lstrip('/') for t in reader.topics} == set(content)
+                assert set(reader.topics) == {f'/{topic}' for topic in content}
                 pictures.append(
                     [decode_image(m.message) for m in reader.messages(['image/compressed'])]
                 )

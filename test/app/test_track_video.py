@@ -25,7 +25,7 @@ def test_from_video_to_report(walk_video, tmp_path, capsys):
     assert sorted(x.name for x in out.iterdir()) == ['report', 'tracked', 'video']
     assert (out / 'report' / 'report.html').stat().st_size > 100_000
     truth = read_truth(walk_video / 'rendered' / 'truth.npz')
-    scored = score_bag(out / 'tracked', truth, topics=['pose_mixture'])['pose_mixture']
+    scored = score_bag(out / 'tracked', truth, topics=['pose_mixture'])['/pose_mixture']
     assert len(scored.scores) == 7
     # Of the depth of limbs the first images know little; the right way round is below 0.2 m.
     assert np.median(scored.scores.best) < 0.1

@@ -15,7 +15,7 @@ import pytest
 
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.messages.headers import header_message
-from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, TrackState
 
 Read = Callable[[Path], tuple[list[tuple[int, str, bytes]], str | None]]
 
@@ -109,4 +109,10 @@ def pose_mixture() -> PoseMixture:
         segment_lengths={'trunk': 0.5, 'thigh': 0.41},
         log_likelihoods=np.array([-3.0, -2.0, -1.0]),
         degrees_of_freedom=np.array([0.0, 5.0, 0.0]),
+        state=TrackState.TRACKING,
+        track_id=2,
+        identities=np.array([4, 1, 9]),
+        joint_covariances=np.eye(3)
+        * np.array([[1e-4, 2e-4], [3e-4, 4e-4], [5e-4, 6e-4]])[..., None, None],
+        joint_velocities=rng.normal(size=(3, 2, 3)),
     )

@@ -1,38 +1,48 @@
 import threading
 
-from hmt_ros.nodes.estimating_thread import InputQueue, Waiting
+from hmt_ros.nodes.estimating_thread import Arrived, InputQueue, Waiting
+
+
+def put(queue, *items):
+    for source, content in items:
+        queue.put(Waiting(source, content, 0.0, content if source == 'image' else 0))
+
+
+def contents(arrived):
+    return [waiting.content for waiting in arrived.waiting]
 
 
 def test_first_in_first_out():
     queue = InputQueue({'image': 2}, counted='image')
-    queue.put('info', 'a', 1.0)
-    queue.put('image', 'b', 2.0)
-    queue.put('info', 'c', 3.0)
+    waiting = [Waiting('info', 'a', 1.0), Waiting('image', 'b', 2.0, 7), Waiting('info', 'c', 3.0)]
+    for one in waiting:
+        queue.put(one)
     assert len(queue) == 3
-    assert queue.get() == Waiting('info', 'a', 1.0, 0)
-    assert queue.get() == Waiting('image', 'b', 2.0, 0)
-    assert queue.get() == Waiting('info', 'c', 3.0, 0)
+    assert queue.get() == Arrived(tuple(waiting))
+    assert len(queue) == 0
 
 
 def test_oldest_images_are_dropped_and_counted():
     queue = InputQueue({'image': 2, 'info': 1}, counted='image')
     for i in range(5):
-        queue.put('image', i, 0.0)
-        queue.put('info', i, 0.0)
+        put(queue, ('image', i), ('info', i))
     assert len(queue) == 3
-    assert [queue.get()[1:] for _ in range(3)] == [(3, 0.0, 3), (4, 0.0, 0), (4, 0.0, 0)]
+    arrived = queue.get()
+    assert contents(arrived) == [3, 4, 4]
+    assert (arrived.dropped, arrived.stamps_ns) == (3, (0, 1, 2))
     queue.limit('image', 1)
-    queue.put('image', 5, 0.0)
-    queue.put('image', 6, 0.0)
-    assert queue.get() == Waiting('image', 6, 0.0, 1)
+    put(queue, ('image', 5), ('image', 6))
+    arrived = queue.get()
+    assert (contents(arrived), arrived.dropped, arrived.stamps_ns) == ([6], 1, (5,))
 
 
 def test_never_grows():
     queue = InputQueue({'image': 3}, counted='image')
-    for i in range(10_000):
-        queue.put('image', i, 0.0)
+    put(queue, *(('image', i) for i in range(10_000)))
     assert len(queue) == 3
-    assert queue.get() == Waiting('image', 9997, 0.0, 9997)
+    arrived = queue.get()
+    assert (contents(arrived), arrived.dropped) == ([9997, 9998, 9999], 9997)
+    assert arrived.stamps_ns == tuple(range(9897, 9997))
 
 
 def test_closing_ends_who_waits():
@@ -43,15 +53,14 @@ def test_closing_ends_who_waits():
     queue.close()
     thread.join(10)
     assert found == [None]
-    queue.put('image', 1, 0.0)
+    put(queue, ('image', 1))
     assert len(queue) == 0
     assert queue.get() is None
 
 
 def test_closing_returns_what_waited():
     queue = InputQueue({'image': 1}, counted='image')
-    queue.put('restart', 'a', 1.0)
-    queue.put('image', 'b', 2.0)
-    queue.put('image', 'c', 3.0)
-    assert queue.close() == [Waiting('restart', 'a', 1.0, 1), Waiting('image', 'c', 3.0, 0)]
-    assert queue.close() == []
+    put(queue, ('restart', 'a'), ('image', 1), ('image', 2))
+    left = queue.close()
+    assert (contents(left), left.dropped, left.stamps_ns) == (['a', 2], 1, (1,))
+    assert queue.close() == Arrived(())

@@ -206,7 +206,7 @@ def test_bytes_that_are_no_message(running, small_camera):
     running.send('camera_info', small_camera.info())
     data = serialise(small_camera.image(0))
     count = len(running.handled)
-    running.node._thread.queue.put('image', data[:60], time.monotonic())
+    running.node._thread.put('image', data[:60], time.monotonic())
     running.spin_until(lambda: len(running.handled) > count)
     assert faults(running.handled[-1])[0].startswith('message of image can not be read: ')
     assert faults(running.send('image', small_camera.image(1))) == []
@@ -359,10 +359,58 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
     stamps = [stamp for stamp, _ in stub_tracker.made[0].seen]
     assert stamps == [small_camera.stamp(index) for index in (0, 10, 11)]
     assert one.node._session.state.counts == {'received': 12, 'tracked': 3, 'dropped': 9}
+    # Every image is answered, those that were dropped by their stamps.
+    one.spin_until(lambda: sum(h.source == 'image' for h in one.handled) == 12)
+    dropped = [h for h in one.handled if h.source == 'image' and h.faults]
+    assert [h.stamp_ns for h in dropped] == [small_camera.stamp(i) for i in range(1, 10)]
+    assert 'is dropped: newer ones came before its turn' in dropped[0].faults[0]
+    assert not any(h.warnings for h in dropped)
     one.spin_until(lambda: any('late: 9 images' in d.status[0].message for d in one.diagnostics))
     level, _, values = one.diagnosis()
     assert values['images dropped'] == '9'
     assert level in (0, 1)
+
+
+def test_late_node_goes_on_with_the_newest_complete_image(
+    world, small_camera, stub_tracker, held_estimate
+):
+    begun, go = held_estimate
+    one = world(use_keypoints=True).start()
+    one.send('camera_info', small_camera.info())
+    queue = one.node._thread.queue
+    sent = 0
+
+    def publish(source, index):
+        nonlocal sent
+        one.publishers[source].publish(serialise(getattr(small_camera, source)(index)))
+        sent += 1
+
+    publish('image', 0)
+    publish('keypoints', 0)
+    one.spin_until(begun.is_set, 'the estimate of the first image')
+    sent = 0
+    for index in range(1, 7):
+        publish('image', index)
+        if index <= 4:
+            publish('keypoints', index)
+        # DDS keeps the order of one topic only.
+        one.spin_until(lambda: len(queue) >= sent)
+    go.set()
+    seen = stub_tracker.made[0].seen
+    one.spin_until(lambda: len(seen) == 2)
+    # 5 and 6 still wait for their keypoints.
+    for index in (5, 6):
+        publish('keypoints', index)
+        one.spin_until(lambda index=index: len(seen) == index - 2)
+    assert [stamp for stamp, _ in seen] == [small_camera.stamp(index) for index in (0, 4, 5, 6)]
+    assert all(keypoints is not None for _, keypoints in seen)
+    one.spin_until(lambda: len(one.handled) == 1 + 7 + 7)
+    counts = one.node._session.state.counts
+    assert counts == {'received': 7, 'tracked': 4, 'dropped': 3}
+    assert sum(h.source == 'image' for h in one.handled) == 7
+    told = [text for h in one.handled for text in h.faults]
+    assert len(told) == 3
+    assert all('newer ones came before its turn' in text for text in told)
 
 
 def test_diagnostics(running, small_camera):

@@ -198,11 +198,11 @@ def test_lifecycle(world, likelihoods):
 
 def test_queue_holds_what_was_published(running, likelihoods):
     """Mixtures that come while one is smoothed wait."""
-    queue = running.node._thread.queue
+    thread = running.node._thread
     data = serialise(likelihoods.message(0))
     count = len(running.handled)
-    queue.put('likelihood_mixture', data[:60], 0.0)
-    queue.put('likelihood_mixture', data, 0.0)
+    thread.put('likelihood_mixture', data[:60], 0.0)
+    thread.put('likelihood_mixture', data, 0.0)
     running.spin_until(lambda: len(running.handled) == count + 2)
     first, second = running.handled[-2:]
     assert 'message of likelihood_mixture can not be read' in first.faults[0]

@@ -12,7 +12,7 @@ import pytest
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.sessions import bme_session, track_start
+from hmt_ros.sessions import bme_session, camera_session, track_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
 from hmt_ros.tracking.beginning import Source
 from hmt_ros.tracking.ground import Ground
@@ -21,6 +21,7 @@ from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.depth_images import depth_message
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.images import compressed_image_message, image_message
+from msg_tools.messages.message_types import register_definitions
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 FRAME_NS = 100_000_000
@@ -42,6 +43,7 @@ class StubTracker:
         self.silhouettes = SimpleNamespace(doubted=False, share=0.9, known='known')
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.track_id, self.started_from = 0, None
+        self.log_likelihoods = np.array([-1.5, -2.5])
         self.known_ground = known_ground
         up = np.array([0.0, -1.0, 0.0]) if known_ground.up is None else known_ground.up
         self.ground = Ground(up, 0.1, known_ground.camera_height, 0.02)
@@ -69,7 +71,15 @@ class StubTracker:
 
     @property
     def modes(self):
-        return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]))
+        identities = np.array([len(self.seen), 77])
+        return SimpleNamespace(log_likelihoods=np.array([-1.0, -2.0]), identities=identities)
+
+    @property
+    def velocities(self):
+        """To the right, from the second image on."""
+        moving = np.zeros((2, self.body.dimension))
+        moving[:, 0] = [1.5, 0.0]
+        return moving if len(self.seen) > 1 else None
 
     @property
     def point_estimate(self):
@@ -335,3 +345,30 @@ class Likelihoods:
 @pytest.fixture(scope='session')
 def likelihoods():
     return Likelihoods()
+
+
+# hri_msgs 2.0, as far as REP 155 is spoken here.
+HRI_MSGS = {
+    'IdsList': 'std_msgs/Header header\nstring[] ids\n',
+    'NormalizedPointOfInterest2D': 'float32 x\nfloat32 y\nfloat32 c\n',
+    'NormalizedRegionOfInterest2D': (
+        'std_msgs/Header header\n'
+        'float32 xmin\nfloat32 ymin\nfloat32 xmax\nfloat32 ymax\nfloat32 c\n'
+    ),
+    'Skeleton2D': 'std_msgs/Header header\nNormalizedPointOfInterest2D[18] skeleton\n',
+}
+
+
+@pytest.fixture(scope='session')
+def hri_msgs(tmp_path_factory):
+    """Makes the messages of hri_msgs known, which need not be installed."""
+    folder = tmp_path_factory.mktemp('hri_msgs')
+    for name, text in HRI_MSGS.items():
+        (folder / f'{name}.msg').write_text(text)
+    register_definitions('hri_msgs', folder)
+
+
+@pytest.fixture
+def few_wait(monkeypatch):
+    """Only `queue_size` images may wait for other inputs."""
+    monkeypatch.setattr(camera_session, 'MOST_INCOMPLETE', 1)

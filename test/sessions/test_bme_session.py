@@ -165,6 +165,7 @@ def test_what_is_strange_about_a_silhouette_is_told_once(session, somebody):
     assert one.state.faults['silhouette'] == 2
 
 
+@pytest.mark.usefixtures('few_wait')
 def test_images_wait_for_the_camera(session, outputs, somebody):
     one = session(queue_size=2)
     handled = [one.take(IMAGE, somebody.image(index)) for index in range(3)]

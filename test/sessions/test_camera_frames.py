@@ -141,6 +141,7 @@ def test_missing_transforms_do_not_stop_the_track(session, stub_tracker, small_c
     np.testing.assert_allclose(tracker.gravities[-1], up_of(6), atol=1e-12)
 
 
+@pytest.mark.usefixtures('few_wait')
 def test_no_image_is_dropped_for_want_of_transforms(session, stub_tracker, small_camera, outputs):
     one = session(queue_size=2, input_timeout=60.0)
     one.take(CAMERA_INFO, small_camera.info())

@@ -70,9 +70,11 @@ def test_images_wait_for_depth(session, small_camera, stub_tracker):
 
 
 def test_a_full_queue_names_what_is_missing(session, small_camera):
-    one = session(queue_size=2, input_timeout=60.0)
-    faults = [one.take(IMAGE, small_camera.image(index)).faults for index in range(3)]
-    assert 'no depth of its stamp has come, and queue_size is 2' in faults[2][0]
+    one, index = session(input_timeout=60.0), iter(range(20))
+    faults = []
+    while not faults:
+        faults = one.take(IMAGE, small_camera.image(next(index))).faults
+    assert 'no depth of its stamp has come, and' in faults[0]
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,10 @@ from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import KEYPOINTS, PREDICTION, FilterSession
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.tracking import Status
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
-from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.pose_mixtures import MixtureKind, TrackState, pose_mixture_of
 from test.sessions.conftest import JOINTS, Likelihoods
 
 MIXTURES = ['pose_mixture', 'likelihood_mixture']
@@ -57,6 +58,70 @@ def test_images_become_messages_in_their_order(session, outputs, small_camera):
     assert (one.state.misfit, one.state.evaluations) == (0.125, 7)
 
 
+def mixtures_of(outputs, topic='pose_mixture'):
+    """Contents of the mixtures on a topic."""
+    data = [output.data for output in outputs if output.topic == topic]
+    return [pose_mixture_of(deserialise(each, TOPICS[topic].msgtype)) for each in data]
+
+
+def test_mixtures_tell_state_track_and_identities(session, outputs, small_camera, stub_tracker):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.take(IMAGE, small_camera.image(1))
+    stub_tracker.empty.add(small_camera.stamp(2))
+    one.take(IMAGE, small_camera.image(2))
+    states = [TrackState.TRACKING, TrackState.TRACKING, TrackState.NOBODY]
+    for topic in MIXTURES:
+        found = mixtures_of(outputs, topic)
+        assert [content.state for content in found] == states
+        assert [content.track_id for content in found] == [1, 1, 1]
+    ids = [content.identities.tolist() for content in mixtures_of(outputs)]
+    assert ids == [[1, 77], [2, 77], []]
+    likelihoods = mixtures_of(outputs, 'likelihood_mixture')
+    assert [content.identities.tolist() for content in likelihoods] == [[0, 0], [0, 0], []]
+
+
+def test_joints_have_covariances_and_velocities(session, outputs, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.take(IMAGE, small_camera.image(1))
+    first, second = mixtures_of(outputs)
+    # Nothing is known of motion in the first image.
+    assert first.joint_velocities is None
+    assert np.allclose(second.joint_velocities[0], [1.5, 0.0, 0.0])
+    assert np.allclose(second.joint_velocities[1], 0.0)
+    for content in (first, second, *mixtures_of(outputs, 'likelihood_mixture')):
+        assert np.linalg.eigvalsh(content.joint_covariances).min() > 0
+
+
+def test_a_lost_track_is_told(session, outputs, small_camera, stub_tracker, monkeypatch):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+
+    def step(tracker, *inputs, **more):
+        found = usual(tracker, *inputs, **more)
+        tracker.status = Status.LOST
+        return found
+
+    usual = stub_tracker.step
+    monkeypatch.setattr(stub_tracker, 'step', step)
+    one.take(IMAGE, small_camera.image(0))
+    assert [content.state for content in mixtures_of(outputs)] == [TrackState.LOST]
+
+
+def test_a_reset_starts_a_new_track(session, outputs, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    one.restart()
+    assert one.state.track_id == 1
+    one.take(IMAGE, small_camera.image(1))
+    assert [content.track_id for content in mixtures_of(outputs)] == [1, 2]
+    assert one.state.track_id == 2
+
+
 def test_same_messages_same_bytes(session, outputs, small_camera):
     for _ in range(2):
         one = session()
@@ -93,6 +158,7 @@ def test_images_wait_for_the_camera(session, outputs, small_camera):
     assert [stamp for topic, stamp in handled.published if topic == 'markers'] == tracked(outputs)
 
 
+@pytest.mark.usefixtures('few_wait')
 def test_oldest_images_that_wait_are_dropped(session, outputs, small_camera):
     one = session(queue_size=2)
     handled = [one.take(IMAGE, small_camera.image(index)) for index in range(5)]
@@ -105,6 +171,7 @@ def test_oldest_images_that_wait_are_dropped(session, outputs, small_camera):
     assert one.state.faults['camera_info'] == 3
 
 
+@pytest.mark.usefixtures('few_wait')
 def test_uncalibrated_camera_is_told_once(session, outputs, small_camera):
     one = session(queue_size=1)
     handled = []
@@ -480,6 +547,7 @@ def test_images_wait_for_masks(session, small_camera, stub_tracker, outputs):
     assert one.state.faults == {'no mask': 2, 'mask without an image': 1}
 
 
+@pytest.mark.usefixtures('few_wait')
 def test_images_wait_for_masks_and_keypoints(session, small_camera, stub_tracker, outputs):
     one = session(use_mask=True, use_keypoints=True, queue_size=2, input_timeout=60.0)
     one.take(CAMERA_INFO, small_camera.info())
@@ -491,7 +559,7 @@ def test_images_wait_for_masks_and_keypoints(session, small_camera, stub_tracker
     one.take(KEYPOINTS, small_camera.keypoints(3))
     faults = [one.take(IMAGE, small_camera.image(index)).faults for index in (1, 2, 3)]
     assert faults[:2] == [(), ()]
-    assert 'no mask of its stamp has come, and queue_size is 2' in faults[2][0]
+    assert 'no mask of its stamp has come, and 2 newer images wait' in faults[2][0]
 
 
 def broken(message):
@@ -588,6 +656,7 @@ def test_predictions_start_a_track(session, small_camera, likelihoods, stub_trac
     assert stub_tracker.made[0].nobody_predicted == [False, True]
 
 
+@pytest.mark.usefixtures('few_wait')
 def test_images_wait_for_predictions(session, small_camera, likelihoods, outputs):
     one = session(use_predictions=True, input_timeout=0.15, queue_size=2)
     one.take(CAMERA_INFO, small_camera.info())
@@ -599,7 +668,7 @@ def test_images_wait_for_predictions(session, small_camera, likelihoods, outputs
     one.parameters = replace(one.parameters, input_timeout=60.0)
     handled = one.take(IMAGE, small_camera.image(3))
     (fault,) = handled.faults
-    assert 'no pose_prediction of its stamp has come, and queue_size is 2' in fault
+    assert 'no pose_prediction of its stamp has come, and 2 newer images wait' in fault
     one.take(PREDICTION, likelihoods.message(3))
     assert tracked(outputs)[1:] == [small_camera.stamp(i) for i in (2, 3)]
 

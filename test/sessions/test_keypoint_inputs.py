@@ -106,6 +106,7 @@ def test_positions_in_space_are_not_used_unless_asked_for(session, small_camera,
     assert keypoints.positions is None
 
 
+@pytest.mark.usefixtures('few_wait')
 def test_images_wait_for_positions_in_space(session, small_camera, stub_tracker, outputs):
     one = session(use_keypoints_3d=True, input_timeout=0.25, queue_size=3)
     for index in range(2):

@@ -12,7 +12,7 @@ from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
 from hmt_ros.smoothing import MixtureSmoother
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import EARLIEST_NS, header_message, time_ns
-from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.pose_mixtures import MixtureKind, TrackState, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
 
 LAG = 2
@@ -100,6 +100,70 @@ def test_errors_that_last_make_mixtures_wider(session, outputs, likelihoods):
     assert np.array_equal(wide.means, narrow.means)
 
 
+def test_smoothed_poses_tell_state_track_and_motion(session, outputs, likelihoods):
+    one = session(max_trajectories=2)
+    for index in range(5):
+        message = likelihoods.message(index)
+        message.track_id = 3
+        message.state = int(TrackState.LOST if index == 1 else TrackState.TRACKING)
+        one.take(MIXTURE, message)
+    one.finish()
+    found = [pose_mixture_of(message) for message in read(outputs, 'smoothed_pose_mixture')]
+    assert [content.state for content in found] == [
+        TrackState.LOST if index == 1 else TrackState.TRACKING for index in range(5)
+    ]
+    body = likelihoods.body
+    wrist, elbow = body.joint_names.index('left_wrist'), body.dof_names.index('left_elbow')
+    for content in found:
+        assert content.track_id == 3
+        assert sorted(content.identities) == [1, 2]
+        assert np.linalg.eigvalsh(content.joint_covariances).min() > 0
+        # The elbow bends by half a radian a second, and nothing else moves.
+        swing = body.joint_jacobians(content.means)[:, wrist, :, elbow]
+        speeds = np.linalg.norm(content.joint_velocities[:, wrist], axis=1)
+        assert np.allclose(speeds, 0.5 * np.linalg.norm(swing, axis=1), rtol=0.25)
+        pelvis = body.joint_names.index('pelvis')
+        assert np.abs(content.joint_velocities[:, pelvis]).max() < 0.01
+    # The bent elbow keeps its number.
+    bent = [content.identities[np.argmax(content.means[:, elbow])] for content in found]
+    assert len(set(bent)) == 1
+
+
+def test_components_that_were_merged_go_on_as_the_heaviest(session, outputs, likelihoods):
+    one = session(max_trajectories=4, max_hypotheses=1)
+    for index in range(4):
+        one.take(MIXTURE, likelihoods.message(index))
+    for message in read(outputs, 'smoothed_pose_mixture'):
+        content = pose_mixture_of(message)
+        assert content.joint_velocities.shape == (1, 19, 3)
+        assert content.identities[0] > 0
+
+
+def test_another_track_is_another_window(session, outputs, likelihoods):
+    one = session()
+    for index, track in enumerate((1, 1, 2, 2)):
+        message = likelihoods.message(index)
+        message.track_id = track
+        handled = one.take(MIXTURE, message)
+        assert bool(handled.warnings) == (index == 2)
+    assert one.state.window == 2
+    one.finish()
+    tracks = [message.track_id for message in read(outputs, 'smoothed_pose_mixture')]
+    assert tracks == [1, 1, 2, 2]
+
+
+def test_trajectories_need_no_kinematics(session, outputs, likelihoods):
+    one = session(max_trajectories=3)
+    for index in range(3):
+        one.take(MIXTURE, likelihoods.message(index))
+    body = likelihoods.body
+    content = trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1])
+    assert content.joint_names == body.joint_names
+    joints = body.joint_positions(content.means.reshape(-1, body.dimension))
+    assert content.joint_positions.shape == (3, 3, len(body.joint_names), 3)
+    np.testing.assert_allclose(content.joint_positions.reshape(joints.shape), joints, atol=1e-12)
+
+
 def test_trajectories(session, outputs, likelihoods):
     one = session(max_trajectories=3)
     for index in range(4):
@@ -172,7 +236,9 @@ def test_a_new_body_begins_a_new_window(session, outputs, likelihoods):
     other = likelihoods.body.with_stature(1.6)
     one.take(MIXTURE, likelihoods.message(0))
     handled = one.take(MIXTURE, likelihoods.message(1, other))
-    assert handled.warnings == ('mixtures are about another body: a new window begins',)
+    assert handled.warnings == (
+        'mixtures are about another body or another track: a new window begins',
+    )
     assert smoothed(outputs) == [likelihoods.stamp(0)]
     # The same body once more changes nothing.
     assert one.take(MIXTURE, likelihoods.message(2, other)).warnings == ()

@@ -45,6 +45,7 @@ def track(body):
         posterior=GaussianMixture(np.array([0.5, 0.3, 0.2]), poses, covariances),
         likelihood=GaussianMixture(np.array([0.6, 0.4]), poses[:2], covariances[:2]),
         log_likelihoods=np.array([-3.0, -2.0, -1.0]),
+        likelihood_values=np.array([-2.5, -1.5]),
         point=poses[1],
         ground=Ground(np.array([0.0, -0.8, -0.6]), 0.05, 1.5, 0.1),
         contacts={'left_foot': 0.75, 'right_foot': 0.25},
@@ -84,7 +85,9 @@ def test_mixtures(track, body):
     assert np.array_equal(
         [c.log_likelihood for c in found['pose_mixture'].components], [-3.0, -2.0, -1.0]
     )
-    assert np.isnan([c.log_likelihood for c in found['likelihood_mixture'].components]).all()
+    assert np.array_equal(
+        [c.log_likelihood for c in found['likelihood_mixture'].components], [-2.5, -1.5]
+    )
 
 
 def test_joint_states_are_those_of_the_point_estimate(track, body):
@@ -163,6 +166,7 @@ def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
                 'posterior': mixture,
                 'likelihood': mixture,
                 'log_likelihoods': np.zeros(2),
+                'likelihood_values': np.zeros(2),
                 'point': poses[1],
             }
         )

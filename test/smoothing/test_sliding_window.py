@@ -57,6 +57,22 @@ def test_final_marginals_are_those_given_what_the_lag_saw(modes, walk, exact):
         assert divergence(marginals[t], pose.mixture) < 0.1
 
 
+@pytest.mark.parametrize('moving', [True, False])
+def test_velocities_of_final_poses(walk, moving):
+    """A point moves by (2, -1) a second; a state with a velocity takes it to rest at first."""
+    chosen = FAST if moving else walk
+    places = np.array([2.0, -1.0]) * np.arange(8)[:, None]
+    mixtures = [GaussianMixture([1.0], [place], [1e-4 * np.eye(2)]) for place in places]
+    _, final = run(SlidingWindow(MixtureSmoother(chosen), fixed_lag=3), mixtures)
+    for t, pose in enumerate(final):
+        tolerance = 0.8 * 0.4**t if moving else 0.0
+        np.testing.assert_allclose(pose.velocities, [[2.0, -1.0]], atol=0.02 + tolerance)
+        assert pose.identities == (0,)
+    # Of one pose alone nothing is known.
+    _, (alone,) = run(SlidingWindow(MixtureSmoother(walk), fixed_lag=3), mixtures[:1])
+    assert alone.velocities is None
+
+
 def test_a_window_that_is_not_full_is_the_whole_sequence(modes, walk):
     mixtures = modes(3.0, times=4)
     window = SlidingWindow(MixtureSmoother(walk, max_trajectories=12), fixed_lag=10)

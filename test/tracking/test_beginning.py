@@ -103,8 +103,7 @@ def test_depth_is_as_uncertain_as_the_stature(start, human37, walk, stature):
     mixture = tracker.posterior
     sigma = np.sqrt(mixture.covariances[0, 2, 2])
     wrong = mixture.means[0, 2] - walk[1, 2]
-    # Of keypoints only a share is believed, so that it is more than the spread of statures.
-    assert 0.04 * walk[1, 2] < sigma < 0.15 * walk[1, 2]
+    assert 0.04 * walk[1, 2] < sigma < 0.12 * walk[1, 2]
     assert abs(wrong) < 2.5 * sigma
     # In proportion to the size the depth is right.
     assert mixture.means[0, 2] / tracker.body.stature == pytest.approx(

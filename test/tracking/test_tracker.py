@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Body, load_body
+from hmt_ros.body.kinematics import forward
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
@@ -163,6 +164,12 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     assert 0.1 < beta < 0.4
     weights = np.exp(-beta * (energies - energies.min()))
     assert np.allclose(likelihood.weights, np.sort(weights / weights.sum())[::-1], atol=1e-12)
+    # Its log at the means is that of the image, without the prior of the body.
+    frames = forward(tracker.body.skeleton, likelihood.means)
+    term = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).keypoint_term(seen, None)
+    values = term.energy(frames, np.arange(len(likelihood))).value
+    assert len(likelihood) > 1
+    assert np.allclose(tracker.log_likelihoods, -values, rtol=1e-9)
 
 
 def test_the_same_seed_and_images_give_identical_bytes(follow):

@@ -15,7 +15,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.import_video.camera_file import camera_of_view, read_camera
@@ -23,6 +22,7 @@ from hmt_ros.app.import_video.frames import Frame, FrameSource, Selection, open_
 from hmt_ros.app.import_video.keypoint_files import FoundPersons, read_keypoints
 from hmt_ros.app.import_video.masks import Masks
 from hmt_ros.app.import_video.persons import Choice, Chooser
+from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.app.rendered_bag import FRAME_ID, START_NS
 from hmt_ros.body import Camera
 from hmt_ros.detectors.mediapipe_pose import MediaPipePose
@@ -224,7 +224,7 @@ def _import(arguments: argparse.Namespace) -> int:
 
 def tell(text: str) -> None:
     """Prints a line for the user on stderr, above the progress bar."""
-    tqdm.write(f'import-video: {text}', file=sys.stderr)
+    tell_user('import-video', text)
 
 
 def import_video(options: ImportOptions, tell: Tell) -> Imported:
@@ -249,11 +249,12 @@ def import_video(options: ImportOptions, tell: Tell) -> Imported:
         see = _seer(options, found, masks, opened)
         writer = opened.enter_context(BagWriter(options.output, overwrite=options.overwrite))
         frames = opened.enter_context(closing(_same_size(source, selection)))
-        bar = opened.enter_context(
-            tqdm(frames, unit='image', desc=str(options.output), disable=options.quiet or None)
+        counted = with_progress(
+            frames, str(options.output), 'images', _expected(source, selection), quiet=options.quiet
         )
+        shown = opened.enter_context(closing(counted))
         lifts = options.detector is not None or (found is not None and found.lifts)
-        result = _write(writer, options, bar, see, lifts)
+        result = _write(writer, options, shown, see, lifts)
         if not result.images:
             raise ValueError(
                 f'{options.source}: no frame was read'
@@ -268,6 +269,13 @@ def import_video(options: ImportOptions, tell: Tell) -> Imported:
                 'see --first-number'
             )
     return result
+
+
+def _expected(source: FrameSource, selection: Selection) -> int | None:
+    """Number of frames that will be imported; None if that is unknown before they are read."""
+    if not source.claimed or selection.start > 0 or math.isfinite(selection.end):
+        return None
+    return -(-source.claimed // selection.every)
 
 
 Seer = Callable[[Frame, int], tuple[Keypoints | None, Mask | None]]
@@ -360,7 +368,7 @@ _NOBODY = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 
 
 def _are_near(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Whether pixels (n, 2) lie in an image, or beside it by a quarter of its size at most."""
+    """Whether pixels (n, 2) lie within an image that is enlarged by a quarter of its size."""
     size = np.array([width, height])
     return np.all((pixels > -_NEAR * size) & (pixels < (1 + _NEAR) * size), axis=1)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,7 +80,7 @@ class Selection:
             yield number, time_ns, first is not None and (number - first) % self.every == 0
 
 
-class FrameSource:
+class FrameSource(ABC):
     """Frames of a file or a folder.
 
     Args:
@@ -104,13 +105,13 @@ class FrameSource:
         self._by_name = {Path(x).stem: i for i, x in reversed([*enumerate(names)])}
         self._by_name |= {x: i for i, x in enumerate(names)}
 
+    @abstractmethod
     def frames(self, selection: Selection) -> Iterator[Frame]:
         """The frames that are wanted; once only.
 
         Raises:
             ValueError: a frame can not be read.
         """
-        raise NotImplementedError
 
     def number_of(self, label: str | int) -> int:
         """Number, from 0, of the frame that a label means.
@@ -274,7 +275,7 @@ def _upright(content: bytes) -> tuple[Image, bytes | None]:
     """The image in a file, upright, and the file if it is a JPEG that needs no turning.
 
     Raises:
-        ValueError: there is no image in it.
+        ValueError: the file does not hold an image.
     """
     if content.startswith(b'\xff\xd8\xff'):
         as_stored = decode_picture(content, 'jpeg')

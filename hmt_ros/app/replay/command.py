@@ -11,12 +11,12 @@ order in which they come: the bags are the same, byte for byte. `hmt_ros.session
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from pathlib import Path
 
-from tqdm import tqdm
-
 from hmt_ros.app.command_line import CommandParser, run_command
+from hmt_ros.app.progress import tell_user
 from hmt_ros.app.replay.many_bags import is_many, replay_many
 from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
@@ -50,6 +50,7 @@ examples:
   replay walk.mcap -o out --subject walk.yaml --set max_hypotheses=16 --set proposals=css --seed 1
   replay walk.mcap -o out --subject walk.yaml --config filter.yaml --live
   replay walk.mcap -o out --background empty.png --set bme.stature=1.75
+  replay recording -o out --namespace /humans/bodies/anna --image-topic /camera/image_raw
   replay archive -o tracked --subject {bag}/subject.yaml --scheduler local
 
 exit code: 0 done, 1 bad input (one line on stderr explains it) or some of several bags failed (one
@@ -158,11 +159,45 @@ def _parser() -> CommandParser:
         help='topic of the calibration (default: camera_info beside the images, else the only one)',
     )
     topics.add_argument(
+        '--mask-topic',
+        metavar='NAME',
+        help='topic of the masks (default: mask, else mask/compressed)',
+    )
+    topics.add_argument(
+        '--depth-topic',
+        metavar='NAME',
+        help='topic of depth images that are registered to the images (default: depth)',
+    )
+    topics.add_argument(
+        '--keypoints-topic',
+        metavar='NAME',
+        help='topic of the 2D keypoints (default: keypoints)',
+    )
+    topics.add_argument(
+        '--namespace',
+        type=_namespace,
+        default='',
+        metavar='NAME',
+        help='namespace of the results, such as /humans/bodies/anna (default: the root); topics of '
+        'IN in this namespace are preferred to those in the root',
+    )
+    topics.add_argument(
         '--with-images',
         action='store_true',
         help='also copy images and camera_info into OUT (bags get large)',
     )
     return parser
+
+
+def _namespace(text: str) -> str:
+    """Reads a namespace of ROS; '' for the root."""
+    name = text.strip('/')
+    if name and not re.fullmatch(r'[A-Za-z_]\w*(/[A-Za-z_]\w*)*', name, re.ASCII):
+        raise argparse.ArgumentTypeError(
+            f'wanted a namespace such as /humans/bodies/anna (letters, digits, _; no name begins '
+            f'with a digit), saw {text!r}'
+        )
+    return f'/{name}' if name else ''
 
 
 def _replay(arguments: argparse.Namespace) -> int:
@@ -179,7 +214,7 @@ def _replay(arguments: argparse.Namespace) -> int:
 
 def tell(text: str) -> None:
     """Prints a line for the user on stderr, above the progress bar."""
-    tqdm.write(f'replay: {text}', file=sys.stderr)
+    tell_user('replay', text)
 
 
 if __name__ == '__main__':

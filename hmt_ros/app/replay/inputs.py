@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
 from hmt_ros.sessions.filter_session import DEPTH, KEYPOINTS, KEYPOINTS_3D
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools import BagError, BagMessage, BagReader, Topic
+from msg_tools.bags.contents import absolute_name
 from msg_tools.messages import keypoints
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
@@ -18,6 +20,8 @@ CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 # Names of topics that are preferred to all others.
 _USUAL = ('image/compressed', 'image')
 GROUND_TRUTH = 'ground_truth'
+# End of the name of the topic of the filter's drawings.
+OVERLAY = 'overlay/compressed'
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,14 @@ class RecordedInput:
 
 
 def recorded_input(
-    bag: BagReader, image_topic: str | None = None, camera_info_topic: str | None = None
+    bag: BagReader,
+    image_topic: str | None = None,
+    camera_info_topic: str | None = None,
+    *,
+    mask_topic: str | None = None,
+    depth_topic: str | None = None,
+    keypoints_topic: str | None = None,
+    namespace: str = '',
 ) -> RecordedInput:
     """Finds the topics.
 
@@ -85,34 +96,50 @@ def recorded_input(
 
     Args:
         bag: an open bag.
-        image_topic, camera_info_topic: names that replace the automatic choice.
+        image_topic, camera_info_topic, mask_topic, depth_topic, keypoints_topic: names that
+            replace the automatic choice.
+        namespace: topics in it are preferred to those in the root, '/humans/bodies/p1' for example.
 
     Raises:
         BagError: there are no images, no camera_info, or several topics to choose from.
     """
-    image = _image_topic(bag, image_topic)
+    named = partial(_in_namespace, bag, namespace)
+    kinds = (keypoints.KEYPOINTS_2D,)
+    mask = named(MASK, (RAW,)) or named(COMPRESSED_MASK, (COMPRESSED,))
+    if mask_topic is not None:
+        mask = bag.find_topic((RAW, COMPRESSED), mask_topic)
+    joints = named(KEYPOINTS, kinds)
+    if keypoints_topic is not None:
+        joints = bag.find_topic(kinds, keypoints_topic)
+    depth = named(DEPTH, (RAW,))
+    if depth_topic is not None:
+        depth = bag.find_topic((RAW,), depth_topic)
+    besides = [topic.name.lstrip('/') for topic in (mask, depth) if topic is not None]
+    image = _image_topic(bag, image_topic, namespace, (*MASKS, DEPTH, *besides))
     found = {source: _named(bag, source, (TRANSFORMS_TYPE,)) for source in TRANSFORMS}
     return RecordedInput(
         image,
         _camera_info_topic(bag, image, camera_info_topic),
-        _named(bag, MASK, (RAW,)) or _named(bag, COMPRESSED_MASK, (COMPRESSED,)),
-        _named(bag, DEPTH, (RAW,)),
-        _named(bag, KEYPOINTS, (keypoints.KEYPOINTS_2D,)),
-        _named(bag, KEYPOINTS_3D, (keypoints.KEYPOINTS_3D,)),
-        _named(bag, GROUND_TRUTH, (POSE_MIXTURE,)),
+        mask,
+        depth,
+        joints,
+        named(KEYPOINTS_3D, (keypoints.KEYPOINTS_3D,)),
+        named(GROUND_TRUTH, (POSE_MIXTURE,)),
         {source: topic for source, topic in found.items() if topic is not None},
     )
 
 
-def _image_topic(bag: BagReader, name: str | None) -> Topic:
+def _image_topic(
+    bag: BagReader, name: str | None, namespace: str, besides: tuple[str, ...]
+) -> Topic:
     kinds = (COMPRESSED, RAW)
     if name is not None:
         return bag.find_topic(kinds, name)
     for usual in _USUAL:
-        topic = _named(bag, usual, kinds)
+        topic = _in_namespace(bag, namespace, usual, kinds)
         if topic is not None:
             return topic
-    return _the_only(bag, kinds, '--image-topic', besides=(*MASKS, DEPTH))
+    return _the_only(bag, kinds, '--image-topic', besides=besides)
 
 
 def _camera_info_topic(bag: BagReader, image: Topic, name: str | None) -> Topic:
@@ -141,6 +168,14 @@ def _with_messages(bag: BagReader, kinds: tuple[str, ...]) -> list[Topic]:
     ]
 
 
+def _in_namespace(
+    bag: BagReader, namespace: str, name: str, kinds: tuple[str, ...]
+) -> Topic | None:
+    """The topic with a name in a namespace, else in the root, with messages of one of the types."""
+    inside = absolute_name(name, namespace).lstrip('/')
+    return _named(bag, inside, kinds) or _named(bag, name, kinds)
+
+
 def _named(bag: BagReader, name: str, kinds: tuple[str, ...]) -> Topic | None:
     """The topic with a name and with messages of one of the types."""
     for topic in _with_messages(bag, kinds):
@@ -152,9 +187,13 @@ def _named(bag: BagReader, name: str, kinds: tuple[str, ...]) -> Topic | None:
 def _the_only(
     bag: BagReader, kinds: tuple[str, ...], option: str, besides: tuple[str, ...] = ()
 ) -> Topic:
-    """The only topic of some types, except those of some names."""
+    """The only topic of some types, except those of some names and the drawings of the tracker."""
     every = _with_messages(bag, kinds)
-    found = [topic for topic in every if topic.name.lstrip('/') not in besides]
+    found = [
+        topic
+        for topic in every
+        if topic.name.lstrip('/') not in besides and not topic.name.endswith(OVERLAY)
+    ]
     if len(found) == 1:
         return found[0]
     if len(found) > 1:

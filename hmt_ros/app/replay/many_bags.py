@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 import hmt_ros
 from hmt_ros.app.command_line import INTERRUPTED
+from hmt_ros.app.progress import show_progress
 from hmt_ros.app.replay.one_bag import Tell, replay_bag
 from hmt_ros.app.replay.options import ReplayOptions, parameters_of_bag
 from msg_tools import BagError
@@ -32,7 +33,10 @@ from msg_tools.bags.bag_metadata import FILE_NAME, SUFFIXES
 from msg_tools.files.error_line import error_line
 
 # Options that change the new bag, besides the parameters.
-_DECIDING = ('image_topic', 'camera_info_topic', 'with_images', 'keep_going')
+_DECIDING = (
+    'image_topic', 'camera_info_topic', 'mask_topic', 'depth_topic', 'keypoints_topic', 'namespace',
+    'with_images', 'keep_going',
+)  # fmt: skip
 
 DONE, BEFORE, FAILED = 'done', 'done before', 'failed'
 
@@ -42,12 +46,16 @@ _PATIENCE = 10.0  # s, until a scheduler answers
 
 
 class Job(NamedTuple):
-    """The replay of one of many bags: name of the new bag in its folder, paths, options."""
+    """The replay of one of many bags: name of the new bag in its folder, paths, options.
+
+    `shows` tells whether the progress of this bag is shown, besides that of all.
+    """
 
     name: str
     source: Path
     target: Path
     options: ReplayOptions
+    shows: bool = False
 
 
 @dataclass(frozen=True)
@@ -99,12 +107,13 @@ def replay_many(
     """
     if options.live:
         raise ValueError('--live replays one bag at a time; leave it out for several')
-    jobs = _jobs(sources, output, options)
+    shows = scheduler is None and not options.quiet
+    jobs = _jobs(sources, output, options, shows=shows)
     counts = dict.fromkeys((DONE, BEFORE, FAILED), 0)
     try:
         with (
             _alone_in(output),
-            tqdm(total=len(jobs), unit='bag', disable=True if options.quiet else None) as bar,
+            show_progress(str(output), 'bags', len(jobs), quiet=options.quiet) as bar,
         ):
             outcomes = map(replay_job, jobs) if scheduler is None else _by_dask(jobs, scheduler)
             for outcome in outcomes:
@@ -201,7 +210,7 @@ def _replayed_once(job: Job, tell: Tell) -> tuple[str, str]:
         )
     target.parent.mkdir(parents=True, exist_ok=True)
     _write_record(record, {'done': False, 'made_from': made_from})
-    replayed = replay_bag(job.source, target, options, tell)
+    replayed = replay_bag(job.source, target, options, tell, shows=job.shows)
     _write_record(
         record,
         {
@@ -274,7 +283,9 @@ def _write_record(path: Path, content: dict[str, Any]) -> None:
 # Which bags
 
 
-def _jobs(sources: Sequence[Path], output: Path, options: ReplayOptions) -> list[Job]:
+def _jobs(
+    sources: Sequence[Path], output: Path, options: ReplayOptions, *, shows: bool
+) -> list[Job]:
     """The jobs of the command, with absolute paths."""
     found: dict[str, Path] = {}
     for path in sources:
@@ -291,7 +302,7 @@ def _jobs(sources: Sequence[Path], output: Path, options: ReplayOptions) -> list
     for name, bag in found.items():
         source = bag.absolute()
         own = replace(options.of_bag(source).with_absolute_paths(), quiet=True)
-        jobs.append(Job(name, source, output.absolute() / name, own))
+        jobs.append(Job(name, source, output.absolute() / name, own, shows))
     return jobs
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
+from hmt_ros.app.progress import Progress, show_progress
 from hmt_ros.app.replay.background import ReadAhead, WriteBehind
-from hmt_ros.app.replay.inputs import COMPRESSED, GROUND_TRUTH, RecordedInput, recorded_input
+from hmt_ros.app.replay.inputs import COMPRESSED, GROUND_TRUTH, RecordedInput
 from hmt_ros.app.replay.options import NodeParameters, ReplayOptions, node_parameters
 from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PlayedTrack
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
@@ -24,6 +24,7 @@ from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
 from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
+from msg_tools.bags.contents import absolute_name
 from msg_tools.messages import keypoints
 from msg_tools.messages.depth_images import depth_message
 from msg_tools.messages.headers import SECOND_NS, header_message, time_ns
@@ -53,7 +54,9 @@ class Replayed:
         return f'{self.tracked} of {self.images} images tracked'
 
 
-def replay_bag(source: Path, target: Path, options: ReplayOptions, tell: Tell) -> Replayed:
+def replay_bag(
+    source: Path, target: Path, options: ReplayOptions, tell: Tell, *, shows: bool | None = None
+) -> Replayed:
     """Replays a bag into a new one, which is written completely or not at all.
 
     Args:
@@ -61,6 +64,7 @@ def replay_bag(source: Path, target: Path, options: ReplayOptions, tell: Tell) -
         target: folder of the new bag.
         options: options of the command, for this bag.
         tell: receives lines for the user.
+        shows: whether progress is shown; None: unless `options.quiet`.
 
     Raises:
         ValueError: bad input.
@@ -70,7 +74,7 @@ def replay_bag(source: Path, target: Path, options: ReplayOptions, tell: Tell) -
     with BagReader(source) as bag:
         if not options.keep_going:
             bag.raise_damage()
-        recorded = recorded_input(bag, options.image_topic, options.camera_info_topic)
+        recorded = options.recorded(bag)
         parameters = node_parameters(options, recorded)
         # The files that the parameters name are read before a node starts.
         subject = prepare_start(parameters.filter).initial
@@ -78,7 +82,7 @@ def replay_bag(source: Path, target: Path, options: ReplayOptions, tell: Tell) -
             sources = ' or '.join(parameters.filter.sources)
             tell(f'no --subject: the track starts from {sources}{_subject_hint(source)}')
         recorded = _used(recorded, parameters)
-        with BagWriter(target, overwrite=options.overwrite) as out:
+        with BagWriter(target, overwrite=options.overwrite, namespace=options.namespace) as out:
             topics = dict(track_messages.TOPICS)
             if parameters.smoother is not None:
                 topics.update(smoothed_messages.TOPICS)
@@ -87,18 +91,17 @@ def replay_bag(source: Path, target: Path, options: ReplayOptions, tell: Tell) -
             for topic, published in topics.items():
                 out.add_topic(topic, published.msgtype, latched=published.latched)
             if recorded.transforms and TF_STATIC in recorded.transforms:
-                out.add_topic(recorded.transforms[TF_STATIC].name, TRANSFORMS_TYPE, latched=True)
+                topic = absolute_name(recorded.transforms[TF_STATIC].name)
+                out.add_topic(topic, TRANSFORMS_TYPE, latched=True)
             way = LiveTrack if options.live else OfflineTrack
             # Bytes are compressed and images decoded while the next image is tracked.
+            hidden = options.quiet if shows is None else not shows
             with WriteBehind() as behind:
                 write = partial(behind.call, out.write_serialised)
                 with (
                     way(parameters, write) as track,
-                    tqdm(
-                        total=recorded.image.message_count,
-                        unit='image',
-                        desc=str(target),
-                        disable=options.quiet or None,  # None: shown where stderr is a terminal
+                    show_progress(
+                        str(target), 'images', recorded.image.message_count, quiet=hidden
                     ) as bar,
                 ):
                     result = _play(options, bag, recorded, track, out, behind, bar, tell)
@@ -130,7 +133,7 @@ def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
 
 def _play(
     options: ReplayOptions, bag: BagReader, recorded: RecordedInput, track: PlayedTrack,
-    out: BagWriter, behind: WriteBehind, bar: tqdm, tell: Tell,
+    out: BagWriter, behind: WriteBehind, bar: Progress, tell: Tell,
 ) -> Replayed:  # fmt: skip
     """Hands the messages of the bag to the nodes, and copies those that the new bag keeps."""
     result = Replayed()
@@ -156,7 +159,9 @@ def _play(
     with ReadAhead(partial(_read, messages, not options.live), messages.close) as ahead:
         for source, stored, given in _readable(ahead, options.keep_going, tell):
             if source in copied:
-                behind.call(out.write, stored.topic, stored.log_time_ns, stored.message)
+                # Inputs keep their names, whatever the namespace of the results.
+                topic = absolute_name(stored.topic)
+                behind.call(out.write, topic, stored.log_time_ns, stored.message)
             if source == GROUND_TRUTH:
                 continue
             check(track.take(source, given))

@@ -50,7 +50,27 @@ class ReplayOptions:
     seed: int | None = None
     image_topic: str | None = None
     camera_info_topic: str | None = None
+    mask_topic: str | None = None
+    depth_topic: str | None = None
+    keypoints_topic: str | None = None
+    namespace: str = ''
     with_images: bool = False
+
+    def recorded(self, bag: BagReader) -> RecordedInput:
+        """The topics of a bag that a replay with these options reads.
+
+        Raises:
+            BagError: there are no images, no camera_info, or several topics to choose from.
+        """
+        return recorded_input(
+            bag,
+            self.image_topic,
+            self.camera_info_topic,
+            mask_topic=self.mask_topic,
+            depth_topic=self.depth_topic,
+            keypoints_topic=self.keypoints_topic,
+            namespace=self.namespace,
+        )
 
     def of_bag(self, source: Path) -> ReplayOptions:
         """The options for one bag: `{bag}` in names of files becomes its folder."""
@@ -96,7 +116,7 @@ def parameters_of_bag(source: Path, options: ReplayOptions) -> NodeParameters:
         ValueError: bad input.
     """
     with BagReader(source) as bag:
-        recorded = recorded_input(bag, options.image_topic, options.camera_info_topic)
+        recorded = options.recorded(bag)
     return node_parameters(options, recorded)
 
 

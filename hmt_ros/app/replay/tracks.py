@@ -1,7 +1,8 @@
 """BME, filter and smoother take the messages of a bag, offline or as real nodes.
 
 The BME takes each image before the filter, which takes the `pose_prediction` of the BME; the
-smoother takes the `likelihood_mixture` of the filter; then the next message follows. At the end of
+smoother takes the `likelihood_mixture` of the filter, and the BME its `pose_mixture` if it is to
+predict less often while the person is tracked; then the next message follows. At the end of
 the bag the smoother finishes: no message tells the node, so it is deactivated.
 """
 
@@ -16,7 +17,7 @@ from hmt_ros.app.replay.live_node import LiveNode
 from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER, NodeParameters
 from hmt_ros.app.replay.player import Player
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
-from hmt_ros.sessions.bme_session import BmeSession
+from hmt_ros.sessions.bme_session import TRACK, BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
 from hmt_ros.sessions.filter_session import (
     DEPTH,
@@ -67,6 +68,7 @@ class OfflineTrack(PlayedTrack):
         self._bme = self._smoother = None
         if parameters.bme is not None:
             self._bme = BmeSession(parameters.bme, self._predict)
+        self._heard = _heard_by_bme(parameters)
         self._filter = FilterSession(parameters.filter, self._filtered)
         if parameters.smoother is not None:
             self._smoother = SmootherSession(parameters.smoother, lambda output: write(*output))
@@ -85,10 +87,12 @@ class OfflineTrack(PlayedTrack):
                 result = _together(result, self._filter.take(PREDICTION, read))
         result = _together(result, self._filter.take(source, message))
         handed, self._handed = self._handed, []
-        if self._smoother is not None:
-            for topic, _, data in handed:
-                read = deserialise(data, track_messages.TOPICS[topic].msgtype)
+        for topic, _, data in handed:
+            read = deserialise(data, track_messages.TOPICS[topic].msgtype)
+            if self._smoother is not None and topic in HANDED_ON:
                 result = _together(result, self._smoother.take(topic, read))
+            if self._bme is not None and topic in self._heard:
+                result = _together(result, self._bme.take(topic, read))
         return result
 
     def finish(self) -> Handled:
@@ -103,7 +107,7 @@ class OfflineTrack(PlayedTrack):
 
     def _filtered(self, output: Output) -> None:
         self._write(*output)
-        if output.topic in HANDED_ON:
+        if output.topic in HANDED_ON or output.topic in self._heard:
             self._handed.append(output)
 
 
@@ -120,6 +124,7 @@ class LiveTrack(PlayedTrack):
 
     def __init__(self, parameters: NodeParameters, write: Write) -> None:
         self._parameters, self._write = parameters, write
+        self._heard = _heard_by_bme(parameters)
         self._bme: LiveNode | None = None
         self._smoother: LiveNode | None = None
 
@@ -162,6 +167,7 @@ class LiveTrack(PlayedTrack):
                 self._bme.wait_until_active()
                 self._bme.wait_for_subscribers((PREDICTION,), 2)
                 self._filter.wait_until_heard(SEEN_BY_BME, 2)
+                self._filter.wait_for_subscribers(self._heard, 2)
             if self._smoother is not None:
                 self._smoother.wait_until_active()
                 self._filter.wait_for_subscribers(HANDED_ON, 2)
@@ -189,10 +195,11 @@ class LiveTrack(PlayedTrack):
             for topic, _ in result.published:
                 result = _together(result, self._filter.answer(topic))
         result = _together(result, self._filter.answer(source))
-        if self._smoother is not None:
-            handed = [topic for topic, _ in result.published if topic in HANDED_ON]
-            for topic in handed:
+        for topic, _ in result.published:
+            if self._smoother is not None and topic in HANDED_ON:
                 result = _together(result, self._smoother.answer(topic))
+            if self._bme is not None and topic in self._heard:
+                result = _together(result, self._bme.answer(topic))
         return result
 
     def finish(self) -> Handled:
@@ -201,6 +208,12 @@ class LiveTrack(PlayedTrack):
             return Handled(FINISH, 0, (), (), ())
         self._smoother.deactivate()
         return self._smoother.answer(FINISH)
+
+
+def _heard_by_bme(parameters: NodeParameters) -> tuple[str, ...]:
+    """Topics of the filter that the BME takes, as sources of the same names."""
+    hears = parameters.bme is not None and parameters.bme.tracked_interval > 0
+    return (TRACK,) if hears else ()
 
 
 def _together(one: Handled | None, other: Handled) -> Handled:

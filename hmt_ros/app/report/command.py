@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from hmt_ros.app.bag_scores import chosen_topics, score_bag
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
+from hmt_ros.app.progress import Progress, show_progress
 from hmt_ros.app.recorded_bodies import body_topics
 from hmt_ros.app.report.grounds import read_grounds
 from hmt_ros.app.report.images import FilmStrip, ImageSource, film_strip, image_source
@@ -122,8 +121,7 @@ def write_report(options: ReportOptions) -> tuple[Content, str]:
     source = image_source(
         options.bag, options.images, options.image_topic, options.camera_info_topic
     )
-    # None: shown where stderr is a terminal.
-    with tqdm(unit='message', desc=str(options.output), disable=options.quiet or None) as bar:
+    with show_progress(str(options.output), 'messages', quiet=options.quiet) as bar:
         content = _content(options, source, bar)
         with _FOLDER.new(options.output, overwrite=options.overwrite) as folder:
             folder.mkdir()
@@ -137,15 +135,16 @@ def write_report(options: ReportOptions) -> tuple[Content, str]:
     return content, '\n'.join([*lines, *content.notes])
 
 
-def _content(options: ReportOptions, source: ImageSource | None, bar: tqdm) -> Content:
+def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) -> Content:
     """Reads and scores what the page shows."""
     truth = read_truth(options.truth) if options.truth else recorded_truth(options.bag)
     with BagReader(options.bag) as bag:
         topics = chosen_topics(bag, options.topics)
-        bar.total = bag.message_count({*topics, *body_topics(bag)}) * (1 if truth is None else 2)
+        total = bag.message_count({*topics, *body_topics(bag)}) * (1 if truth is None else 2)
     if source is not None:
         with BagReader(source.bag) as bag:
-            bar.total += bag.message_count([source.topic])
+            total += bag.message_count([source.topic])
+    bar.total = total
     everything = read_mixtures(
         options.bag, topics=topics, body_model=options.body, progress=bar.update
     )

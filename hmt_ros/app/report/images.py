@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hmt_ros.app.replay.inputs import CAMERA_INFO_TYPE, COMPRESSED, RAW, recorded_input
+from hmt_ros.app.replay.inputs import CAMERA_INFO_TYPE, COMPRESSED, OVERLAY, RAW, recorded_input
 from hmt_ros.body import Camera
 from hmt_ros.inference.arrays import Image
 from msg_tools import BagReader
@@ -17,8 +17,6 @@ from msg_tools.messages.camera_info import camera_from_info
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image, encode_jpeg
 
-# The end of the name of the topic on which the tracker publishes its drawings.
-OVERLAY = 'overlay/compressed'
 # Width in px and quality, from the best to the smallest.
 _LEVELS = (
     (640, 80), (640, 65), (480, 65), (480, 50), (360, 50), (320, 40), (240, 35), (160, 30),

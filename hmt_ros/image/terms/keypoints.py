@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +23,10 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import Frames, forward
 from hmt_ros.body.skeleton import Skeleton, other_side
 from hmt_ros.image.keypoint_schemes import (
-    JOINTS,
     MIRROR,
-    Landmark,
     SlopeModel,
-    landmark_called,
+    landmarks_of,
     noise_of,
-    scheme_of,
     slope_models,
 )
 from hmt_ros.image.surface import lens_of
@@ -61,7 +58,7 @@ EXCHANGED = np.array([[0, 0, 0], [1, 1, 1], [0, 1, 0], [0, 0, 1]], dtype=np.int6
 NOT_EXCHANGED = np.array([[0.0, -np.inf, -np.inf, -np.inf]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Keypoints:
     """Image positions of joints, from any 2D detector or by hand.
 
@@ -125,7 +122,7 @@ class Keypoints:
         Raises:
             ValueError: there is no such scheme.
         """
-        marks = [self._landmark(name, body, scheme) for name in self.names]
+        marks = landmarks_of(self.names, body.joint_names, scheme)
         names = [
             name if mark is None else mark.joint
             for name, mark in zip(self.names, marks, strict=True)
@@ -159,13 +156,6 @@ class Keypoints:
             noise=noise,
         )
         return renamed, strange
-
-    def _landmark(self, name: str, body: Body, scheme: str) -> Landmark | None:
-        """What a name means; None: a joint of the body, or nothing that is known."""
-        found = scheme_of(self.names, scheme)
-        if found is not None:
-            return found.landmark(name)
-        return None if name in body.joint_names or scheme == JOINTS else landmark_called(name)
 
     def magnification(self) -> float:
         """About how many px a metre has at the person, by how far the keypoints reach."""
@@ -205,11 +195,12 @@ class KeypointTerm:
         self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
         """See `hmt_ros.body.pose_terms.FrameTerm`."""
+        measured = self.measured
         n, d = frames.count, self.skeleton.dimension
         poses = n if derivatives else 0
         value, gradient, hessian = np.zeros(n), np.zeros((poses, d)), np.zeros((poses, d, d))
         add_keypoints(
-            self._points, self._slopes, tree_of(self.skeleton), lens_of(self.camera),
+            measured.points, measured.slopes, tree_of(self.skeleton), lens_of(self.camera),
             float(self.settings.scale), float(self.settings.weight), *self._priors(rows, n),
             *frames.by_pose(), *frames.dofs_by_pose(), value, gradient, hessian,
         )  # fmt: skip
@@ -217,13 +208,14 @@ class KeypointTerm:
 
     def exchanged(self, frames: Frames, rows: Index) -> Array:
         """Log probabilities (N, E) of the exchanges at the frames of N poses."""
+        measured = self.measured
         exchanged, priors = self._priors(rows, frames.count)
         result = np.empty(priors.shape)
         energies = np.empty((exchanged.shape[1], 2))
         columns, origins = frames.by_pose()
         for n in range(frames.count):
             group_energies(
-                self._points, self._slopes, lens_of(self.camera), float(self.settings.scale),
+                measured.points, measured.slopes, lens_of(self.camera), float(self.settings.scale),
                 columns[n], origins[n], energies,
             )  # fmt: skip
             exchange_log_posterior(
@@ -241,8 +233,9 @@ class KeypointTerm:
         """
         joints, places, pixels, projection = self._likeliest(frames)
         shown = np.flatnonzero(np.isfinite(pixels).all(0))
-        whiteners = self._points.whiteners[shown]
-        error = np.einsum('kab,kb->ka', whiteners, pixels.T[shown] - self._points.pixels[shown])
+        points = self.measured.points
+        whiteners = points.whiteners[shown]
+        error = np.einsum('kab,kb->ka', whiteners, pixels.T[shown] - points.pixels[shown])
         by_point = np.einsum('kab,bik->kai', whiteners, projection[..., shown])
         s = self.settings
         shrink = 1.0 / (1.0 + error**2 / s.scale**2)
@@ -261,13 +254,14 @@ class KeypointTerm:
         The exchange of sides is the likeliest; of a landmark behind the camera it is NaN.
         """
         pixels = self._likeliest(frames)[2]
-        error = pixels.T - self._points.pixels
-        whitened = np.einsum('kab,kb->ka', self._points.whiteners, error)
+        points = self.measured.points
+        error = pixels.T - points.pixels
+        whitened = np.einsum('kab,kb->ka', points.whiteners, error)
         return np.asarray(np.linalg.norm(whitened, axis=1))
 
     def _likeliest(self, frames: Frames) -> tuple[Index, Array, Array, Array]:
         """In the likeliest exchange: joints (P,), places (P, 3), pixels (2, P), derivatives."""
-        points, everyone = self._points, np.zeros(1, dtype=np.intp)
+        points, everyone = self.measured.points, np.zeros(1, dtype=np.intp)
         exchanged, _ = self._priors(everyone, 1)
         sides = exchanged[int(np.argmax(self.exchanged(frames, everyone)[0]))][points.groups]
         every = np.arange(len(sides))
@@ -275,7 +269,7 @@ class KeypointTerm:
         columns, origins = (x[0] for x in frames.by_pose())
         places = origins[segments] + np.einsum('kji,kj->ki', columns[segments], offsets)
         pixels, projection = self.camera.project_with_derivative(places.T)
-        return self._joints[every, sides], places, pixels, projection
+        return self.measured.joints[every, sides], places, pixels, projection
 
     def _priors(self, rows: Index, count: int) -> tuple[NDArray[np.int64], Array]:
         """Which groups each exchange exchanges (E, G), and log priors (N, E)."""
@@ -284,99 +278,108 @@ class KeypointTerm:
         chosen = self.exchanges[rows] if len(self.exchanges) > 1 else self.exchanges[[0] * count]
         return EXCHANGED, np.ascontiguousarray(chosen)
 
-    @cached_property
-    def _counted(self) -> Keypoints:
-        return self.keypoints[np.flatnonzero(self.keypoints.seen)]
-
-    @cached_property
-    def _joints(self) -> Index:
-        """(P, 2) joints of the skeleton that keypoints show, as they are called and exchanged."""
-        names, index = self._counted.names, self.skeleton.joint_index
-        known = self.skeleton.joint_names
-        others = [x if other_side(x) not in known else other_side(x) for x in names]
-        return np.stack([index(names), index(others)], axis=1)
-
-    @cached_property
-    def _points(self) -> Points:
-        k, skeleton, joints = self._counted, self.skeleton, self._joints
-        segments = skeleton.joint_segments[joints].astype(np.int64)
-        own = np.zeros((len(joints), 3)) if k.offsets is None else k.offsets
-        offsets = skeleton.joint_offsets[joints] + np.stack([own, own * MIRROR], axis=1)
-        covariances = self.settings.sigma**2 * k.covariances
-        confidences = k.confidences[:, None, None]
-        if k.noise is not None:
-            magnification = self.magnification or k.magnification()
-            blur = (self.settings.sigma * magnification * k.noise) ** 2
-            covariances = covariances + blur[:, None, None] * np.eye(2)
-            confidences = np.ones_like(confidences)
-        precision = np.linalg.inv(covariances) * confidences
-        whiteners = np.linalg.cholesky(precision).transpose(0, 2, 1)
-        groups = [_group_of(skeleton, name) for name in k.names]
-        return Points(
-            segments, offsets, k.pixels, np.ascontiguousarray(whiteners), np.array(groups, np.int64)
-        )
-
-    @cached_property
-    def _slopes(self) -> Slopes:
-        """The bones that were lifted."""
-        k, skeleton = self._counted, self.skeleton
-        found = []
-        if k.positions is not None:
-            lifted = _first_of(k.names, k.positions)
-            pixels = _first_of(k.names, k.pixels)
-            at_rest = _rest(skeleton)
-            for bone in slope_models():
-                if bone.segment not in skeleton.segment_names:
-                    continue
-                measured = _bone(lifted, bone)
-                local = _bone(at_rest, bone)
-                middle = _middle(pixels, bone)
-                if measured is None or local is None or middle is None:
-                    continue
-                ray = self.camera.rays(middle[None])[0]
-                ray = ray / np.linalg.norm(ray)
-                other = bone.mirrored()
-                swapped = _bone(at_rest, other)
-                assert swapped is not None
-                own, far = (skeleton.segment_names.index(x.segment) for x in (bone, other))
-                columns = _rest_columns(skeleton)
-                found.append(
-                    (
-                        (own, far),
-                        np.stack([columns[own] @ local, bone.sign * columns[far] @ swapped]),
-                        ray,
-                        float(measured @ ray),
-                        1.0 / (self.settings.sigma * bone.sigma),
-                        _group_of(skeleton, bone.ends[0]),
-                    )
-                )
-        if not found:
-            return _NO_SLOPES
-        segments, directions, rays, slopes, weights, groups = zip(*found, strict=True)
-        return Slopes(
-            np.array(segments, np.int64), np.array(directions), np.array(rays), np.array(slopes),
-            np.array(weights), np.array(groups, np.int64),
-        )  # fmt: skip
+    @property
+    def measured(self) -> MeasuredKeypoints:
+        """What the keypoints say of the skeleton, whatever its pose."""
+        sigma = self.settings.sigma
+        return _measured(self.skeleton, self.camera, self.keypoints, sigma, self.magnification)
 
 
-_NO_SLOPES = Slopes(
-    np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0),
-    np.zeros(0, np.int64),
-)  # fmt: skip
+@dataclass(frozen=True, eq=False)
+class MeasuredKeypoints:
+    """What P keypoints that count say of a skeleton, whatever its pose.
+
+    Attributes:
+        joints: (P, 2) of the skeleton that they show, as they are called and exchanged.
+        points: where they were seen, and on which segment they lie.
+        slopes: of the bones that were lifted.
+    """
+
+    joints: Index
+    points: Points
+    slopes: Slopes
+
+
+# A track makes a term for every set of hypotheses of an image, and a start one for every trial of
+# lengths. What does not depend on the hypotheses, or on the lengths, is worked out once.
+@lru_cache(maxsize=16)
+def _measured(
+    skeleton: Skeleton, camera: Camera, keypoints: Keypoints, sigma: float, magnification: float
+) -> MeasuredKeypoints:
+    counted, whiteners = _whitened(keypoints, sigma, magnification)
+    names, known = counted.names, skeleton.joint_names
+    others = [x if other_side(x) not in known else other_side(x) for x in names]
+    joints = np.stack([skeleton.joint_index(names), skeleton.joint_index(others)], axis=1)
+    own = np.zeros((len(joints), 3)) if counted.offsets is None else counted.offsets
+    offsets = skeleton.joint_offsets[joints] + np.stack([own, own * MIRROR], axis=1)
+    segments = skeleton.joint_segments[joints].astype(np.int64)
+    groups = np.array([_group_of(skeleton, i) for i in segments[:, 0]], dtype=np.int64)
+    points = Points(segments, offsets, counted.pixels, whiteners, groups)
+    return MeasuredKeypoints(joints, points, _slopes(skeleton, camera, counted, sigma))
 
 
 @lru_cache(maxsize=16)
-def _rest(skeleton: Skeleton) -> dict[str, Array]:
-    """Positions (3,) of the joints of a skeleton at rest."""
-    joints = forward(skeleton, np.zeros((1, skeleton.dimension))).joints()[..., 0]
-    return dict(zip(skeleton.joint_names, joints, strict=True))
+def _whitened(keypoints: Keypoints, sigma: float, magnification: float) -> tuple[Keypoints, Array]:
+    """The keypoints that count, and matrices (P, 2, 2) that make their noise white."""
+    k = keypoints[np.flatnonzero(keypoints.seen)]
+    covariances = sigma**2 * k.covariances
+    confidences = k.confidences[:, None, None]
+    if k.noise is not None:
+        blur = (sigma * (magnification or k.magnification()) * k.noise) ** 2
+        covariances = covariances + blur[:, None, None] * np.eye(2)
+        confidences = np.ones_like(confidences)
+    precision = np.linalg.inv(covariances) * confidences
+    return k, np.ascontiguousarray(np.linalg.cholesky(precision).transpose(0, 2, 1))
+
+
+def _slopes(skeleton: Skeleton, camera: Camera, keypoints: Keypoints, sigma: float) -> Slopes:
+    """The bones that were lifted."""
+    lifted: dict[str, Array] = {}
+    if keypoints.positions is not None:
+        lifted = _first_of(keypoints.names, keypoints.positions)
+    pixels = _first_of(keypoints.names, keypoints.pixels)
+    pairs, directions, rays, slopes, weights, groups = [], [], [], [], [], []
+    for bone, segments, along in _bones(skeleton):
+        measured, middle = _direction(lifted, bone), _middle(pixels, bone)
+        if measured is None or middle is None:
+            continue
+        ray = camera.rays(middle[None])[0]
+        ray = ray / np.linalg.norm(ray)
+        first = skeleton.joint_index([bone.ends[0].replace('mid_', 'left_')])
+        pairs.append(segments)
+        directions.append(along)
+        rays.append(ray)
+        slopes.append(float(measured @ ray))
+        weights.append(1.0 / (sigma * bone.sigma))
+        groups.append(_group_of(skeleton, int(skeleton.joint_segments[first][0])))
+    n = len(pairs)
+    return Slopes(
+        np.reshape(pairs, (n, 2)).astype(np.int64), np.reshape(directions, (n, 2, 3)),
+        np.reshape(rays, (n, 3)), np.array(slopes, np.float64), np.array(weights, np.float64),
+        np.array(groups, np.int64),
+    )  # fmt: skip
 
 
 @lru_cache(maxsize=16)
-def _rest_columns(skeleton: Skeleton) -> Array:
-    """(S, 3, 3) axes of the segments at rest, one a row."""
-    columns, _ = forward(skeleton, np.zeros((1, skeleton.dimension))).by_pose()
-    return np.asarray(columns[0])
+def _bones(skeleton: Skeleton) -> list[tuple[SlopeModel, tuple[int, int], Array]]:
+    """The bones that a skeleton has: their model, segments as called and exchanged, and directions.
+
+    The directions (2, 3) are in the frames of these segments; that of the other side has the sign
+    of the model.
+    """
+    at_rest = forward(skeleton, np.zeros((1, skeleton.dimension)))
+    places = dict(zip(skeleton.joint_names, at_rest.joints()[..., 0], strict=True))
+    columns = at_rest.by_pose()[0][0]
+    result = []
+    for bone in slope_models():
+        other = bone.mirrored()
+        known = {bone.segment, other.segment} <= {*skeleton.segment_names}
+        own, far = _direction(places, bone), _direction(places, other)
+        if known and own is not None and far is not None:
+            i, j = (skeleton.segment_names.index(x.segment) for x in (bone, other))
+            directions = np.stack([columns[i] @ own, bone.sign * columns[j] @ far])
+            result.append((bone, (i, j), directions))
+    return result
 
 
 def _first_of(names: tuple[str, ...], values: Array) -> dict[str, Array]:
@@ -398,7 +401,7 @@ def _end(places: Mapping[str, Array], name: str) -> Array | None:
     return 0.5 * (pair[0] + pair[1])
 
 
-def _bone(places: Mapping[str, Array], bone: SlopeModel) -> Array | None:
+def _direction(places: Mapping[str, Array], bone: SlopeModel) -> Array | None:
     """Unit vector (3,) along a bone; None: an end is missing, or both are one."""
     first, last = (_end(places, name) for name in bone.ends)
     if first is None or last is None:
@@ -413,9 +416,9 @@ def _middle(pixels: Mapping[str, Array], bone: SlopeModel) -> Array | None:
     return None if first is None or last is None else 0.5 * (first + last)
 
 
-def _group_of(skeleton: Skeleton, joint: str) -> int:
-    """Group that a joint is exchanged with."""
-    joint = joint.replace('mid_', 'left_') if joint.startswith('mid_') else joint
-    if other_side(joint) == joint:
-        return CENTRE
-    return ARMS if any(x in joint for x in ('shoulder', 'elbow', 'wrist', 'hand')) else LEGS
+def _group_of(skeleton: Skeleton, segment: int) -> int:
+    """Group that what lies on a segment is exchanged with."""
+    for chain, segments in skeleton.chains.items():
+        if segment in segments:
+            return {'arm': ARMS, 'leg': LEGS}.get(chain.rpartition('_')[2], CENTRE)
+    return CENTRE

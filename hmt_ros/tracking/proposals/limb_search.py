@@ -24,9 +24,9 @@ from hmt_ros.inference.energy import Derivatives, Restricted, Student, Sum
 from hmt_ros.tracking.posterior import Posterior
 
 # Degrees of freedom of the Student prior that keeps a limb near its prediction: heavy tails.
+TAILS = 4.0
 # Number of samples that are put where the keypoints are, and of Newton steps that do it.
 PLACED, PLACING_STEPS = 4, 8
-TAILS = 4.0
 # Factor on the standard deviations of the body's prior, of the samples that are drawn from it.
 WIDE = 1.3
 

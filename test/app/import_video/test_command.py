@@ -51,26 +51,26 @@ def test_video_with_keypoints(video, tmp_path, number_in):
     keypoints = arrays(tmp_path / 'k.npz', 10)
     assert run(video, tmp_path / 'bag', '--keypoints', keypoints) == 0
     found = content(tmp_path / 'bag')
-    assert sorted(found) == ['camera_info', 'image/compressed', 'keypoints', 'keypoints_3d']
+    assert sorted(found) == ['/camera_info', '/image/compressed', '/keypoints', '/keypoints_3d']
     stamps = [START_NS + 40_000_000 * i for i in range(10)]
     for topic, messages in found.items():
         assert [stamp for stamp, _ in messages] == stamps, topic
         assert {x.header.frame_id for _, x in messages} == {'camera_optical_frame'}
-    assert [number_in(decode_image(x)) for _, x in found['image/compressed']] == [*range(10)]
-    camera = camera_from_info(found['camera_info'][0][1], (64, 48))
+    assert [number_in(decode_image(x)) for _, x in found['/image/compressed']] == [*range(10)]
+    camera = camera_from_info(found['/camera_info'][0][1], (64, 48))
     assert camera.fx == pytest.approx(32 / np.tan(np.radians(30)))
-    messages = [x for _, x in found['keypoints']]
+    messages = [x for _, x in found['/keypoints']]
     assert [len(x.names) for x in messages] == [3, 3, 0, 3, 3, 3, 3, 3, 3, 3]
     assert tuple(messages[4].names) == NAMES
     assert list(messages[4].u) == [14, 18, 14]
     assert list(messages[4].confidence) == [0.5] * 3
     assert len(messages[4].covariance) == 0
-    lifted = [x for _, x in found['keypoints_3d']]
+    lifted = [x for _, x in found['/keypoints_3d']]
     assert [len(x.names) for x in lifted] == [len(x.names) for x in messages]
     assert list(lifted[4].z) == [1.0] * 3
     with BagReader(tmp_path / 'bag') as bag:
         recorded = recorded_input(bag)
-        assert recorded.image.name == 'image/compressed'
+        assert recorded.image.name == '/image/compressed'
         assert recorded.keypoints is not None
 
 
@@ -85,9 +85,9 @@ def test_jpeg_files_are_copied_and_masks_are_found_by_name(folder, tmp_path):
     assert run(folder, tmp_path / 'bag', *options) == 0
     found = content(tmp_path / 'bag')
     files = [(folder / f'img_{i}.jpg').read_bytes() for i in range(1, 11)]
-    assert [bytes(x.data) for _, x in found['image/compressed']] == files
-    assert [stamp for stamp, _ in found['mask']] == [5, 200_000_005]
-    assert np.array_equal(decode_mask(found['mask'][0][1]), picture > 0)
+    assert [bytes(x.data) for _, x in found['/image/compressed']] == files
+    assert [stamp for stamp, _ in found['/mask']] == [5, 200_000_005]
+    assert np.array_equal(decode_mask(found['/mask'][0][1]), picture > 0)
 
 
 def test_masks_of_a_video(video, tmp_path):
@@ -102,7 +102,7 @@ def test_masks_of_a_video(video, tmp_path):
     writer.release()
     options = ['--masks', tmp_path / 'masks.mp4', '--start', '0.1', '--every', 3]
     assert run(video, tmp_path / 'bag', *options) == 0
-    masks = [decode_mask(x) for _, x in content(tmp_path / 'bag')['mask']]
+    masks = [decode_mask(x) for _, x in content(tmp_path / 'bag')['/mask']]
     assert [round(x.mean() * 64) for x in masks] == pytest.approx([20, 32, 44], abs=1)
 
 
@@ -124,7 +124,7 @@ def test_one_of_several_persons(video, tmp_path):
     (tmp_path / 'k.json').write_text(json.dumps(entries), 'utf-8')
     options = ['--keypoints', tmp_path / 'k.json', '--first-number', 1, '--person', 'id:9']
     assert run(video, tmp_path / 'bag', *options) == 0
-    columns = [x.u[0] for _, x in content(tmp_path / 'bag')['keypoints']]
+    columns = [x.u[0] for _, x in content(tmp_path / 'bag')['/keypoints']]
     assert columns == [50.0 - i for i in range(10)]
 
 
@@ -165,17 +165,17 @@ def test_detector(video, tmp_path, monkeypatch):
     found = content(tmp_path / 'bag')
     stamps = [START_NS + 80_000_000 * i for i in range(5)]
     assert made[0].stamps == [*stamps, 'closed']
-    for topic in ('keypoints', 'keypoints_3d', 'mask'):
+    for topic in ('/keypoints', '/keypoints_3d', '/mask'):
         assert [stamp for stamp, _ in found[topic]] == stamps
-    assert [len(x.names) for _, x in found['keypoints']] == [0, 3, 0, 3, 0]
-    assert [decode_mask(x).any(1).sum() for _, x in found['mask']] == [1, 2, 3, 4, 5]
+    assert [len(x.names) for _, x in found['/keypoints']] == [0, 3, 0, 3, 0]
+    assert [decode_mask(x).any(1).sum() for _, x in found['/mask']] == [1, 2, 3, 4, 5]
 
 
 def test_mediapipe_itself(mediapipe, walk_video, tmp_path):
     """It finds the hips of a rendered person, each on its side."""
     out = tmp_path / 'bag'
     assert run(walk_video / 'walk.mp4', out, '--detector', 'mediapipe') == 0
-    messages = [x for _, x in content(out)['keypoints'] if len(x.names)]
+    messages = [x for _, x in content(out)['/keypoints'] if len(x.names)]
     assert len(messages) >= 6
     truth = np.load(walk_video / 'rendered' / 'truth.npz')
     for name in ('left_hip', 'right_hip'):

@@ -93,7 +93,7 @@ IMAGE, INFO = ('image', image(0)), ('camera_info', info(0))
     ('entries', 'message'),
     [
         pytest.param([INFO], 'has no topic of type CompressedImage or Image', id='no images'),
-        pytest.param([IMAGE], 'has images on image, but no camera_info', id='no camera_info'),
+        pytest.param([IMAGE], 'has images on /image, but no camera_info', id='no camera_info'),
         pytest.param(
             [('camera_info', info(0, k=np.zeros(9))), IMAGE],
             'the camera is not calibrated (K is zero)',
@@ -167,7 +167,7 @@ IMAGE, INFO = ('image', image(0)), ('camera_info', info(0))
         ),
         pytest.param(
             [('a/info', info(0)), ('b/info', info(0)), IMAGE],
-            'name one of a/info, b/info by --camera-info-topic',
+            'name one of /a/info, /b/info by --camera-info-topic',
             id='several calibrations',
         ),
     ],
@@ -299,7 +299,7 @@ def test_start_that_nothing_explains(good, tmp_path, capsys):
         (['--set', 'max_hypotheses=20'], 'max_hypotheses <= candidates'),
         (['--set', 'image_transport=raw'], 'image_transport is decided by replay'),
         (['--set', 'proposals=['], '--set proposals=['),
-        (['--image-topic', 'imag'], 'has no topic imag; it has camera_info, image'),
+        (['--image-topic', 'imag'], 'has no topic imag; it has /camera_info, /image'),
         (['--image-topic', 'camera_info'], 'CameraInfo, wanted CompressedImage or Image'),
         (['--camera-info-topic', 'image'], 'wanted CameraInfo'),
         (['--liev'], 'unrecognized arguments: --liev; see --help'),

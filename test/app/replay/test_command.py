@@ -1,12 +1,15 @@
 """replay, offline."""
 
 import sys
+from operator import itemgetter
 from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from hmt_ros.app.replay.command import main
 from hmt_ros.app.replay.inputs import recorded_input
@@ -19,6 +22,7 @@ from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.tracking import Status
 from hmt_ros.tracking.ground import Ground
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
+from msg_tools.bags.contents import absolute_name
 from msg_tools.messages.bodies import body_of
 from msg_tools.messages.depth_images import depth_message
 from msg_tools.messages.headers import header_message, time_ns
@@ -40,12 +44,13 @@ def recorded():
     found, last = [], None
     with BagReader(REACH) as bag:
         for stored in bag.messages():
-            if stored.topic == 'image/compressed':
+            name = stored.topic.removeprefix('/')
+            if name == 'image/compressed':
                 last = stored.log_time_ns
-                if sum(topic == stored.topic for topic, _, _ in found) == IMAGES:
+                if sum(topic == name for topic, _, _ in found) == IMAGES:
                     break
-            if stored.topic != 'body':
-                found.append((stored.topic, stored.log_time_ns, stored.message))
+            if name != 'body':
+                found.append((name, stored.log_time_ns, stored.message))
     return [entry for entry in found if last is not None and entry[1] < last]
 
 
@@ -57,10 +62,12 @@ def write(folder, entries):
 
 
 def read(folder):
+    """Messages of a bag by the names of their topics, all of which are absolute."""
     found = {}
     with BagReader(folder) as bag:
         for stored in bag.messages():
             found.setdefault(stored.topic, []).append(stored)
+    assert all(topic.startswith('/') for topic in found)
     return found
 
 
@@ -144,29 +151,33 @@ def replayed(short, tmp_path_factory):
 def test_topics(replayed, entries):
     found = read(replayed)
     stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
-    assert {topic: len(messages) for topic, messages in found.items()} == {
+    counts = {
         **dict.fromkeys(STARTS, 1),
         'ground_truth': IMAGES,
         **{topic: IMAGES for topic in (*TOPICS, *SMOOTHED_TOPICS) if topic not in STARTS},
     }
+    assert {topic: len(messages) for topic, messages in found.items()} == {
+        absolute_name(topic): count for topic, count in counts.items()
+    }
     for topic, published in {**TOPICS, **SMOOTHED_TOPICS}.items():
-        assert {stored.msgtype for stored in found[topic]} == {published.msgtype}
+        messages = found[absolute_name(topic)]
+        assert {stored.msgtype for stored in messages} == {published.msgtype}
         if topic not in STARTS:
-            assert [stored.log_time_ns for stored in found[topic]] == stamps
+            assert [stored.log_time_ns for stored in messages] == stamps
     assert sorted(content(replayed)) == ['metadata.yaml', 'tracked.mcap']
 
 
 def test_mixtures_explain_the_images(replayed):
     found = read(replayed)
-    (body,) = (stored.message for stored in found['body'])
-    first = pose_mixture_of(found['pose_mixture'][0].message, body.dof_names, body.joint_names)
+    (body,) = (stored.message for stored in found['/body'])
+    first = pose_mixture_of(found['/pose_mixture'][0].message, body.dof_names, body.joint_names)
     body_joints = body_of(first, load_body('human37')).joint_positions
     for posterior, likelihood, truth, state, overlay in zip(
-        found['pose_mixture'],
-        found['likelihood_mixture'],
-        found['ground_truth'],
-        found['joint_states'],
-        found['overlay/compressed'],
+        found['/pose_mixture'],
+        found['/likelihood_mixture'],
+        found['/ground_truth'],
+        found['/joint_states'],
+        found['/overlay/compressed'],
         strict=True,
     ):
         mixture = pose_mixture_of(posterior.message, body.dof_names, body.joint_names)
@@ -186,6 +197,82 @@ def test_mixtures_explain_the_images(replayed):
         assert decode_image(overlay.message).shape == (360, 480, 3)
 
 
+def test_log_likelihoods_of_both_mixtures_are_known(replayed):
+    found = read(replayed)
+    for topic in ('/pose_mixture', '/likelihood_mixture'):
+        for stored in found[topic]:
+            values = [component.log_likelihood for component in stored.message.components]
+            assert np.isfinite(values).all(), topic
+
+
+def test_results_in_a_namespace(still, entries, tmp_path, capsys):
+    """Inputs keep their names; those in the namespace are preferred to those in the root."""
+    place = '/humans/bodies/anna'
+    keypoints = MESSAGES.create(
+        'hmt_msgs/msg/Keypoints2D',
+        header=entries[0][2].header,
+        names=['nose'],
+        u=np.array([9.0], np.float32),
+        v=np.array([9.0], np.float32),
+    )
+    names = ('keypoints', f'{place}/keypoints', '/detector/keypoints')
+    extra = [(name, entries[0][1], keypoints) for name in names]
+    bag = write(tmp_path / 'bag', [*extra, *entries])
+    results = {
+        f'{place}/{topic}' if topic != '/tf' else '/tf' for topic in (*TOPICS, *SMOOTHED_TOPICS)
+    }
+    command = [str(bag), *PERSON, '--quiet', '-o']
+    for name, given in (('absolute', place), ('slash', 'humans/bodies/anna/')):
+        out = tmp_path / name
+        assert main([*command, str(out), '--namespace', given]) == 0
+        assert read(out).keys() == {*results, '/ground_truth', f'{place}/keypoints'}
+    chosen = tmp_path / 'chosen'
+    arguments = ['--namespace', place, '--keypoints-topic', '/detector/keypoints']
+    assert main([*command, str(chosen), *arguments]) == 0
+    assert read(chosen).keys() == {*results, '/ground_truth', '/detector/keypoints'}
+    assert main([*command, str(tmp_path / 'root')]) == 0
+    assert '/keypoints' in read(tmp_path / 'root')
+    capsys.readouterr()
+    for wrong in ('/humans/7', 'a b', '/a//b'):
+        assert main([*command, str(tmp_path / 'wrong'), '--namespace', wrong]) == 1
+        line = capsys.readouterr().err
+        assert 'wanted a namespace such as /humans/bodies/anna' in line
+        assert repr(wrong) in line
+    assert main([*command, str(tmp_path / 'wrong'), '--mask-topic', 'keypoints']) == 1
+    assert 'wanted CompressedImage or Image' in capsys.readouterr().err.replace(
+        'Image or CompressedImage', 'CompressedImage or Image'
+    )
+
+
+def test_bag_with_relative_names(still, entries, short, tmp_path):
+    """Bags of earlier versions are read as before."""
+    old = tmp_path / 'old.mcap'
+    relative_names(short / 'short.mcap', old)
+    with BagReader(old) as bag:
+        assert set(bag.topics) == {'image/compressed', 'camera_info', 'ground_truth'}
+    for source, name in ((old, 'a'), (short, 'b')):
+        assert main([str(source), '-o', str(tmp_path / name / 'out'), *SUBJECT, '--quiet']) == 0
+    assert content(tmp_path / 'a' / 'out') == content(tmp_path / 'b' / 'out')
+
+
+def relative_names(source, target):
+    """Copies an MCAP file; names of topics lose their slash."""
+    with source.open('rb') as file, target.open('wb') as copy:
+        writer = Writer(copy)
+        writer.start(profile='ros2')
+        channels = {}
+        for schema, channel, message in make_reader(file).iter_messages():
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic[1:], 'cdr', known, channel.metadata
+                )
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time
+            )
+        writer.finish()
+
+
 def test_without_a_subject_a_prediction_starts_the_track(short, tmp_path, capsys):
     out = tmp_path / 'out'
     command = [str(short), '-o', str(out), '--background', str(REACH / 'background.png')]
@@ -195,10 +282,10 @@ def test_without_a_subject_a_prediction_starts_the_track(short, tmp_path, capsys
         in capsys.readouterr().err
     )
     found = read(out)
-    assert {len(found[topic]) for topic in ('pose_prediction', 'pose_mixture')} == {IMAGES}
-    predicted = pose_mixture_of(found['pose_prediction'][0].message)
+    assert {len(found[topic]) for topic in ('/pose_prediction', '/pose_mixture')} == {IMAGES}
+    predicted = pose_mixture_of(found['/pose_prediction'][0].message)
     assert predicted.kind == MixtureKind.PREDICTION
-    (body,) = (stored.message for stored in found['body'])
+    (body,) = (stored.message for stored in found['/body'])
     # The person is about as large as the model says; the first image says a little.
     model = load_predictor().body.segment_lengths
     assert dict(zip(body.segment_names, body.segment_lengths, strict=True)) == pytest.approx(
@@ -212,12 +299,12 @@ def test_without_a_subject_a_prediction_starts_the_track(short, tmp_path, capsys
 def test_predictions_beside_a_subject(still, short, tmp_path):
     out = tmp_path / 'out'
     assert main([str(short), '-o', str(out), *PERSON, '--bme', '--quiet']) == 0
-    assert len(read(out)['pose_prediction']) == IMAGES
+    assert len(read(out)['/pose_prediction']) == IMAGES
     assert [prediction is None for prediction in still[0].predictions] == [False] * IMAGES
 
 
 def test_ground_truth_is_copied(replayed, entries):
-    copied = [stored.message for stored in read(replayed)['ground_truth']]
+    copied = [stored.message for stored in read(replayed)['/ground_truth']]
     given = [message for topic, _, message in entries if topic == 'ground_truth']
     for one, other in zip(copied, given, strict=True):
         assert one.header == other.header
@@ -245,12 +332,12 @@ def test_images_are_copied_on_demand(still, short, tmp_path, entries):
     found = read(out)
     for topic in ('image/compressed', 'camera_info'):
         given = [(time, m.header) for name, time, m in entries if name == topic]
-        assert [(s.log_time_ns, s.message.header) for s in found[topic]] == given
+        assert [(s.log_time_ns, s.message.header) for s in found[f'/{topic}']] == given
     # What came out can be tracked again.
     assert main([str(out), '-o', str(tmp_path / 'again'), *SUBJECT, '--quiet']) == 0
     assert read(tmp_path / 'again').keys() == read(tmp_path / 'out').keys() - {
-        'image/compressed',
-        'camera_info',
+        '/image/compressed',
+        '/camera_info',
     }
 
 
@@ -297,7 +384,7 @@ def test_keypoints_of_the_bag_are_used(still, entries, tmp_path):
     options = [*SUBJECT, '--quiet', '-o']
     assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
     assert still[-1].keypoints == [('head', 'left_hip', 'right_hip'), ()]
-    assert len(read(tmp_path / 'out')['pose_mixture']) == IMAGES
+    assert len(read(tmp_path / 'out')['/pose_mixture']) == IMAGES
     assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_keypoints=false']) == 0
     assert still[-1].keypoints == [None] * IMAGES
 
@@ -362,7 +449,7 @@ def test_masks_of_the_bag_are_used(still, entries, tmp_path, topic):
     options = [*SUBJECT, '--quiet', '-o']
     assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
     assert still[-1].masks == [4000, None]
-    assert len(read(tmp_path / 'out')['pose_mixture']) == IMAGES
+    assert len(read(tmp_path / 'out')['/pose_mixture']) == IMAGES
     assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_mask=false']) == 0
     assert still[-1].masks == [None] * IMAGES
 
@@ -375,12 +462,17 @@ def test_depth_of_the_bag_is_used(still, entries, tmp_path, capsys, kind):
     unit = 1000 if kind is np.uint16 else 1
     depth = np.full(decode_image(pictures[0][2]).shape[:2], 3 * unit, kind)
     extra = [('depth', stamp + 1000, depth_message(MESSAGES, depth, stamp, ''))]
-    bag = write(tmp_path / 'bag', sorted(entries + extra, key=lambda entry: entry[1]))
+    at = itemgetter(1)
+    bag = write(tmp_path / 'bag', sorted(entries + extra, key=at))
     options = [*SUBJECT, '--quiet', '-o']
     assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
     assert still[-1].depths == [3.0, *[None] * (IMAGES - 1)]
     assert len(read(tmp_path / 'out')['pose_mixture']) == IMAGES
     assert 'no depth has come for the image of' in capsys.readouterr().err
+    aligned = '/camera/aligned_depth_to_color/image_raw'
+    bag = write(tmp_path / 'robot', renamed(sorted(entries + extra, key=at), {'depth': aligned}))
+    assert main([str(bag), *options, str(tmp_path / 'named'), '--depth-topic', aligned]) == 0
+    assert still[-1].depths == [3.0, *[None] * (IMAGES - 1)]
     assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_depth=false']) == 0
     assert still[-1].depths == [None] * IMAGES
 
@@ -413,7 +505,7 @@ def test_topics_are_found_by_their_names(entries, tmp_path):
         found = recorded_input(bag)
         assert found.image.name == '/cam/image_raw/compressed'
         assert found.camera_info.name == '/cam/camera_info'
-        assert found.ground_truth.name == 'ground_truth'
+        assert found.ground_truth.name == '/ground_truth'
         assert (found.keypoints, found.transport) == (None, 'compressed')
     several = write(tmp_path / 'several', renamed(entries, names) + renamed(entries, others))
     with BagReader(several) as bag:
@@ -428,8 +520,8 @@ def test_topics_are_found_by_their_names(entries, tmp_path):
         assert found.camera_info.name == '/cam/camera_info'
     usual = write(tmp_path / 'usual', renamed(entries, others) + entries)
     with BagReader(usual) as bag:
-        assert recorded_input(bag).image.name == 'image/compressed'
-        assert recorded_input(bag).camera_info.name == 'camera_info'
+        assert recorded_input(bag).image.name == '/image/compressed'
+        assert recorded_input(bag).camera_info.name == '/camera_info'
 
 
 def test_learned_background_needs_images_before_the_track(still, short, tmp_path, entries):
@@ -439,7 +531,7 @@ def test_learned_background_needs_images_before_the_track(still, short, tmp_path
     subject.write_text(text.replace(str(stamps[0]), str(stamps[1])))
     out = tmp_path / 'out'
     assert main([str(short), '-o', str(out), '--subject', str(subject), '--quiet']) == 0
-    assert [stored.log_time_ns for stored in read(out)['pose_mixture']] == stamps[1:]
+    assert [stored.log_time_ns for stored in read(out)['/pose_mixture']] == stamps[1:]
 
 
 def test_nothing_is_overwritten_unasked(still, short, tmp_path, capsys):

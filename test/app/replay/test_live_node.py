@@ -44,7 +44,7 @@ def recorded(images):
         for stored in bag.messages(['image/compressed', 'camera_info', 'ground_truth']):
             if stored.log_time_ns - first >= images * 10**9 // 15:
                 break
-            found.append((stored.topic, stored.log_time_ns, stored.message))
+            found.append((stored.topic[1:], stored.log_time_ns, stored.message))
     return found
 
 

@@ -46,7 +46,7 @@ def test_every_bag_gets_one_of_its_name(archive, tracked, tmp_path):
     assert sorted(path.name for path in tracked.iterdir()) == ['a', 'a.replay.json', 'day']
     for name in ('a', 'day/b'):
         with BagReader(tracked / name) as bag:
-            assert bag.topics['pose_mixture'].message_count == 2
+            assert bag.topics['/pose_mixture'].message_count == 2
         record = json.loads((tracked / f'{name}.replay.json').read_text())
         assert record['done'] is True
         assert (record['images'], record['tracked']) == (2, 2)
@@ -58,7 +58,7 @@ def test_every_bag_gets_one_of_its_name(archive, tracked, tmp_path):
 
 
 def test_bags_that_are_done_are_skipped(archive, tracked, monkeypatch, capsys):
-    def never(source, target, options, tell):
+    def never(source, target, options, tell, **shown):
         raise AssertionError
 
     before = {path: path.stat().st_mtime_ns for path in tracked.rglob('*')}
@@ -90,7 +90,7 @@ def test_what_was_left_half_done_is_done_anew(archive, tracked, tmp_path, monkey
     usual = many_bags.replay_bag
     begun = []
 
-    def killed(source, target, options, tell):
+    def killed(source, target, options, tell, **shown):
         """Leaves what a process leaves that is killed in its second bag."""
         if begun:
             folder = target.with_name(f'.{target.name}.0123abcd.partial')
@@ -98,7 +98,7 @@ def test_what_was_left_half_done_is_done_anew(archive, tracked, tmp_path, monkey
             (folder / 'b.mcap').write_bytes(b'half')
             raise KeyboardInterrupt
         begun.append(target.name)
-        return usual(source, target, options, tell)
+        return usual(source, target, options, tell, **shown)
 
     monkeypatch.setattr(many_bags, 'replay_bag', killed)
     assert main(command) == 130

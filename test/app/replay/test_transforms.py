@@ -6,6 +6,7 @@ import pytest
 from hmt_ros.app.replay.command import main
 from hmt_ros.body.camera import Viewpoint
 from msg_tools import RosbagsMessages
+from msg_tools.bags.contents import absolute_name
 from msg_tools.messages.ground import ground_of
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.states import transforms_message
@@ -63,14 +64,15 @@ def replayed(moving, tmp_path_factory):
 
 
 def data(folder, topic):
-    return [(stored.log_time_ns, bytes(stored.data)) for stored in read(folder)[topic]]
+    messages = read(folder)[absolute_name(topic)]
+    return [(stored.log_time_ns, bytes(stored.data)) for stored in messages]
 
 
 def test_ground_is_that_of_the_frame(replayed):
     found = read(replayed)
-    grounds = [ground_of(stored.message) for stored in found['ground']]
+    grounds = [ground_of(stored.message) for stored in found['/ground']]
     assert [x.stamp_ns for x in grounds] == [
-        time_ns(stored.message.header.stamp) for stored in found['pose_mixture']
+        time_ns(stored.message.header.stamp) for stored in found['/pose_mixture']
     ]
     for ground in grounds:
         np.testing.assert_allclose(ground.up, VIEW.rotation[:, 2], atol=1e-9)
@@ -85,12 +87,12 @@ def test_same_numbers_as_with_parameters_of_the_same_gravity(replayed, moving, t
     other, one = read(tmp_path / 'out'), read(replayed)
     # The transforms are not used, and not copied.
     assert '/tf_static' not in other
-    for first, second in zip(one['pose_mixture'], other['pose_mixture'], strict=True):
+    for first, second in zip(one['/pose_mixture'], other['/pose_mixture'], strict=True):
         pairs = zip(first.message.components, second.message.components, strict=True)
         for a, b in pairs:
             np.testing.assert_allclose(a.mean, b.mean, atol=1e-5)
             assert a.weight == pytest.approx(b.weight, abs=1e-4)
-    for first, second in zip(one['ground'], other['ground'], strict=True):
+    for first, second in zip(one['/ground'], other['/ground'], strict=True):
         np.testing.assert_allclose(first.message.plane, second.message.plane, atol=1e-6)
 
 
@@ -100,7 +102,7 @@ def test_new_bag_has_what_was_used(replayed, moving, tmp_path):
     assert data(replayed, '/tf_static') == data(moving, '/tf_static')
     links = {message for _, message in data(replayed, '/tf')}
     assert {message for _, message in data(moving, '/tf')} < links
-    assert len(found['/tf']) == len(given['/tf']) + len(found['ground'])
+    assert len(found['/tf']) == len(given['/tf']) + len(found['/ground'])
     out = tmp_path / 'again'
     arguments = [str(replayed), '-o', str(out), *PERSON, *SMALL, *FRAME, '--no-smoother']
     assert main([*arguments, '--quiet']) == 0
@@ -118,7 +120,7 @@ def test_bag_without_transforms(entries, tmp_path, capsys):
     assert len(lines) == 1
     assert "no transform from gravity_frame 'world' to" in lines[0]
     assert "there is no frame 'world'; there are: " in lines[0]
-    (first, _) = read(out)['ground']
+    (first, _) = read(out)['/ground']
     assert ground_of(first.message).up.tolist() == [0.0, -1.0, 0.0]
 
 
@@ -134,7 +136,7 @@ def test_damaged_transforms_are_told_and_left_out(entries, tmp_path, capsys):
     streams = capsys.readouterr()
     assert "transform from 'robot' to 'world': its quaternion has length 0, wanted 1" in streams.err
     assert "there is no frame 'world'" in streams.err
-    assert len(read(out)['ground']) == 2
+    assert len(read(out)['/ground']) == 2
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def positions(data, text, *shape):
 # What stands in the page.
 
 
-@pytest.mark.parametrize('topic', ['pose_mixture', 'smoothed_pose_mixture'])
+@pytest.mark.parametrize('topic', ['/pose_mixture', '/smoothed_pose_mixture'])
 def test_modes_are_those_of_the_bag(made, data, body, topic):
     (layer,) = (layer for layer in data['layers'] if layer['topic'] == topic)
     with BagReader(made.out) as bag:
@@ -110,9 +110,9 @@ def test_truth_errors_and_calibration(made, data, body, poses):
         assert told['calibration']['together'][at_half] == pytest.approx(
             told['coverage_50'], abs=1e-4
         )
-    trajectories = data['scores']['topics']['trajectory_mixture']
+    trajectories = data['scores']['topics']['/trajectory_mixture']
     assert trajectories['calibration'] == {'together': None, 'each': None}
-    assert any(note.startswith('trajectory_mixture') for note in data['notes'])
+    assert any(note.startswith('/trajectory_mixture') for note in data['notes'])
 
 
 def test_truth_without_pelvis_is_aligned_at_the_hips(made, body, poses, tmp_path):
@@ -166,10 +166,10 @@ def test_the_same_bag_gives_the_same_page(made, page, tmp_path):
 
 def test_ground_truth_of_the_bag_is_used(body, poses, data, tmp_path):
     found = data_of(make(write_out(tmp_path / 'out', body, poses), tmp_path / 'report'))
-    assert found['truth']['source'].endswith('(ground_truth)')
+    assert found['truth']['source'].endswith('(/ground_truth)')
     assert [layer['topic'] for layer in found['layers']] == [
-        'pose_mixture',
-        'smoothed_pose_mixture',
+        '/pose_mixture',
+        '/smoothed_pose_mixture',
     ]
     assert found['truth']['known'] == data['truth']['known']
     assert found['images'] is None
@@ -210,10 +210,10 @@ def test_what_the_tracker_drew_stands_in_for_images(body, poses, tmp_path):
 def test_chosen_topics_and_fewer_times(made, tmp_path):
     options = ['--topic', 'smoothed_pose_mixture', '--times', '4', '--truth', made.truth]
     found = data_of(make(made.out, tmp_path / 'report', *options))
-    assert [layer['topic'] for layer in found['layers']] == ['smoothed_pose_mixture']
+    assert [layer['topic'] for layer in found['layers']] == ['/smoothed_pose_mixture']
     assert found['trajectories'] == []
     assert np.allclose(found['times'], [0.0, 0.2, 0.4, 0.6])
-    assert found['scores']['topics']['smoothed_pose_mixture']['frames'] == FRAMES
+    assert found['scores']['topics']['/smoothed_pose_mixture']['frames'] == FRAMES
     assert found['notes'] == [f'4 of {FRAMES} times are shown']
 
 
@@ -247,7 +247,7 @@ def test_mixtures_without_covariances_and_missing_frames(body, poses, tmp_path):
 
     out = write_out(tmp_path / 'out', body, poses, change=change)
     found = data_of(make(out, tmp_path / 'report'))
-    assert found['scores']['topics']['pose_mixture']['calibration']['together'] is None
+    assert found['scores']['topics']['/pose_mixture']['calibration']['together'] is None
     assert not (tmp_path / 'report' / 'calibration.png').exists()
 
     with BagWriter(tmp_path / 'predicted') as bag:

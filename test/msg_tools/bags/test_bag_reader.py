@@ -70,18 +70,18 @@ def write_metadata(folder: Path, names: list[str]) -> None:
 def test_reads_what_the_writer_wrote(small_bag: Path) -> None:
     with BagReader(small_bag) as bag:
         assert {name: topic.message_count for name, topic in bag.topics.items()} == {
-            'note': 1,
-            'text': 26,
-            'image/compressed': 13,
+            '/note': 1,
+            '/text': 26,
+            '/image/compressed': 13,
         }
-        assert bag.topics['note'].msgtype == STRING
+        assert bag.topic('note').msgtype == STRING
         assert bag.message_count() == 40
         assert bag.message_count(['/text', 'note']) == 27
         assert (bag.start_ns, bag.end_ns) == (10**18, 10**18 + 38 * 10**8)
         stored = list(bag.messages(['text']))
         assert [message.message.data for message in stored[:2]] == ['text 1', 'text 2']
         assert stored[0].message is stored[0].message
-        assert all(message.topic == 'text' and message.msgtype == STRING for message in stored)
+        assert all(message.topic == '/text' and message.msgtype == STRING for message in stored)
         # Again, and as a single file.
         assert [m.log_time_ns for m in bag.messages(['text'])] == [m.log_time_ns for m in stored]
     assert values(small_bag / 'small.mcap', ['text']) == values(small_bag, ['text'])
@@ -161,7 +161,7 @@ def test_compressed_file_that_was_cut(tmp_path: Path, small_bag: Path) -> None:
     path.write_bytes(content[: len(content) // 2])
     with BagReader(path) as bag:
         stream = bag.messages()
-        assert next(stream).topic == 'note'
+        assert next(stream).topic == '/note'
         with pytest.raises(BagError, match=r'cut\.mcap\.zstd breaks off'):
             list(stream)
 
@@ -233,6 +233,21 @@ def test_big_endian_messages(tmp_path: Path, messages: RosbagsMessages) -> None:
     with BagReader(path) as bag:
         (stored,) = bag.messages()
         assert stored.message.position.tolist() == [1.5, -2.0]
+
+
+def test_relative_names_mean_topics_in_a_namespace(
+    tmp_path: Path, messages: RosbagsMessages
+) -> None:
+    with BagWriter(tmp_path / 'bag') as writer:
+        for topic in ('/p/body', '/p/note', '/q/note'):
+            writer.write(topic, 1, messages.create(STRING, data=topic))
+    with BagReader(tmp_path / 'bag') as bag:
+        assert [m.message.data for m in bag.messages(['body', 'q/note'])] == ['/p/body', '/q/note']
+        with pytest.raises(BagError, match='several topics note: name one of /p/note, /q/note'):
+            bag.topic('note')
+        for absolute in ('/body', '/note'):
+            with pytest.raises(BagError, match=f'has no topic {absolute}; it has /p/body, '):
+                bag.topic(absolute)
 
 
 def test_find_topic(tmp_path: Path, messages: RosbagsMessages) -> None:

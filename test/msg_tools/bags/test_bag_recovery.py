@@ -256,6 +256,23 @@ def test_all_that_a_file_holds_is_kept(tmp_path: Path, messages: RosbagsMessages
     assert profile['depth'] == 7
 
 
+def test_topics_of_ros_get_absolute_names(tmp_path: Path, messages: RosbagsMessages) -> None:
+    with (tmp_path / 'old.mcap').open('wb') as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema(STRING, 'ros2msg', b'string data')
+        text = serialise(messages.create(STRING, data='text'))
+        for topic, encoding in (('note', 'cdr'), ('/note', 'cdr'), ('sensor.log', 'json')):
+            writer.add_message(writer.register_channel(topic, encoding, schema), 1, text, 1)
+        writer.finish()
+    counts: list[int | None] = []
+    recover_bag(tmp_path / 'old.mcap', tmp_path / 'out', counts.append)
+    assert counts == [3, 3, 3]
+    with BagReader(tmp_path / 'out') as bag:
+        found = {name: topic.message_count for name, topic in bag.topics.items()}
+    assert found == {'/note': 2, 'sensor.log': 1}
+
+
 @pytest.mark.parametrize('text', ['', 'a: [', '5', '[5]', '- [a]'])
 def test_quality_of_service_that_nobody_understands(text: str) -> None:
     assert recorded_quality_of_service(text) == []

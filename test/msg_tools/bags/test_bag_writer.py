@@ -56,6 +56,24 @@ def test_same_calls_write_the_same_bytes(tmp_path: Path, messages: RosbagsMessag
     assert sorted(path.name for path in (tmp_path / 'a').iterdir()) == ['bag']
 
 
+def test_topics_have_absolute_names(tmp_path: Path, messages: RosbagsMessages) -> None:
+    """rosbag2 makes the names that a user gives absolute, and compares them with these."""
+    text = messages.create(STRING, data='')
+    with BagWriter(tmp_path / 'bag', namespace='/humans/bodies/p1') as bag:
+        bag.add_topic('body', STRING, latched=True)
+        for topic in ('body', '/humans/bodies/p1/body', 'image/compressed', '/tf'):
+            bag.write(topic, 1, text)
+        with pytest.raises(BagError, match='topic /humans/bodies/p1/body is there already'):
+            bag.add_topic('/humans/bodies/p1/body', STRING)
+    with (tmp_path / 'bag' / 'bag.mcap').open('rb') as file:
+        written = Counter(channel.topic for _, channel, _ in make_reader(file).iter_messages())
+    wanted = {'/humans/bodies/p1/body': 2, '/humans/bodies/p1/image/compressed': 1, '/tf': 1}
+    assert written == wanted
+    content = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    topics = content['rosbag2_bagfile_information']['topics_with_message_count']
+    assert {one['topic_metadata']['name']: one['message_count'] for one in topics} == wanted
+
+
 def test_metadata_is_that_of_rosbag2(tmp_path: Path, messages: RosbagsMessages) -> None:
     write_bag(tmp_path / 'bag', messages)
     text = (tmp_path / 'bag' / 'metadata.yaml').read_text()

@@ -20,6 +20,7 @@ from msg_tools.messages.pose_mixtures import (
     POSE_MIXTURE,
     MixtureKind,
     PoseMixture,
+    TrackState,
     pose_mixture_message,
     pose_mixture_of,
 )
@@ -27,9 +28,9 @@ from msg_tools.messages.pose_mixtures import (
 
 def test_kinds_are_those_of_the_message() -> None:
     constants = typestore().fielddefs['hmt_msgs/msg/PoseMixture'][0]
-    assert {name: value for name, _, value in constants} == {
-        kind.name: kind.value for kind in MixtureKind
-    }
+    kinds = {kind.name: kind.value for kind in MixtureKind}
+    states = {f'STATE_{state.name}': state.value for state in TrackState}
+    assert {name: value for name, _, value in constants} == kinds | states
 
 
 def test_round_trip_sorts_by_weight(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:

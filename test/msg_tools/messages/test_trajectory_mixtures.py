@@ -31,6 +31,8 @@ CONTENT = TrajectoryMixture(
     body_model='human34',
     dof_names=('x', 'y', 'bend'),
     frame_id='camera',
+    joint_names=('pelvis', 'head'),
+    joint_positions=RNG.normal(size=(2, 5, 2, 3)),
 )
 
 
@@ -39,11 +41,22 @@ def test_round_trip_sorts_by_weight(messages: RosbagsMessages) -> None:
     message = deserialise(data, 'hmt_msgs/msg/TrajectoryMixture')
     assert message.header.stamp == message.stamps[-1]
     back = trajectory_mixture_of(message, CONTENT.dof_names)
-    for name in ('weights', 'means', 'marginal_covariances', 'log_joint', 'inflation'):
+    for name in (
+        'weights', 'means', 'marginal_covariances', 'log_joint', 'inflation', 'joint_positions',
+    ):  # fmt: skip
         np.testing.assert_array_equal(getattr(back, name), getattr(CONTENT, name)[::-1])
     np.testing.assert_array_equal(back.free_energy, CONTENT.free_energy)
-    for name in ('stamps_ns', 'final_until_ns', 'body_model', 'dof_names', 'frame_id'):
+    for name in (
+        'stamps_ns', 'final_until_ns', 'body_model', 'dof_names', 'frame_id', 'joint_names',
+    ):  # fmt: skip
         assert getattr(back, name) == getattr(CONTENT, name)
+
+
+def test_without_joints(messages: RosbagsMessages) -> None:
+    content = replace(CONTENT, joint_names=(), joint_positions=None)
+    back = trajectory_mixture_of(trajectory_mixture_message(messages, content))
+    assert back.joint_names == ()
+    assert back.joint_positions is None
 
 
 def test_without_covariances(messages: RosbagsMessages) -> None:
@@ -62,6 +75,8 @@ def test_without_covariances(messages: RosbagsMessages) -> None:
         ({'stamps_ns': ()}, r'2 components of 0 poses, wanted one at least'),
         ({'marginal_covariances': np.zeros((2, 5, 3, 3))}, r'not positive definite'),
         ({'log_joint': np.zeros(3)}, r'log_joint has shape \(3,\), wanted \(2,\)'),
+        ({'joint_names': ('a',)}, r'joint_positions has shape \(2, 5, 2, 3\), wanted'),
+        ({'joint_positions': np.full((2, 5, 2, 3), np.nan)}, r'joint_positions has values'),
         ({'dof_names': ('x', 'y', 'x')}, r"dof_names has the name 'x' twice"),
         ({'means': np.full((2, 5, 3), np.inf)}, r'means has values that are not finite'),
     ],
@@ -78,9 +93,11 @@ def test_messages_that_contradict_themselves(messages: RosbagsMessages) -> None:
     message.components[1].means = np.zeros(14)
     with pytest.raises(MessageError, match='component 1: means has 14 values, wanted 15'):
         trajectory_mixture_of(message)
-    message.components[0].marginal_covariances = np.zeros(0)
-    with pytest.raises(MessageError, match='some components have covariances, others have none'):
-        trajectory_mixture_of(message)
+    for name in ('marginal_covariances', 'joint_positions'):
+        message = trajectory_mixture_message(messages, CONTENT)
+        setattr(message.components[0], name, np.zeros(0))
+        with pytest.raises(MessageError, match=f'some components have {name}, others have none'):
+            trajectory_mixture_of(message)
     message.components = []
     with pytest.raises(MessageError, match='no components'):
         trajectory_mixture_of(message)

@@ -1,0 +1,141 @@
+"""Progress of a command on stderr: a bar on a terminal, a line every ten seconds elsewhere.
+
+The lines come from a thread, so that a step which takes long shows that the command still works.
+stdout is left to results.
+
+    with show_progress(str(output), 'images', total=120) as bar:
+        for image in images:
+            ...
+            bar.update()
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Generator, Iterable
+from threading import Event, Thread
+from typing import Any, TextIO, TypeAlias, TypeVar
+
+from tqdm import tqdm
+
+Item = TypeVar('Item')
+
+INTERVAL = 10.0  # s, between two lines
+
+
+class ProgressLines:
+    """Progress as lines; nothing is printed before the first interval has passed.
+
+    A context manager with the interface of tqdm, as far as it is used here.
+
+    Args:
+        what: what is made, the beginning of each line.
+        unit: what is counted, in the plural; '' if nothing is.
+        total: number of units of the whole; None if unknown; may be set later.
+        file: where the lines go; None: stderr.
+        clock: gives the time, s.
+        ended: wakes the thread at the end; its `wait` takes the interval.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        unit: str,
+        total: float | None = None,
+        *,
+        file: TextIO | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        ended: Event | None = None,
+    ) -> None:
+        self.total = total
+        self._what, self._unit, self._clock = what, unit, clock
+        self._file = sys.stderr if file is None else file
+        self._ended = Event() if ended is None else ended
+        self._count, self._printed, self._start = 0, False, clock()
+        self._thread = Thread(target=self._print_lines, name='progress', daemon=True)
+
+    def __enter__(self) -> ProgressLines:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        if self._printed:
+            counted = f'{self._count} {self._unit} in ' if self._unit else ''
+            self._print(f'{counted}{_duration(self._clock() - self._start)}')
+
+    def update(self, n: int = 1) -> None:
+        """Counts n more units as done."""
+        self._count += n
+
+    def line(self) -> str:
+        """How much of how many is done, at what rate, and how much time is left."""
+        spent = self._clock() - self._start
+        so_far = f'{_duration(spent)} so far'
+        if not self._unit:
+            return so_far
+        known = self.total is not None and self.total >= self._count
+        parts = [f'{self._count} of {self.total:g} {self._unit}' if known else '']
+        parts[0] = parts[0] or f'{self._count} {self._unit}'
+        rate = self._count / spent if spent > 0 else 0.0
+        if rate:
+            parts.append(f'{rate:.3g} a second')
+        if rate and known and self.total is not None:
+            parts.append(f'{_duration((self.total - self._count) / rate)} left')
+        else:
+            parts.append(so_far)
+        return ', '.join(parts)
+
+    def _print_lines(self) -> None:
+        while not self._ended.wait(INTERVAL):
+            self._printed = True
+            self._print(self.line())
+
+    def _print(self, text: str) -> None:
+        print(f'{self._what}: {text}', file=self._file, flush=True)
+
+
+Progress: TypeAlias = 'tqdm[Any] | ProgressLines'
+
+
+def show_progress(
+    what: str, unit: str = '', total: float | None = None, *, quiet: bool = False
+) -> Progress:
+    """The progress of a command, as a bar or as lines.
+
+    Args:
+        what: what is made: a name of a file, or a verb such as 'reading'.
+        unit: what is counted, in the plural; '' if nothing is.
+        total: number of units of the whole; None if unknown.
+        quiet: whether nothing is shown.
+    """
+    if quiet or sys.stderr.isatty():
+        # One bar below another is removed at its end.
+        return tqdm(desc=what, unit=f' {unit}', total=total, disable=quiet, leave=None)
+    return ProgressLines(what, unit, total)
+
+
+def with_progress(
+    items: Iterable[Item], what: str, unit: str, total: float | None = None, *, quiet: bool = False
+) -> Generator[Item, None, None]:
+    """The items; shows how many of them are done.
+
+    Args:
+        items: to go through.
+        what, unit, total, quiet: see `show_progress`.
+    """
+    with show_progress(what, unit, total, quiet=quiet) as bar:
+        for item in items:
+            yield item
+            bar.update()
+
+
+def tell_user(command: str, text: str) -> None:
+    """Prints a line for the user on stderr, above the bar of `show_progress`."""
+    tqdm.write(f'{command}: {text}', file=sys.stderr)
+
+
+def _duration(seconds: float) -> str:
+    return str(tqdm.format_interval(seconds))

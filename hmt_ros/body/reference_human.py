@@ -1,0 +1,351 @@
+"""The reference model of a human of REP 155, fitted to joint positions.
+
+Frames: the body has x forward, y to the left, z up, its origin midway between the hips. At zero the
+person stands upright with hanging arms and legs. Joints, parent links and axes are those of
+`human-tpl.xacro` of the package human_description:
+
+    body -waist-> waist -(r_torso, y_torso)-> torso      y; then x and z, which are added
+    torso -r_head, y_head, p_head-> head                 x, z, -y
+    torso -(l_clavicle)-> l_y_shoulder ... l_shoulder    x, added; then -z, x, z (right: mirrored)
+    l_shoulder -l_elbow-> l_elbow -> l_wrist             -y
+    body -l_y_hip, l_p_hip, l_r_hip-> l_hip              -z, x, -y (right: only x is mirrored)
+    l_hip -l_knee-> l_knee -> l_ankle                    -y
+
+The reference has a trunk that only leans forward, and shoulders at a fixed place on it. The four
+added joints let the trunk bend sideways and twist and the shoulders lift, so that the model passes
+through all joint positions; without `additions` there are none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmt_ros.inference.arrays import Array
+
+# Joints of the reference with the ranges that it gives them, rad.
+_LIMB_RANGES = {
+    '{}_y_shoulder': (-1.1, 1.9),
+    '{}_p_shoulder': (-0.4, 3.3),
+    '{}_r_shoulder': (-1.7, 1.5),
+    '{}_elbow': (0.0, 2.5),
+    '{}_y_hip': (-0.1, 0.6),
+    '{}_p_hip': (-0.4, 3.3),
+    '{}_r_hip': (-0.4, 0.7),
+    '{}_knee': (-2.5, 0.0),
+}
+RANGES = {
+    'waist': (-0.2, 1.0),
+    'r_head': (-1.0, 1.0),
+    'y_head': (-1.4, 1.4),
+    'p_head': (-1.5, 1.5),
+    **{name.format(side): x for side in 'lr' for name, x in _LIMB_RANGES.items()},
+}
+REFERENCE_JOINTS = tuple(RANGES)
+ADDED_JOINTS = ('r_torso', 'y_torso', 'l_clavicle', 'r_clavicle')
+SIDES = {'l': ('left', 1.0), 'r': ('right', -1.0)}
+# Joints of our bodies that the model needs.
+NEEDED = (
+    'pelvis',
+    'neck',
+    'head',
+    *(
+        f'{side}_{joint}'
+        for side, _ in SIDES.values()
+        for joint in ('hip', 'knee', 'ankle', 'shoulder', 'elbow', 'wrist')
+    ),
+)
+# Sine of the angle below which two bones have one direction, and lengths that are none, m.
+_STRAIGHT, _NOTHING = 1e-4, 1e-3
+_UNLIMITED = (-np.pi, np.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint of the model, between two links.
+
+    Attributes:
+        name: of the joint, without the identity of the body.
+        parent, child: links.
+        origin: (3,) of the child in the frame of the parent, m.
+        axis: (3,) unit vector; None: the joint is fixed.
+    """
+
+    name: str
+    parent: str
+    child: str
+    origin: Array
+    axis: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceHuman:
+    """The model of one person in one pose.
+
+    Attributes:
+        joints: of the model at the person's lengths, parents before their children.
+        angles: rad, in [-pi, pi], by joint, without the fixed ones.
+        rotation: (3, 3) from the body's frame to that of the joint positions.
+        origin: (3,) of the body, m.
+    """
+
+    joints: tuple[Joint, ...]
+    angles: dict[str, float]
+    rotation: Array
+    origin: Array
+
+    def links(self) -> tuple[list[str], Array, Array]:
+        """Names (L) of all links but the body, their rotations (L, 3, 3) and origins (L, 3), m.
+
+        Both are in the frame of the body.
+        """
+        frames = {'body': (np.eye(3), np.zeros(3))}
+        for joint in self.joints:
+            rotation, place = frames[joint.parent]
+            place = place + rotation @ joint.origin
+            if joint.axis is not None:
+                rotation = rotation @ _turn(joint.axis, self.angles[joint.name])
+            frames[joint.child] = (rotation, place)
+        del frames['body']
+        rotations, places = zip(*frames.values(), strict=True)
+        return list(frames), np.array(rotations), np.array(places)
+
+
+def fit_reference_human(
+    names: Sequence[str],
+    positions: Array,
+    previous: Mapping[str, float] | None = None,
+    *,
+    additions: bool = True,
+) -> ReferenceHuman:
+    """The reference model in the pose that joint positions show.
+
+    What positions do not tell keeps its last value: the roll of a limb that is straight, the yaw
+    of one that hangs straight down. They never tell that the head turns: `y_head` is 0.
+
+    Args:
+        names: (J) of the joints.
+        positions: (J, 3) m, in any right-handed frame.
+        previous: angles of the image before; None: all zero.
+        additions: whether the model has the joints that the reference does not have. Without them
+            limbs keep their directions, and shoulders are where the reference has them.
+
+    Raises:
+        ValueError: a joint that is needed is not there, or two of a bone are at one place.
+    """
+    missing = [name for name in NEEDED if name not in names]
+    if missing:
+        raise ValueError(f'joint positions of {", ".join(missing)} are missing')
+    at = {name: positions[list(names).index(name)] for name in NEEDED}
+    before = dict.fromkeys((*REFERENCE_JOINTS, *ADDED_JOINTS), 0.0) | dict(previous or {})
+    origin = (at['left_hip'] + at['right_hip']) / 2
+    rotation = _body_axes(at, origin)
+    in_body = {name: rotation.T @ (place - origin) for name, place in at.items()}
+    angles: dict[str, float] = {}
+    torso = _fit_trunk(in_body, angles, additions=additions)
+    head = torso.T @ _direction(in_body, 'neck', 'head')
+    angles['p_head'] = float(np.arcsin(np.clip(-head[0], -1.0, 1.0)))
+    angles['r_head'] = float(np.arctan2(-head[1], head[2]))
+    angles['y_head'] = 0.0
+    for letter, (side, sign) in SIDES.items():
+        if additions:
+            out, up = (torso.T @ (in_body[f'{side}_shoulder'] - in_body['neck']))[1:]
+            angles[f'{letter}_clavicle'] = float(np.arctan2(up, sign * out))
+        lifted = angles.get(f'{letter}_clavicle', 0.0)
+        base = torso @ _turn(np.array([sign, 0.0, 0.0]), lifted)
+        _fit_arm(in_body, letter, base, before, angles)
+        _fit_leg(in_body, letter, before, angles)
+    joints = _joints(in_body, additions=additions)
+    ordered = {j.name: angles[j.name] for j in joints if j.axis is not None}
+    return ReferenceHuman(joints, ordered, rotation, origin)
+
+
+def _direction(at: Mapping[str, Array], first: str, last: str) -> Array:
+    """Unit vector (3,) from one joint to another."""
+    return _unit(at[last] - at[first], f'{first} and {last}')
+
+
+def _unit(vector: Array, what: str) -> Array:
+    length = float(np.linalg.norm(vector))
+    if not length > _NOTHING:
+        raise ValueError(f'{what} are at one place: they have no direction')
+    result: Array = vector / length
+    return result
+
+
+def _body_axes(at: Mapping[str, Array], origin: Array) -> Array:
+    """Columns x forward, y from the right hip to the left, z up along the pelvis."""
+    y = _direction(at, 'right_hip', 'left_hip')
+    up = at['pelvis'] - origin
+    if np.linalg.norm(up - y * (y @ up)) < _NOTHING:
+        up = at['neck'] - origin
+    z = _unit(up - y * (y @ up), 'the line of the hips and the trunk')
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def _fit_trunk(at: Mapping[str, Array], angles: dict[str, float], *, additions: bool) -> Array:
+    """Angles of the trunk; returns the axes (3, 3) of the torso in the frame of the body."""
+    z = _direction(at, 'pelvis', 'neck')
+    if not additions:
+        angles['waist'] = float(np.arctan2(z[0], z[2]))
+        return _turn(np.array([0.0, 1.0, 0.0]), angles['waist'])
+    across = at['left_shoulder'] - at['right_shoulder']
+    y = _unit(across - z * (z @ across), 'the shoulders')
+    r = np.stack([np.cross(y, z), y, z], axis=1)
+    # r = Ry(waist) Rx(r_torso) Rz(y_torso)
+    angles['waist'] = float(np.arctan2(r[0, 2], r[2, 2]))
+    angles['r_torso'] = float(np.arcsin(np.clip(-r[1, 2], -1.0, 1.0)))
+    angles['y_torso'] = float(np.arctan2(r[1, 0], r[1, 1]))
+    return r
+
+
+def _fit_arm(
+    at: Mapping[str, Array],
+    letter: str,
+    base: Array,
+    before: Mapping[str, float],
+    angles: dict[str, float],
+) -> None:
+    """Angles of an arm that hangs on a frame `base` (3, 3).
+
+    Upper arm: Rz(-s a) Rx(s b) Rz(s c), with s = 1 on the left and -1 on the right.
+    """
+    side, s = SIDES[letter]
+    names = [f'{letter}_{axis}_shoulder' for axis in 'ypr']
+    upper = base.T @ _direction(at, f'{side}_shoulder', f'{side}_elbow')
+    lower = base.T @ _direction(at, f'{side}_elbow', f'{side}_wrist')
+    bend = np.cross(lower, upper)
+    sine = float(np.linalg.norm(bend))
+    angles[f'{letter}_elbow'] = float(np.arctan2(sine, upper @ lower))
+    b = float(np.arctan2(np.hypot(upper[0], upper[1]), -upper[2]))
+    hangs = np.sin(b) < _STRAIGHT
+    a = before[names[0]] if hangs else float(np.arctan2(upper[0], s * upper[1]))
+    c = before[names[2]]
+    if sine > _STRAIGHT:
+        # The elbow bends forward: its axis is the y axis of the upper arm.
+        axis = (_turn_z(-s * a) @ _turn_x(s * b)).T @ (bend / sine)
+        c = s * float(np.arctan2(-axis[0], axis[1]))
+    found = [(a, b, c), (a + np.pi, -b, c + np.pi)]
+    angles.update(zip(names, _nearest_to_ranges(found, names), strict=True))
+
+
+def _fit_leg(
+    at: Mapping[str, Array], letter: str, before: Mapping[str, float], angles: dict[str, float]
+) -> None:
+    """Angles of a leg. Thigh: Rz(-a) Rx(s b) Ry(-c), with s = 1 on the left and -1 on the right."""
+    side, s = SIDES[letter]
+    names = [f'{letter}_{axis}_hip' for axis in 'ypr']
+    thigh = _direction(at, f'{side}_hip', f'{side}_knee')
+    shin = _direction(at, f'{side}_knee', f'{side}_ankle')
+    bend = np.cross(thigh, shin)
+    sine = float(np.linalg.norm(bend))
+    angles[f'{letter}_knee'] = -float(np.arctan2(sine, thigh @ shin))
+    found = []
+    if sine > _STRAIGHT:
+        # The knee bends backward: its axis is the y axis of the thigh, (-sin, cos cos, sin).
+        y = bend / sine
+        b = float(np.arcsin(np.clip(y[2], -1.0, 1.0)))
+        level = np.hypot(y[0], y[1]) > _STRAIGHT
+        a = float(np.arctan2(y[0], y[1])) if level else before[names[0]]
+        turns = [(a, b), (a + np.pi, np.pi - b)]
+    else:
+        # With the last yaw: the direction of the thigh is Rz(-a) Rx(s b) (sin c, 0, -cos c).
+        a = before[names[0]]
+        x, y_, z = _turn_z(a) @ thigh
+        turns = [(a, float(np.arctan2(y_, -z))), (a, float(np.arctan2(-y_, z)))]
+    for a, b in turns:
+        x, _, z = (_turn_z(-a) @ _turn_x(b)).T @ thigh
+        found.append((a, s * b, float(np.arctan2(x, -z))))
+    angles.update(zip(names, _nearest_to_ranges(found, names), strict=True))
+
+
+def _nearest_to_ranges(
+    found: Sequence[tuple[float, ...]], names: Sequence[str]
+) -> tuple[float, ...]:
+    """Of several sets of angles for one direction the one that is least beyond the ranges."""
+    wrapped = [tuple(float((x + np.pi) % (2 * np.pi) - np.pi) for x in each) for each in found]
+
+    def excess(each: tuple[float, ...]) -> float:
+        limits = [RANGES[name] for name in names]
+        return sum(max(lo - x, x - hi, 0.0) for x, (lo, hi) in zip(each, limits, strict=True))
+
+    return min(wrapped, key=excess)
+
+
+def _joints(at: Mapping[str, Array], *, additions: bool) -> tuple[Joint, ...]:
+    """The joints of the model, at the lengths that positions in the frame of the body have."""
+
+    def length(first: str, last: str) -> float:
+        return float(np.linalg.norm(at[last] - at[first]))
+
+    trunk, head = length('pelvis', 'neck'), length('neck', 'head')
+    added = additions
+    result = [
+        # In the reference the trunk leans about the hips.
+        _joint('waist', 'body', 'waist', (0, 0, float(at['pelvis'][2])), (0, 1, 0)),
+    ]
+    if added:
+        result += [
+            _joint('r_torso', 'waist', 'r_torso', (0, 0, 0), (1, 0, 0)),
+            _joint('y_torso', 'r_torso', 'y_torso', (0, 0, 0), (0, 0, 1)),
+        ]
+    result += [
+        _joint('torso', 'y_torso' if added else 'waist', 'torso', (0, 0, trunk), None),
+        _joint('r_head', 'torso', 'r_head', (0, 0, 0), (1, 0, 0)),
+        _joint('y_head', 'r_head', 'y_head', (0, 0, 0), (0, 0, 1)),
+        _joint('p_head', 'y_head', 'p_head', (0, 0, 0), (0, -1, 0)),
+        _joint('head', 'p_head', 'head', (0, 0, head), None),
+    ]
+    for x, (side, s) in SIDES.items():
+        shoulder = (0, s * length('neck', f'{side}_shoulder'), 0)
+        arm = (0, 0, -length(f'{side}_shoulder', f'{side}_elbow'))
+        forearm = (0, 0, -length(f'{side}_elbow', f'{side}_wrist'))
+        hip = (0, s * length('left_hip', 'right_hip') / 2, 0)
+        thigh = (0, 0, -length(f'{side}_hip', f'{side}_knee'))
+        shin = (0, 0, -length(f'{side}_knee', f'{side}_ankle'))
+        upper, yaw, pitch = f'{x}_shoulder', f'{x}_y_shoulder', f'{x}_p_shoulder'
+        clavicle = f'{x}_clavicle'
+        if added:
+            result.append(_joint(clavicle, 'torso', clavicle, (0, 0, 0), (s, 0, 0)))
+        result += [
+            _joint(yaw, clavicle if added else 'torso', yaw, shoulder, (0, 0, -s)),
+            _joint(pitch, yaw, pitch, (0, 0, 0), (s, 0, 0)),
+            _joint(f'{x}_r_shoulder', pitch, upper, (0, 0, 0), (0, 0, s)),
+            _joint(f'{x}_elbow', upper, f'{x}_elbow', arm, (0, -1, 0)),
+            _joint(f'{x}_wrist', f'{x}_elbow', f'{x}_wrist', forearm, None),
+            _joint(f'{x}_y_hip', 'body', f'{x}_y_hip', hip, (0, 0, -1)),
+            _joint(f'{x}_p_hip', f'{x}_y_hip', f'{x}_p_hip', (0, 0, 0), (s, 0, 0)),
+            _joint(f'{x}_r_hip', f'{x}_p_hip', f'{x}_hip', (0, 0, 0), (0, -1, 0)),
+            _joint(f'{x}_knee', f'{x}_hip', f'{x}_knee', thigh, (0, -1, 0)),
+            _joint(f'{x}_ankle', f'{x}_knee', f'{x}_ankle', shin, None),
+        ]
+    return tuple(result)
+
+
+def _joint(
+    name: str,
+    parent: str,
+    child: str,
+    origin: Sequence[float],
+    axis: Sequence[float] | None,
+) -> Joint:
+    turns = None if axis is None else np.array(axis, dtype=np.float64)
+    return Joint(name, parent, child, np.array(origin, dtype=np.float64), turns)
+
+
+def _turn(axis: Array, angle: float) -> Array:
+    """Rotation (3, 3) about a unit vector; Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    result: Array = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)
+    return result
+
+
+def _turn_x(angle: float) -> Array:
+    return _turn(np.array([1.0, 0.0, 0.0]), angle)
+
+
+def _turn_z(angle: float) -> Array:
+    return _turn(np.array([0.0, 0.0, 1.0]), angle)

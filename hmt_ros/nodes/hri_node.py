@@ -1,0 +1,198 @@
+"""hri_node: mixtures of people in, the topics and frames of REP 155 out; around a session.
+
+Bodies come and go, and their topics with them. People come as well: once a second the node looks
+for mixtures in namespaces that it does not know yet.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from hmt_ros.nodes.run_node import run
+from hmt_ros.nodes.session_node import SessionNode
+from hmt_ros.nodes.subscribed_topic import (
+    CAMERA_INFO_TOPIC,
+    LATCHED,
+    RELIABLE,
+    SubscribedTopic,
+    image_topic,
+    message_class,
+    read_installed_messages,
+)
+from hmt_ros.sessions.handled import Handled, Output
+from hmt_ros.sessions.hri_parameters import HriParameters
+from hmt_ros.sessions.hri_session import (
+    BODIES,
+    HriSession,
+    mixture_source,
+    published_topic,
+)
+from hmt_ros.sessions.session import everything
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.humans import IDS
+from msg_tools.messages.pose_mixtures import POSE_MIXTURE
+
+_MIXTURES = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
+_URDF = 'urdf'
+# Subscriptions to people who come by themselves.
+_MOST_TOPICS = 64
+
+
+class InstalledHriSession(HriSession):
+    """A bridge whose messages are installed; see `HriSession`.
+
+    Raises:
+        ValueError: the package hri_msgs is not installed.
+    """
+
+    def __init__(
+        self,
+        parameters: HriParameters,
+        publish: Callable[[Output], None],
+        wanted: Callable[[str], bool] = everything,
+    ) -> None:
+        read_installed_messages(IDS, 'hri_node')
+        super().__init__(parameters, publish, wanted)
+
+
+class HriNode(SessionNode[HriSession, HriParameters]):
+    """The node; its parameters are the fields of `HriParameters`.
+
+    It declares a parameter `human_description_<id>` with the URDF of each body, as REP 155 asks.
+    """
+
+    NAME = 'hri_node'
+    SUBJECT = 'bodies'
+    SESSION = InstalledHriSession
+    DEFAULTS = HriParameters()
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        # Of bodies: by topic. They belong to the thread that estimates.
+        self._of_bodies: dict[str, Any] = {}
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._search = self.create_timer(1.0, self._look_for_people, clock=steady)
+
+    def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
+        return ()
+
+    def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
+        p = self._settings
+        yield CAMERA_INFO_TOPIC
+        if p.publish_cropped:
+            yield image_topic(p.image_transport)
+        for namespace in p.named or self._found():
+            yield self._mixtures_in(namespace)
+
+    def _finish(self, session: HriSession) -> None:
+        self._tell(session.finish())
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Listens."""
+        result = super().on_activate(state)
+        self._look_for_people()
+        return result
+
+    # People come.
+
+    def _mixtures_in(self, namespace: str) -> SubscribedTopic:
+        topic = f'{namespace.rstrip("/")}/{self._settings.mixture_topic}'
+        return SubscribedTopic(mixture_source(namespace), topic, POSE_MIXTURE, _MIXTURES)
+
+    def _found(self) -> list[str]:
+        """Namespaces below /humans/bodies in which somebody publishes mixtures."""
+        end = f'/{self._settings.mixture_topic}'
+        kind = POSE_MIXTURE
+        found = [
+            topic.removesuffix(end)
+            for topic, kinds in self.get_topic_names_and_types()
+            if topic.startswith(f'{BODIES}/') and topic.endswith(end) and kind in kinds
+        ]
+        return sorted(found)
+
+    def _look_for_people(self) -> None:
+        thread = self._thread
+        if thread is None or self._settings.named or not self._inputs:
+            return
+        known = {subscription.topic_name for subscription in self._inputs}
+        for namespace in self._found():
+            one = self._mixtures_in(namespace)
+            if one.topic in known:
+                continue
+            if len(known) >= _MOST_TOPICS:
+                self.get_logger().warn(
+                    f'{_MOST_TOPICS} topics are subscribed to, which is the limit: mixtures in '
+                    f'{namespace} are left out; name those that count in the parameter namespaces',
+                    once=True,
+                )
+                return
+            thread.listen(one)
+            self._subscribe(one)
+            known.add(one.topic)
+            self.get_logger().info(f'mixtures from {one.topic}')
+
+    # Bodies come and go; called by the thread that estimates.
+
+    def _publisher_of(self, topic: str) -> Any:
+        if topic in self._outputs:
+            return self._outputs[topic]
+        if topic not in self._of_bodies:
+            published = published_topic(topic)
+            self._of_bodies[topic] = self.create_publisher(
+                message_class(published.msgtype),
+                topic,
+                LATCHED if published.latched else RELIABLE,
+                # Handlers of events would belong to the executor's thread.
+                event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
+            )
+        return self._of_bodies[topic]
+
+    def _publish(self, output: Output) -> None:
+        self._publisher_of(output.topic).publish(output.data)
+        identity, _, name = output.topic.removeprefix(f'{BODIES}/').partition('/')
+        if name == _URDF:
+            text = str(deserialise(output.data, 'std_msgs/msg/String').data)
+            parameter = f'human_description_{identity}'
+            if self.has_parameter(parameter):
+                self.set_parameters([Parameter(parameter, value=text)])
+            else:
+                self.declare_parameter(parameter, text)
+
+    def _is_wanted(self, topic: str) -> bool:
+        return bool(self._publisher_of(topic).get_subscription_count())
+
+    def _tell(self, handled: Handled) -> None:
+        super()._tell(handled)
+        session = self._session
+        self._forget_bodies(set() if session is None else session.identities)
+
+    def _forget_bodies(self, kept: set[str]) -> None:
+        """Ends the topics and parameters of bodies that are not there any more."""
+        for topic in list(self._of_bodies):
+            identity, _, name = topic.removeprefix(f'{BODIES}/').partition('/')
+            if identity in kept:
+                continue
+            self.destroy_publisher(self._of_bodies.pop(topic))
+            if name == _URDF:
+                self.undeclare_parameter(f'human_description_{identity}')
+
+    def _close(self) -> None:
+        super()._close()
+        self._forget_bodies(set())
+
+
+def main(args: list[str] | None = None) -> int:
+    """Runs the node until a signal stops it; returns 0, or 1 if it could not start."""
+    return run(HriNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,70 @@
+"""Parameters of the node that speaks REP 155.
+
+`hmt_ros/config/hri_node.yaml` lists them with their defaults; it is written by
+
+    python -m hmt_ros.sessions.hri_parameters > hmt_ros/config/hri_node.yaml
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import dataclass
+
+from hmt_ros.sessions.declared_parameters import (
+    AT_ONCE,
+    NEXT_CONFIGURE,
+    ImageNodeParameters,
+    parameter_field,
+)
+from hmt_ros.sessions.parameter_file import parameter_file_text
+
+MIXTURES = ('pose_mixture', 'smoothed_pose_mixture')
+
+
+@dataclass(frozen=True)
+class HriParameters(ImageNodeParameters):
+    """All parameters of the node that speaks REP 155.
+
+    Attributes:
+        namespaces: Namespaces of the people whose mixtures are taken, separated by blanks, such as
+            '/humans/bodies/p1 /lab/anna'; if empty, all below /humans/bodies in which mixtures are
+            published.
+        mixture_topic: Name of the mixtures in these namespaces, 'pose_mixture' of the filter, or
+            'smoothed_pose_mixture' of the smoother, which are steadier and come later.
+        publish_cropped: If true, the node subscribes to the images, and publishes the part of each
+            that shows a body.
+        publish_links: If true, /tf tells the frames of all links of a body; if false, only that of
+            the body itself, for use with robot_state_publisher.
+        added_joints: If true, the kinematic model has four joints that the reference of REP 155
+            does not have, with which it passes through all joint positions; if false, the trunk
+            only leans, and the shoulders have a fixed place on it.
+        longest_silence: Time without a mixture after which a body is not tracked any more, by the
+            stamps of camera_info, s.
+    """
+
+    namespaces: str = parameter_field('', NEXT_CONFIGURE)
+    mixture_topic: str = parameter_field('pose_mixture', NEXT_CONFIGURE)
+    publish_cropped: bool = parameter_field(True, NEXT_CONFIGURE)
+    publish_links: bool = parameter_field(True, AT_ONCE)
+    added_joints: bool = parameter_field(True, AT_ONCE)
+    longest_silence: float = parameter_field(2.0, AT_ONCE, (0.1, 3600.0))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.mixture_topic not in MIXTURES:
+            raise ValueError(f'mixture_topic must be one of {MIXTURES}, saw {self.mixture_topic!r}')
+        for namespace in self.named:
+            if not re.fullmatch(r'/|(/[A-Za-z_][A-Za-z0-9_]*)+', namespace):
+                raise ValueError(
+                    f'namespaces: wanted names such as /humans/bodies/anna, saw {namespace!r}'
+                )
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The namespaces, each once."""
+        return tuple(dict.fromkeys(self.namespaces.split()))
+
+
+if __name__ == '__main__':
+    sys.stdout.write(parameter_file_text('hri_node', HriParameters()))

@@ -1,0 +1,373 @@
+"""REP 155 behind its topics: mixtures of people in, bodies as robots expect them out.
+
+The rules:
+
+- A track of a person is a body. Its identity is the name of the person, the namespace without
+  /humans/bodies/, and the number of the track: p1_2 is the second track in /humans/bodies/p1. A
+  person who was lost and is found again by a new track is a new body, as the REP wants it.
+- /humans/bodies/tracked lists the bodies that are tracked. A body that the filter calls lost is not
+  in the list until the same track goes on; it ends with the track, with a mixture without
+  components, and `longest_silence` after its last mixture.
+- A body is shown in one pose, its heaviest mode. While that mode lasts another one replaces it only
+  with twice its weight.
+- Regions, landmarks and cropped images need a calibrated camera_info, frames and joint states do
+  not. A cropped image needs the image of the stamp of the mixture.
+- A mixture that is not younger than the one before of that person is skipped, or ends all bodies
+  with `reset_on_time_jump`.
+- What can not be used is skipped. The first fault of each kind is logged; all are counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from hmt_ros.body import Camera
+from hmt_ros.body.reference_human import Joint, ReferenceHuman, fit_reference_human
+from hmt_ros.inference.arrays import Array
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.handled import Fault, Handled, Output
+from hmt_ros.sessions.hri_parameters import HriParameters
+from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState, everything
+from msg_tools import MessageError
+from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
+from msg_tools.messages.detections import SKELETON_2D
+from msg_tools.messages.headers import SECOND_NS
+from msg_tools.messages.humans import (
+    IDS,
+    REGION,
+    cropped_message,
+    human_joint_states,
+    human_transforms,
+    human_urdf,
+    ids_message,
+    landmarks_in_space,
+    region_in_image,
+    region_message,
+    skeleton_message,
+)
+from msg_tools.messages.images import ImageError
+from msg_tools.messages.pose_mixtures import PoseMixture, TrackState, pose_mixture_of
+
+BODIES = '/humans/bodies'
+TRACKED, FRAMES = f'{BODIES}/tracked', '/tf'
+TOPICS = {
+    TRACKED: PublishedTopic(IDS, latched=True),
+    FRAMES: PublishedTopic('tf2_msgs/msg/TFMessage'),
+}
+# In the namespace of each body.
+BODY_TOPICS = {
+    'urdf': PublishedTopic('std_msgs/msg/String', latched=True),
+    'joint_states': PublishedTopic('sensor_msgs/msg/JointState'),
+    'roi': PublishedTopic(REGION),
+    'skeleton2d': PublishedTopic(SKELETON_2D),
+    'cropped': PublishedTopic('sensor_msgs/msg/Image'),
+}
+MIXTURE = 'pose_mixture'
+FINISH = 'finish'  # what `finish` calls the end of the stream
+# Share of the weight of the heaviest mode with which a mode goes on to be shown.
+_KEPT = 0.5
+# Change of a length above which a body is described anew, m.
+_RESHAPED = 0.005
+# A filter that is further behind drops images itself.
+_IMAGES = 20
+
+
+def mixture_source(namespace: str) -> str:
+    """What the session calls the mixtures of a namespace."""
+    return f'{MIXTURE} of {namespace}'
+
+
+def body_topic(identity: str, name: str) -> str:
+    """A topic of a body; `name` is one of `BODY_TOPICS`."""
+    return f'{BODIES}/{identity}/{name}'
+
+
+def published_topic(topic: str) -> PublishedTopic:
+    """What a topic of the session is."""
+    return TOPICS.get(topic) or BODY_TOPICS[topic.rpartition('/')[2]]
+
+
+@dataclass
+class _Person:
+    """A person whose mixtures come in one namespace, and the body that is tracked there.
+
+    Attributes:
+        name: of the person.
+        identity: of the body; '' while there is none.
+        tracked: whether the body is neither lost nor silent.
+        tracks: number of the newest track.
+        newest: stamp of the newest mixture, ns.
+        heard: time at which it came, by the stamps of camera_info, ns.
+        mode: identity of the mode that is shown; 0: none.
+        angles: of the reference model in the image before.
+        described: joints of the model whose URDF was published.
+    """
+
+    name: str
+    identity: str = ''
+    tracked: bool = False
+    tracks: int = 0
+    newest: int | None = None
+    heard: int = 0
+    mode: int = 0
+    angles: dict[str, float] = field(default_factory=dict)
+    described: tuple[Joint, ...] = ()
+
+    def end(self) -> None:
+        """The track has ended."""
+        self.identity, self.tracked = '', False
+
+    def begin(self, track: int) -> None:
+        """A track goes on, or another one begins; 0: it has no number."""
+        if not track:
+            track = self.tracks if self.identity else self.tracks + 1
+        identity = f'{self.name}_{track}'
+        if identity != self.identity:
+            self.mode, self.angles, self.described = 0, {}, ()
+        self.identity, self.tracked, self.tracks = identity, True, track
+
+
+@dataclass(frozen=True)
+class HriState(SessionState):
+    """State of the bridge: its status is 'waiting', 'nobody' or 'tracking'.
+
+    Attributes:
+        bodies: that are tracked.
+    """
+
+    bodies: tuple[str, ...] = ()
+
+    def summary(self) -> str:
+        """The present bodies in a few words."""
+        return f'{len(self.bodies)} bodies'
+
+    def values(self) -> list[tuple[str, str]]:
+        """Keys and values of the diagnostics."""
+        return [('bodies', ' '.join(self.bodies))]
+
+
+class HriSession(Session[HriParameters, HriState]):
+    """Turns mixtures into the messages of REP 155; see `Session` for arguments and attributes."""
+
+    TOPICS = TOPICS
+    COUNTED = MIXTURE
+    UNIT = 'mixture'
+    DONE = 'converted'
+    ESTIMATE = 'every body'
+    CHECKED = ()
+
+    def __init__(
+        self,
+        parameters: HriParameters,
+        publish: Callable[[Output], None],
+        wanted: Callable[[str], bool] = everything,
+    ) -> None:
+        super().__init__(parameters, publish, wanted)
+        self._camera: Camera | None = None
+        self._now = 0
+        self._people: dict[str, _Person] = {}
+        self._images: dict[int, Any] = {}
+        self.state = self._present_state()
+
+    @property
+    def identities(self) -> set[str]:
+        """The bodies that have topics: those that are tracked, or lost but not given up."""
+        return {person.identity for person in self._people.values() if person.identity}
+
+    def finish(self) -> Handled:
+        """Tells that nobody is tracked any more."""
+        self._log.begin()
+        if any(person.tracked for person in self._people.values()):
+            self._people.clear()
+            self._tell_tracked(self._now)
+        self.restart()
+        return self._handled(FINISH, self._now)
+
+    def _forget(self) -> None:
+        self._people.clear()
+        self._images.clear()
+
+    # Inputs.
+
+    def _take(self, source: str, message: Any, stamp: int) -> None:
+        if source == CAMERA_INFO:
+            self._take_camera_info(message, stamp)
+        elif source == IMAGE:
+            self._images[stamp] = message
+            while len(self._images) > _IMAGES:
+                del self._images[next(iter(self._images))]
+        else:
+            self._log.counts['received'] += 1
+            self._take_mixture(source.removeprefix(mixture_source('')), message, stamp)
+
+    def _take_camera_info(self, message: Any, stamp: int) -> None:
+        self._now = stamp
+        try:
+            self._camera = camera_from_info(message)
+        except CameraInfoError as error:
+            self._log.fault(Fault.CAMERA_INFO, str(error))
+        longest = self.parameters.longest_silence * SECOND_NS
+        silent = [p for p in self._people.values() if p.identity and stamp - p.heard > longest]
+        for person in silent:
+            person.end()
+        if silent:
+            self._tell_tracked(stamp)
+
+    def _take_mixture(self, namespace: str, message: Any, stamp: int) -> None:
+        known = self._people.get(namespace)
+        order = self._order(stamp, None if known is None else known.newest)
+        if order is Order.SKIPPED:
+            return
+        try:
+            content = pose_mixture_of(message)
+        except MessageError as error:
+            self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
+            return
+        if order is Order.JUMP:
+            self.restart()
+        person = self._people.setdefault(namespace, _Person(_name_in(namespace)))
+        if self._camera is None:
+            self._now = stamp
+        person.newest, person.heard = stamp, self._now
+        if content.state is TrackState.NOBODY or not len(content.weights):
+            person.end()
+        elif content.state is TrackState.LOST:
+            person.tracked = False
+        else:
+            try:
+                self._show(person, content)
+            except ValueError as error:
+                person.tracked = False
+                self._log.skip(Fault.HUMAN, f'mixture of {stamp} ns shows no body: {error}')
+                self._tell_tracked(stamp)
+                return
+        if not person.tracked:
+            self._tell_tracked(stamp)
+        self._log.counts['converted'] += 1
+
+    # Outputs.
+
+    def _tell_tracked(self, stamp: int) -> None:
+        self._publish(TRACKED, stamp, ids_message(self._messages, self._tracked(), stamp))
+
+    def _tracked(self) -> tuple[str, ...]:
+        return tuple(sorted(p.identity for p in self._people.values() if p.tracked))
+
+    def _show(self, person: _Person, content: PoseMixture) -> None:
+        """Publishes a body in its pose.
+
+        Raises:
+            ValueError: joint positions that are those of no person.
+        """
+        p, stamp = self.parameters, content.stamp_ns
+        shown = _shown_mode(content, person.mode if content.track_id == person.tracks else 0)
+        before = person.angles
+        human = fit_reference_human(
+            content.joint_names, content.joint_positions[shown], before, additions=p.added_joints
+        )
+        person.begin(content.track_id)
+        assert content.identities is not None
+        person.mode, person.angles = int(content.identities[shown]), human.angles
+        self._tell_tracked(stamp)
+        self._publish_model(person, human, stamp, content.frame_id)
+        if self._camera is not None:
+            self._publish_in_image(person, human, content, shown, self._camera)
+
+    def _publish_model(
+        self, person: _Person, human: ReferenceHuman, stamp: int, frame_id: str
+    ) -> None:
+        identity = person.identity
+        if not _alike(human.joints, person.described):
+            person.described = human.joints
+            text = human_urdf(human, identity)
+            message = self._messages.create('std_msgs/msg/String', data=text)
+            self._publish(body_topic(identity, 'urdf'), stamp, message)
+        if self._wanted(topic := body_topic(identity, 'joint_states')):
+            message = human_joint_states(self._messages, human, identity, stamp)
+            self._publish(topic, stamp, message)
+        if self._wanted(FRAMES):
+            links = self.parameters.publish_links
+            message = human_transforms(
+                self._messages, human, identity, stamp, frame_id, links=links
+            )
+            self._publish(FRAMES, stamp, message)
+
+    def _publish_in_image(
+        self,
+        person: _Person,
+        human: ReferenceHuman,
+        content: PoseMixture,
+        shown: int,
+        camera: Camera,
+    ) -> None:
+        """What needs the calibration; nothing of a body that is beyond the image."""
+        identity, stamp, frame = person.identity, content.stamp_ns, content.frame_id
+        places, weights = content.joint_positions, content.weights
+        region = region_in_image(camera, places[shown])
+        if region is None:
+            return
+        if self._wanted(topic := body_topic(identity, 'roi')):
+            others = [region_in_image(camera, each) for each in places]
+            message = region_message(self._messages, camera, region, others, weights, stamp, frame)
+            self._publish(topic, stamp, message)
+        if self._wanted(topic := body_topic(identity, 'skeleton2d')):
+            landmarks = landmarks_in_space(content.joint_names, places, human)
+            message = skeleton_message(
+                self._messages, camera, landmarks, shown, weights, stamp, frame
+            )
+            self._publish(topic, stamp, message)
+        topic = body_topic(identity, 'cropped')
+        if self.parameters.publish_cropped and self._wanted(topic):
+            self._publish_cropped(topic, region, stamp)
+
+    def _publish_cropped(self, topic: str, region: Array, stamp: int) -> None:
+        image = self._images.get(stamp)
+        if image is None:
+            text = f'no image of {stamp} ns has come, of which a mixture tells: it is not cropped'
+            self._log.note(Fault.NO_IMAGE, text)
+            return
+        try:
+            message = cropped_message(self._messages, image, region)
+        except ImageError as error:
+            self._log.note(Fault.IMAGE, str(error))
+            return
+        self._publish(topic, stamp, message)
+
+    # State.
+
+    def _present_state(self) -> HriState:
+        bodies, wants = self._tracked(), ''
+        if self._camera is None:
+            wants = 'a calibrated camera_info'
+        elif not self._people:
+            wants = 'a pose mixture'
+        status = 'waiting' if wants else 'tracking' if bodies else 'nobody'
+        return HriState(status, wants, **self._totals(), bodies=bodies)
+
+
+def _name_in(namespace: str) -> str:
+    """Name of a person, from the namespace of its mixtures."""
+    name = namespace.removeprefix(BODIES).strip('/').replace('/', '_')
+    return name or 'body'
+
+
+def _shown_mode(content: PoseMixture, before: int) -> int:
+    """Index of the mode that is shown, where that of the identity `before` was; 0: none was."""
+    assert content.identities is not None
+    heaviest = int(np.argmax(content.weights))
+    for k in np.flatnonzero(content.identities == before) if before else ():
+        if content.weights[k] >= _KEPT * content.weights[heaviest]:
+            return int(k)
+    return heaviest
+
+
+def _alike(joints: tuple[Joint, ...], others: tuple[Joint, ...]) -> bool:
+    """Whether two models have the same joints, up to small changes of their lengths."""
+    if [joint.name for joint in joints] != [joint.name for joint in others]:
+        return False
+    pairs = zip(joints, others, strict=True)
+    return all(float(np.abs(a.origin - b.origin).max()) <= _RESHAPED for a, b in pairs)

@@ -1,0 +1,149 @@
+"""The node that speaks REP 155, over DDS, where hri_msgs is installed."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import pytest
+
+from hmt_ros.sessions.hri_parameters import HriParameters
+from msg_tools.messages.pose_mixtures import (
+    MixtureKind,
+    PoseMixture,
+    TrackState,
+    pose_mixture_message,
+)
+
+pytestmark = pytest.mark.ros
+TOPIC = '/humans/bodies/p1/pose_mixture'
+
+
+@pytest.fixture
+def installed():
+    if find_spec('hri_msgs') is None:
+        pytest.skip('package hri_msgs is not installed')
+
+
+def mixture(likelihoods, index, track=1, state=TrackState.TRACKING):
+    body, modes = likelihoods.body, likelihoods.mixture(index)
+    means = modes.means.copy()
+    means[:, :2] = 0.0
+    modes = type(modes)(modes.weights, means, modes.covariances)
+    nobody = state is TrackState.NOBODY
+    content = PoseMixture.of_body(
+        body,
+        None if nobody else modes,
+        MixtureKind.POSTERIOR,
+        likelihoods.stamp(index),
+        'lens',
+        state=state,
+        track_id=track,
+    )
+    return pose_mixture_message(likelihoods.messages, content)
+
+
+def test_people_come_and_go(installed, world_of, small_camera, likelihoods):
+    from hmt_msgs.msg import PoseMixture as PoseMixtureMessage
+    from hri_msgs.msg import IdsList, NormalizedRegionOfInterest2D, Skeleton2D
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from sensor_msgs.msg import CameraInfo, Image, JointState
+    from std_msgs.msg import String
+    from tf2_msgs.msg import TFMessage
+
+    from hmt_ros.nodes.hri_node import HriNode
+
+    inputs = {'camera_info': CameraInfo, 'image': Image}
+    one = world_of(HriNode, 'hri_node', inputs)
+    one.start()
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    ids, frames = [], []
+    one.listen(IdsList, '/humans/bodies/tracked', ids, latched)
+    one.listen(TFMessage, '/tf', frames)
+    one.send('camera_info', small_camera.info(0))
+    # Somebody comes whom nobody has announced.
+    one.publishers[TOPIC] = one.other.create_publisher(PoseMixtureMessage, TOPIC, 100)
+    one.spin_until(one.publishers[TOPIC].get_subscription_count, 'a subscription')
+    source = f'pose_mixture of {TOPIC.rpartition("/")[0]}'
+    one.send(source, mixture(likelihoods, 0), TOPIC)
+    one.spin_until(lambda: ids and list(ids[-1].ids) == ['p1_1'])
+    found = {}
+    kinds = {
+        'roi': NormalizedRegionOfInterest2D,
+        'skeleton2d': Skeleton2D,
+        'cropped': Image,
+        'joint_states': JointState,
+        'urdf': String,
+    }
+    for name, kind in kinds.items():
+        found[name] = []
+        qos = latched if name == 'urdf' else 100
+        one.listen(kind, f'/humans/bodies/p1_1/{name}', found[name], qos)
+    one.spin_until(
+        lambda: all(one.node._is_wanted(f'/humans/bodies/p1_1/{name}') for name in kinds)
+    )
+    one.send('image', small_camera.image(1))
+    one.send(source, mixture(likelihoods, 1), TOPIC)
+    one.spin_until(lambda: all(found.values()), 'all topics of a body')
+    assert 0 < found['roi'][0].xmin < found['roi'][0].xmax < 1
+    assert len(found['skeleton2d'][0].skeleton) == 18
+    assert found['cropped'][0].encoding == 'bgr8'
+    assert 'waist_p1_1' in found['joint_states'][0].name
+    urdf = found['urdf'][0].data
+    assert urdf.startswith('<robot name="human_p1_1">')
+    assert one.node.get_parameter('human_description_p1_1').value == urdf
+    one.spin_until(lambda: len(frames) >= 1)
+    assert frames[-1].transforms[0].child_frame_id == 'body_p1_1'
+    _, text, values = one.diagnosis()
+    assert text == 'tracking, 1 bodies'
+    assert values['bodies'] == 'p1_1'
+    assert values['mixtures converted'] == '2'
+
+    # Another track is another body; the topics of the first one go.
+    one.send(source, mixture(likelihoods, 2, track=2), TOPIC)
+    one.spin_until(lambda: list(ids[-1].ids) == ['p1_2'])
+    one.spin_until(lambda: one.other.count_publishers('/humans/bodies/p1_1/roi') == 0)
+    assert not one.node.has_parameter('human_description_p1_1')
+    one.send(source, mixture(likelihoods, 3, 2, TrackState.NOBODY), TOPIC)
+    one.spin_until(lambda: not len(ids[-1].ids))
+    assert one.change_state('deactivate')
+    assert one.change_state('activate')
+    one.spin_until(one.publishers[TOPIC].get_subscription_count, 'a subscription')
+    one.send(source, mixture(likelihoods, 4, 3), TOPIC)
+    one.spin_until(lambda: list(ids[-1].ids) == ['p1_3'])
+    # Who deactivates the node does not leave bodies behind.
+    assert one.change_state('deactivate')
+    one.spin_until(lambda: not len(ids[-1].ids))
+    assert one.change_state('cleanup')
+    assert one.node._of_bodies == {}
+    assert not one.node.has_parameter('human_description_p1_3')
+    one.assert_described(HriParameters())
+
+
+def test_namespaces_that_are_named(installed, world_of, likelihoods):
+    from hmt_msgs.msg import PoseMixture as PoseMixtureMessage
+    from hri_msgs.msg import IdsList
+
+    from hmt_ros.nodes.hri_node import HriNode
+
+    inputs = {'pose_mixture': PoseMixtureMessage, TOPIC[1:]: PoseMixtureMessage}
+    one = world_of(HriNode, 'hri_node', inputs, namespaces='/', publish_cropped=False)
+    one.node.start()
+    one.spin_until(one.publishers['pose_mixture'].get_subscription_count, 'a subscription')
+    ids = []
+    one.listen(IdsList, '/humans/bodies/tracked', ids)
+    one.spin_until(lambda: one.node._is_wanted('/humans/bodies/tracked'))
+    one.spin_until(lambda: one.node._handled.get_subscription_count() == 1)
+    one.send('pose_mixture of /', mixture(likelihoods, 0), 'pose_mixture')
+    one.spin_until(lambda: ids)
+    assert list(ids[0].ids) == ['body_1']
+    assert one.other.count_subscribers(TOPIC) == 0
+    one.assert_refused(({'namespaces': 'p1'}, "saw 'p1'"))
+
+
+def test_a_package_that_is_not_installed_is_told(executable):
+    if find_spec('hri_msgs') is not None:
+        pytest.skip('package hri_msgs is installed')
+    lines = executable('hri_node').stop_at('hri_msgs')
+    (line,) = (line for line in lines if 'hri_msgs' in line)
+    assert '[ERROR]' in line
+    assert 'hri_node needs hri_msgs/IdsList, but the package hri_msgs is not installed' in line

@@ -1,0 +1,274 @@
+"""The clone as one package among others: in a workspace of colcon, for rosdep, for bloom."""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import setuptools
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+HMT_MSGS = ROOT / 'msg_tools' / 'hmt_msgs'
+PARTS = ['colcon.pkg', 'package.xml', 'setup.py', 'setup.cfg', 'resource', 'hmt_ros', 'msg_tools']
+PARTS += ['launch', 'rviz', 'foxglove', 'security']
+
+# A package of the same workspace that uses the messages, as docs/nodes.md tells it to.
+CONSUMER = {
+    'package.xml': """<package format="3">
+  <name>consumer</name><version>0.0.0</version><description>Uses hmt_msgs.</description>
+  <maintainer email="somebody@example.com">somebody</maintainer><license>Apache-2.0</license>
+  <buildtool_depend>ament_cmake</buildtool_depend>
+  <depend>hmt_ros</depend>
+  <export><build_type>ament_cmake</build_type></export>
+</package>
+""",
+    'CMakeLists.txt': """cmake_minimum_required(VERSION 3.20)
+project(consumer)
+find_package(ament_cmake REQUIRED)
+find_package(hmt_msgs REQUIRED)
+ament_package()
+""",
+}
+
+
+def ros_without_this_package() -> dict[str, str]:
+    """The environment of the tests, without the workspace in which they were built."""
+    environment = dict(os.environ)
+    prefixes = [Path(x) for x in os.environ['AMENT_PREFIX_PATH'].split(os.pathsep) if x]
+    own = [x for x in prefixes if any((x / 'share' / n).is_dir() for n in ('hmt_ros', 'hmt_msgs'))]
+    own.append(ROOT)
+    for name in ('AMENT_PREFIX_PATH', 'CMAKE_PREFIX_PATH', 'PYTHONPATH', 'LD_LIBRARY_PATH'):
+        folders = [Path(x) for x in environment.get(name, '').split(os.pathsep) if x]
+        venv = Path(sys.prefix)
+        kept = [x for x in folders if x == venv or not any(x.is_relative_to(y) for y in own)]
+        environment[name] = os.pathsep.join(map(str, kept))
+    environment.pop('COLCON_PREFIX_PATH', None)
+    environment.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None)
+    # Where tools/workspace.sh has unpacked the headers of Python.
+    headers = Path(sys.prefix, 'python-headers')
+    if headers.is_dir():
+        include = f'{headers}{sysconfig.get_path("include")}'
+        environment['CMAKE_ARGS'] = f'-DPython3_INCLUDE_DIR={include}'
+        environment['CPATH'] = str(headers / 'usr' / 'include')
+    return environment
+
+
+@pytest.fixture(scope='module')
+def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A workspace with the clone in src/, after "colcon build"."""
+    if shutil.which('colcon') is None:
+        pytest.skip('colcon is not installed: a workspace cannot be built')
+    folder = tmp_path_factory.mktemp('workspace')
+    for part in PARTS:
+        target = folder / 'src' / 'hmt_ros' / part
+        if (ROOT / part).is_dir():
+            shutil.copytree(ROOT / part, target, ignore=shutil.ignore_patterns('__pycache__'))
+        else:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / part, target)
+    (folder / 'src' / 'consumer').mkdir()
+    for name, text in CONSUMER.items():
+        (folder / 'src' / 'consumer' / name).write_text(text, 'utf-8')
+    done = subprocess.run(
+        ['colcon', 'build'],
+        cwd=folder,
+        env=ros_without_this_package(),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert 'Summary: 2 packages finished' in done.stdout
+    return folder
+
+
+def sourced(workspace: Path, command: str) -> subprocess.CompletedProcess[str]:
+    """A command in a shell that has sourced the workspace."""
+    return subprocess.run(
+        ['bash', '-c', f'source {workspace}/install/setup.bash && {command}'],
+        cwd=workspace,
+        env=ros_without_this_package(),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+
+
+@pytest.mark.ros
+def test_colcon_build_in_a_workspace_builds_the_messages(workspace: Path) -> None:
+    program = (
+        'import hmt_ros, json, sys; from hmt_msgs.msg import PoseComponent, PoseMixture; '
+        'from rclpy.serialization import deserialize_message, serialize_message; '
+        'sent = PoseMixture(components=[PoseComponent(weight=0.25)]); '
+        'got = deserialize_message(serialize_message(sent), PoseMixture); '
+        'json.dump([hmt_ros.__file__, got.components[0].weight], sys.stdout)'
+    )
+    done = sourced(workspace, f"python3 -c '{program}'")
+    assert done.returncode == 0, done.stderr
+    path, weight = json.loads(done.stdout)
+    assert Path(path).is_relative_to(workspace / 'install')
+    assert weight == 0.25
+
+
+@pytest.mark.ros
+def test_a_node_of_a_workspace_starts(workspace: Path) -> None:
+    node = subprocess.Popen(
+        ['bash', '-c', 'source install/setup.bash && exec install/hmt_ros/lib/hmt_ros/filter_node'],
+        cwd=workspace,
+        env=ros_without_this_package(),
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert node.stderr is not None
+    first = node.stderr.readline()
+    node.terminate()
+    rest = node.communicate(timeout=60)[1]
+    assert 'images from /image' in first, first + rest
+
+
+@pytest.mark.ros
+def test_definitions_of_messages_are_installed(workspace: Path) -> None:
+    share = workspace / 'install' / 'hmt_ros' / 'share' / 'hmt_msgs'
+    for path in (*HMT_MSGS.glob('msg/*.msg'), *HMT_MSGS.glob('srv/*.srv')):
+        assert (share / path.relative_to(HMT_MSGS)).read_bytes() == path.read_bytes()
+
+
+# ---- What setup.py does about the messages, without building them ----
+
+
+@pytest.fixture
+def install_messages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SimpleNamespace:
+    """setup.py's functions, its commands of CMake recorded instead of run."""
+    calls: list[tuple[list[str], dict[str, str]]] = []
+    codes: list[int] = []
+
+    def run(command: list[str], *, env: dict[str, str], check: bool) -> SimpleNamespace:
+        calls.append((command, env))
+        return SimpleNamespace(returncode=codes.pop() if codes else 0)
+
+    monkeypatch.setattr(setuptools, 'setup', lambda **_: None)
+    names = runpy.run_path(str(ROOT / 'setup.py'))
+    monkeypatch.setattr(names['subprocess'], 'run', run)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path / 'ros'))
+    return SimpleNamespace(calls=calls, codes=codes, **names)
+
+
+def install_definitions(prefix: Path) -> Path:
+    share = prefix / 'share' / 'hmt_msgs'
+    for name in ('msg', 'srv'):
+        shutil.copytree(HMT_MSGS / name, share / name)
+    shutil.copy(HMT_MSGS / 'package.xml', share)
+    return share
+
+
+def test_messages_of_the_ros_environment_are_not_built_twice(
+    install_messages: Any, tmp_path: Path
+) -> None:
+    install_definitions(tmp_path / 'ros')
+    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
+    assert install_messages.calls == []
+
+
+def test_messages_with_other_definitions_are_built(install_messages: Any, tmp_path: Path) -> None:
+    share = install_definitions(tmp_path / 'ros')
+    (share / 'msg' / 'Body.msg').write_text('string name\n', 'utf-8')
+    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
+    (configure, environment), (compile_, _), (install, _) = install_messages.calls
+    assert configure[:4] == ['cmake', '-S', str(HMT_MSGS), '-B']
+    assert f'-DCMAKE_INSTALL_PREFIX={tmp_path / "install"}' in configure
+    assert [compile_[1], install[1]] == ['--build', '--install']
+    assert environment['DESTDIR'] == ''
+
+
+def test_what_was_built_here_is_kept_up_to_date(install_messages: Any, tmp_path: Path) -> None:
+    """Also if the environment has the same definitions: the copy in the prefix comes first."""
+    install_definitions(tmp_path / 'ros')
+    (tmp_path / 'build').mkdir()
+    (tmp_path / 'build' / 'CMakeCache.txt').touch()
+    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
+    assert len(install_messages.calls) == 3
+
+
+def test_cmake_does_not_see_the_prefix_that_colcon_gives_to_setup_py(
+    install_messages: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = ['/build/prefix_override', '/colcon/colcon_distutils_commands', '/opt/ros/site']
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(folders))
+    monkeypatch.setenv('CMAKE_ARGS', '-DCMAKE_BUILD_TYPE=Release "-DX=a b"')
+    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '/root')
+    command, environment = install_messages.calls[0]
+    assert environment['PYTHONPATH'] == '/opt/ros/site'
+    assert environment['CMAKE_PREFIX_PATH'].startswith(str(tmp_path / 'ros'))
+    assert command[-2:] == ['-DCMAKE_BUILD_TYPE=Release', '-DX=a b']
+    assert environment['DESTDIR'] == '/root'
+
+
+def test_a_failed_build_of_messages_says_what_to_do(install_messages: Any, tmp_path: Path) -> None:
+    install_messages.codes.append(1)
+    with pytest.raises(SystemExit, match='rosdep install') as raised:
+        install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
+    assert len(str(raised.value).splitlines()) == 1
+    assert len(install_messages.calls) == 1
+
+
+def test_only_an_installation_into_ros_builds_messages(
+    install_messages: Any, tmp_path: Path
+) -> None:
+    """pip, which gives no prefix, installs the library alone."""
+    assert not install_messages.in_colcon(tmp_path / 'install' / 'hmt_ros')
+    (tmp_path / 'install').mkdir()
+    (tmp_path / 'install' / '.colcon_install_layout').write_text('isolated\n', 'utf-8')
+    assert install_messages.in_colcon(tmp_path / 'install' / 'hmt_ros')
+    assert install_messages.in_colcon(tmp_path / 'install')
+
+
+# ---- What colcon, rosdep and bloom read ----
+
+
+def test_rosdep_can_resolve_what_it_finds() -> None:
+    """rosdep finds one package here, and knows no package of this repository."""
+    packages = pytest.importorskip('catkin_pkg.packages')
+    found = packages.find_packages(str(ROOT))
+    assert [package.name for package in found.values()] == ['hmt_ros']
+    (package,) = found.values()
+    package.validate()
+    kinds = ('buildtool', 'build', 'build_export', 'exec', 'test')
+    names = {x.name for kind in kinds for x in getattr(package, f'{kind}_depends')}
+    assert names.isdisjoint({'hmt_ros', 'hmt_msgs'})
+    # It installs what the messages need too.
+    messages = pytest.importorskip('catkin_pkg.package').parse_package(str(HMT_MSGS))
+    messages.validate()
+    needed = {x.name for kind in kinds for x in getattr(messages, f'{kind}_depends')}
+    assert needed <= names
+
+
+def test_colcon_builds_the_messages_first_where_both_are_named() -> None:
+    described = yaml.safe_load((ROOT / 'colcon.pkg').read_text('utf-8'))
+    assert described == {'dependencies': ['hmt_msgs']}
+
+
+@pytest.mark.parametrize('folder', [ROOT, HMT_MSGS], ids=['hmt_ros', 'hmt_msgs'])
+def test_metadata_of_a_release(folder: Path) -> None:
+    package = pytest.importorskip('catkin_pkg.package').parse_package(str(folder))
+    assert {url.type for url in package.urls} == {'website', 'bugtracker', 'repository'}
+    assert [person.name for person in package.authors] == ['hmt_ros contributors']
+    assert [person.email for person in package.maintainers] == ['hmt-ros@example.com']
+    assert package.licenses == ['Apache-2.0']
+
+
+def test_both_packages_have_the_same_metadata() -> None:
+    package = pytest.importorskip('catkin_pkg.package')
+    ours, messages = (package.parse_package(str(folder)) for folder in (ROOT, HMT_MSGS))
+    assert [url.url for url in ours.urls] == [url.url for url in messages.urls]
+    assert ours.version == messages.version

@@ -1,0 +1,72 @@
+"""Identities of modes, which last from image to image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.tracking import Tracker, TrackerSettings
+from hmt_ros.tracking.hypotheses import Identities
+
+FRAME = 100_000_000  # ns
+
+
+def jumps(*rows: str) -> np.ndarray:
+    """Degrees of freedom (N, 2) that jumped, 'x'."""
+    return np.array([[c == 'x' for c in row] for row in rows])
+
+
+@pytest.mark.parametrize(
+    ('ancestors', 'jumped', 'expected'),
+    [
+        # Everybody goes on, in another order.
+        ([2, 0, 1], jumps('..', '..', '..'), [3, 1, 2]),
+        # Of two that came from one, the heaviest goes on.
+        ([1, 1, 0], jumps('..', '..', '..'), [2, 4, 1]),
+        # One that moved goes on before a heavier one that jumped.
+        ([1, 1, 0], jumps('x.', '..', '..'), [4, 2, 1]),
+        # Where all have jumped with a limb, the heaviest goes on.
+        ([1, 1, 0], jumps('x.', '.x', '..'), [2, 4, 1]),
+        # What was placed anew comes from nothing.
+        ([1, 2, 0], jumps('xx', '..', '.x'), [4, 3, 1]),
+    ],
+)
+def test_the_heaviest_descendant_keeps_the_number(ancestors, jumped, expected):
+    identities = Identities()
+    before = identities.new(3)
+    assert before.tolist() == [1, 2, 3]
+    found = identities.inherited(before, np.array(ancestors), jumped)
+    assert found.tolist() == expected
+    # A number is given once, even where a mode has ended.
+    after = identities.inherited(found, np.zeros(2, dtype=int), jumps('..', '..'))
+    assert after.tolist() == [expected[0], max(3, *expected) + 1]
+
+
+def test_numbers_of_a_track(human32, camera, filmed):
+    poses, images, empty = filmed('reach', 0.8, camera)
+    settings = TrackerSettings(candidates=8, max_hypotheses=4, searched_chains=1, shape_images=0)
+    start = GaussianMixture(np.ones(1), poses[:1], 1e-3 * np.eye(human32.dimension)[None])
+    runs = []
+    for _ in range(2):
+        tracker = Tracker(human32, camera, settings, BackgroundModel.from_image(empty))
+        tracker.reset(start)
+        found = []
+        for i, image in enumerate(images):
+            tracker.step(image, i * FRAME)
+            found.append(tracker.modes.identities.tolist())
+        runs.append(found)
+        assert found[0][0] == 1
+        # A new track begins with 1 again.
+        tracker.reset(start)
+        tracker.step(images[0], 0)
+        assert tracker.modes.identities[0] == 1
+        assert tracker.velocities is None
+    assert runs[0] == runs[1]
+    seen: set[int] = set()
+    for before, now in zip(runs[0], runs[0][1:], strict=False):
+        seen |= set(before)
+        assert len(set(now)) == len(now)
+        assert set(before) & set(now), 'no mode lasts'
+        assert all(number in before or number not in seen for number in now)
