@@ -12,6 +12,7 @@ are the first mixture.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -220,7 +221,7 @@ def _is_a_stature(body: Body, lengths: Array) -> bool:
     rates = body.stature_rates
     change = float(rates @ (lengths - body.skeleton.lengths))
     variance = float(rates @ body.length_covariance @ rates) + STATURE_MEASURED**2
-    return abs(change) <= MOST_UNUSUAL * variance**0.5
+    return abs(change) <= MOST_UNUSUAL * math.sqrt(variance)
 
 
 def _fit_with_lengths(
