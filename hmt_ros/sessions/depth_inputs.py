@@ -85,3 +85,11 @@ class DepthInputs:
             'its image: use depth that is registered to the colour camera',
         )
         return None
+
+
+def depth_elsewhere(stamp_ns: int) -> str:
+    """Warns of depth images that do not show the person."""
+    return (
+        f'depth of {stamp_ns} ns does not show the person where the image does: depth images are '
+        'not used until they do; wanted depth of the same time, registered to the colour camera'
+    )

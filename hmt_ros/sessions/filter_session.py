@@ -41,7 +41,7 @@ from hmt_ros.sessions.camera_session import (
     StampedInputs,
     WaitingImage,
 )
-from hmt_ros.sessions.depth_inputs import DEPTH, DepthInputs
+from hmt_ros.sessions.depth_inputs import DEPTH, DepthInputs, depth_elsewhere
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_state import IN_BACKGROUND, FilterState
 from hmt_ros.sessions.handled import Fault, Output
@@ -274,6 +274,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             )
             if trusted and self._tracker.silhouettes.doubted:
                 self._report_background(self._tracker.silhouettes.share, stamp)
+            if depth is not None and not self._tracker.depth.believed:
+                self._log.note(Fault.DEPTH_ELSEWHERE, depth_elsewhere(stamp))
             if starts and posterior is not None:
                 self._report_start(self._tracker, stamp)
             if posterior is not None and likelihood is not None:

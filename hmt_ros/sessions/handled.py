@@ -39,6 +39,7 @@ class Fault(Enum):
     DEPTH = 'depth'
     NO_DEPTH = 'no depth'
     LONE_DEPTH = 'depth without an image'
+    DEPTH_ELSEWHERE = 'depth of something else'
     TRANSFORM = 'transform'
     NO_TRANSFORM = 'no transform'
     NO_CAMERA_POSE = 'no pose of the camera'

@@ -81,6 +81,10 @@ class Source(Enum):
     ARRIVAL = 'who has come into view'
 
 
+# Starts whose best pose is near that of the person.
+FROM_JOINTS = (Source.SUBJECT, Source.KEYPOINTS)
+
+
 @dataclass(frozen=True, eq=False)
 class Beginning:
     """What `Track.begin` is given of a start; see there.

@@ -36,6 +36,7 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import Derivatives, EnergyFunction, EnergyTerm, Quadratic
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.depth_belief import LARGEST_MISFIT, depth_misfits
 from hmt_ros.tracking.gravity import Gravity
 from hmt_ros.tracking.start_depth import FEWEST, JointDepths, joint_depths
 from hmt_ros.tracking.subject import Subject
@@ -87,21 +88,31 @@ def start_from_keypoints(
         subject: joints, and what was measured of the person.
         prior_weight: factor on the soft prior of the body.
         upright: what is known of gravity; None: the root leans little against the camera's axes.
-        depths: of the image that the joints were seen in; None: unknown.
+        depths: of the image that the joints were seen in; None: unknown. They are not used where
+            they make a stature that people do not have, or do not show the surface of any pose.
 
     Raises:
         ValueError: joints from which no pose can be fitted.
     """
+    if depths is not None:
+        start = _start(body, camera, subject, prior_weight, upright, depths)
+        misfits = depth_misfits(start.body, camera, start.poses[:1], depths)
+        sized = _sized(body, subject)
+        if _is_a_stature(sized, start.body.skeleton.lengths) and misfits[0] <= LARGEST_MISFIT:
+            return start
+    return _start(body, camera, subject, prior_weight, upright, None)
+
+
+def _start(
+    body: Body, camera: Camera, subject: Subject, prior_weight: float, upright: Gravity | None,
+    depths: ImageMap | None,
+) -> Start:  # fmt: skip
+    """See `start_from_keypoints`."""
     body = _sized(body, subject)
     keypoints = subject.keypoints
     measured = joint_depths(body, keypoints, depths)
     fits = _fit_with_lengths(body, camera, keypoints, upright, measured)
     best = np.argsort(fits.value, kind='stable')[:3]
-    if len(measured.depths) and not _is_a_stature(body, fits.x[best[0], body.dimension :]):
-        # Depths of something else, or in another unit.
-        depths, measured = None, joint_depths(body, keypoints, None)
-        fits = _fit_with_lengths(body, camera, keypoints, upright, measured)
-        best = np.argsort(fits.value, kind='stable')[:3]
     if not np.isfinite(fits.value[best[0]]):
         raise ValueError('no pose of the body explains the keypoints: are they in the image?')
     weights = np.exp(-(fits.value[best] - fits.value[best[0]]))

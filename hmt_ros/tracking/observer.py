@@ -21,6 +21,7 @@ from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.tracking.depth_belief import DepthBelief
 from hmt_ros.tracking.presence import View
 from hmt_ros.tracking.silhouettes import Silhouettes, region_of
 
@@ -35,12 +36,14 @@ class Observer:
 
     Attributes:
         last_image: (H, W, 3) that the optical flow starts from; None: there is no flow.
+        depth: belief in depth images.
     """
 
     def __init__(
         self, camera: Camera, settings: LikelihoodSettings, silhouettes: Silhouettes
     ) -> None:
         self.last_image: Image | None = None
+        self.depth = DepthBelief(camera)
         self._camera = camera
         self._settings = settings
         self._silhouettes = silhouettes
@@ -95,7 +98,7 @@ class Observer:
         found = observe(
             view.image, view.silhouette if believed else None, keypoints,
             last_image=self.last_image, wanted=wanted, unsure=view.unsure,
-            depth=view.depth,
+            depth=view.depth if self.depth.believed else None,
         )  # fmt: skip
         magnification = 0.0 if pose is None else self._camera.magnification(float(pose[2]))
         return replace(found, foreground=view.silhouette, magnification=magnification)

@@ -24,6 +24,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.beginning import (
+    FROM_JOINTS,
     Arrival,
     Beginning,
     Source,
@@ -76,6 +77,7 @@ class Tracker:
 
     Attributes:
         silhouettes: where those of the images come from.
+        depth: belief in depth images.
         ground: the present estimate of gravity and of the floor.
         contacts: probabilities that the feet stand on the floor, by name.
         evaluations: of the likelihood in the last image.
@@ -100,6 +102,7 @@ class Tracker:
         self.camera = camera
         self.silhouettes = Silhouettes(background or BackgroundModel())
         self._observer = Observer(camera, self.settings.likelihood, self.silhouettes)
+        self.depth = self._observer.depth
         self.evaluations = 0
         self.log_likelihoods: Array = np.empty(0)
         self.track_id = 0
@@ -340,6 +343,7 @@ class Tracker:
         self._ground.reset()
         self._starts.arrival = Arrival()
         self._observer.last_image, self._followed = None, None
+        self.depth.reset()
 
     def _take(
         self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool
@@ -370,6 +374,7 @@ class Tracker:
             self._ground.update(self.body, self.modes, resting, dt)
         self._point.update(self.body, self.modes.poses, np.exp(self.modes.log_weights), dt)
         self._observer.last_image, self._followed = view.image, stamp
+        self.depth.update(self.body, self.modes.poses[0], view.depth)
         self.evaluations = self._track.evaluations
         return self.posterior, self._likelihood(observation)
 
@@ -405,6 +410,8 @@ class Tracker:
                 self.silhouettes.check(view.image, beginning.body, self.camera, beginning.best)
                 if self.silhouettes.doubted:
                     view = view._replace(silhouette=None, unsure=None)
+            if beginning.source in FROM_JOINTS:
+                self.depth.update(beginning.body, beginning.best[0], view.depth)
             observation = self._observe(view, beginning.best[0])
             self._begin(observation, beginning, stamp)
             if not self._track.believes_silhouettes:

@@ -41,6 +41,7 @@ class StubTracker:
         self.settings = settings or TrackerSettings()
         self.background = background
         self.silhouettes = SimpleNamespace(doubted=False, share=0.9, known='known')
+        self.depth = SimpleNamespace(believed=True)
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.track_id, self.started_from = 0, None
         self.log_likelihoods = np.array([-1.5, -2.5])

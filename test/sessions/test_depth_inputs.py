@@ -107,3 +107,13 @@ def test_a_jump_in_time_forgets_the_depth(session, small_camera, stub_tracker):
     one.take(IMAGE, small_camera.image(3))
     one.take(DEPTH, small_camera.depth(3))
     assert depths(stub_tracker)[-1] == 3.0
+
+
+def test_depth_of_something_else_is_told_once(session, small_camera, stub_tracker):
+    one = session()
+    for index in range(4):
+        one.take(DEPTH, small_camera.depth(index))
+        warnings = one.take(IMAGE, small_camera.image(index)).warnings
+        assert len(warnings) == (index == 2)
+        stub_tracker.made[0].depth.believed = index == 0
+    assert one.state.faults == {'depth of something else': 2}

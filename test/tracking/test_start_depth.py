@@ -17,6 +17,7 @@ from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import Subject, Tracker
 from hmt_ros.tracking.beginning import Starts
+from hmt_ros.tracking.depth_belief import DepthBelief
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from hmt_ros.tracking.presence import View
 from hmt_ros.tracking.start_depth import depths_of, joint_depths, moved_to_depth
@@ -155,16 +156,18 @@ def tracked(tall, camera, keypoints_of):
     body, poses, images, depths, empty = tall
     true = body.joint_positions(poses)
     found = {}
-    for name in ('depth', 'no depth', 'holes'):
+    for name in ('depth', 'no depth', 'holes', 'shifted'):
         background = BackgroundModel.from_image(empty)
         tracker = Tracker(load_body('human37'), camera, background=background, seed=1)
         tracker.reset(subject_of(keypoints_of(body, poses[0], 2.0)))
         errors = []
         for t, (image, depth) in enumerate(zip(images[:3], depths)):
-            given = {'depth': depth, 'no depth': None, 'holes': np.zeros_like(depth)}[name]
-            posterior, _ = tracker.step(image, 100 * t * MS, depth=given)
+            given = {'depth': depth, 'no depth': None, 'holes': np.zeros_like(depth)}
+            given['shifted'] = np.roll(depth, 20, axis=1)
+            posterior, _ = tracker.step(image, 100 * t * MS, depth=given[name])
             joints = tracker.body.joint_positions(posterior.means[:1])[0]
             errors.append(np.linalg.norm(joints - true[t], axis=1).mean())
+        assert tracker.depth.believed == (name != 'shifted')
         found[name] = np.array(errors), posterior
     return found
 
@@ -188,3 +191,27 @@ def test_depth_of_another_size_is_refused(tall, camera):
     tracker = Tracker(load_body('human37'), camera)
     with pytest.raises(ValueError, match=r'images of \(240, 320\), saw depths of \(24, 32\)'):
         tracker.step(tall[2][0], 0, depth=np.ones((24, 32)))
+
+
+def test_depth_that_is_not_registered_is_left_out(tracked):
+    """Shifted by 20 px of a person some 50 px wide."""
+    assert np.array_equal(tracked['shifted'][0], tracked['no depth'][0])
+
+
+def test_the_belief_comes_back(tall, camera):
+    body, poses, _, depths, _ = tall
+    belief, shifted = DepthBelief(camera), np.roll(depths[0], 20, axis=1)
+    wrong = poses[0] * np.where(np.arange(body.dimension) < 3, 1.1, 1.0)
+    for depth, pose, believed in (
+        (None, wrong, True),
+        (np.zeros_like(shifted), wrong, True),
+        *[(shifted, wrong, False)] * 3,
+        *[(depths[0], wrong, None)] * 10,
+        (depths[0], wrong, True),
+    ):
+        belief.update(body, pose, depth)
+        assert believed is None or belief.believed == believed
+    belief.update(body, wrong, shifted)
+    assert belief.believed
+    belief.reset()
+    assert belief.believed

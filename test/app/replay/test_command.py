@@ -88,6 +88,7 @@ class StandingStill:
         self.depths = []
         self.ground, self.contacts = Ground(np.array([0.0, -1.0, 0.0]), 0.3, None, np.inf), {}
         self.silhouettes = SimpleNamespace(doubted=False, known='known')
+        self.depth = SimpleNamespace(believed=True)
         StandingStill.made.append(self)
 
     def reset(self, start, *, box=None):
