@@ -27,24 +27,24 @@ class Install(install):
         super().finalize_options()
 
     def run(self) -> None:
-        """Install hmt_ros, then hmt_msgs."""
-        super().run()
+        """Install hmt_msgs, then hmt_ros."""
         prefix = Path(self.install_base)
         if in_colcon(prefix) or (self.prefix_is_given and 'AMENT_PREFIX_PATH' in os.environ):
             build_base = Path(self.get_finalized_command('build').build_base)
             install_messages(build_base / MESSAGES, prefix, str(self.root or ''))
+        super().run()
 
 
 class Develop(develop):
     """``develop``, and the messages with it, for ``colcon build --symlink-install``."""
 
     def run(self) -> None:
-        """Install hmt_ros, then hmt_msgs."""
-        super().run()
+        """Install hmt_msgs, then hmt_ros."""
         prefix = Path(self.prefix or sys.prefix)
         if in_colcon(prefix):
             build_base = Path(self.get_finalized_command('build').build_base)
             install_messages(build_base / MESSAGES, prefix, '')
+        super().run()
 
 
 def in_colcon(prefix: Path) -> bool:
@@ -65,7 +65,15 @@ def install_messages(build: Path, prefix: Path, root: str) -> None:
     built_before = (build / 'CMakeCache.txt').is_file()
     if not built_before and messages_are_there():
         return
+    if not os.environ.get('AMENT_PREFIX_PATH'):
+        raise SystemExit(
+            f'{MESSAGES}: no ROS environment, AMENT_PREFIX_PATH is not set. Run "source '
+            '/opt/ros/jazzy/setup.bash" and then the same command'
+        )
     environment = dict(os.environ, DESTDIR=root)
+    # As colcon does for a package of CMake: all processors, unless the user says how many.
+    if 'MAKEFLAGS' not in environment:
+        environment.setdefault('CMAKE_BUILD_PARALLEL_LEVEL', str(os.cpu_count() or 1))
     # What colcon adds for setup.py moves sys.prefix, which CMake would ask for.
     folders = environment.get('PYTHONPATH', '').split(os.pathsep)
     ours = ('prefix_override', 'colcon_distutils_commands')
@@ -76,7 +84,7 @@ def install_messages(build: Path, prefix: Path, root: str) -> None:
     settings += shlex.split(os.environ.get('CMAKE_ARGS', ''))
     steps = [
         ['cmake', '-S', str(ROOT / 'msg_tools' / MESSAGES), '-B', str(build), *settings],
-        ['cmake', '--build', str(build), '--parallel', str(os.cpu_count() or 1)],
+        ['cmake', '--build', str(build)],
         ['cmake', '--install', str(build)],
     ]
     for step in steps:
@@ -170,6 +178,7 @@ setup(
             'filter_node = hmt_ros.nodes.filter_node:main',
             'smoother_node = hmt_ros.nodes.smoother_node:main',
             'bme_node = hmt_ros.nodes.bme_node:main',
+            'people_node = hmt_ros.nodes.people_node:main',
             'track-video = hmt_ros.app.track_video:main',
             'import-video = hmt_ros.app.import_video.command:main',
             'subject = hmt_ros.app.subject:main',

@@ -23,6 +23,7 @@ PAGES = {
     'bme_node': 'nodes.md',
     'keypoints_node': 'nodes.md',
     'keypoints_adapter_node': 'nodes.md',
+    'hri_node': 'nodes.md',
     'bags': 'bags.md',
     'nodes': 'nodes.md',
     'soak': 'robustness.md',
@@ -83,6 +84,7 @@ def parameter_table(node: str) -> str:
     from hmt_ros.sessions.bme_parameters import BmeParameters
     from hmt_ros.sessions.declared_parameters import declared_parameters
     from hmt_ros.sessions.filter_parameters import FilterParameters
+    from hmt_ros.sessions.hri_parameters import HriParameters
     from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
     from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
     from hmt_ros.sessions.smoother_parameters import SmootherParameters
@@ -93,6 +95,7 @@ def parameter_table(node: str) -> str:
         'bme_node': BmeParameters(),
         'keypoints_node': KeypointsParameters(),
         'keypoints_adapter_node': KeypointsAdapterParameters(),
+        'hri_node': HriParameters(),
     }
     lines = ['| parameter | default | range | takes effect | what |', '|---|---|---|---|---|']
     for parameter in declared_parameters(settings[node]):

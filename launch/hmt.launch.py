@@ -1,4 +1,4 @@
-"""Starts the nodes for one person, in a namespace of its own (REP 155).
+"""Starts the nodes for one person, in a namespace of its own, and REP 155 for all if asked to.
 
     ros2 launch hmt_ros hmt.launch.py image:=/camera/image_raw
     ros2 launch hmt_ros hmt.launch.py body_id:=anna image:=/left/image image_transport:=compressed
@@ -34,6 +34,8 @@ OPTICAL, UPRIGHT = 'camera_optical_frame', 'camera_upright'
 # Rotation from (x right, y down, z forward) to (x forward, y left, z up).
 TURN = {'qx': 0.5, 'qy': -0.5, 'qz': 0.5, 'qw': 0.5}
 TRUTH = {'true': True, 'false': False}
+# Interval between two predictions of bme_node while filter_node tracks the person, s.
+TRACKED_INTERVAL = 0.2
 # Environment variables that name a file with settings of Fast DDS.
 PROFILES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 
@@ -82,6 +84,12 @@ ARGUMENTS = (
         '',
         f'optical frame of the images; if given, or with rviz, a frame {UPRIGHT} for views is '
         'published, which has the same direction of view, and z up',
+    ),
+    (
+        'hri',
+        'false',
+        "'true': also start hri_node, for the topics and frames of REP 155 of all people; it needs "
+        'the package hri_msgs',
     ),
     ('rviz', 'false', "'true': also start RViz"),
     ('log_level', 'info', 'log level of the nodes: debug, info, warn, error or fatal'),
@@ -162,7 +170,12 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
             'frame_prefix': f'{_frame(namespace)}/',
         },
         'smoother_node': common,
-        'bme_node': {**camera, **_named(given, 'model_file')},
+        'bme_node': {
+            **camera,
+            **_named(given, 'model_file'),
+            # While the person is tracked the filter needs the processor more.
+            'tracked_interval': TRACKED_INTERVAL if 'filter_node' in names else 0.0,
+        },
         'keypoints_node': {**common, 'image_transport': transport},
         'keypoints_adapter_node': {**common, 'source': given['detections_source']},
     }
@@ -182,6 +195,9 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
         )
         for name in names
     ]
+    if _truth(given, 'hri'):
+        _installed('hri_msgs', 'hri')
+        actions.append(_hri_node(given, share, namespace, common, remappings, env))
     rviz = _truth(given, 'rviz')
     if rviz or given['camera_frame']:
         frames = {'frame-id': given['camera_frame'] or OPTICAL, 'child-frame-id': UPRIGHT}
@@ -214,6 +230,32 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
         command = ['ros2', 'bag', 'play', bag, '--clock', '--delay', '5']
         actions.append(ExecuteProcess(cmd=command, output='both', additional_env=env))
     return actions
+
+
+def _hri_node(
+    given: Mapping[str, str],
+    share: Path,
+    namespace: str,
+    common: Mapping[str, Any],
+    remappings: list[tuple[str, str]],
+    env: dict[str, str],
+) -> Any:
+    """The node that speaks REP 155 about all people below /humans/bodies, or about this one."""
+    values = {**common, 'image_transport': given['image_transport']}
+    if not namespace.startswith('/humans/bodies/'):
+        values['namespaces'] = namespace
+    own = [given['params_file']] if given['params_file'] else []
+    return Node(
+        package=PACKAGE,
+        executable='hri_node',
+        name='hri_node',
+        namespace=namespace,
+        parameters=[str(share / 'config' / 'hri_node.yaml'), _file('hri_node', values), *own],
+        remappings=remappings,
+        ros_arguments=['--log-level', f'{_logger(namespace, "hri_node")}:={given["log_level"]}'],
+        output='both',
+        additional_env=env,
+    )
 
 
 def _room_for_images(share: Path) -> dict[str, str]:

@@ -21,6 +21,7 @@ from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import Scores
 from hmt_ros.sessions import (
     bme_session,
+    hri_session,
     keypoints_adapter_session,
     keypoints_session,
     smoothed_messages,
@@ -29,10 +30,12 @@ from hmt_ros.sessions import (
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import declared_parameters
 from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.tracking.subject import parse_subject
+from msg_tools import typestore
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
@@ -50,6 +53,11 @@ NODES = {
     'bme_node': (BmeParameters(), bme_session.TOPICS),
     'keypoints_node': (KeypointsParameters(), keypoints_session.TOPICS),
     'keypoints_adapter_node': (KeypointsAdapterParameters(), keypoints_adapter_session.TOPICS),
+    'hri_node': (
+        HriParameters(),
+        hri_session.TOPICS
+        | {hri_session.body_topic('<id>', name): x for name, x in hri_session.BODY_TOPICS.items()},
+    ),
 }
 # Programs that are not part of this repository.
 FOREIGN = {
@@ -63,6 +71,9 @@ FOREIGN = {
     'rviz2',
     'sed',
     'git',
+    'docker',
+    'rosdoc2',
+    'sphinx-build',
     'install/hmt_ros/lib/hmt_ros/filter_node',
 }
 
@@ -170,7 +181,7 @@ def test_video_of_the_readme(workplace, walk_video, capsys):
 
 
 def test_subject_file_of_the_page_on_bags():
-    (text,) = (code for code, _ in blocks(ROOT / 'docs' / 'bags.md', 'yaml'))
+    text, *_ = (code for code, _ in blocks(ROOT / 'docs' / 'bags.md', 'yaml'))
     subject = parse_subject(yaml.safe_load(text), load_body('human37'))
     assert len(subject.keypoints.names) == 14
     assert subject.stature == 1.7
@@ -230,6 +241,32 @@ def test_modules_exist(page):
         assert list(ROOT.glob(name.rstrip('/'))), name
 
 
+def test_page_on_numbers_explains_every_field():
+    page = (ROOT / 'docs' / 'numbers.md').read_text('utf-8')
+    explained = {name for row in rows(page, '## One message') for name in codes(row[0])}
+    fields = typestore().fielddefs
+    constants, mixture = fields['hmt_msgs/msg/PoseMixture']
+    wanted = {name for name, _ in mixture} - {'header', 'body_model', 'dof_names', 'joint_names'}
+    wanted |= {f'components[].{name}' for name, _ in fields['hmt_msgs/msg/PoseComponent'][1]}
+    assert wanted <= explained
+    assert explained - wanted == {'header.stamp', 'header.frame_id'}
+    assert {name for name, _, _ in constants} <= set(codes(page))
+
+
+def codes(text):
+    """What stands in backticks in a text."""
+    return re.findall(r'`([^`\n]+)`', text)
+
+
+def test_calibration_on_the_page_on_numbers_is_the_measured_one():
+    tracking = (ROOT / 'docs' / 'tracking.md').read_text('utf-8')
+    table = tracking.partition('Other clips: calibration and motion.\n')[2]
+    cells = [[x.strip() for x in line.strip('|').split('|')] for line in table.splitlines()]
+    measured = [row[1:6] for row in cells if row[0] == 'mean' and row[1] != 'MediaPipe 3D']
+    page = (ROOT / 'docs' / 'numbers.md').read_text('utf-8')
+    assert rows(page, '## 90 % regions') == measured
+
+
 def test_numbers_of_evaluate_are_explained():
     text = (ROOT / 'docs' / 'evaluation.md').read_text('utf-8')
     named = set(re.findall(r'`([a-z_0-9]+)`', text))
@@ -245,6 +282,26 @@ def test_numbers_of_evaluate_are_explained():
     explained |= {f'{kind}coverage_{q}' for kind in ('', 'joint_') for q in (50, 90)}
     assert explained <= named
     assert {'heaviest', 'best', 'expected', 'modes', 'perplexity'} <= fields
+
+
+def test_every_page_is_in_the_contents():
+    index = (ROOT / 'docs' / 'index.md').read_text('utf-8')
+    trees = re.findall(r'```{toctree}\n(.*?)```', index, re.DOTALL)
+    lines = [line for tree in trees for line in tree.splitlines()]
+    listed = [line for line in lines if line and not line.startswith(':')]
+    pages = {page.stem for page in (ROOT / 'docs').glob('*.md')} - {'index'}
+    assert sorted(listed) == sorted(pages), 'list every page once in docs/index.md'
+
+
+def test_rosdoc2_finds_the_pages():
+    package = (ROOT / 'package.xml').read_text('utf-8')
+    (name,) = re.findall(r'<rosdoc2>(.*)</rosdoc2>', package)
+    kind, config = yaml.safe_load_all((ROOT / name).read_text('utf-8'))
+    assert kind == {'type': 'rosdoc2 config', 'version': 1}
+    (builder,) = config['builders']
+    folder = (ROOT / name).parent / builder['sphinx']['sphinx_sourcedir']
+    assert (folder / 'conf.py').is_file()
+    assert (folder / 'index.md').is_file()
 
 
 def test_the_picture_of_the_readme():

@@ -7,7 +7,6 @@ what they are given take their place; what is given is then started as launch_ro
 from __future__ import annotations
 
 import importlib.util
-import json
 import re
 import runpy
 import subprocess
@@ -28,6 +27,7 @@ from hmt_ros.sessions import bme_session, keypoints_session, smoothed_messages, 
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import values_of, with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.parameter_file import read_parameter_file
@@ -175,6 +175,21 @@ def test_nodes_that_find_keypoints(actions):
     assert f'{NAMESPACE}/detections' in allowed['keypoints_adapter_node']['subscribe']
 
 
+def test_rep_155(actions):
+    made = actions(hri='true', image_transport='compressed', bag='walk')
+    assert list(made) == ['filter_node', 'smoother_node', 'bme_node', 'hri_node', 'bag']
+    bridge = made['hri_node']
+    assert bridge['namespace'] == NAMESPACE
+    assert dict(bridge['remappings'])['camera_info'] == '/camera/camera_info'
+    own = parameters(bridge)
+    assert own.pop('use_sim_time') is True
+    settings = with_values(HriParameters(), own)
+    # All people that there are.
+    assert (settings.named, settings.image_transport) == ((), 'compressed')
+    elsewhere = parameters(actions(hri='true', namespace='/lab/anna')['hri_node'])
+    assert elsewhere['namespaces'] == '/lab/anna'
+
+
 def test_room_for_raw_images(actions, monkeypatch):
     for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'):
         monkeypatch.delenv(name, raising=False)
@@ -274,6 +289,7 @@ def test_what_is_not_installed_is_told_before_a_node_starts(actions, description
     names = description['actions_of'].__globals__
     monkeypatch.setitem(names, 'get_package_share_directory', directory)
     for missing, argument, value in (
+        ('hri_msgs', 'hri', 'true'),
         ('tf2_ros', 'rviz', 'true'),
         ('tf2_ros', 'camera_frame', 'lens'),
         ('rviz2', 'rviz', 'true'),
@@ -320,6 +336,7 @@ def test_everything_is_installed(monkeypatch):
         'share/hmt_ros/launch/hmt.launch.py',
         'share/hmt_ros/rviz/hmt.rviz',
         'share/hmt_ros/foxglove/hmt.json',
+        'share/hmt_ros/foxglove/hmt_bag.json',
         *(f'share/hmt_ros/config/{name}.yaml' for name in SETTINGS),
     } <= installed
 
@@ -350,26 +367,6 @@ def test_rviz_shows_topics_of_the_nodes_relative_to_a_namespace():
     }
     assert any(one['Class'].endswith('/TF') for one in displays)
     assert 'robot_description' not in text
-
-
-def panels(layout: Any) -> set[str]:
-    """Panels that the tree of a layout names."""
-    if isinstance(layout, str):
-        return {layout}
-    assert layout['direction'] in ('row', 'column')
-    return panels(layout['first']) | panels(layout['second'])
-
-
-def test_layout_shows_topics_of_the_nodes():
-    text = (ROOT / 'foxglove' / 'hmt.json').read_text('utf-8')
-    layout = json.loads(text)
-    assert panels(layout['layout']) == layout['configById'].keys()
-    named = set(re.findall(r'"/humans/bodies/p1/([a-z_/]+)', text))
-    assert named <= TOPICS.keys()
-    assert {'markers', 'human_description', 'overlay/compressed', 'pose_mixture'} <= named
-    assert '/robot_description' not in text
-    selected = layout['configById']['DiagnosticStatusPanel!filter']['selectedName']
-    assert selected == 'humans/bodies/p1/filter_node: track'
 
 
 def test_page_lists_the_arguments(description):
@@ -614,7 +611,7 @@ def test_images_of_the_camera_become_a_person_in_the_namespace(started):
         started.wait_until_active(name)
     node, arrived = started.node, {}
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    for topic in ('human_description', 'joint_states', '/tf', 'pose_prediction', 'markers'):
+    for topic in ('human_description', 'human_joint_states', '/tf', 'pose_prediction', 'markers'):
         package, _, kind = TOPICS[topic].msgtype.split('/')
 
         def keep(message, topic=topic):
@@ -636,8 +633,8 @@ def test_images_of_the_camera_become_a_person_in_the_namespace(started):
     )
     with BagReader(REACH) as bag:
         for stored in bag.messages(list(kinds)):
-            data = deserialize_message(bytes(stored.data), kinds[stored.topic])
-            publishers[stored.topic].publish(data)
+            topic = stored.topic.removeprefix('/')
+            publishers[topic].publish(deserialize_message(bytes(stored.data), kinds[topic]))
             for _ in range(4):
                 started.executor.spin_once(timeout_sec=0.05)
             if len(arrived) == 5:
@@ -650,7 +647,7 @@ def test_images_of_the_camera_become_a_person_in_the_namespace(started):
     assert {t.child_frame_id for t in arrived['/tf'].transforms} == set(links[1:])
     assert all(link.startswith('body_p1/') for link in links[1:])
     movable = {one.attrib['name'] for one in robot.findall('joint') if one.get('type') != 'fixed'}
-    assert set(arrived['joint_states'].name) == movable
+    assert set(arrived['human_joint_states'].name) == movable
     assert len(arrived['pose_prediction'].components) > 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import runpy
 import shutil
 import subprocess
@@ -214,12 +215,42 @@ def test_cmake_does_not_see_the_prefix_that_colcon_gives_to_setup_py(
     assert environment['DESTDIR'] == '/root'
 
 
+@pytest.mark.parametrize(
+    ('name', 'value', 'level'),
+    [('MAKEFLAGS', '-j1', None), ('CMAKE_BUILD_PARALLEL_LEVEL', '3', '3'), (None, '', 'all')],
+)
+def test_messages_are_built_by_as_many_processes_as_the_user_wants(
+    install_messages: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    name: str | None,
+    value: str,
+    level: str | None,
+) -> None:
+    for other in ('MAKEFLAGS', 'CMAKE_BUILD_PARALLEL_LEVEL'):
+        monkeypatch.delenv(other, raising=False)
+    if name is not None:
+        monkeypatch.setenv(name, value)
+    install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
+    wanted = str(os.cpu_count()) if level == 'all' else level
+    assert install_messages.calls[1][1].get('CMAKE_BUILD_PARALLEL_LEVEL') == wanted
+
+
 def test_a_failed_build_of_messages_says_what_to_do(install_messages: Any, tmp_path: Path) -> None:
     install_messages.codes.append(1)
     with pytest.raises(SystemExit, match='rosdep install') as raised:
         install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
     assert len(str(raised.value).splitlines()) == 1
     assert len(install_messages.calls) == 1
+
+
+def test_without_a_ros_environment_nothing_is_built(
+    install_messages: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv('AMENT_PREFIX_PATH')
+    with pytest.raises(SystemExit, match=r'source /opt/ros/jazzy/setup\.bash'):
+        install_messages.install_messages(tmp_path / 'build', tmp_path / 'install', '')
+    assert install_messages.calls == []
 
 
 def test_only_an_installation_into_ros_builds_messages(
@@ -272,3 +303,36 @@ def test_both_packages_have_the_same_metadata() -> None:
     ours, messages = (package.parse_package(str(folder)) for folder in (ROOT, HMT_MSGS))
     assert [url.url for url in ours.urls] == [url.url for url in messages.urls]
     assert ours.version == messages.version
+
+
+# ---- Files that are not run here: they name what is there ----
+
+
+def test_workflow_runs_what_the_project_is_tested_with() -> None:
+    workflow = yaml.safe_load((ROOT / '.github' / 'workflows' / 'ci.yml').read_text('utf-8'))
+    wheels, jazzy = workflow['jobs']['wheels'], workflow['jobs']['jazzy']
+    assert wheels['strategy']['matrix']['python'] == ['3.10', '3.11', '3.12', '3.13']
+    assert 'CPython 3.10 to 3.13' in (ROOT / 'README.md').read_text('utf-8')
+    assert wheels['steps'][-1]['run'].endswith(' .ci/run')
+    assert os.access(ROOT / '.ci' / 'run', os.X_OK)
+    assert jazzy['container'].startswith('ros:jazzy')
+    scripts = '\n'.join(step.get('run', '') for step in jazzy['steps'])
+    for path in re.findall(r'\btest/[\w./]+', scripts):
+        assert (ROOT / path).exists(), path
+    for name in re.findall(r'ros2 run hmt_ros ([\w-]+)', scripts):
+        assert f"'{name} = " in (ROOT / 'setup.py').read_text('utf-8'), name
+
+
+def test_dockerfile_installs_as_the_page_on_workspaces_says() -> None:
+    page = (ROOT / 'docs' / 'workspace.md').read_text('utf-8')
+    dockerfile = (ROOT / 'tools' / 'docker' / 'Dockerfile').read_text('utf-8')
+    build = page.partition('## Build')[2].partition('```bash\n')[2].partition('```')[0]
+    for command in ('rosdep install --from-paths src --ignore-src -y', 'colcon build'):
+        assert command in build
+        assert command in dockerfile
+    assert 'numba' in build
+    assert 'numba' in dockerfile
+    (line,) = [x for x in page.splitlines() if x.startswith('docker build ')]
+    assert line in dockerfile
+    ignored = (ROOT / 'tools' / 'docker' / 'Dockerfile.dockerignore').read_text('utf-8').split('\n')
+    assert not set(PARTS) & set(ignored)

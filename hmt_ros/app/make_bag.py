@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
+from hmt_ros.app.crossing_bag import CROSSING, crossing_takes, write_crossing
 from hmt_ros.app.rendered_bag import MEASURED, Take, new_bag_folder, write_bag
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.camera import Viewpoint
@@ -52,7 +53,8 @@ def _parser() -> CommandParser:
     parser = CommandParser('make-bag', 'Renders a motion into a bag with ground truth.')
     parser.add_argument(
         'name',
-        help=f'a procedural motion ({", ".join(PROCEDURAL_MOTIONS)}), or any name with --mocap',
+        help=f'a procedural motion ({", ".join(PROCEDURAL_MOTIONS)}), {CROSSING} for two people '
+        'who walk past each other, or any name with --mocap',
     )
     parser.add_output('DIR', 'bag', 'folder of the bag')
     parser.add_argument(
@@ -178,16 +180,13 @@ def _make_bag(arguments: argparse.Namespace) -> int:
         shadow=Scene.shadow if arguments.shadow else 0.0,
     )
     camera = _camera(arguments.size, arguments.fov)
+    given = {'quality': arguments.jpeg_quality, 'progress': not arguments.quiet}
     with new_bag_folder(arguments.output, overwrite=arguments.overwrite) as folder:
-        write_bag(
-            folder,
-            motion_of(options, viewpoint),
-            camera,
-            scene,
-            quality=arguments.jpeg_quality,
-            with_depth=arguments.depth,
-            progress=not arguments.quiet,
-        )
+        if options.name == CROSSING and options.mocap is None:
+            write_crossing(folder, _crossing(options, viewpoint), camera, scene, **given)
+        else:
+            take = motion_of(options, viewpoint)
+            write_bag(folder, take, camera, scene, with_depth=arguments.depth, **given)
     return 0
 
 
@@ -197,17 +196,31 @@ def _camera(size: tuple[int, int], fov: float) -> Camera:
     return Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
+def _crossing(options: MotionOptions, viewpoint: Viewpoint) -> list[Take]:
+    for name in ('heading', 'stature', 'start'):
+        if getattr(options, name):
+            raise ValueError(f'--{name} does not go with {CROSSING}, whose seed determines it')
+    duration = DURATION if options.duration is None else options.duration
+    body = _body(options.body)
+    return crossing_takes(body, duration, options.fps, options.seed, viewpoint)
+
+
+def _body(name: str) -> Body:
+    body = load_body(name)
+    missing = sorted(set(MEASURED) - set(body.segment_lengths))
+    if missing or not body.shapes:
+        what = f'no lengths {missing}' if missing else 'no flesh'
+        raise ValueError(f'body {name} has {what}: wanted one such as human37')
+    return body
+
+
 def motion_of(options: MotionOptions, viewpoint: Viewpoint) -> Take:
     """The motion that options choose, before a camera.
 
     Raises:
         ValueError: options that do not go together, or a file that can not be used.
     """
-    body = load_body(options.body)
-    missing = sorted(set(MEASURED) - set(body.segment_lengths))
-    if missing or not body.shapes:
-        what = f'no lengths {missing}' if missing else 'no flesh'
-        raise ValueError(f'body {options.body} has {what}: wanted one such as human37')
+    body = _body(options.body)
     heading = None if options.heading is None else math.radians(options.heading)
     if options.mocap is not None:
         if options.stature is not None:

@@ -1,8 +1,8 @@
 """Rendered bags: images of a moving person, with ground truth, as a bag and files beside it.
 
-The bag has the topics `image/compressed`, `camera_info`, `ground_truth` (hmt_msgs/PoseMixture) and
-`body` (hmt_msgs/Body, latched), and `depth` (sensor_msgs/Image, 16UC1) on request. Its folder also
-has the files that replay and evaluate need: `background.png` (the empty scene), `subject.yaml`
+The bag has the topics `/image/compressed`, `/camera_info`, `/ground_truth` (hmt_msgs/PoseMixture)
+and `/body` (hmt_msgs/Body, latched), and `/depth` (sensor_msgs/Image, 16UC1) on request. Its folder
+also has the files that replay and evaluate need: `background.png` (the empty scene), `subject.yaml`
 (joints as clicked in the first image) and `truth.npz` (joints, pixels and silhouettes).
 """
 
@@ -33,7 +33,8 @@ from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixt
 
 FRAME_ID = 'camera_optical_frame'
 START_NS = 1_700_000_000 * SECOND_NS  # stamp of the first image
-FILES_BESIDE = ('background.png', 'subject.yaml', 'truth.npz')
+# Of two people each has an own file of the truth.
+FILES_BESIDE = ('background.png', 'subject.yaml', 'truth.npz', 'truth_a.npz', 'truth_b.npz')
 CLICK_SIGMA = 2.0  # px
 OF_CLICKS = 5  # stream of random numbers of a seed; `hmt_ros.image` uses others
 TAPE = 0.005  # resolution of the measured lengths of a subject, m

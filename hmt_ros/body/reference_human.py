@@ -59,7 +59,8 @@ NEEDED = (
 )
 # Sine of the angle below which two bones have one direction, and lengths that are none, m.
 _STRAIGHT, _NOTHING = 1e-4, 1e-3
-_UNLIMITED = (-np.pi, np.pi)
+# Weight of a change of angles from image to image against angles beyond their ranges.
+_STEADY = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +87,7 @@ class ReferenceHuman:
 
     Attributes:
         joints: of the model at the person's lengths, parents before their children.
-        angles: rad, in [-pi, pi], by joint, without the fixed ones.
+        angles: rad, in [-pi, pi), by joint, without the fixed ones.
         rotation: (3, 3) from the body's frame to that of the joint positions.
         origin: (3,) of the body, m.
     """
@@ -122,8 +123,10 @@ def fit_reference_human(
 ) -> ReferenceHuman:
     """The reference model in the pose that joint positions show.
 
-    What positions do not tell keeps its last value: the roll of a limb that is straight, the yaw
-    of one that hangs straight down. They never tell that the head turns: `y_head` is 0.
+    Of the two sets of angles that a limb may have for one direction, the one that is within the
+    ranges of the reference and near the last one is chosen. What positions do not tell keeps its
+    last value: the roll of a limb that is straight, the yaw of one that hangs straight down. They
+    never tell that the head turns: `y_head` is 0.
 
     Args:
         names: (J) of the joints.
@@ -228,7 +231,7 @@ def _fit_arm(
         axis = (_turn_z(-s * a) @ _turn_x(s * b)).T @ (bend / sine)
         c = s * float(np.arctan2(-axis[0], axis[1]))
     found = [(a, b, c), (a + np.pi, -b, c + np.pi)]
-    angles.update(zip(names, _nearest_to_ranges(found, names), strict=True))
+    angles.update(zip(names, _best_angles(found, names, before), strict=True))
 
 
 def _fit_leg(
@@ -258,20 +261,27 @@ def _fit_leg(
     for a, b in turns:
         x, _, z = (_turn_z(-a) @ _turn_x(b)).T @ thigh
         found.append((a, s * b, float(np.arctan2(x, -z))))
-    angles.update(zip(names, _nearest_to_ranges(found, names), strict=True))
+    angles.update(zip(names, _best_angles(found, names, before), strict=True))
 
 
-def _nearest_to_ranges(
-    found: Sequence[tuple[float, ...]], names: Sequence[str]
+def _best_angles(
+    found: Sequence[tuple[float, ...]], names: Sequence[str], before: Mapping[str, float]
 ) -> tuple[float, ...]:
-    """Of several sets of angles for one direction the one that is least beyond the ranges."""
-    wrapped = [tuple(float((x + np.pi) % (2 * np.pi) - np.pi) for x in each) for each in found]
+    """Of several sets of angles for one direction the one that fits ranges and last values best."""
 
-    def excess(each: tuple[float, ...]) -> float:
-        limits = [RANGES[name] for name in names]
-        return sum(max(lo - x, x - hi, 0.0) for x, (lo, hi) in zip(each, limits, strict=True))
+    def cost(each: tuple[float, ...]) -> float:
+        terms = zip(each, (RANGES[name] for name in names), names, strict=True)
+        return sum(
+            max(lo - x, x - hi, 0.0) + _STEADY * abs(_wrapped(x - before[name]))
+            for x, (lo, hi), name in terms
+        )
 
-    return min(wrapped, key=excess)
+    return min((tuple(map(_wrapped, each)) for each in found), key=cost)
+
+
+def _wrapped(angle: float) -> float:
+    """The angle in [-pi, pi)."""
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _joints(at: Mapping[str, Array], *, additions: bool) -> tuple[Joint, ...]:

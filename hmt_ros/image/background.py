@@ -89,6 +89,8 @@ class BackgroundModel:
         self.changed = 0.0
         self._shape: tuple[int, ...] = ()
         self._nearby: tuple[Image, Image] | None = None
+        # The last image and what was found in it: several people ask for the same.
+        self._last: tuple[Image, Image] | None = None
         self._parts: _Parts | None = None
 
     @classmethod
@@ -111,7 +113,7 @@ class BackgroundModel:
         self._check(image)
         self.frames += 1
         self._model.apply(image, learningRate=1.0 / self.frames)
-        self._nearby = None
+        self._nearby = self._last = None
 
     def forget(self) -> None:
         """Forgets all that was learned; `complete` puts the background together anew."""
@@ -165,9 +167,18 @@ class BackgroundModel:
         """
         return self.split(image, region).foreground
 
-    def split(self, image: Image, region: Box | None = None) -> Silhouette:
-        """Foreground of an image, as for `silhouette`, and what may be person or shadow."""
+    def split(
+        self, image: Image, region: Box | None = None, others: Mask | None = None
+    ) -> Silhouette:
+        """Foreground of an image, as for `silhouette`, and what may be person or shadow.
+
+        Args:
+            image, region: as for `silhouette`.
+            others: (H, W) pixels that somebody else covers; None: none.
+        """
         raw = self._subtracted(image)
+        if others is not None:
+            raw = np.where(others, 0, raw).astype(np.uint8)
         mask = raw == FOREGROUND
         part, unsure = mask[_part(region)], np.zeros(mask.shape, dtype=np.bool_)
         if part.size:
@@ -189,11 +200,15 @@ class BackgroundModel:
         if parts is not None and parts.changed:
             self._learn_alone(parts.image)
             parts.changed = False
+        if parts is None and self._last is not None and self._last[0] is image:
+            return self._last[1]
         raw = np.asarray(self._model.apply(image, learningRate=FROZEN), dtype=np.uint8)
         raw[(raw == FOREGROUND) & self._is_beside(image)] = 0
         if parts is not None:
             raw[parts.unknown] = 0
         self.changed = cv2.countNonZero(raw) / raw.size
+        if parts is None:
+            self._last = (image, raw)
         return raw
 
     def _is_beside(self, image: Image) -> Mask:

@@ -63,6 +63,7 @@ def observe(
     last_image: Image | None = None,
     wanted: Collection[str] | None = None,
     unsure: Mask | None = None,
+    others: Mask | None = None,
     depth: NDArray[np.floating] | None = None,
 ) -> Observation:
     """The evidence that an image gives to the terms of the likelihood.
@@ -76,6 +77,7 @@ def observe(
         last_image: the image before, of the same size, for the optical flow.
         wanted: names of terms; None: all.
         unsure: (H, W) pixels that may belong to the silhouette; None: none.
+        others: (H, W) pixels that somebody else covers; None: none.
         depth: (H, W) depth along the axis of the camera, m; None: unknown. 0, NaN and what is out
             of range says nothing.
 
@@ -89,7 +91,10 @@ def observe(
     if depth is not None and depth.shape != image.shape[:2]:
         raise ValueError(f'depth {depth.shape} for an image {image.shape[:2]}')
     known = silhouette if silhouette is not None and silhouette.any() else None
-    box = window if known is None else _box(known)
+    box = window
+    if known is not None:
+        # Somebody may be anywhere behind the others.
+        box = _box(known if others is None else known | others)
     left, top, right, bottom = _grown(box, MARGIN, image.shape)
     rows, columns = slice(top, bottom), slice(left, right)
     mask = None
@@ -98,10 +103,16 @@ def observe(
     doubtful = None
     if known is not None and unsure is not None:
         doubtful = np.ascontiguousarray(unsure[rows, columns]).view(np.uint8)
+    hidden = None
+    if others is not None:
+        hidden = np.ascontiguousarray(others[rows, columns]).view(np.uint8)
+    measured = depth
+    if depth is not None and others is not None:
+        measured = np.where(others, 0.0, depth)
     before = None if last_image is None else np.ascontiguousarray(last_image[rows, columns])
     part = ImageWindow(
-        np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful,
-        None if depth is None else depth[rows, columns],
+        np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful, hidden,
+        None if measured is None else measured[rows, columns],
     )  # fmt: skip
     evidence = {
         term.name: found

@@ -134,6 +134,9 @@ def _capture(  # type: ignore[no-untyped-def]
         if visible[i]:
             u, v = pixels[i, 0], pixels[i, 1]
             visible[i] = 0.0 <= u < size[0] and 0.0 <= v < size[1]
+        if visible[i]:
+            # Somebody else is there.
+            visible[i] = not np.isnan(sample(intensity, 0, pixels[i, 0], pixels[i, 1])[0])
     covered, hidden = np.empty(count, np.bool_), np.empty(count, np.bool_)
     everything = np.ones(len(flesh.part_segments), np.bool_)
     mark_visibility(flesh, everything, columns, origins, parts, points, visible, covered, hidden)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from hmt_ros.nodes.subscribed_topic import SubscribedTopic
 from hmt_ros.sessions.handled import Handled
-from hmt_ros.sessions.session import Session
+from hmt_ros.sessions.session import Session, kind_of
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import stamp_in
@@ -62,8 +62,8 @@ class InputQueue:
     """First in, first out, between two threads.
 
     Args:
-        limits: most that may wait, by source; a source that is not named has none.
-        counted: the source whose dropped members are counted.
+        limits: most that may wait, by source or by kind of source; others have no limit.
+        counted: the kind of source whose dropped members are counted.
     """
 
     def __init__(self, limits: Mapping[str, int], counted: str) -> None:
@@ -77,7 +77,7 @@ class InputQueue:
         self._changed = threading.Condition()
 
     def limit(self, source: str, most: int) -> None:
-        """Changes how many of a source may wait."""
+        """Changes how many of a source, or of each of a kind, may wait."""
         with self._changed:
             self._limits[source] = most
 
@@ -89,9 +89,11 @@ class InputQueue:
                 return
             self._waiting.append(waiting)
             self._sizes[source] += 1
-            while self._sizes[source] > self._limits.get(source, self._sizes[source]):
+            kind = kind_of(source)
+            most = self._limits.get(source, self._limits.get(kind, self._sizes[source]))
+            while self._sizes[source] > most:
                 index = next(i for i, item in enumerate(self._waiting) if item.source == source)
-                if source == self._counted:
+                if kind == self._counted:
                     self._dropped += 1
                     self._dropped_stamps.append(self._waiting[index].stamp_ns)
                 del self._waiting[index]
@@ -179,13 +181,13 @@ class EstimatingThread:
     ) -> None:
         self._session = session
         session.interrupted = self._is_interrupted
-        self._inputs: dict[str, SubscribedTopic] = {one.source: one for one in inputs}
-        self._stamped = {one.source for one in self._inputs.values() if one.opens_with_header}
-        limits = {one.source: one.waiting for one in self._inputs.values()}
+        self._inputs: dict[str, SubscribedTopic] = {}
+        self._stamped: set[str] = set()
         # Of several requests to start anew the last counts.
-        limits[_RESTART] = 1
-        limits[session.COUNTED] = session.most_waiting
+        limits = {_RESTART: 1, session.COUNTED: session.most_waiting}
         self.queue = InputQueue(limits, counted=session.COUNTED)
+        for one in inputs:
+            self.listen(one)
         self._tell, self._tell_change = tell, tell_change
         self._inner_faults, self._log_error = inner_faults, log_error
         self._latencies: deque[float] = deque(maxlen=1000)
@@ -195,7 +197,8 @@ class EstimatingThread:
 
     def listen(self, one: SubscribedTopic) -> None:
         """Adds a topic that messages come from."""
-        self.queue.limit(one.source, one.waiting)
+        if kind_of(one.source) != self._session.COUNTED:
+            self.queue.limit(one.source, one.waiting)
         self._inputs[one.source] = one
         if one.opens_with_header:
             self._stamped.add(one.source)
@@ -229,7 +232,7 @@ class EstimatingThread:
         self._thread.join(timeout)
         if self._thread.is_alive():
             return False
-        counted = sum(waiting.source == self._session.COUNTED for waiting in left.waiting)
+        counted = sum(kind_of(waiting.source) == self._session.COUNTED for waiting in left.waiting)
         self._session.count_dropped(left.dropped + counted)
         for waiting in left.waiting:
             if waiting.source == _RESTART:
@@ -270,7 +273,7 @@ class EstimatingThread:
             waiting.content()
             return
         done = session.state.counts[session.DONE]
-        if waiting.source == session.COUNTED:
+        if kind_of(waiting.source) == session.COUNTED:
             self._arrivals[waiting.stamp_ns] = waiting.arrival
             if len(self._arrivals) > _REMEMBERED:
                 del self._arrivals[next(iter(self._arrivals))]

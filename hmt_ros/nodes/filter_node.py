@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 from hmt_msgs.srv import Reset
@@ -33,6 +34,11 @@ class FilterNode(SessionNode[FilterSession, FilterParameters]):
     SUBJECT = 'track'
     SESSION = FilterSession
     DEFAULTS = FilterParameters()
+
+    def _defaults(self) -> FilterParameters:
+        """Persons in namespaces have frames of their own."""
+        namespace = self.get_namespace().strip('/')
+        return replace(self.DEFAULTS, frame_prefix=f'{namespace}/') if namespace else self.DEFAULTS
 
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         yield Reset, '~/reset', self._on_reset

@@ -1,7 +1,7 @@
 """hri_node: mixtures of people in, the topics and frames of REP 155 out; around a session.
 
-Bodies come and go, and their topics with them. People come as well: once a second the node looks
-for mixtures in namespaces that it does not know yet.
+Bodies come and go, and their topics with them. People do as well: four times a second the node
+looks for mixtures in namespaces that it does not know yet, and leaves those that are gone.
 """
 
 from __future__ import annotations
@@ -42,8 +42,9 @@ from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 _MIXTURES = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 _URDF = 'urdf'
-# Subscriptions to people who come by themselves.
+# Subscriptions at a time to people who come by themselves, and period of the search for them, s.
 _MOST_TOPICS = 64
+_SEARCH = 0.25
 
 
 class InstalledHriSession(HriSession):
@@ -79,7 +80,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
         # Of bodies: by topic. They belong to the thread that estimates.
         self._of_bodies: dict[str, Any] = {}
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._search = self.create_timer(1.0, self._look_for_people, clock=steady)
+        self._search = self.create_timer(_SEARCH, self._look_for_people, clock=steady)
 
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         return ()
@@ -101,7 +102,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
         self._look_for_people()
         return result
 
-    # People come.
+    # People come and go.
 
     def _mixtures_in(self, namespace: str) -> SubscribedTopic:
         topic = f'{namespace.rstrip("/")}/{self._settings.mixture_topic}'
@@ -122,6 +123,11 @@ class HriNode(SessionNode[HriSession, HriParameters]):
         thread = self._thread
         if thread is None or self._settings.named or not self._inputs:
             return
+        end = f'/{self._settings.mixture_topic}'
+        for subscription in list(self._inputs):
+            if subscription.topic_name.endswith(end) and not subscription.get_publisher_count():
+                self._inputs.remove(subscription)
+                self.destroy_subscription(subscription)
         known = {subscription.topic_name for subscription in self._inputs}
         for namespace in self._found():
             one = self._mixtures_in(namespace)

@@ -83,12 +83,12 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(self.NAME, **options)
-        declared = declared_parameters(self.DEFAULTS)
+        declared = declared_parameters(defaults := self._defaults())
         self.declare_parameters(
             '', [(p.name, _as_in_ros(p.default), _descriptor(p)) for p in declared]
         )
         values = {p.name: self.get_parameter(p.name).value for p in declared}
-        self._settings: Parameters = with_values(self.DEFAULTS, values)
+        self._settings: Parameters = with_values(defaults, values)
         self._names = values.keys()
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._refuse_impossible_transitions()
@@ -119,6 +119,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._timer = self.create_timer(1.0, self._diagnose_period, clock=steady)
 
     # What a node decides.
+
+    def _defaults(self) -> Any:
+        return self.DEFAULTS
 
     @abstractmethod
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:

@@ -7,7 +7,7 @@ triangles share no pixel and leave none out. Colours are taken at a finer raster
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -71,6 +71,39 @@ def render_frames(body: Body, poses: ArrayLike, camera: Camera, scene: Scene) ->
         yield renderer.render(pose, frame)
 
 
+def render_people(
+    bodies: Sequence[Body], poses: Sequence[ArrayLike], camera: Camera, scene: Scene, frame: int = 0
+) -> tuple[NDArray[np.uint8], NDArray[np.int8]]:
+    """Picture of several people in a scene; of two the nearer one hides the other as a whole.
+
+    Args:
+        bodies: with flesh; each person has clothes of its own.
+        poses: (d,) of each.
+        camera: the camera; the viewpoint of the scene is its place.
+        scene: place, light, clothes and noise.
+        frame: number of the picture, which seeds its noise.
+
+    Returns:
+        (H, W, 3) uint8, BGR, and (H, W) the number of the person who is seen there; -1: nobody.
+    """
+    shape = (camera.height, camera.width)
+    image, owners = scene.background(camera).copy(), np.full(shape, -1, dtype=np.int8)
+    drawn = []
+    for number, (body, pose) in enumerate(zip(bodies, poses, strict=True)):
+        renderer = _renderer(body, camera, scene, number)
+        frames = forward(body.skeleton, np.asarray(pose, dtype=np.float64)[None])
+        points = frames.points(renderer.mesh.segments, renderer.mesh.vertices)
+        if scene.shadow > 0:
+            renderer.darken(image, points)
+        drawn.append((float(points[:, 2].mean()), number, renderer, frames, points))
+    for _, number, renderer, frames, points in sorted(drawn, key=lambda x: -x[0]):
+        triangles = _project(renderer.mesh, points, camera)
+        owners.reshape(-1)[_fill(triangles, *shape).pixels] = number
+        if (owners == number).any():
+            renderer.draw(image, triangles, frames)
+    return scene.add_noise(image, frame), owners
+
+
 def render_silhouettes(body: Body, poses: ArrayLike, camera: Camera) -> Mask:
     """Silhouettes (N, H, W) of a body at poses (N, d), the same as the masks of `render`.
 
@@ -108,17 +141,17 @@ class _Renderer:
         triangles = _project(self.mesh, points, camera)
         image = scene.background(camera).copy()
         if scene.shadow > 0:
-            self._darken(image, points)
+            self.darken(image, points)
         front = _front(triangles, _fill(triangles, *shape), shape)
         parts = np.full(shape, -1, dtype=np.int8)
         parts.reshape(-1)[front.pixels] = self.mesh.parts[triangles.corners[0, front.triangles]]
         depth = np.full(shape, np.inf, dtype=np.float32)
         depth.reshape(-1)[front.pixels] = 1.0 / front.inverse_depth
         if len(front.pixels):
-            self._draw(image, triangles, frames)
+            self.draw(image, triangles, frames)
         return Rendered(scene.add_noise(image, frame), parts >= 0, parts, depth)
 
-    def _draw(self, image: Picture, triangles: _Triangles, frames: Frames) -> None:
+    def draw(self, image: Picture, triangles: _Triangles, frames: Frames) -> None:
         """The person into the image."""
         k = SUPERSAMPLING
         height, width = image.shape[:2]
@@ -145,7 +178,7 @@ class _Renderer:
         window *= 1.0 - seen[:, :, 3:]
         window += seen[:, :, :3]
 
-    def _darken(self, image: Picture, points: Array) -> None:
+    def darken(self, image: Picture, points: Array) -> None:
         """The shadow of the person's vertices (V, 3, 1) into the image."""
         camera, scene = self.camera, self.scene
         fallen = scene.shadow_points(points[:, :, 0])[:, :, None]
@@ -240,8 +273,8 @@ def _mesh(body: Body) -> Mesh:
 
 
 @lru_cache(maxsize=4)
-def _renderer(body: Body, camera: Camera, scene: Scene) -> _Renderer:
-    mesh, clothes = _mesh(body), Clothes.of_seed(body, scene.seed)
+def _renderer(body: Body, camera: Camera, scene: Scene, wearer: int = 0) -> _Renderer:
+    mesh, clothes = _mesh(body), Clothes.of_seed(body, scene.seed + wearer)
     places = clothes.places(mesh.segments, mesh.vertices)
     return _Renderer(body, camera, scene, mesh, places, clothes)
 

@@ -19,6 +19,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from hmt_ros.body import Camera
 from hmt_ros.inference.arrays import Image, Mask
+from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.declared_parameters import CameraNodeParameters
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.session import Order, Session, State, everything
@@ -126,6 +127,16 @@ class CameraSession(Session[CameraParameters, State]):
         assert self._newest is not None
         return inputs.is_settled(stamp) or self._newest - stamp > timeout * SECOND_NS
 
+    def _has_transforms(self, frames: CameraFrames, waiting: WaitingImage) -> bool:
+        """Whether an image need not wait for transforms to frames."""
+        if not frames.wanted or len(self._waiting) > self.most_waiting:
+            return True
+        timeout = self.parameters.input_timeout * SECOND_NS
+        assert self._newest is not None
+        return self._newest - waiting.stamp_ns > timeout or frames.is_settled(
+            self._frame_of(waiting), waiting.stamp_ns, timeout
+        )
+
     def _take(self, source: str, message: Any, stamp: int) -> None:
         if source == CAMERA_INFO:
             self._take_camera_info(message)
@@ -228,6 +239,10 @@ class CameraSession(Session[CameraParameters, State]):
             stamp = self._waiting.popleft().stamp_ns
             self._dropped.append(stamp)
             self._log.drop(self._late(stamp))
+            self._leave_out(stamp)
+
+    def _leave_out(self, stamp: int) -> None:
+        """Takes the inputs of an image that is dropped although they have come."""
 
     def _drop_incomplete_images(self) -> None:
         most = max(self.parameters.queue_size, MOST_INCOMPLETE)

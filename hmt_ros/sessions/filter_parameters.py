@@ -93,13 +93,17 @@ class FilterParameters(CameraNodeParameters):
             /tf_static tell the height of the camera, before camera_height does.
         fixed_frame: Name of a frame that stands still, such as odom; /tf and /tf_static then tell
             how the camera moves, and the motion prior, gravity, floor and contacts are those of
-            that frame, while poses stay in the camera frame; empty switches it off.
+            that frame; empty switches it off.
+        publish_in_fixed_frame: If true, markers and person_pose are published in fixed_frame, whose
+            z axis must point up, and mixtures in the frame <fixed_frame>_optical, which has the
+            same origin and the axes of a camera; if false, in the frame of the camera.
         overlay_modes: Maximum number of modes drawn on the image, the heaviest; 0 switches the
             overlay off.
         overlay_quality: JPEG quality of the overlay.
-        publish_tf: If true, the links of the point estimate are published on /tf.
+        publish_tf: If true, the links of the point estimate are published on /tf, and
+            camera_upright where gravity is known.
         frame_prefix: Prefix of the names of the links on /tf and in human_description, which tells
-            several persons apart.
+            several persons apart; in a namespace the node takes the namespace for default.
         tracker: settings of the tracker.
         background: settings of the background subtraction.
     """
@@ -119,10 +123,11 @@ class FilterParameters(CameraNodeParameters):
     gravity_frame: str = parameter_field('', NEXT_CONFIGURE)
     floor_in_gravity_frame: bool = parameter_field(False, NEXT_CONFIGURE)
     fixed_frame: str = parameter_field('', NEXT_CONFIGURE)
+    publish_in_fixed_frame: bool = parameter_field(False, NEXT_CONFIGURE)
     overlay_modes: int = parameter_field(3, AT_ONCE, (0, 64))
     overlay_quality: int = parameter_field(85, AT_ONCE, (1, 100))
     publish_tf: bool = parameter_field(True, AT_ONCE)
-    frame_prefix: str = parameter_field('', AT_ONCE)
+    frame_prefix: str = parameter_field('human/', AT_ONCE)
     tracker: TrackerSettings = field(
         default_factory=TrackerSettings, metadata=nested_parameters(NEXT_TRACK, _TRACKER)
     )
@@ -144,6 +149,8 @@ class FilterParameters(CameraNodeParameters):
             raise ValueError('use_keypoints_3d needs use_keypoints, which is false')
         if self.gravity:
             unit_vector(self.gravity, 'gravity')
+        if self.publish_in_fixed_frame and not self.fixed_frame:
+            raise ValueError('publish_in_fixed_frame needs the name of fixed_frame, which is empty')
         if self.floor_in_gravity_frame and not self.gravity_frame:
             raise ValueError(
                 'floor_in_gravity_frame needs the name of gravity_frame, which is empty'

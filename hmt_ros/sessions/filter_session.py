@@ -28,9 +28,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hmt_ros.body import Body, Camera
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
@@ -44,6 +47,7 @@ from hmt_ros.sessions.camera_session import (
 from hmt_ros.sessions.depth_inputs import DEPTH, DepthInputs, depth_elsewhere
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_state import IN_BACKGROUND, FilterState
+from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D, KeypointInputs
 from hmt_ros.sessions.session import everything
@@ -108,12 +112,14 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         p = parameters
         self.frames = CameraFrames(p.gravity_frame, p.fixed_frame, floor=p.floor_in_gravity_frame)
         self._tracker: Tracker | None = None
-        self._tracks = 0
+        self._tracks, self._turn = 0, 0.0
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
         self._keypoints = KeypointInputs(self._log)
         self._depths = DepthInputs(self._log)
         self._predictions: StampedInputs[PosePrediction | Status] = StampedInputs()
+        # Of an image that was left out since the last estimate.
+        self._late_prediction: PosePrediction | None = None
         self.state = self._present_state()
 
     def restart(self, start: TrackStart | None = None) -> None:
@@ -149,7 +155,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if self._tracker is not None:
             self._tracks = self._tracker.track_id
         self._tracker = None
-        self._shown_body = None
+        self._shown_body, self._turn = None, 0.0
 
     def _forget_inputs(self, stamp: int) -> None:
         super()._forget_inputs(stamp)
@@ -158,6 +164,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._keypoints.clear()
         self._depths.images.clear()
         self._predictions.clear()
+        self._late_prediction = None
         self.frames.forget_after(stamp)
 
     def _stamp_of(self, source: str, message: Any) -> int:
@@ -207,18 +214,20 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         return (
             super()._is_ready(waiting)
             and self._missing_here(waiting.stamp_ns) is None
-            and self._has_transforms(waiting)
+            and self._has_transforms(self.frames, waiting)
         )
 
-    def _has_transforms(self, waiting: WaitingImage) -> bool:
-        """Whether an image need not wait for transforms."""
-        if not self.frames.wanted or len(self._waiting) > self.most_waiting:
-            return True
-        timeout = self.parameters.input_timeout * SECOND_NS
-        assert self._newest is not None
-        return self._newest - waiting.stamp_ns > timeout or self.frames.is_settled(
-            self._frame_of(waiting), waiting.stamp_ns, timeout
-        )
+    def _leave_out(self, stamp: int) -> None:
+        # A person moves little until the next image: the prediction is a hypothesis there, too.
+        found = self._predictions.take(stamp)
+        if isinstance(found, PosePrediction):
+            self._late_prediction = found
+
+    def _prediction_of(self, stamp: int) -> PosePrediction | Status | None:
+        """What was predicted from an image or, without that, from one left out before it."""
+        found = self._predictions.take(stamp)
+        late, self._late_prediction = self._late_prediction, None
+        return late if found is None else found
 
     def _missing_input(self, stamp: int) -> Fault:
         return self._missing_here(stamp) or super()._missing_input(stamp)
@@ -245,16 +254,34 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         keypoints = None
         if p.use_keypoints:
             keypoints = self._keypoints.take(stamp, p, self.start.body)
-        prediction = self._predictions.take(stamp) if p.use_predictions else None
+        prediction = self._prediction_of(stamp) if p.use_predictions else None
         depth = None
         if p.use_depth:
             depth = self._depths.take(waiting.image, stamp, self._dropped)
+        self._follow(waiting, camera, keypoints, prediction, depth=depth)
+
+    def _new_tracker(self, camera: Camera) -> Tracker:
+        return self.start.tracker(camera, self._known_ground())
+
+    def _known_ground(self) -> KnownGround:
+        return self.frames.known_ground(self.start.parameters.known_ground)
+
+    def _follow(
+        self,
+        waiting: WaitingImage,
+        camera: Camera,
+        keypoints: Keypoints | None,
+        prediction: PosePrediction | Status | None,
+        others: Mask | None = None,
+        depth: NDArray[np.float32] | None = None,
+    ) -> None:
+        """Takes an image with its inputs; see `Tracker.step`."""
+        stamp = waiting.stamp_ns
         starts = self._tracker is None or self._tracker.status is Status.WAITING
         try:
             self._look_at_frames(waiting)
             if self._tracker is None:
-                known = self.frames.known_ground(self.start.parameters.known_ground)
-                self._tracker = self.start.tracker(camera, known)
+                self._tracker = self._new_tracker(camera)
                 self._tracker.track_id = self._tracks
             elif self.frames.newest:
                 seen = self.frames.known_ground(KnownGround())
@@ -270,6 +297,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 prediction if isinstance(prediction, PosePrediction) else None,
                 waiting.mask,
                 nobody_predicted=prediction is Status.NOBODY,
+                others=others,
                 depth=depth,
             )
             if trusted and self._tracker.silhouettes.doubted:
@@ -328,6 +356,18 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if starts:
             self._shown_body = tracker.body
         frame = waiting.frame_id
+        fixed = None
+        if p.publish_in_fixed_frame:
+            if self.frames.pose is None:
+                self._log.skip(
+                    Fault.NO_CAMERA_POSE,
+                    f'the image of {waiting.stamp_ns} ns is tracked, but not published: its place '
+                    f'in fixed_frame {p.fixed_frame!r} is unknown',
+                )
+                return
+            fixed = FixedFrame(p.fixed_frame, self.frames.pose, self._turn)
+            self._turn = fixed.turn_of(tracker.body, posterior.means[0])
+        known = self.frames.known_ground(self.start.parameters.known_ground)
         track = TrackedImage(
             image=waiting.image,
             stamp_ns=waiting.stamp_ns,
@@ -346,6 +386,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             track_id=tracker.track_id,
             identities=tracker.modes.identities,
             velocities=tracker.velocities,
+            up=known.up,
+            fixed=fixed,
         )
         presentation = Presentation(
             tracker.settings.max_hypotheses,
@@ -376,7 +418,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             tracker.track_id,
             tracker.settings.max_hypotheses,
             waiting.stamp_ns,
-            waiting.frame_id,
+            f'{p.fixed_frame}_optical' if p.publish_in_fixed_frame else waiting.frame_id,
             waiting.image if p.overlay_modes else None,
             p.overlay_quality,
             self._wanted,

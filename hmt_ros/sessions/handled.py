@@ -32,6 +32,9 @@ class Fault(Enum):
     KEYPOINTS_3D = 'keypoints_3d'
     NO_KEYPOINTS_3D = 'no keypoints_3d'
     DETECTIONS = 'detections'
+    NO_DETECTIONS = 'no detections'
+    LONE_DETECTIONS = 'detections without an image'
+    PEOPLE = 'too many people'
     DETECTOR = 'detector'
     MASK = 'mask'
     NO_MASK = 'no mask'
@@ -56,6 +59,7 @@ class Fault(Enum):
     GAP = 'gap'
     HUMAN = 'reference model'
     NO_IMAGE = 'no image'
+    OTHER_CAMERA = 'other camera'
 
 
 class Output(NamedTuple):
@@ -99,9 +103,11 @@ class HandlingLog:
             'dropped' and what the session counts.
         faults: number by kind.
         last_fault: the newest; '' before the first.
+        prefix: what texts begin with: of whom they are.
     """
 
     def __init__(self) -> None:
+        self.prefix = ''
         self.counts: Counter[str] = Counter()
         self.faults: Counter[str] = Counter()
         self.last_fault = ''
@@ -115,19 +121,19 @@ class HandlingLog:
 
     def fault(self, kind: Fault | MessageFault, text: str) -> None:
         """Reports something that could not be used."""
-        self._told.append(one_line(text))
+        self._told.append(one_line(f'{self.prefix}{text}'))
         self.note(kind, text)
 
     def note(self, kind: Fault | MessageFault, text: str, *, warn: bool = False) -> None:
         """Warns of the first of a kind, and where `warn` says so; the others are counted."""
         self.faults[kind.value] += 1
-        self.last_fault = one_line(text)
+        self.last_fault = one_line(f'{self.prefix}{text}')
         if warn or self.faults[kind.value] == 1:
             self._warned.append(self.last_fault)
 
     def tell(self, text: str) -> None:
         """Logs something that is no fault."""
-        self._warned.append(one_line(text))
+        self._warned.append(one_line(f'{self.prefix}{text}'))
 
     def skip(self, kind: Fault | MessageFault, text: str) -> None:
         """Reports a message that was to be estimated from and can not be used."""

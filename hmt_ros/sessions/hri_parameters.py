@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     NEXT_CONFIGURE,
-    ImageNodeParameters,
+    TRANSPORTS,
+    NodeParameters,
     parameter_field,
 )
 from hmt_ros.sessions.parameter_file import parameter_file_text
@@ -23,7 +24,7 @@ MIXTURES = ('pose_mixture', 'smoothed_pose_mixture')
 
 
 @dataclass(frozen=True)
-class HriParameters(ImageNodeParameters):
+class HriParameters(NodeParameters):
     """All parameters of the node that speaks REP 155.
 
     Attributes:
@@ -32,6 +33,8 @@ class HriParameters(ImageNodeParameters):
             published.
         mixture_topic: Name of the mixtures in these namespaces, 'pose_mixture' of the filter, or
             'smoothed_pose_mixture' of the smoother, which are steadier and come later.
+        image_transport: Transport of the images, 'raw' (topic image) or 'compressed' (topic
+            image/compressed).
         publish_cropped: If true, the node subscribes to the images, and publishes the part of each
             that shows a body.
         publish_links: If true, /tf tells the frames of all links of a body; if false, only that of
@@ -41,17 +44,24 @@ class HriParameters(ImageNodeParameters):
             only leans, and the shoulders have a fixed place on it.
         longest_silence: Time without a mixture after which a body is not tracked any more, by the
             stamps of camera_info, s.
+        queue_size: Maximum number of mixtures that wait; when the node is late the oldest are
+            dropped.
     """
 
     namespaces: str = parameter_field('', NEXT_CONFIGURE)
     mixture_topic: str = parameter_field('pose_mixture', NEXT_CONFIGURE)
+    image_transport: str = parameter_field('raw', NEXT_CONFIGURE)
     publish_cropped: bool = parameter_field(True, NEXT_CONFIGURE)
     publish_links: bool = parameter_field(True, AT_ONCE)
     added_joints: bool = parameter_field(True, AT_ONCE)
     longest_silence: float = parameter_field(2.0, AT_ONCE, (0.1, 3600.0))
+    queue_size: int = parameter_field(5, AT_ONCE, (1, 1000))
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        if self.image_transport not in TRANSPORTS:
+            raise ValueError(
+                f'image_transport must be one of {TRANSPORTS}, saw {self.image_transport!r}'
+            )
         if self.mixture_topic not in MIXTURES:
             raise ValueError(f'mixture_topic must be one of {MIXTURES}, saw {self.mixture_topic!r}')
         for namespace in self.named:

@@ -10,8 +10,8 @@ The rules:
   components, and `longest_silence` after its last mixture.
 - A body is shown in one pose, its heaviest mode. While that mode lasts another one replaces it only
   with twice its weight.
-- Regions, landmarks and cropped images need a calibrated camera_info, frames and joint states do
-  not. A cropped image needs the image of the stamp of the mixture.
+- Regions, landmarks and cropped images need the calibrated camera_info of the frame of the mixture,
+  frames and joint states do not. A cropped image needs the image of the stamp of the mixture.
 - A mixture that is not younger than the one before of that person is skipped, or ends all bodies
   with `reset_on_time_jump`.
 - What can not be used is skipped. The first fault of each kind is logged; all are counted.
@@ -72,6 +72,8 @@ FINISH = 'finish'  # what `finish` calls the end of the stream
 _KEPT = 0.5
 # Change of a length above which a body is described anew, m.
 _RESHAPED = 0.005
+# People of whom no body is tracked who are remembered, for the numbers of their tracks.
+_REMEMBERED = 1000
 # A filter that is further behind drops images itself.
 _IMAGES = 20
 
@@ -168,6 +170,7 @@ class HriSession(Session[HriParameters, HriState]):
     ) -> None:
         super().__init__(parameters, publish, wanted)
         self._camera: Camera | None = None
+        self._frame = ''
         self._now = 0
         self._people: dict[str, _Person] = {}
         self._images: dict[int, Any] = {}
@@ -201,13 +204,12 @@ class HriSession(Session[HriParameters, HriState]):
             while len(self._images) > _IMAGES:
                 del self._images[next(iter(self._images))]
         else:
-            self._log.counts['received'] += 1
             self._take_mixture(source.removeprefix(mixture_source('')), message, stamp)
 
     def _take_camera_info(self, message: Any, stamp: int) -> None:
         self._now = stamp
         try:
-            self._camera = camera_from_info(message)
+            self._camera, self._frame = camera_from_info(message), str(message.header.frame_id)
         except CameraInfoError as error:
             self._log.fault(Fault.CAMERA_INFO, str(error))
         longest = self.parameters.longest_silence * SECOND_NS
@@ -229,7 +231,7 @@ class HriSession(Session[HriParameters, HriState]):
             return
         if order is Order.JUMP:
             self.restart()
-        person = self._people.setdefault(namespace, _Person(_name_in(namespace)))
+        person = self._person_in(namespace)
         if self._camera is None:
             self._now = stamp
         person.newest, person.heard = stamp, self._now
@@ -248,6 +250,14 @@ class HriSession(Session[HriParameters, HriState]):
         if not person.tracked:
             self._tell_tracked(stamp)
         self._log.counts['converted'] += 1
+
+    def _person_in(self, namespace: str) -> _Person:
+        if namespace not in self._people:
+            gone = [name for name, person in self._people.items() if not person.identity]
+            for name in gone[: max(len(gone) - _REMEMBERED + 1, 0)]:
+                del self._people[name]
+            self._people[namespace] = _Person(_name_in(namespace))
+        return self._people[namespace]
 
     # Outputs.
 
@@ -274,8 +284,17 @@ class HriSession(Session[HriParameters, HriState]):
         person.mode, person.angles = int(content.identities[shown]), human.angles
         self._tell_tracked(stamp)
         self._publish_model(person, human, stamp, content.frame_id)
-        if self._camera is not None:
-            self._publish_in_image(person, human, content, shown, self._camera)
+        if self._camera is None:
+            return
+        if self._frame and content.frame_id not in ('', self._frame):
+            self._log.note(
+                Fault.OTHER_CAMERA,
+                f'mixtures of {person.name} are in the frame {content.frame_id}, camera_info is '
+                f'that of {self._frame}: their places in the image are not published; remap '
+                'camera_info and image to the camera of the filter',
+            )
+            return
+        self._publish_in_image(person, human, content, shown, self._camera)
 
     def _publish_model(
         self, person: _Person, human: ReferenceHuman, stamp: int, frame_id: str

@@ -17,12 +17,11 @@ from hmt_ros.sessions.camera_session import StampedInputs
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from msg_tools import MessageError
+from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.keypoints import Positions, keypoints_of, positions_of
 
 KEYPOINTS, KEYPOINTS_3D = 'keypoints', 'keypoints_3d'
 
-# Keypoints of a detector that saw nobody.
-NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 # Sets of unknown names that are warned of, each once; a detector has one.
 _MOST_WARNINGS = 20
 

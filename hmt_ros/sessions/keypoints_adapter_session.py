@@ -23,13 +23,14 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import CAMERA_INFO
 from hmt_ros.sessions.chosen_person import ChosenPerson
 from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, NO_KEYPOINTS
+from hmt_ros.sessions.keypoint_inputs import KEYPOINTS
 from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
 from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState, everything
 from msg_tools import MessageError
 from msg_tools.messages import keypoints
 from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
 from msg_tools.messages.detections import (
+    NO_KEYPOINTS,
     people_of_floats,
     people_of_yolo,
     person_of_skeleton,

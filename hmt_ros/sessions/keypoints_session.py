@@ -21,10 +21,11 @@ from hmt_ros.detectors.mediapipe_pose import DetectorError, MediaPipePose
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import IMAGE, MASK
 from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D, NO_KEYPOINTS
+from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState, everything
 from msg_tools.messages import keypoints
+from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.images import ImageError, decode_image, image_message
 from msg_tools.messages.keypoints import keypoints_message, positions_message
 

@@ -77,6 +77,11 @@ class SessionState(ABC):
         """Keys and values that only this kind of session has in the diagnostics."""
 
 
+def kind_of(source: str) -> str:
+    """What a source has in common with others: 'mixture' of 'mixture of /humans/bodies/p1'."""
+    return source.partition(' of ')[0]
+
+
 def everything(_topic: str) -> bool:
     """Every topic is wanted."""
     return True
@@ -107,7 +112,8 @@ class Session(ABC, Generic[Parameters, State]):
 
     Attributes:
         TOPICS: the topics that are published.
-        COUNTED: source of the messages that are estimated from.
+        COUNTED: source of the messages that are estimated from, or the kind of several sources, see
+            `kind_of`.
         UNIT: what one of them is called.
         DONE: what those are called that were used; a key of `SessionState.counts`.
         ESTIMATE: what starts anew when time jumps back.
@@ -155,7 +161,7 @@ class Session(ABC, Generic[Parameters, State]):
         """
         self._log.begin()
         stamp = self._stamp_of(source, message)
-        self._log.counts['received'] += source == self.COUNTED
+        self._log.counts['received'] += kind_of(source) == self.COUNTED
         self._take(source, message, stamp)
         if not more:
             self._use_what_has_come()

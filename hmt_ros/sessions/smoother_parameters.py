@@ -74,6 +74,8 @@ class SmootherParameters(NodeParameters):
         method: Smoothing method: 'paths', the most probable paths in closed form, or 'variational',
             refined as in VMS, which takes seconds for an image.
         fixed_lag: Number of later poses after which a pose is final; 0 is filtering.
+        longest_lag: Maximum time by which a final pose is older than the newest one, s; where poses
+            are rare, fewer than fixed_lag later ones are awaited. 0 sets no limit.
         window_length: Number of the newest mixtures that are kept for ~/smooth_window.
         max_trajectories: Maximum number of components of a mixture over trajectories.
         max_hypotheses: Maximum number of components of smoothed_pose_mixture.
@@ -97,6 +99,7 @@ class SmootherParameters(NodeParameters):
     body_model: str = parameter_field('', NEXT_WINDOW)
     method: str = parameter_field('paths', NEXT_WINDOW)
     fixed_lag: int = parameter_field(7, NEXT_WINDOW, (0, 1000))
+    longest_lag: float = parameter_field(0.7, NEXT_WINDOW, (0.0, 3600.0))
     window_length: int = parameter_field(47, AT_ONCE, (1, 10_000))
     max_trajectories: int = parameter_field(16, NEXT_WINDOW, (1, 1024))
     max_hypotheses: int = parameter_field(8, AT_ONCE, (1, 1024))

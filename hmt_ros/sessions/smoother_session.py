@@ -4,8 +4,9 @@ The node and offline replay give their messages to a `SmootherSession`; the same
 same order give the same bytes. The rules:
 
 - Mixtures are smoothed in the order of their stamps, in a sliding window. A pose is published as
-  smoothed once `fixed_lag` later ones have been seen; the poses that are still open are published
-  when the window ends: at the end of the stream (`finish`), where time jumps back, at a new body.
+  smoothed once `fixed_lag` later ones have been seen, or before it is older than the newest by
+  `longest_lag`; the poses that are still open are published when the window ends: at the end of the
+  stream (`finish`), where time jumps back, at a new body.
 - A mixture that is not younger than the one before is skipped, or starts a new window with
   `reset_on_time_jump`.
 - A mixture names its body and carries the segment lengths of the person; without lengths it is
@@ -20,6 +21,7 @@ same order give the same bytes. The rules:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -28,6 +30,7 @@ import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.session import Order, Session, SessionState, everything
@@ -277,7 +280,12 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
 
     def _new_window(self, body: Body) -> SlidingWindow:
         p = self.parameters
-        return SlidingWindow(self._smoother(body, PathSmoother), p.fixed_lag, p.random_seed)
+        return SlidingWindow(
+            self._smoother(body, PathSmoother),
+            p.fixed_lag,
+            p.random_seed,
+            longest_lag=p.longest_lag or math.inf,
+        )
 
     def _smoother(self, body: Body, closed_form: type[MixtureSmoother]) -> MixtureSmoother:
         """The smoother that the parameters ask for, with `closed_form` for the paths."""
@@ -285,8 +293,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         kind = closed_form if p.method == 'paths' else MixtureSmoother
         return kind(
             p.dynamics.of(body),
-            body.lower,
-            body.upper,
+            *_limits(body),
             p.max_trajectories,
             through_modes=p.through_modes,
             error_correlation=p.error_correlation,
@@ -370,6 +377,13 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
     except OSError as error:
         text = error_line(error)
         raise ValueError(f'{text}; body_model names it, or a file with it') from error
+
+
+def _limits(body: Body) -> tuple[Array, Array]:
+    """Limits (d,) of poses in any frame: the place of the root has none."""
+    lower, upper = body.lower.copy(), body.upper.copy()
+    lower[:3], upper[:3] = -np.inf, np.inf
+    return lower, upper
 
 
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:

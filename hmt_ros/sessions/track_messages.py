@@ -18,6 +18,7 @@ from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.tracking.ground import Ground
@@ -27,6 +28,7 @@ from msg_tools.messages.ground import GROUND, GroundState, ground_message
 from msg_tools.messages.ground_markers import ground_markers, removed_ground
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.markers import skeleton_markers
+from msg_tools.messages.person_poses import PERSON_POSE, person_pose, person_pose_message
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,
@@ -43,12 +45,16 @@ TOPICS = {
     'human_description': PublishedTopic('std_msgs/msg/String', latched=True),
     'pose_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
     'likelihood_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
+    'person_pose': PublishedTopic(PERSON_POSE),
     'ground': PublishedTopic(GROUND),
-    'joint_states': PublishedTopic('sensor_msgs/msg/JointState'),
+    'human_joint_states': PublishedTopic('sensor_msgs/msg/JointState'),
     '/tf': PublishedTopic('tf2_msgs/msg/TFMessage'),
     'markers': PublishedTopic('visualization_msgs/msg/MarkerArray'),
     'overlay/compressed': PublishedTopic('sensor_msgs/msg/CompressedImage'),
 }
+
+# Frame at the camera with x forward and z up, where gravity is known; a prefix stands before it.
+UPRIGHT = 'camera_upright'
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +76,10 @@ class TrackedImage:
         track_id: number of the track.
         identities: (K,) of the components of the posterior.
         velocities: (K, d) of the components of the posterior, per second; None: unknown.
+        up: (3,) unit vector against gravity in the camera frame; None: it is not known, at most
+            estimated.
+        fixed: frame that mixtures, markers and the pose of the person are published in; None: the
+            frame of the camera.
     """
 
     image: NDArray[np.uint8]
@@ -89,6 +99,8 @@ class TrackedImage:
     track_id: int = 0
     identities: Index | None = None
     velocities: Array | None = None
+    up: Array | None = None
+    fixed: FixedFrame | None = None
 
 
 @dataclass(frozen=True)
@@ -135,29 +147,7 @@ def track_messages(
     skeleton = track.body.skeleton
     frames = forward(skeleton, track.posterior.means)
     joints = frames.joints().transpose(2, 0, 1)
-    posterior = PoseMixture.of_body(
-        track.body,
-        track.posterior,
-        MixtureKind.POSTERIOR,
-        stamp,
-        frame,
-        joint_positions=joints,
-        log_likelihoods=track.log_likelihoods,
-        state=track.state,
-        track_id=track.track_id,
-        identities=track.identities,
-        velocities=track.velocities,
-    )
-    likelihood = PoseMixture.of_body(
-        track.body,
-        track.likelihood,
-        MixtureKind.LIKELIHOOD,
-        stamp,
-        frame,
-        state=track.state,
-        track_id=track.track_id,
-        log_likelihoods=track.likelihood_values,
-    )
+    posterior, likelihood = _mixtures(track, joints)
     ground = _ground_state(track)
     if track.starts:
         publish('body', message_of_body(messages, track.body, stamp, frame))
@@ -168,27 +158,38 @@ def track_messages(
         publish('pose_mixture', pose_mixture_message(messages, posterior))
     if wanted('likelihood_mixture'):
         publish('likelihood_mixture', pose_mixture_message(messages, likelihood))
+    if wanted('person_pose'):
+        pose, its_frame = person_pose(track.body, track.posterior), frame
+        if track.fixed is not None:
+            pose, its_frame = pose.seen_from(*track.fixed.camera), track.fixed.name
+        publish('person_pose', person_pose_message(messages, pose, stamp, its_frame))
     if wanted('ground'):
         publish('ground', ground_message(messages, ground))
-    if wanted('joint_states'):
+    if wanted('human_joint_states'):
         names = posterior.dof_names
-        publish('joint_states', joint_state_message(messages, names, track.point, stamp, frame))
+        publish(
+            'human_joint_states', joint_state_message(messages, names, track.point, stamp, frame)
+        )
     if presentation.publish_tf and wanted('/tf'):
         publish('/tf', _link_transforms(messages, track, presentation.frame_prefix))
     if wanted('markers'):
         names = track.body.joint_names
+        shown, its_frame = joints, frame
+        if track.fixed is not None:
+            rotation, translation = track.fixed.camera
+            shown, its_frame = joints @ rotation.T + translation, track.fixed.name
         array = skeleton_markers(
             messages,
-            joints,
+            shown,
             names,
             [(names[a], names[b]) for a, b in skeleton.bones],
             track.posterior.weights,
             stamp,
-            frame,
+            its_frame,
             ranks=max(presentation.max_hypotheses, len(track.posterior)),
         )
-        shown = forward(skeleton, track.point[None]).joints()[..., 0]
-        array.markers += ground_markers(messages, ground, shown, names)
+        stands = forward(skeleton, track.point[None]).joints()[..., 0]
+        array.markers += ground_markers(messages, ground, stands, names)
         publish('markers', array)
     if presentation.overlay_modes and wanted('overlay/compressed'):
         drawn = draw_modes(
@@ -249,6 +250,41 @@ def nobody_messages(
         publish('overlay/compressed', picture)
 
 
+def _mixtures(track: TrackedImage, joints: Array) -> tuple[PoseMixture, PoseMixture]:
+    """Posterior and likelihood, with joints (K, J, 3) of the posterior in the camera frame."""
+    posterior, likelihood, velocities = track.posterior, track.likelihood, track.velocities
+    frame, positions = track.frame_id, joints
+    if (fixed := track.fixed) is not None:
+        posterior, velocities = fixed.placed(track.body, posterior, velocities)
+        likelihood, _ = fixed.placed(track.body, likelihood)
+        frame, positions = fixed.optical, fixed.motion.points(joints)
+    return (
+        PoseMixture.of_body(
+            track.body,
+            posterior,
+            MixtureKind.POSTERIOR,
+            track.stamp_ns,
+            frame,
+            joint_positions=positions,
+            log_likelihoods=track.log_likelihoods,
+            state=track.state,
+            track_id=track.track_id,
+            identities=track.identities,
+            velocities=velocities,
+        ),
+        PoseMixture.of_body(
+            track.body,
+            likelihood,
+            MixtureKind.LIKELIHOOD,
+            track.stamp_ns,
+            frame,
+            state=track.state,
+            track_id=track.track_id,
+            log_likelihoods=track.likelihood_values,
+        ),
+    )
+
+
 def _ground_state(track: TrackedImage) -> GroundState:
     """What is known of gravity and of the floor, as a message holds it."""
     ground = track.ground
@@ -265,14 +301,17 @@ def _ground_state(track: TrackedImage) -> GroundState:
 
 
 def _link_transforms(messages: MessageFactory, track: TrackedImage, prefix: str) -> Any:
-    """Every link of the URDF in the point estimate, seen from the camera."""
+    """Every link of the URDF in the point estimate, and frames with z up, from the camera."""
     frames = forward(track.body.skeleton, track.point[None])
     names, rotations, origins = link_frames(track.body.skeleton, frames, track.point, 0)
-    return transforms_message(
-        messages,
-        [track.frame_id] * len(names),
-        [f'{prefix}{name}' for name in names],
-        rotations,
-        origins,
-        track.stamp_ns,
-    )
+    parents = [track.frame_id] * len(names)
+    children = [f'{prefix}{name}' for name in names]
+    if track.up is not None:
+        parents, children = [*parents, track.frame_id], [*children, f'{prefix}{UPRIGHT}']
+        rotations = np.concatenate([rotations, upright(track.up)[None]])
+        origins = np.concatenate([origins, np.zeros((1, 3))])
+    if track.fixed is not None:
+        parents, children = [*parents, track.fixed.name], [*children, track.fixed.optical]
+        rotations = np.concatenate([rotations, FROM_OPTICAL[None]])
+        origins = np.concatenate([origins, np.zeros((1, 3))])
+    return transforms_message(messages, parents, children, rotations, origins, track.stamp_ns)

@@ -40,15 +40,37 @@ class TrackStart:
     initial: Subject | GaussianMixture | None
     box: Box | None = None
 
-    def tracker(self, camera: Camera, ground: KnownGround | None = None) -> Tracker:
+    def tracker(
+        self,
+        camera: Camera,
+        ground: KnownGround | None = None,
+        shared: BackgroundModel | None = None,
+    ) -> Tracker:
         """A tracker that waits for its first image.
 
         Args:
             camera: calibrated.
             ground: what is known of gravity and of the floor; None: what the parameters tell.
+            shared: background of several people, which somebody else learns; None: an own one.
 
         Raises:
             ValueError: the background was taken by another camera, or the box is not in its image.
+        """
+        p = self.parameters
+        background = self.background_model(camera) if shared is None else shared
+        known = p.known_ground if ground is None else ground
+        tracker = Tracker(
+            self.body, camera, p.tracker, background, p.random_seed, known_ground=known,
+            shared_background=shared is not None,
+        )  # fmt: skip
+        tracker.reset(self.initial, box=self.box)
+        return tracker
+
+    def background_model(self, camera: Camera) -> BackgroundModel:
+        """The empty scene before a camera, as far as it is known.
+
+        Raises:
+            ValueError: it was taken by another camera.
         """
         p = self.parameters
         background = BackgroundModel(p.background)
@@ -60,12 +82,7 @@ class TrackStart:
                     f'{camera.width}x{camera.height}'
                 )
             background = BackgroundModel.from_image(self.background, p.background)
-        known = p.known_ground if ground is None else ground
-        tracker = Tracker(
-            self.body, camera, p.tracker, background, p.random_seed, known_ground=known
-        )
-        tracker.reset(self.initial, box=self.box)
-        return tracker
+        return background
 
 
 def prepare_start(

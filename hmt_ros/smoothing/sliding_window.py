@@ -8,11 +8,13 @@ next one has the component
 
 where C takes the pose out of the state. The window is smoothed with that density in the place of
 the first likelihood, so that a new image costs the same however long the sequence is. A pose is
-final once as many later ones have been seen as the lag says.
+final once as many later ones have been seen as the lag says, or earlier, before it is older than
+the newest pose by a longest time.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +31,7 @@ from hmt_ros.smoothing.mixture_smoother import MixtureSmoother, intervals_of
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 
+SECOND_NS = 10**9
 # Components with a share below exp(-25) are given up, and those are merged whose means lie within
 # this many standard deviations, and whose sizes are alike.
 NEGLIGIBLE = 25.0
@@ -76,15 +79,27 @@ class SlidingWindow:
         smoother: how a window is smoothed.
         fixed_lag: how many later poses are seen before a pose is final.
         seed: of all randomness.
+        longest_lag: time by which a final pose may be older than the newest one, s; where poses are
+            rare, fewer later ones are seen.
 
     Raises:
         ValueError: a lag that is negative.
     """
 
-    def __init__(self, smoother: MixtureSmoother, fixed_lag: int = 12, seed: int = 0) -> None:
+    def __init__(
+        self,
+        smoother: MixtureSmoother,
+        fixed_lag: int = 12,
+        seed: int = 0,
+        *,
+        longest_lag: float = math.inf,
+    ) -> None:
         if fixed_lag < 0:
             raise ValueError(f'fixed_lag must not be negative, saw {fixed_lag}')
+        if not longest_lag >= 0:
+            raise ValueError(f'longest_lag must not be negative, saw {longest_lag}')
         self.smoother, self.fixed_lag, self.seed = smoother, fixed_lag, seed
+        self.longest_lag = longest_lag
         self.reset()
 
     def reset(self) -> None:
@@ -94,6 +109,8 @@ class SlidingWindow:
         self._first: GaussianMixture | None = None
         self._last: TrajectoryMixture | None = None
         self._next_identity = 0
+        # Poses of the window, the oldest, that are final already.
+        self._final = 0
 
     @property
     def stamps_ns(self) -> tuple[int, ...]:
@@ -127,15 +144,24 @@ class SlidingWindow:
             self._first = first_state(mixture, dynamics)
         self._stamps.append(int(stamp_ns))
         self._mixtures.append(mixture)
-        if len(self._stamps) > self.fixed_lag + 1:
-            self._advance()
+        for number in range(1, self._final + 1):
+            self._advance(number)
         found = self._smooth()
-        final: tuple[FinalPose, ...] = ()
-        if len(self._stamps) == self.fixed_lag + 1:
-            found = replace(found, final_until_ns=self._stamps[0])
-            final = (_final_pose(found, 0),)
+        self._final = self._number_of_final()
+        if self._final:
+            found = replace(found, final_until_ns=self._stamps[self._final - 1])
         self._last = found
-        return WindowUpdate(found, final)
+        return WindowUpdate(found, tuple(_final_pose(found, t) for t in range(self._final)))
+
+    def _number_of_final(self) -> int:
+        """How many poses of the window, the oldest, are not to be revised."""
+        stamps = self._stamps
+        by_number = max(len(stamps) - self.fixed_lag, 0)
+        if len(stamps) < 2 or self.longest_lag == math.inf:
+            return by_number
+        # Until the next pose comes they would grow too old.
+        until = 2 * stamps[-1] - stamps[-2] - round(self.longest_lag * SECOND_NS)
+        return max(by_number, sum(stamp < until for stamp in stamps[:-1]))
 
     def finish(self) -> tuple[FinalPose, ...]:
         """The poses that are still open, as final as they will be, and forgets everything."""
@@ -151,13 +177,17 @@ class SlidingWindow:
         self.reset()
         return result
 
-    def _advance(self) -> None:
-        """Takes the oldest pose out: the density of the state moves on to the next one."""
+    def _advance(self, number: int) -> None:
+        """Takes the oldest pose out: the density of the state moves on to the next one.
+
+        Args:
+            number: of the next one among the poses of the trajectories found last.
+        """
         assert self._first is not None
         interval = (self._stamps[1] - self._stamps[0]) * 1e-9
         followed = None
-        if self._last is not None and self._last.times > 1:
-            followed = (self._last.weights, self._last.states[:, 1])
+        if self._last is not None and self._last.times > number:
+            followed = (self._last.weights, self._last.states[:, number])
         self._first = filtered_state(
             self._first,
             self._mixtures[1],

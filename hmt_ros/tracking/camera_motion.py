@@ -112,14 +112,26 @@ class CameraMotion:
 
     def poses(self, body: Body, poses: Array) -> Array:
         """Poses (N, d) of a body in the new camera frame, within its limits."""
+        return np.clip(self.free_poses(body, poses), body.lower, body.upper)
+
+    def free_poses(self, body: Body, poses: Array, turn: float = 0.0) -> Array:
+        """Poses (N, d) of a body in the new frame, which need not be before a camera.
+
+        Args:
+            body: of the poses.
+            poses: (N, d).
+            turn: angle about z by which the root has turned, up to whole turns, rad: where it was
+                followed over several motions.
+        """
         root, offset = root_rotation_dofs(body.skeleton), body.skeleton.offsets[0]
         result = poses.copy()
         result[:, :3] = self.points(poses[:, :3] + offset) - offset
         angles = root_angles(body, self.rotation @ root_rotations(body, poses))
         # The turn nearest to that of before.
-        angles[:, 0] += 2.0 * np.pi * np.round((poses[:, root[0]] - angles[:, 0]) / (2.0 * np.pi))
+        offset_of_turns = poses[:, root[0]] + turn - angles[:, 0]
+        angles[:, 0] += 2.0 * np.pi * np.round(offset_of_turns / (2.0 * np.pi))
         result[:, root] = angles
-        return np.clip(result, body.lower, body.upper)
+        return result
 
     def jacobians(self, body: Body, before: Array, after: Array) -> Array:
         """Derivatives (N, d, d) of `poses` at poses (N, d), whose results are `after`."""
@@ -147,13 +159,14 @@ class CameraMotion:
             poses=poses,
             expected=self.poses(body, modes.expected),
             velocities=(jacobians @ modes.velocities[..., None])[..., 0],
-            covariances=_propagated(jacobians, modes.covariances),
-            filtered=_propagated(jacobians, modes.filtered),
-            state_covariances=_propagated(states, modes.state_covariances),
+            covariances=propagated(jacobians, modes.covariances),
+            filtered=propagated(jacobians, modes.filtered),
+            state_covariances=propagated(states, modes.state_covariances),
         )
 
 
-def _propagated(jacobians: Array, covariances: Array) -> Array:
+def propagated(jacobians: Array, covariances: Array) -> Array:
+    """Covariances J S J' (N, n, n) of what has Jacobians (N, n, m), from those (N, m, m)."""
     result: Array = jacobians @ covariances @ jacobians.swapaxes(1, 2)
     return 0.5 * (result + result.swapaxes(1, 2))
 

@@ -57,6 +57,7 @@ class Observer:
         poses: Array | None,
         *,
         nobody_predicted: bool,
+        others: Mask | None = None,
         depth: NDArray[np.floating] | None = None,
     ) -> View:
         """What an image may show of a person.
@@ -68,17 +69,18 @@ class Observer:
             body: of the person.
             poses: (K, d) in the image before; None: the person may be anywhere.
             nobody_predicted: whether a predictor saw nobody.
+            others: (H, W) pixels that somebody else covers; None: none.
             depth: (H, W) of a depth camera, m, if any.
         """
         s = self._settings
         found, changed = None, 0.0
         if s.containment.weight > 0 or s.coverage.weight > 0:
             region = None if poses is None else region_of(body, self._camera, poses)
-            found = self._silhouettes.silhouette(image, mask, region)
+            found = self._silhouettes.silhouette(image, mask, region, others)
             if found is not None and mask is None:
                 changed = self._silhouettes.background.changed
         foreground, unsure = (None, None) if found is None else found
-        return View(image, foreground, changed, keypoints, nobody_predicted, unsure, depth)
+        return View(image, foreground, changed, keypoints, nobody_predicted, unsure, others, depth)
 
     def observation(self, view: View, pose: Array | None, *, believed: bool) -> Observation:
         """What an image says of a person.
@@ -98,6 +100,7 @@ class Observer:
         found = observe(
             view.image, view.silhouette if believed else None, keypoints,
             last_image=self.last_image, wanted=wanted, unsure=view.unsure,
+            others=view.others,
             depth=view.depth if self.depth.believed else None,
         )  # fmt: skip
         magnification = 0.0 if pose is None else self._camera.magnification(float(pose[2]))

@@ -13,12 +13,14 @@ yes; nobody is there when the person has not been seen for `absence_time`.
                  no:   otherwise, or where the colours on M were not seen before
     border       no:   no more than a tenth of the joints lie in the image
 
-M are the pixels that the model covers and F those of the silhouette. Where the clothes have the
-colours of the room only a part of M is foreground: usual is what this track has seen so far, with
-time constant `MEMORY`. Colours are asked where the silhouette can not be used: m and n are the
-means of p(M | colour), the ratio of two histograms, over M and over its surroundings; inside and
-outside are usual values of m and n. When they are alike the colours say nothing. Colours are
-learned slowly and from clear images, or else they would become those of the room.
+Of somebody whom others hide for the most part no cue says no, for `LONGEST_HIDDEN` at most.
+
+M are the pixels that the model covers and nobody else, and F those of the silhouette. Where the
+clothes have the colours of the room only a part of M is foreground: usual is what this track has
+seen so far, with time constant `MEMORY`. Colours are asked where the silhouette can not be used: m
+and n are the means of p(M | colour), the ratio of two histograms, over M and over its surroundings;
+inside and outside are usual values of m and n. When they are alike the colours say nothing. Colours
+are learned slowly and from clear images, or else they would become those of the room.
 """
 
 from __future__ import annotations
@@ -72,6 +74,9 @@ INSIDE, CLEARLY_INSIDE = 0.65, 0.8
 LEAST_CONTRAST = 0.2
 LEAST_APART = 0.25
 LEAST_FAMILIAR = 0.3
+# Share of the model that others cover from which the person is hidden; how long one may be, s.
+HIDDEN = 0.6
+LONGEST_HIDDEN = 3.0
 # Bins of a colour channel.
 BINS = 8
 
@@ -86,6 +91,7 @@ class View(NamedTuple):
         keypoints: of a detector; without any that was seen: it saw nobody. None: no detector.
         nobody_predicted: whether a predictor saw nobody.
         unsure: (H, W) what may be the person or a shadow; None: nothing.
+        others: (H, W) what somebody else covers; None: nothing.
         depth: (H, W) depth along the axis of the camera, m; None: unknown.
     """
 
@@ -95,6 +101,7 @@ class View(NamedTuple):
     keypoints: Keypoints | None = None
     nobody_predicted: bool = False
     unsure: Mask | None = None
+    others: Mask | None = None
     depth: NDArray[np.floating] | None = None
 
 
@@ -106,10 +113,13 @@ class Presence:
 
     Attributes:
         absent: whether nobody is there.
+        hidden: whether others hid the person in the last image.
     """
 
     def __init__(self, absence_time: float) -> None:
         self.absent = False
+        self.hidden = False
+        self._hidden_for = 0.0
         self._absence_time = absence_time
         self._share = FIRST_SHARE
         self._area = np.inf
@@ -145,6 +155,14 @@ class Presence:
         """Whether the person is seen in an image; learns from it what is usual."""
         step = max(round(camera.height / RASTER), 1)
         model = covered(body, camera, pose, step)
+        whole = max(_count(model), 1)
+        if view.others is not None:
+            model = model & ~_at(view.others, model)
+        open_to_view = _count(model) / whole
+        self.hidden = view.others is not None and open_to_view < 1.0 - HIDDEN
+        self._hidden_for = self._hidden_for + dt if self.hidden else 0.0
+        if self.hidden and self._hidden_for <= LONGEST_HIDDEN:
+            return True
         cues = [sees_person(view.keypoints), False if view.nobody_predicted else None]
         if _inside(body, camera, pose) <= LEAST_INSIDE:
             cues.append(False)
@@ -153,7 +171,7 @@ class Presence:
             silhouette = _at(view.silhouette, model)
             usable = view.changed <= MOST_CHANGED + _count(model) / model.size
             usable = usable and step**2 * _count(silhouette) <= MOST_AREA * self._area
-            cues.append(usable and self._on_silhouette(view.silhouette, model, step, dt))
+            cues.append(usable and self._on_silhouette(view, model, step, dt, open_to_view))
         image = _at(view.image, model)
         score = None
         if not usable and True not in cues:
@@ -164,10 +182,14 @@ class Presence:
             self._colours.learn(image, model, dt)
         return seen
 
-    def _on_silhouette(self, silhouette: Mask, model: Mask, step: int, dt: float) -> bool:
+    def _on_silhouette(
+        self, view: View, model: Mask, step: int, dt: float, open_to_view: float
+    ) -> bool:
+        silhouette = view.silhouette
+        assert silhouette is not None
         found = _at(silhouette, model)
         share = _count(found & model) / max(_count(model), 1)
-        area = step**2 * _count(found)
+        area = step**2 * _count(found) / max(open_to_view, 1.0 - HIDDEN)
         if share < LEAST_SHARE * self._share:
             return area >= LEAST_AREA * self._area and looks_like_person(silhouette)
         gain = min(dt / MEMORY, 1.0)

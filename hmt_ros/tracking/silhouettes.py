@@ -41,6 +41,7 @@ class Silhouettes:
 
     Args:
         background: the empty scene, or a model that is to learn it.
+        shared: whether the background is that of other people, too: somebody else learns it.
 
     Attributes:
         background: as it is known so far.
@@ -48,11 +49,12 @@ class Silhouettes:
         doubted: whether the background was learned with the person in it, and is not known again.
     """
 
-    def __init__(self, background: BackgroundModel) -> None:
+    def __init__(self, background: BackgroundModel, *, shared: bool = False) -> None:
         self.background = background
         self.share = np.nan
         self.doubted = False
-        self._learning = background.frames == 0
+        self._shared = shared
+        self._learning = background.frames == 0 and not shared
         self._seen_from: CameraPose | None = None
 
     @property
@@ -66,7 +68,7 @@ class Silhouettes:
     def forget(self) -> None:
         """Begins anew without a background: the camera sees another scene."""
         self.background = BackgroundModel(self.background.settings)
-        self.share, self.doubted, self._learning = np.nan, False, True
+        self.share, self.doubted, self._learning = np.nan, False, not self._shared
 
     def see_from(self, pose: CameraPose, camera: Camera) -> None:
         """Takes the pose of the camera at an image; from another view the scene is another."""
@@ -81,19 +83,27 @@ class Silhouettes:
         if self._learning and not self.doubted and (mask is None or not mask.any()):
             self.background.learn(image)
 
-    def silhouette(self, image: Image, mask: Mask | None, region: Box | None) -> Silhouette | None:
+    def silhouette(
+        self,
+        image: Image,
+        mask: Mask | None,
+        region: Box | None,
+        others: Mask | None = None,
+    ) -> Silhouette | None:
         """The silhouette in an image; None: unknown.
 
         Args:
             image: (H, W, 3).
             mask: (H, W) of a segmenter, if any.
             region: where the person can be; None: anywhere.
+            others: (H, W) pixels that somebody else covers; None: none.
         """
         if mask is not None:
+            mask = mask if others is None else mask & ~others
             return Silhouette(one_person(mask, self.background.settings, region))
         if self.doubted or not self.background.frames:
             return None
-        return self.background.split(image, region)
+        return self.background.split(image, region, others)
 
     def check(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
         """Doubts the background if too little of the person, in poses (K, d), is foreground.
@@ -124,14 +134,21 @@ class Silhouettes:
             self.check(image, body, camera, poses[:1])
 
 
-def region_of(body: Body, camera: Camera, poses: Array) -> Box | None:
-    """Where a person in poses (K, d) can be in the next image; None: anywhere."""
+def region_of(
+    body: Body, camera: Camera, poses: Array, margin: float = REGION_MARGIN
+) -> Box | None:
+    """Where a person in poses (K, d) can be in the next image; None: anywhere.
+
+    Args:
+        body, camera, poses: of the person.
+        margin: around all joints, as a fraction of their extent.
+    """
     pixels = camera.project(body.joint_positions(poses)).reshape(-1, 2)
     pixels = pixels[np.isfinite(pixels).all(1)]
     if len(pixels) == 0:
         return None
     low, high = pixels.min(0), pixels.max(0)
-    margin = REGION_MARGIN * max(float((high - low).max()), 1.0)
+    margin = margin * max(float((high - low).max()), 1.0)
     size = (camera.width, camera.height)
     left, top = (int(x) for x in np.clip(np.floor(low - margin), 0, size))
     right, bottom = (int(x) for x in np.clip(np.ceil(high + margin), 0, size))

@@ -56,7 +56,7 @@ RESTING = 0.3
 class Status(Enum):
     """What the tracker is doing."""
 
-    WAITING = 'waiting'  # for the image that the subject's joints were seen in, or for somebody
+    WAITING = 'waiting'  # for the subject's image, or for somebody
     TRACKING = 'tracking'
     LOST = 'lost'
     NOBODY = 'nobody'  # is in view
@@ -74,6 +74,7 @@ class Tracker:
         seed: of all randomness. The same images, settings and seed give the same numbers.
         extra: further energy terms of the posterior.
         known_ground: gravity and floor, as far as they are known; the rest is estimated.
+        shared_background: whether the background is that of several trackers; none learns it.
 
     Attributes:
         silhouettes: where those of the images come from.
@@ -96,11 +97,13 @@ class Tracker:
         seed: int = 0,
         extra: Sequence[FrameTerm] = (),
         known_ground: KnownGround | None = None,
+        *,
+        shared_background: bool = False,
     ) -> None:
         self.settings = settings or TrackerSettings()
         self.model = body
         self.camera = camera
-        self.silhouettes = Silhouettes(background or BackgroundModel())
+        self.silhouettes = Silhouettes(background or BackgroundModel(), shared=shared_background)
         self._observer = Observer(camera, self.settings.likelihood, self.silhouettes)
         self.depth = self._observer.depth
         self.evaluations = 0
@@ -159,6 +162,7 @@ class Tracker:
         mask: Mask | None = None,
         *,
         nobody_predicted: bool = False,
+        others: Mask | None = None,
         depth: NDArray[np.floating] | None = None,
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """Takes the next image.
@@ -175,6 +179,8 @@ class Tracker:
             mask: (H, W) where a segmenter sees the person, which replaces background subtraction;
                 all false: it sees nobody; None: unknown.
             nobody_predicted: whether that regression saw nobody in this image.
+            others: (H, W) pixels that somebody else covers or may cover: they speak neither for a
+                pose nor against it; None: there are none.
             depth: (H, W) depth of what each pixel shows, along the axis of the camera, m; 0, NaN
                 and what is out of range says nothing. None: unknown.
 
@@ -192,10 +198,9 @@ class Tracker:
         size = (self.camera.height, self.camera.width)
         if image.shape[:2] != size:
             raise ValueError(f'the camera gives images of {size}, saw {image.shape[:2]}')
-        if mask is not None and mask.shape != size:
-            raise ValueError(f'the camera gives images of {size}, saw a mask of {mask.shape}')
-        if depth is not None and depth.shape != size:
-            raise ValueError(f'the camera gives images of {size}, saw depths of {depth.shape}')
+        for each, name in ((mask, 'a mask'), (others, 'a mask'), (depth, 'depths')):
+            if each is not None and each.shape != size:
+                raise ValueError(f'the camera gives images of {size}, saw {name} of {each.shape}')
         if self._last_stamp is not None and stamp <= self._last_stamp:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
         self.evaluations = 0
@@ -205,7 +210,7 @@ class Tracker:
         near = self.modes.poses if self._track.begun and not self._track.lost else None
         view = self._observer.view(
             image, keypoints, mask, self.body, near,
-            nobody_predicted=nobody_predicted, depth=depth,
+            nobody_predicted=nobody_predicted, others=others, depth=depth,
         )  # fmt: skip
         found = self._take(view, stamp, prediction, masked=mask is not None)
         self._last_stamp = stamp
@@ -354,7 +359,7 @@ class Tracker:
             if self._presence.absent:
                 self._drop_track()
                 return None, None
-            if not seen and view.silhouette is not None:
+            if self._nothing_to_see(view) or (not seen and view.silhouette is not None):
                 # Nothing is there to fit modes to.
                 return self._expected(stamp), self._likelihood(Observation())
             observation = self._observe(view, self.modes.poses[0])
@@ -423,6 +428,11 @@ class Tracker:
         self._presence = Presence(self.settings.absence_time)
         self._is_seen(view, stamp)
         return observation
+
+    def _nothing_to_see(self, view: View) -> bool:
+        """Whether others hide the person, and no detector sees what is left."""
+        keypoints = view.keypoints
+        return self._presence.hidden and (keypoints is None or not keypoints.seen.any())
 
     def _expected(self, stamp: int) -> GaussianMixture:
         """The posterior of a time at which nothing is seen."""

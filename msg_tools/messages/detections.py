@@ -1,15 +1,16 @@
-"""People in the messages of other detectors, as keypoints of a scheme.
+"""People in the messages of detectors: identities, keypoints, boxes.
 
+- hmt_msgs/People2D: people with keypoints of any names, boxes, or both, with or without an id.
 - hri_msgs/Skeleton2D (REP 155): one person, 18 landmarks in units of the image.
 - yolo_msgs/DetectionArray (yolo_ros): people with an id, landmarks that are numbered from 1.
 - std_msgs/Float32MultiArray: rows u, v or u, v, confidence, px, of one person, or of several with
   an outermost dimension. The label of the outermost dimension may be the stamp of the image, ns.
-
-vision_msgs has no message with keypoints.
+- vision_msgs/Detection2DArray: people with an id and a box, and no keypoints.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,15 +18,30 @@ from numpy.typing import NDArray
 
 from hmt_ros.image.keypoint_schemes import Scheme, schemes
 from hmt_ros.image.terms.keypoints import Keypoints
-from msg_tools.messages.keypoints import checked_keypoints
+from msg_tools.messages.headers import header_message
+from msg_tools.messages.keypoints import (
+    FARTHEST_PIXEL,
+    checked_keypoints,
+    keypoints_message,
+    keypoints_of,
+)
 from msg_tools.messages.message_error import MessageError
+from msg_tools.messages.message_types import MessageFactory
 
 Array = NDArray[np.float64]
 
 SKELETON_2D, YOLO = 'hri_msgs/msg/Skeleton2D', 'yolo_msgs/msg/DetectionArray'
 FLOATS = 'std_msgs/msg/Float32MultiArray'
+PEOPLE_2D, BOXES = 'hmt_msgs/msg/People2D', 'vision_msgs/msg/Detection2DArray'
+REGION = 'sensor_msgs/msg/RegionOfInterest'
+# Classes of vision_msgs detections that are people: names of data sets, and their numbers in COCO.
+PERSON_CLASSES = ('person', 'people', 'human', 'pedestrian', '0', '')
 # People in one image.
 MAX_PEOPLE = 1000
+
+
+# Keypoints of a detector that saw nobody, or that finds none.
+NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 
 
 class DetectedPerson(NamedTuple):
@@ -33,11 +49,24 @@ class DetectedPerson(NamedTuple):
 
     Attributes:
         name: identity that the detector gives; '' if it gives none.
-        keypoints: all landmarks of the scheme; their covariances are unknown.
+        keypoints: landmarks under the names of their scheme; none: there is only a box.
+        box: (left, top, right, bottom) px; None: unknown.
     """
 
     name: str
     keypoints: Keypoints
+    box: tuple[float, float, float, float] | None = None
+
+    @property
+    def extent(self) -> Array | None:
+        """Corners (2, 2), left top and right bottom, of the box or of the keypoints that were seen.
+
+        None: nothing of the person was seen.
+        """
+        if self.box is not None:
+            return np.array(self.box, dtype=np.float64).reshape(2, 2)
+        pixels = self.keypoints.pixels[self.keypoints.seen]
+        return np.stack([pixels.min(0), pixels.max(0)]) if len(pixels) else None
 
 
 def person_of_skeleton(message: Any, width: int, height: int) -> DetectedPerson:
@@ -59,6 +88,89 @@ def person_of_skeleton(message: Any, width: int, height: int) -> DetectedPerson:
     # (0, 0) is the edge of the first pixel, whose centre is the origin here.
     rows[:, :2] = rows[:, :2] * (width, height) - 0.5
     return _person('', scheme, rows)
+
+
+def people_of_message(message: Any, sigma_px: float) -> list[DetectedPerson]:
+    """The people in an hmt_msgs/People2D.
+
+    Args:
+        message: the message.
+        sigma_px: as for `keypoints_of`.
+
+    Raises:
+        MessageError: numbers of keypoints or boxes that are not those of the people; keypoints that
+            `keypoints_of` refuses.
+    """
+    n = len(message.ids)
+    _check_count(n)
+    for name, values in (('keypoints', message.keypoints), ('boxes', message.boxes)):
+        if len(values) not in (0, n):
+            raise MessageError(f'people: {n} ids with {len(values)} {name}, wanted {n} or none')
+    people = []
+    for i in range(n):
+        keypoints = NO_KEYPOINTS
+        if len(message.keypoints) and len(message.keypoints[i].names):
+            keypoints = keypoints_of(message.keypoints[i], sigma_px)
+        box = None
+        if len(message.boxes) and message.boxes[i].width:
+            b = message.boxes[i]
+            left, top = float(b.x_offset), float(b.y_offset)
+            box = (left, top, left + float(b.width), top + float(b.height))
+        people.append(DetectedPerson(str(message.ids[i]), keypoints, box))
+    return people
+
+
+def people_message(
+    messages: MessageFactory, people: Sequence[DetectedPerson], stamp_ns: int, frame_id: str
+) -> Any:
+    """hmt_msgs/People2D of the people in an image with a stamp."""
+    boxes = []
+    for person in people:
+        left, top, right, bottom = (0, 0, 0, 0) if person.box is None else person.box
+        x, y = max(int(left), 0), max(int(top), 0)
+        width, height = max(int(right) - x, 0), max(int(bottom) - y, 0)
+        boxes.append(messages.create(REGION, x_offset=x, y_offset=y, width=width, height=height))
+    return messages.create(
+        PEOPLE_2D,
+        header=header_message(messages, stamp_ns, frame_id),
+        ids=[person.name for person in people],
+        keypoints=[
+            keypoints_message(messages, person.keypoints, stamp_ns, frame_id) for person in people
+        ],
+        boxes=boxes,
+    )
+
+
+def people_of_boxes(message: Any) -> list[DetectedPerson]:
+    """The people in a vision_msgs/Detection2DArray: detections of another class are left out.
+
+    Raises:
+        MessageError: a box that has no area, or numbers that are no positions.
+    """
+    _check_count(len(message.detections))
+    people = []
+    for detection in message.detections:
+        results = detection.results
+        classes = [str(each.hypothesis.class_id).lower() for each in results[:1]]
+        if classes and classes[0] not in PERSON_CLASSES:
+            continue
+        centre = detection.bbox.center.position
+        size = np.array([detection.bbox.size_x, detection.bbox.size_y], dtype=np.float64)
+        middle = np.array([centre.x, centre.y], dtype=np.float64)
+        numbers = [*middle.tolist(), *size.tolist()]
+        if not (np.isfinite(numbers).all() and (size > 0).all()):
+            raise MessageError(
+                f'detection {detection.id!r} has the centre and size {numbers}, wanted a box of px'
+            )
+        if max(map(abs, numbers)) > FARTHEST_PIXEL:
+            raise MessageError(
+                f'detection {detection.id!r} has the centre and size {numbers}, wanted numbers '
+                f'within {FARTHEST_PIXEL:g} px'
+            )
+        left, top = (middle - 0.5 * size).tolist()
+        right, bottom = (middle + 0.5 * size).tolist()
+        people.append(DetectedPerson(str(detection.id), NO_KEYPOINTS, (left, top, right, bottom)))
+    return people
 
 
 def people_of_yolo(message: Any, scheme: Scheme) -> list[DetectedPerson]:

@@ -36,6 +36,13 @@ def test_oldest_images_are_dropped_and_counted():
     assert (contents(arrived), arrived.dropped, arrived.stamps_ns) == ([6], 1, (5,))
 
 
+def test_each_source_of_a_kind_has_its_own_limit():
+    queue = InputQueue({'mixture': 1}, counted='mixture')
+    put(queue, ('mixture of /a', 1), ('mixture of /b', 2), ('mixture of /a', 3), ('image', 4))
+    arrived = queue.get()
+    assert (contents(arrived), arrived.dropped) == ([2, 3, 4], 1)
+
+
 def test_never_grows():
     queue = InputQueue({'image': 3}, counted='image')
     put(queue, *(('image', i) for i in range(10_000)))

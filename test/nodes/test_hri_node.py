@@ -119,6 +119,28 @@ def test_people_come_and_go(installed, world_of, small_camera, likelihoods):
     one.assert_described(HriParameters())
 
 
+def test_people_who_are_gone_make_room(installed, world_of, monkeypatch):
+    from hmt_msgs.msg import PoseMixture as PoseMixtureMessage
+    from sensor_msgs.msg import CameraInfo
+
+    from hmt_ros.nodes import hri_node
+
+    monkeypatch.setattr(hri_node, '_MOST_TOPICS', 2)
+    one = world_of(hri_node.HriNode, 'hri_node', {'camera_info': CameraInfo}, publish_cropped=False)
+    one.start()
+    first, second = (
+        one.other.create_publisher(PoseMixtureMessage, f'/humans/bodies/{name}/pose_mixture', 100)
+        for name in 'ab'
+    )
+    one.spin_until(first.get_subscription_count, 'a subscription')
+    one.spin_until(lambda: one.warnings(), 'a warning')
+    (text,) = one.warnings()
+    assert text.startswith('2 topics are subscribed to, which is the limit')
+    assert 'mixtures in /humans/bodies/b are left out' in text
+    one.other.destroy_publisher(first)
+    one.spin_until(second.get_subscription_count, 'a subscription to the other')
+
+
 def test_namespaces_that_are_named(installed, world_of, likelihoods):
     from hmt_msgs.msg import PoseMixture as PoseMixtureMessage
     from hri_msgs.msg import IdsList

@@ -36,7 +36,10 @@ class StubTracker:
     empty: set[int] = set()  # noqa: RUF012  # stamps of images without a person
     fault: Exception | None = None
 
-    def __init__(self, body, camera, settings=None, background=None, seed=0, known_ground=None):
+    def __init__(
+        self, body, camera, settings=None, background=None, seed=0, known_ground=None,
+        shared_background=False,
+    ):  # fmt: skip
         self.body, self.camera, self.seed = body, camera, seed
         self.settings = settings or TrackerSettings()
         self.background = background
@@ -88,8 +91,8 @@ class StubTracker:
         return self.body.prior_mean if isinstance(start, Subject) else start.means[0]
 
     def step(
-        self, image, stamp, keypoints=None, prediction=None, mask=None, *,
-        nobody_predicted=False, depth=None,
+        self, image, stamp, keypoints=None, prediction=None, mask=None, *, nobody_predicted=False,
+        others=None, depth=None,
     ):  # fmt: skip
         assert image.shape == (self.camera.height, self.camera.width, 3)
         if self.fault is not None:

@@ -1,18 +1,20 @@
 """The rules of the session, with a predictor that costs nothing."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hmt_ros.body import Camera
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, BmeSession
+from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, TRACK, BmeSession
 from hmt_ros.sessions.camera_session import MASK
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Handled
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.images import compressed_image_message, image_message
-from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
+from msg_tools.messages.pose_mixtures import MixtureKind, TrackState, pose_mixture_of
 
 FRAME_NS = 100_000_000
 
@@ -285,3 +287,74 @@ def test_model_file_that_can_not_be(background_file, tmp_path):
         parameters = with_values(BmeParameters(), {'model_file': str(path)})
         with pytest.raises(ValueError, match=name):
             BmeSession(parameters, lambda output: None)
+
+
+def track(likelihoods, index, state=TrackState.TRACKING):
+    message = (
+        likelihoods.nobody(index) if state == TrackState.NOBODY else likelihoods.message(index)
+    )
+    message.state = int(state)
+    return message
+
+
+def looked_at(stub_predictor, one, somebody, indices):
+    before = len(stub_predictor.asked)
+    handled = [one.take(IMAGE, somebody.image(index)) for index in indices]
+    assert all(len(h.published) == 1 and h.faults == () for h in handled)
+    return len(stub_predictor.asked) - before
+
+
+def test_tracked_person_is_predicted_at_a_low_rate(
+    session, outputs, somebody, stub_predictor, likelihoods
+):
+    one = session(tracked_interval=0.3)
+    one.take(CAMERA_INFO, somebody.info())
+    # Without a track, from every image.
+    assert looked_at(stub_predictor, one, somebody, range(3)) == 3
+    for index in range(3, 9):
+        one.take(TRACK, track(likelihoods, index - 1))
+        looked_at(stub_predictor, one, somebody, [index])
+    content = predictions(outputs)
+    assert [len(message.components) > 0 for message in content] == [
+        True, True, True, False, False, True, False, False, True,
+    ]  # fmt: skip
+    assert [message.state for message in content[3:5]] == [TrackState.TRACKING] * 2
+    assert (content[3].kind, content[3].header.frame_id) == (MixtureKind.PREDICTION, 'lens')
+    assert one.state.counts == {'received': 9, 'predicted': 5, 'left': 4}
+    assert dict(one.state.values())['images left to the track'] == '4'
+
+
+@pytest.mark.parametrize('state', [TrackState.LOST, TrackState.NOBODY, TrackState.UNKNOWN])
+def test_every_image_is_predicted_from_without_a_sure_track(
+    session, somebody, stub_predictor, likelihoods, state
+):
+    one = session(tracked_interval=100.0)
+    one.take(CAMERA_INFO, somebody.info())
+    looked_at(stub_predictor, one, somebody, [0])
+    one.take(TRACK, track(likelihoods, 0))
+    assert looked_at(stub_predictor, one, somebody, [1]) == 0
+    one.take(TRACK, track(likelihoods, 1, state))
+    assert looked_at(stub_predictor, one, somebody, [2, 3]) == 2
+
+
+def test_track_that_is_silent_is_not_relied_on(session, somebody, stub_predictor, likelihoods):
+    one = session(tracked_interval=100.0)
+    one.take(CAMERA_INFO, somebody.info())
+    looked_at(stub_predictor, one, somebody, [0])
+    one.take(TRACK, track(likelihoods, 0))
+    assert looked_at(stub_predictor, one, somebody, [5, 10]) == 0
+    assert looked_at(stub_predictor, one, somebody, [11, 12]) == 2
+
+
+def test_track_counts_no_more_after_time_has_jumped(session, somebody, stub_predictor, likelihoods):
+    one = session(tracked_interval=100.0, reset_on_time_jump=True)
+    one.take(CAMERA_INFO, somebody.info())
+    looked_at(stub_predictor, one, somebody, [5])
+    one.take(TRACK, track(likelihoods, 5))
+    assert looked_at(stub_predictor, one, somebody, [6]) == 0
+    assert one.take(IMAGE, somebody.image(1)).faults == ()
+    assert looked_at(stub_predictor, one, somebody, [2]) == 1
+    # What can not be used is told of as usual.
+    one.take(TRACK, track(likelihoods, 2))
+    one.parameters = replace(one.parameters, reset_on_time_jump=False)
+    assert 'comes after one of' in one.take(IMAGE, somebody.image(1)).faults[0]

@@ -22,7 +22,15 @@ from test.sessions.conftest import JOINTS, Likelihoods
 
 MIXTURES = ['pose_mixture', 'likelihood_mixture']
 STARTS = ['body', 'human_description']
-ONE_IMAGE = [*MIXTURES, 'ground', 'joint_states', '/tf', 'markers', 'overlay/compressed']
+ONE_IMAGE = [
+    *MIXTURES,
+    'person_pose',
+    'ground',
+    'human_joint_states',
+    '/tf',
+    'markers',
+    'overlay/compressed',
+]
 
 
 @pytest.fixture
@@ -341,7 +349,7 @@ def test_nobody_in_view_is_told_once(session, outputs, small_camera, stub_tracke
 
 
 def test_an_empty_view_that_nobody_wants_to_see(session, outputs, small_camera, stub_tracker):
-    one = session(wanted=lambda topic: topic == 'joint_states')
+    one = session(wanted=lambda topic: topic == 'human_joint_states')
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
     stub_tracker.empty.add(small_camera.stamp(1))
@@ -673,6 +681,56 @@ def test_images_wait_for_predictions(session, small_camera, likelihoods, outputs
     assert tracked(outputs)[1:] == [small_camera.stamp(i) for i in (2, 3)]
 
 
+def test_image_that_is_left_to_the_track_neither_waits_nor_says_nobody(
+    session, small_camera, likelihoods, stub_tracker
+):
+    one = session(use_predictions=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    one.take(IMAGE, small_camera.image(0))
+    left = likelihoods.nobody(0)
+    left.state = int(TrackState.TRACKING)
+    one.take(PREDICTION, left)
+    assert stub_tracker.made[0].predictions == [None]
+    assert stub_tracker.made[0].nobody_predicted == [False]
+
+
+def test_late_filter_leaves_images_out_but_not_what_was_predicted(
+    session, small_camera, likelihoods, stub_tracker, outputs
+):
+    one = session(use_predictions=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    left = likelihoods.nobody(3)
+    left.state = int(TrackState.TRACKING)
+    # All have come during an estimate.
+    handled = [one.take(IMAGE, small_camera.image(index), more=True) for index in range(4)]
+    for index in range(3):
+        handled += [one.take(PREDICTION, likelihoods.message(index), more=True)]
+    assert all(h.published == () and h.faults == () for h in handled)
+    last = one.take(PREDICTION, left)
+    assert tracked(outputs) == [small_camera.stamp(3)]
+    assert len(last.faults) == 3
+    assert f'image of {small_camera.stamp(2)} ns is dropped: newer ones came' in last.faults[2]
+    assert one.state.counts == {'received': 4, 'tracked': 1, 'dropped': 3}
+    assert one.state.faults == {'old start': 1}
+    (used,) = stub_tracker.made[0].predictions
+    assert np.array_equal(used.mixture.means, likelihoods.mixture(2).means)
+    # Once.
+    one.take(IMAGE, small_camera.image(4))
+    one.take(PREDICTION, likelihoods.nobody(4))
+    assert stub_tracker.made[0].nobody_predicted == [False, True]
+
+
+def test_images_that_are_complete_at_once_are_all_used_in_lock_step(
+    session, small_camera, likelihoods, outputs
+):
+    one = session(use_predictions=True)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in range(4):
+        one.take(IMAGE, small_camera.image(index))
+    one.take(PREDICTION, likelihoods.message(3))
+    assert tracked(outputs) == [small_camera.stamp(index) for index in range(4)]
+
+
 def test_predictions_are_not_used_unless_asked_for(session, small_camera, likelihoods, outputs):
     one = session(subject_file='')
     one.take(CAMERA_INFO, small_camera.info())
@@ -880,7 +938,9 @@ def test_switches_of_the_outputs(session, small_camera, outputs):
     one = session(overlay_modes=0, publish_tf=False)
     one.take(CAMERA_INFO, small_camera.info())
     one.take(IMAGE, small_camera.image(0))
-    assert [o.topic for o in outputs] == [*STARTS, *MIXTURES, 'ground', 'joint_states', 'markers']
+    assert [o.topic for o in outputs] == [
+        topic for topic in [*STARTS, *ONE_IMAGE] if topic not in ('/tf', 'overlay/compressed')
+    ]
 
 
 def test_urdf_comes_again_with_other_frames(session, small_camera, outputs):
@@ -898,7 +958,7 @@ def test_urdf_comes_again_with_other_frames(session, small_camera, outputs):
     ]
     links = [ET.fromstring(text).findall('link')[:2] for text in texts]
     assert [[link.attrib['name'] for link in pair] for pair in links] == [
-        ['lens', 'pelvis.root_tx'],
+        ['lens', 'human/pelvis.root_tx'],
         ['lens', 'anna/pelvis.root_tx'],
         ['other', 'anna/pelvis.root_tx'],
     ]

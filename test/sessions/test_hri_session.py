@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from hmt_ros.body import Camera
 from hmt_ros.body.reference_human import REFERENCE_JOINTS
 from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.sessions import hri_session
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.hri_parameters import HriParameters
@@ -123,6 +124,17 @@ def test_several_people(session, outputs, people):
     assert tracked(outputs)[-1] == ['lab_anna_3', 'p1_1', 'p2_4']
     one.take(P2, people(1, 4, TrackState.NOBODY))
     assert tracked(outputs)[-1] == ['lab_anna_3', 'p1_1']
+
+
+def test_people_who_are_gone_are_forgotten(session, outputs, people, monkeypatch):
+    monkeypatch.setattr(hri_session, '_REMEMBERED', 3)
+    one = session()
+    one.take(P1, people(0))
+    gone = people(0, 1, TrackState.NOBODY)
+    for number in range(10):
+        one.take(mixture_source(f'/humans/bodies/n{number}'), gone)
+    assert len(one._people) == 4
+    assert one.identities == {'p1_1'}
 
 
 def test_who_is_silent_is_not_tracked(session, outputs, people, small_camera):
@@ -316,6 +328,15 @@ def test_an_image_that_has_not_come_is_told(session, outputs, people, small_came
     quiet = session(publish_cropped=False)
     quiet.take(CAMERA_INFO, small_camera.info(0))
     assert quiet.take(P1, people(0)).warnings == ()
+
+
+def test_another_camera_is_told(session, outputs, people, small_camera):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info(0, frame_id='left'))
+    handled = one.take(P1, people(0))
+    assert 'of p1 are in the frame lens, camera_info is that of left' in handled.warnings[0]
+    assert not any(o.topic.endswith(('roi', 'skeleton2d', 'cropped')) for o in outputs)
+    assert tracked(outputs) == [['p1_1']]
 
 
 def test_what_can_not_be_used_is_told(session, outputs, people, small_camera):

@@ -91,7 +91,7 @@ def test_mixtures(track, body):
 
 
 def test_joint_states_are_those_of_the_point_estimate(track, body):
-    state = made(track)['joint_states']
+    state = made(track)['human_joint_states']
     assert tuple(state.name) == body.dof_names
     assert np.array_equal(state.position, track.point)
 
@@ -172,7 +172,7 @@ def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
         )
     )
     urdf = found['human_description'].data
-    root, frames = forward_kinematics(urdf, found['joint_states'])
+    root, frames = forward_kinematics(urdf, found['human_joint_states'])
     assert root == 'lens'
     transforms = {t.child_frame_id: t.transform for t in found['/tf'].transforms}
     # No link without a frame and no frame without a link.
@@ -190,7 +190,7 @@ def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
         np.testing.assert_allclose([point.x, point.y, point.z], place[:3], atol=1e-9)
         assert np.allclose(place[:3], body.joint_positions(poses[1:])[0, index], atol=1e-9)
     # The URDF in the body is the same, with names of its own.
-    plain_root, plain_frames = forward_kinematics(found['body'].urdf, found['joint_states'])
+    plain_root, plain_frames = forward_kinematics(found['body'].urdf, found['human_joint_states'])
     assert plain_root == 'lens'
     assert {f'anna/{link}' for link in plain_frames if link != 'lens'} == transforms.keys()
 

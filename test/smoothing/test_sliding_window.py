@@ -164,3 +164,45 @@ def test_bad_input_leaves_the_window_as_it_was(modes, walk):
     assert window.step(6, mixtures[1]).trajectories.times == 2
     with pytest.raises(ValueError, match='fixed_lag'):
         SlidingWindow(MixtureSmoother(walk), fixed_lag=-1)
+
+
+@pytest.mark.parametrize(
+    ('interval', 'lags'), [(0.1, {0.4}), (0.2, {0.6}), (0.25, {0.5}), (0.5, {0.5}), (0.9, {0.0})]
+)
+def test_rare_poses_are_final_before_they_are_old(modes, interval, lags):
+    window = SlidingWindow(MixtureSmoother(FAST), fixed_lag=4, longest_lag=0.7)
+    step = round(interval * 1e9)
+    found = set()
+    final = []
+    for t, mixture in enumerate(modes(2.0, times=9)):
+        update = window.step(t * step, mixture)
+        assert len(window.stamps_ns) <= 5
+        final += update.final
+        if t > 4:
+            found |= {round((t * step - pose.stamp_ns) * 1e-9, 3) for pose in update.final}
+    # At 0.9 s the one before is already too old when the next comes, and is told at once then.
+    assert found == (lags if interval < 0.7 else {0.9})
+    final += window.finish()
+    assert [pose.stamp_ns for pose in final] == [t * step for t in range(9)]
+
+
+def test_after_a_gap_all_old_poses_are_final(modes, walk):
+    mixtures = modes(2.0, times=6)
+    window = SlidingWindow(MixtureSmoother(walk), fixed_lag=9, longest_lag=0.7)
+    for t in range(4):
+        assert window.step(t * 10**8, mixtures[t]).final == ()
+    update = window.step(5 * 10**9, mixtures[4])
+    assert [pose.stamp_ns for pose in update.final] == [t * 10**8 for t in range(4)]
+    assert window.step(5 * 10**9 + 10**8, mixtures[5]).final == ()
+    assert window.stamps_ns == (5 * 10**9, 5 * 10**9 + 10**8)
+    assert [pose.stamp_ns for pose in window.finish()] == [5 * 10**9, 5 * 10**9 + 10**8]
+
+
+def test_a_limit_that_is_not_reached_changes_nothing(modes):
+    mixtures = modes(2.0, times=9)
+    runs = [
+        run(SlidingWindow(MixtureSmoother(FAST), fixed_lag=3, longest_lag=limit), mixtures, 10**8)
+        for limit in (0.3, np.inf)
+    ]
+    for one, other in zip(*(final for _, final in runs), strict=True):
+        assert np.array_equal(one.mixture.means, other.mixture.means)

@@ -1,7 +1,7 @@
 """import-video: writes a video, its camera and what a detector found in it into a bag for replay.
 
-The bag has the topics `image/compressed` and `camera_info`, and as far as they are known
-`keypoints`, `keypoints_3d` and `mask`, with the stamp of the frame that they belong to.
+The bag has the topics `/image/compressed` and `/camera_info`, and as far as they are known
+`/keypoints`, `/keypoints_3d` and `/mask`, with the stamp of the frame that they belong to.
 """
 
 from __future__ import annotations

@@ -33,10 +33,11 @@ model trained on silhouettes (--bme); neither knows the size of the person:
   stature_m: 1.75                        # optional
 
 OUT gets the topics pose_mixture and likelihood_mixture (hmt_msgs/PoseMixture: weights, poses,
-covariances, joint positions), body, joint_states, /tf, markers and overlay/compressed; from the
-smoother smoothed_pose_mixture, trajectory_mixture, smoothed_joint_states and trajectory_markers;
-from the BME pose_prediction; and the ground_truth of IN if it has one. OUT is written completely or
-not at all.
+covariances, joint positions), body, person_pose, human_joint_states, /tf, markers and
+overlay/compressed; from the smoother smoothed_pose_mixture, trajectory_mixture,
+smoothed_joint_states and trajectory_markers; from the BME pose_prediction; and the ground_truth of
+IN if it has one. Their names are absolute, /pose_mixture or, with --namespace /humans/bodies/anna,
+/humans/bodies/anna/pose_mixture. OUT is written completely or not at all.
 
 Several bags, or a folder with bags at any depth, go into the folder OUT, each under its own name,
 with <name>.replay.json beside it, which records what it was made from. A bag that exists already,
@@ -93,6 +94,12 @@ def _parser() -> CommandParser:
         action='store_true',
         help='skip unusable messages, with a warning for the first of each kind of fault, and read '
         'a damaged bag as far as possible (default: stop there)',
+    )
+    parser.add_argument(
+        '--people',
+        action='store_true',
+        help='track several people, found by the detections in the bag, each into topics '
+        'humans/bodies/<id>/...; without smoother and BME',
     )
     parser.add_argument(
         '--scheduler',

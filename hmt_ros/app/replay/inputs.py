@@ -8,6 +8,8 @@ from functools import partial
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
 from hmt_ros.sessions.filter_session import DEPTH, KEYPOINTS, KEYPOINTS_3D
+from hmt_ros.sessions.people_parameters import SOURCES
+from hmt_ros.sessions.people_session import DETECTIONS
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools import BagError, BagMessage, BagReader, Topic
 from msg_tools.bags.contents import absolute_name
@@ -36,6 +38,7 @@ class RecordedInput:
         keypoints: topic of 2D keypoints; None if the bag has none.
         keypoints_3d: topic of their positions in space; None if the bag has none.
         ground_truth: topic of the ground truth; None if the bag has none.
+        detections: topic of several people, for the people node; None if the bag has none.
         transforms: topics of transforms by source, those that the bag has of `TRANSFORMS`; None if
             transforms are not used.
     """
@@ -48,6 +51,7 @@ class RecordedInput:
     keypoints_3d: Topic | None
     ground_truth: Topic | None
     transforms: Mapping[str, Topic] | None = None
+    detections: Topic | None = None
 
     @property
     def transport(self) -> str:
@@ -72,6 +76,8 @@ class RecordedInput:
             sources[self.keypoints_3d.name] = KEYPOINTS_3D
         if self.ground_truth is not None:
             sources[self.ground_truth.name] = GROUND_TRUTH
+        if self.detections is not None:
+            sources[self.detections.name] = DETECTIONS
         sources |= {topic.name: source for source, topic in (self.transforms or {}).items()}
         for stored in bag.messages(sources):
             yield sources[stored.topic], stored
@@ -126,6 +132,7 @@ def recorded_input(
         named(KEYPOINTS_3D, (keypoints.KEYPOINTS_3D,)),
         named(GROUND_TRUTH, (POSE_MIXTURE,)),
         {source: topic for source, topic in found.items() if topic is not None},
+        _named(bag, DETECTIONS, tuple(SOURCES.values())),
     )
 
 

@@ -14,12 +14,14 @@ from hmt_ros.app.progress import Progress, show_progress
 from hmt_ros.app.replay.background import ReadAhead, WriteBehind
 from hmt_ros.app.replay.inputs import COMPRESSED, GROUND_TRUTH, RecordedInput
 from hmt_ros.app.replay.options import NodeParameters, ReplayOptions, node_parameters
-from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PlayedTrack
+from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PeopleTrack, PlayedTrack
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, MASK
 from hmt_ros.sessions.declared_parameters import LONGEST_TIMEOUT
 from hmt_ros.sessions.filter_session import DEPTH, KEYPOINTS, KEYPOINTS_3D
 from hmt_ros.sessions.handled import Handled
+from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.people_session import DETECTIONS
 from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS, TRANSFORMS_TYPE
 from hmt_ros.tracking import Subject
@@ -78,12 +80,12 @@ def replay_bag(
         parameters = node_parameters(options, recorded)
         # The files that the parameters name are read before a node starts.
         subject = prepare_start(parameters.filter).initial
-        if subject is None and not options.quiet:
+        if subject is None and not options.quiet and not options.people:
             sources = ' or '.join(parameters.filter.sources)
             tell(f'no --subject: the track starts from {sources}{_subject_hint(source)}')
         recorded = _used(recorded, parameters)
         with BagWriter(target, overwrite=options.overwrite, namespace=options.namespace) as out:
-            topics = dict(track_messages.TOPICS)
+            topics = {} if options.people else dict(track_messages.TOPICS)
             if parameters.smoother is not None:
                 topics.update(smoothed_messages.TOPICS)
             if parameters.bme is not None:
@@ -93,21 +95,32 @@ def replay_bag(
             if recorded.transforms and TF_STATIC in recorded.transforms:
                 topic = absolute_name(recorded.transforms[TF_STATIC].name)
                 out.add_topic(topic, TRANSFORMS_TYPE, latched=True)
-            way = LiveTrack if options.live else OfflineTrack
             # Bytes are compressed and images decoded while the next image is tracked.
             hidden = options.quiet if shows is None else not shows
-            with WriteBehind() as behind:
-                write = partial(behind.call, out.write_serialised)
-                with (
-                    way(parameters, write) as track,
-                    show_progress(
-                        str(target), 'images', recorded.image.message_count, quiet=hidden
-                    ) as bar,
-                ):
-                    result = _play(options, bag, recorded, track, out, behind, bar, tell)
+            with (
+                WriteBehind() as behind,
+                _track(options, parameters, out, behind) as track,
+                show_progress(
+                    str(target), 'images', recorded.image.message_count, quiet=hidden
+                ) as bar,
+            ):
+                result = _play(options, bag, recorded, track, out, behind, bar, tell)
             if not result.tracked:
                 raise ValueError(f'{source}: {_why_nothing(result, subject)}')
     return result
+
+
+def _track(
+    options: ReplayOptions, parameters: NodeParameters, out: BagWriter, behind: WriteBehind
+) -> PlayedTrack:
+    write = partial(behind.call, out.write_serialised)
+    if options.people:
+
+        def add_topic(name: str, msgtype: str, latched: bool) -> None:
+            behind.call(partial(out.add_topic, name, msgtype, latched=latched))
+
+        return PeopleTrack(parameters, write, add_topic)
+    return LiveTrack(parameters, write) if options.live else OfflineTrack(parameters, write)
 
 
 def _subject_hint(bag: Path) -> str:
@@ -122,6 +135,9 @@ def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
         recorded = replace(recorded, mask=None)
     if not parameters.filter.use_depth:
         recorded = replace(recorded, depth=None)
+    if isinstance(parameters.filter, PeopleParameters):
+        return replace(recorded, keypoints=None, keypoints_3d=None, ground_truth=None)
+    recorded = replace(recorded, detections=None)
     if not parameters.filter.use_keypoints:
         recorded = replace(recorded, keypoints=None)
     if not parameters.filter.use_keypoints_3d:
@@ -138,14 +154,16 @@ def _play(
     """Hands the messages of the bag to the nodes, and copies those that the new bag keeps."""
     result = Replayed()
     # Small inputs are copied, so that a replay of the new bag has the same as this one.
-    copied = {GROUND_TRUTH, KEYPOINTS, KEYPOINTS_3D, *TRANSFORMS}
+    copied = {GROUND_TRUTH, DETECTIONS, KEYPOINTS, KEYPOINTS_3D, *TRANSFORMS}
     if options.with_images:
         copied |= {IMAGE, CAMERA_INFO}
 
     def check(handled: Handled) -> None:
         behind.check()
-        # A pose_mixture may say that nobody is in view.
-        result.tracked += sum(topic == 'joint_states' for topic, _ in handled.published)
+        # A pose_mixture may say that nobody is in view; several people may be.
+        result.tracked += len(
+            {stamp for topic, stamp in handled.published if topic.endswith('human_joint_states')}
+        )
         if handled.faults:
             result.last_fault = handled.faults[-1]
             if not options.keep_going:

@@ -12,12 +12,14 @@ from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.parameter_file import read_parameter_file
+from hmt_ros.sessions.people_parameters import SOURCES, PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from msg_tools import BagReader
 from msg_tools.files.error_line import error_line
 from msg_tools.files.plain_yaml import load_plain_yaml
 
 FILTER, SMOOTHER, BME = 'filter_node', 'smoother_node', 'bme_node'
+PEOPLE_NODE = 'people_node'
 # Prefixes of the parameters of a node in --set.
 _PREFIXES = {SMOOTHER: 'smoother.', BME: 'bme.', FILTER: ''}
 # Parameters that the bag and the command decide, whatever a parameter file says.
@@ -55,6 +57,7 @@ class ReplayOptions:
     keypoints_topic: str | None = None
     namespace: str = ''
     with_images: bool = False
+    people: bool = False
 
     def recorded(self, bag: BagReader) -> RecordedInput:
         """The topics of a bag that a replay with these options reads.
@@ -102,7 +105,10 @@ class ReplayOptions:
 
 
 class NodeParameters(NamedTuple):
-    """Parameters of the nodes; None for a node that does not take part."""
+    """Parameters of the nodes; None for a node that does not take part.
+
+    Those of the filter are those of the people node where several people are tracked.
+    """
 
     filter: FilterParameters
     smoother: SmootherParameters | None = None
@@ -126,6 +132,8 @@ def node_parameters(options: ReplayOptions, recorded: RecordedInput) -> NodePara
     Raises:
         ValueError: unknown parameters or values.
     """
+    if options.people:
+        return NodeParameters(_people_parameters(options, recorded))
     tracking = _filter_parameters(options, recorded)
     smoothing = _smoother_parameters(options) if options.with_smoother else None
     predicting = None
@@ -160,6 +168,37 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
     return with_values(FilterParameters(), values)
 
 
+def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> PeopleParameters:
+    """Parameters of the people node, which takes the place of all other nodes.
+
+    Raises:
+        ValueError: options of one person, or no detections of several.
+    """
+    unfit: dict[str, object] = {
+        '--live': options.live,
+        '--subject': options.subject,
+        '--bme': options.bme is not None,
+    }
+    for option, value in unfit.items():
+        if value:
+            raise ValueError(f'{option} does not go with --people')
+    if recorded.detections is None:
+        kinds = ', '.join(kind.replace('/msg/', '/') for kind in SOURCES.values())
+        raise ValueError(f'--people needs the topic detections, of {kinds}: the bag has none')
+    values = _given_values(options, PEOPLE_NODE)
+    given = {
+        'random_seed': options.seed,
+        'body_model': options.body,
+        'background_file': None if options.background is None else str(options.background),
+    }
+    values |= {name: value for name, value in given.items() if value is not None}
+    sources = {kind: source for source, kind in SOURCES.items()}
+    values['source'] = sources[recorded.detections.msgtype]
+    values.setdefault('use_mask', recorded.mask is not None)
+    values['image_transport'] = recorded.transport
+    return with_values(PeopleParameters(), values)
+
+
 def _smoother_parameters(options: ReplayOptions) -> SmootherParameters:
     values = _given_values(options, SMOOTHER)
     if options.seed is not None:
@@ -190,7 +229,7 @@ def _given_values(options: ReplayOptions, node: str) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for file in options.config:
         # Sections for all nodes go to the filter: many names mean something else to the smoother.
-        read = read_parameter_file(file, node, by_name=node != FILTER)
+        read = read_parameter_file(file, node, by_name=node not in (FILTER, PEOPLE_NODE))
         values.update(
             (name, value)
             for name, value in read.items()
@@ -200,6 +239,7 @@ def _given_values(options: ReplayOptions, node: str) -> dict[str, Any]:
         name, equals, value = text.partition('=')
         owner = next(owner for owner, prefix in _PREFIXES.items() if name.startswith(prefix))
         name = name.removeprefix(_PREFIXES[owner])
+        owner = PEOPLE_NODE if owner == FILTER and options.people else owner
         if not equals or name in _DECIDED_HERE:
             why = f'{name} is decided by replay' if equals else 'wanted NAME=VALUE'
             raise ValueError(f'--set {text}: {why}')

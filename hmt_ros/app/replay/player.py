@@ -31,6 +31,7 @@ class Player:
         try:
             import rclpy
             from diagnostic_msgs.msg import DiagnosticArray
+            from geometry_msgs.msg import PoseWithCovarianceStamped
             from hmt_msgs.msg import (
                 Body,
                 Ground,
@@ -52,7 +53,8 @@ class Player:
             ) from error
         kinds = (
             Body, CameraInfo, CompressedImage, Ground, Handled, Image, JointState, Keypoints2D,
-            Keypoints3D, MarkerArray, PoseMixture, String, TFMessage, TrajectoryMixture,
+            Keypoints3D, MarkerArray, PoseMixture, PoseWithCovarianceStamped, String, TFMessage,
+            TrajectoryMixture,
         )  # fmt: skip
         self.classes: dict[str, Any] = {
             f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}': kind for kind in kinds

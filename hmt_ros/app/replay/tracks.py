@@ -27,6 +27,8 @@ from hmt_ros.sessions.filter_session import (
     FilterSession,
 )
 from hmt_ros.sessions.handled import Handled, Output
+from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.people_session import PeopleSession, published_topic
 from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
 from msg_tools.messages import keypoints
@@ -109,6 +111,45 @@ class OfflineTrack(PlayedTrack):
         self._write(*output)
         if output.topic in HANDED_ON or output.topic in self._heard:
             self._handed.append(output)
+
+
+class PeopleTrack(PlayedTrack):
+    """Several people, without ROS.
+
+    Args:
+        parameters: parameters of the nodes; those of the filter are those of the people node.
+        write: takes topic, stamp and bytes of each published message.
+        add_topic: takes name, type and `latched` of a topic of a person before its first message.
+
+    Raises:
+        ValueError: the parameters name a file that can not be used.
+    """
+
+    def __init__(
+        self, parameters: NodeParameters, write: Write, add_topic: Callable[[str, str, bool], None]
+    ) -> None:
+        assert isinstance(parameters.filter, PeopleParameters)
+        self._write, self._add_topic = write, add_topic
+        self._known: set[str] = set()
+        self._session = PeopleSession(parameters.filter, self._take_output)
+
+    def __exit__(self, *_: object) -> None:
+        """See `PlayedTrack`; nothing is open."""
+
+    def take(self, source: str, message: Any) -> Handled:
+        """See `PlayedTrack`."""
+        return self._session.take(source, message)
+
+    def finish(self) -> Handled:
+        """See `PlayedTrack`."""
+        return self._session.finish()
+
+    def _take_output(self, output: Output) -> None:
+        if output.topic not in self._known:
+            self._known.add(output.topic)
+            published = published_topic(output.topic)
+            self._add_topic(output.topic, published.msgtype, published.latched)
+        self._write(*output)
 
 
 class LiveTrack(PlayedTrack):

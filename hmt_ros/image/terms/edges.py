@@ -30,6 +30,8 @@ ORIENTATIONS = 4
 EDGE_LOW, EDGE_HIGH = 40.0, 100.0
 # Edges further outside the silhouette than this belong to the background, px.
 MARGIN = 4
+# Distance to an edge that is taken where somebody else hides what is there, px.
+HIDDEN = 2.0
 # Fewer visible points than this do not make each of them count more.
 FEWEST = 20
 
@@ -50,6 +52,8 @@ def edge_distances(window: ImageWindow) -> ImageMap:
     edges = cv2.Canny(dx, dy, EDGE_LOW, EDGE_HIGH) > 0
     if window.widest_distance is not None:
         edges &= window.widest_distance <= MARGIN
+    if window.others is not None:
+        edges &= window.others == 0
     rows, columns = np.nonzero(edges)
     angle = np.arctan2(dy[rows, columns], dx[rows, columns])
     result = np.empty((ORIENTATIONS, *grey.shape), dtype=np.float32)
@@ -61,6 +65,8 @@ def edge_distances(window: ImageWindow) -> ImageMap:
             result[k] = cv2.distanceTransform(free, cv2.DIST_L2, 3)
         else:
             result[k] = 1e3
+        if window.others is not None:
+            result[k][window.others > 0] = HIDDEN
     return window.as_map(result)
 
 

@@ -59,6 +59,8 @@ class ImageWindow:
         mask: (h, w) silhouette, 0 or 1; None: unknown.
         unsure: (h, w) pixels that may belong to it, 0 or 1; None: there are none.
         last_image: (h, w, 3) the same part of the image before; None: there is none.
+        others: (h, w) pixels that show or may show somebody else, 0 or 1: they neither speak for a
+            pose nor against it; None: there are none.
         depth: (h, w) the same part of the depth image, m; None: there is none.
     """
 
@@ -68,6 +70,7 @@ class ImageWindow:
     mask: Image | None
     last_image: Image | None
     unsure: Image | None = None
+    others: Image | None = None
     depth: NDArray[np.floating] | None = None
 
     @cached_property
@@ -78,9 +81,12 @@ class ImageWindow:
     @cached_property
     def widest_distance(self) -> NDArray[np.float32] | None:
         """Distance (h, w) to the outline of the silhouette with all that may belong to it, px."""
-        if self.mask is None or self.unsure is None:
+        if self.mask is None or (self.unsure is None and self.others is None):
             return self.signed_distance
-        return _signed_distance(self.mask | self.unsure)
+        widest = self.mask
+        for more in (self.unsure, self.others):
+            widest = widest if more is None else widest | more
+        return _signed_distance(widest)
 
     def as_map(self, channels: NDArray[np.float32]) -> ImageMap:
         """Values (C, h, w) of the window as a map of the whole image."""

@@ -97,7 +97,10 @@ def distance_map(window: ImageWindow) -> ImageMap | None:
     if signed is None or widest is None:
         return None
     # What may be a shadow or the person forbids nothing.
-    if widest is not signed:
+    if window.others is not None:
+        # Behind others the person may reach beyond the image.
+        signed = np.minimum(signed, widest)
+    elif widest is not signed:
         signed = np.minimum(signed, np.maximum(widest, 0.0))
     return window.as_map(signed[None])
 
@@ -137,11 +140,14 @@ def outline(window: ImageWindow, count: int = OUTLINE_POINTS) -> Outline | None:
     # The outline lies half a pixel outside the last pixels of the silhouette.
     pixels = pixels[good]
     beliefs = np.ones(len(pixels))
-    if window.unsure is not None:
+    if window.unsure is not None or window.others is not None:
         column, row = np.round(pixels + BESIDE * normals).astype(int).T
         column = np.clip(column, 0, mask.shape[1] - 1)
         row = np.clip(row, 0, mask.shape[0] - 1)
-        beliefs[window.unsure[row, column] > 0] = UNSURE
+        if window.unsure is not None:
+            beliefs[window.unsure[row, column] > 0] = UNSURE
+        if window.others is not None:
+            beliefs[window.others[row, column] > 0] = 0.0
     pixels = pixels + 0.5 * normals + np.array([window.left, window.top])
     return Outline(pixels, normals, beliefs)
 

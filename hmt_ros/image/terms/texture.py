@@ -45,13 +45,16 @@ class TextureInputs(NamedTuple):
 
 
 def blurred_colours(window: ImageWindow) -> ImageMap:
-    """The blurred image, three channels."""
+    """The blurred image, three channels; NaN where somebody else is."""
     blurred = cv2.GaussianBlur(window.image, (0, 0), BLUR).astype(np.float32)
-    return window.as_map(np.ascontiguousarray(blurred.transpose(2, 0, 1)))
+    return _map_without_others(window, blurred)
 
 
 def optical_flow(window: ImageWindow) -> ImageMap | None:
-    """Dense flow from the last image to this one, two channels, px [Kroeger et al., ECCV 2016]."""
+    """Dense flow from the last image to this one, two channels, px [Kroeger et al., ECCV 2016].
+
+    NaN where somebody else is.
+    """
     if window.last_image is None:
         return None
     grey = [cv2.cvtColor(x, cv2.COLOR_BGR2GRAY) for x in (window.last_image, window.image)]
@@ -60,7 +63,15 @@ def optical_flow(window: ImageWindow) -> ImageMap | None:
     # The stubs do not know that there may be no flow to start from.
     method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     flow = method.calc(grey[0], grey[1], None)
-    return window.as_map(np.ascontiguousarray(flow.transpose(2, 0, 1)))
+    return _map_without_others(window, flow)
+
+
+def _map_without_others(window: ImageWindow, values: Any) -> ImageMap:
+    """Values (h, w, C) as a map."""
+    channels = np.ascontiguousarray(values.transpose(2, 0, 1))
+    if window.others is not None:
+        channels[:, window.others > 0] = np.nan
+    return window.as_map(channels)
 
 
 def _inputs(term: Weighting, evidence: Any, _request: Request) -> TextureInputs:
@@ -91,6 +102,10 @@ def add_intensity(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyp
             errors[c] = (value - texture.colours[t, q, c]) / term.sigma
             slopes[c, 0], slopes[c, 1] = gu / term.sigma, gv / term.sigma
             square += errors[c] * errors[c]
+        if np.isnan(square):
+            # Somebody else hides it: it costs what is usual, wherever it is.
+            energy += geman_mcclure(1.0, term.scale, each)[0]
+            continue
         rho, _, curvature = geman_mcclure(np.sqrt(square), term.scale, each)
         energy += rho
         g0, g1, h00, h01, h11 = 0.0, 0.0, 1e-9, 0.0, 1e-9
@@ -126,6 +141,9 @@ def add_motion(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-
         u, v = texture.pixels[t, q, 0], texture.pixels[t, q, 1]
         fu, _, _ = sample(flow, 0, u, v)
         fv, _, _ = sample(flow, 1, u, v)
+        if np.isnan(fu):
+            energy += geman_mcclure(1.0, term.scale, each)[0]
+            continue
         inverse = 1.0 / (term.sigma + FLOW_ERROR * np.sqrt(fu * fu + fv * fv))
         e0, e1 = (pixel[0, 0] - u - fu) * inverse, (pixel[0, 1] - v - fv) * inverse
         rho, _, curvature = geman_mcclure(np.sqrt(e0 * e0 + e1 * e1), term.scale, each)

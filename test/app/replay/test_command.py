@@ -98,7 +98,7 @@ class StandingStill:
     def modes(self):
         return self
 
-    log_likelihoods = np.zeros(1)
+    log_likelihoods, identities, velocities = np.zeros(1), np.ones(1, dtype=int), None
 
     @property
     def point_estimate(self):
@@ -177,7 +177,7 @@ def test_mixtures_explain_the_images(replayed):
         found['/pose_mixture'],
         found['/likelihood_mixture'],
         found['/ground_truth'],
-        found['/joint_states'],
+        found['/human_joint_states'],
         found['/overlay/compressed'],
         strict=True,
     ):

@@ -1,0 +1,161 @@
+"""people: two people cross, one before the other; are they told apart afterwards?
+
+For every seed a bag is rendered (`make-bag crossing`: 320x240, 3 s at 10 Hz, COCO keypoints of both
+without identities, none where a person is hidden) and replayed (`replay --people`). A track is that
+of the person to whose pelvis it is the nearer one, by depth and direction, in the first second;
+after the crossing each must still be. The error is that of the joints of the heaviest mode from the
+pelvis, mm.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.clips import table
+from benchmarks.command import benchmark_parser, show, told
+from benchmarks.machine import description
+from hmt_ros.app.crossing_bag import PEOPLE
+from hmt_ros.app.make_bag import main as make_bag
+from hmt_ros.app.replay.one_bag import replay_bag
+from hmt_ros.app.replay.options import ReplayOptions
+from hmt_ros.app.truth import read_truth
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
+from hmt_ros.evaluation.track_scores import Truth
+from hmt_ros.inference.arrays import Array
+from hmt_ros.sessions.person_session import BODIES
+from msg_tools import BagReader
+from msg_tools.messages.pose_mixtures import pose_mixture_of
+
+SEEDS, QUICK = 10, 1
+DURATION, FPS, SIZE = 3.0, 10.0, '320x240'
+# Shares of the time in which people are told apart before and after the crossing.
+BEFORE, AFTER = 0.33, 0.75
+
+Joints = dict[int, Array]
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the benchmark."""
+    parser = benchmark_parser('people', __doc__, quick='one seed')
+    parser.add_argument('--seeds', type=int, default=SEEDS, help=f'number of seeds ({SEEDS})')
+    parser.add_argument('--keep', type=Path, help='folder in which the bags stay')
+    arguments = parser.parse_args(argv)
+    seeds = QUICK if arguments.quick else arguments.seeds
+    return show(measure(seeds, arguments.keep), as_text, as_json=arguments.json)
+
+
+def measure(seeds: int = SEEDS, keep: Path | None = None) -> dict[str, Any]:
+    """Scores of the crossings of some seeds; the bags stay in a folder, if one is given."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = keep or Path(folder)
+        rows = [one_crossing(seed, place) for seed in told('people', range(seeds))]
+    return {'machine': description(), 'crossings': rows}
+
+
+def one_crossing(seed: int, folder: Path) -> dict[str, Any]:
+    """Scores of one seed."""
+    made, tracked = folder / f'crossing{seed}', folder / f'tracked{seed}'
+    make_bag(
+        ['crossing', '-o', str(made), '--seed', str(seed), '--size', SIZE, '--fps', str(FPS),
+         '--duration', str(DURATION), '--overwrite', '--quiet']
+    )  # fmt: skip
+    options = ReplayOptions(
+        overwrite=True, quiet=True, people=True, background=made / 'background.png',
+        settings=['overlay_modes=0'],
+    )  # fmt: skip
+    replay_bag(made, tracked, options, lambda text: None)
+    truths = [read_truth(made / f'truth_{name}.npz') for name in PEOPLE]
+    return {'seed': seed, **scores(truths, tracks_in(tracked))}
+
+
+def tracks_in(bag: Path) -> dict[str, tuple[tuple[str, ...], Joints]]:
+    """Names and positions (J, 3), m, of the joints of the heaviest mode by stamp, by identity."""
+    result: dict[str, tuple[tuple[str, ...], Joints]] = {}
+    with BagReader(bag) as read:
+        topics = [name for name in read.topics if name.endswith('/pose_mixture')]
+        for stored in read.messages(topics):
+            content = pose_mixture_of(stored.message)
+            if len(content.weights):
+                name = stored.topic.removeprefix(f'{BODIES}/').removesuffix('/pose_mixture')
+                _, joints = result.setdefault(name, (content.joint_names, {}))
+                joints[content.stamp_ns] = content.joint_positions[0]
+    return result
+
+
+def scores(
+    truths: list[Truth], tracks: dict[str, tuple[tuple[str, ...], Joints]]
+) -> dict[str, Any]:
+    """Whether each track stays with the person that it began with, and how far it is off."""
+    stamps = sorted(truths[0].joints)
+    early = stamps[: round(BEFORE * len(stamps))]
+    late = stamps[round(AFTER * len(stamps)) :]
+    owners = {name: _owner(truths, *track, early) for name, track in tracks.items()}
+    result: dict[str, Any] = {'tracks': len(tracks)}
+    kept = []
+    for number, truth in enumerate(truths):
+        own = [name for name, owner in owners.items() if owner == number]
+        name = own[0] if own else ''
+        kept.append(
+            bool(own) and _owner(truths, *tracks[name], late) == number
+            and all(stamp in tracks[name][1] for stamp in late)
+        )  # fmt: skip
+        for when, chosen in (('before', early), ('after', late)):
+            error = _error(truth, *tracks[name], chosen) if own else np.nan
+            result[f'{PEOPLE[number]}, {when}, mm'] = 1e3 * error
+    result['kept'] = all(kept)
+    return result
+
+
+def _owner(
+    truths: list[Truth], names: tuple[str, ...], joints: Joints, stamps: list[int]
+) -> int | None:
+    """Number of the person to whom a track is nearest in most of some images; None: in none."""
+    place, votes = names.index('pelvis'), np.zeros(len(truths))
+    for stamp in stamps:
+        if stamp in joints:
+            away = [
+                np.linalg.norm(
+                    joints[stamp][place] - truth.joints[stamp][truth.joint_names.index('pelvis')]
+                )
+                for truth in truths
+            ]
+            votes[int(np.argmin(away))] += 1
+    return int(np.argmax(votes)) if votes.any() else None
+
+
+def _error(truth: Truth, names: tuple[str, ...], joints: Joints, stamps: list[int]) -> float:
+    """Mean distance of the joints from the true ones, both from the pelvis, m."""
+    errors = []
+    for stamp in stamps:
+        if stamp not in joints:
+            continue
+        own = [joints[stamp][names.index(x)] for x in ('pelvis', *EVALUATED_JOINTS)]
+        true = [
+            truth.joints[stamp][truth.joint_names.index(x)] for x in ('pelvis', *EVALUATED_JOINTS)
+        ]
+        gap = (np.array(own) - own[0]) - (np.array(true) - true[0])
+        errors.append(float(np.linalg.norm(gap[1:], axis=1).mean()))
+    return float(np.mean(errors)) if errors else float('nan')
+
+
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+    """What was measured, as a table."""
+    rows = result['crossings']
+    columns = [name for name in rows[0] if name.endswith('mm')]
+    lines = [
+        [str(row['seed']), 'yes' if row['kept'] else 'no', str(row['tracks']),
+         *(f'{row[name]:.0f}' for name in columns)]
+        for row in rows
+    ]  # fmt: skip
+    kept = sum(row['kept'] for row in rows)
+    shown = table([['seed', 'kept', 'tracks', *columns], *lines], markdown=markdown)
+    return f'{shown}\n\nBoth keep their tracks in {kept} of {len(rows)} crossings.'
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,168 @@
+"""people_node: images and detections of several people in, mixtures over the poses of each out.
+
+The topics of a person are opened when the person is first seen, and closed some seconds after.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from hmt_msgs.srv import Reset
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+
+from hmt_ros.nodes.run_node import run
+from hmt_ros.nodes.session_node import SessionNode
+from hmt_ros.nodes.subscribed_topic import (
+    CAMERA_INFO_TOPIC,
+    LATCHED,
+    MASK_TOPICS,
+    RELIABLE,
+    TRANSFORM_TOPICS,
+    SubscribedTopic,
+    image_topic,
+    message_class,
+    read_installed_messages,
+)
+from hmt_ros.sessions.handled import Output
+from hmt_ros.sessions.people_parameters import SOURCES, PeopleParameters
+from hmt_ros.sessions.people_session import DETECTIONS, PeopleSession, published_topic
+from hmt_ros.sessions.person_session import person_of
+from hmt_ros.sessions.session import everything
+from msg_tools.files.error_line import error_line
+
+# Periods of the diagnostics after which the topics of somebody who has left are closed: the last
+# messages are still on their way.
+STAYS_OPEN = 5
+
+
+class InstalledPeopleSession(PeopleSession):
+    """Several people, of detections whose package is installed; see `PeopleSession`.
+
+    Raises:
+        ValueError: the package of `source` is not installed.
+    """
+
+    def __init__(
+        self,
+        parameters: PeopleParameters,
+        publish: Callable[[Output], None],
+        wanted: Callable[[str], bool] = everything,
+    ) -> None:
+        msgtype = SOURCES[parameters.source]
+        read_installed_messages(msgtype, f'source {parameters.source}')
+        super().__init__(parameters, publish, wanted)
+
+
+class PeopleNode(SessionNode[PeopleSession, PeopleParameters]):
+    """The node; its parameters are the fields of `PeopleParameters`."""
+
+    NAME = 'people_node'
+    SUBJECT = 'people'
+    SESSION = InstalledPeopleSession
+    DEFAULTS = PeopleParameters()
+
+    def __init__(self, **options: Any) -> None:
+        # The thread that estimates opens topics, that of the executor closes them.
+        self._opening = threading.Lock()
+        self._left: dict[str, int] = {}
+        super().__init__(**options)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Listens no more; the topics of all people are closed."""
+        result = super().on_deactivate(state)
+        self._close_topics({name for topic in self._outputs if (name := person_of(topic))})
+        return result
+
+    def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
+        yield Reset, '~/reset', self._on_reset
+
+    def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
+        yield CAMERA_INFO_TOPIC
+        yield SubscribedTopic(DETECTIONS, DETECTIONS, SOURCES[self._settings.source])
+        yield from MASK_TOPICS
+        if self._session is not None and self._session.frames.wanted:
+            yield from TRANSFORM_TOPICS
+        yield image_topic(self._settings.image_transport)
+
+    def _on_reset(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
+        session, thread = self._session, self._thread
+        if session is None or thread is None:
+            response.success, response.message = False, 'the node is not active'
+            return response
+        if len(request.initial.components) or request.box.width:
+            response.success = False
+            response.message = 'a mixture or a box is of one person: wanted an empty request'
+            return response
+        failed: list[str] = []
+
+        def restart() -> None:
+            try:
+                session.restart()
+            except ValueError as error:
+                failed.append(error_line(error))
+
+        thread.restart(restart)
+        response.success = not failed
+        response.message = failed[0] if failed else 'the next detections start new tracks'
+        return response
+
+    # Called by the thread that estimates.
+
+    def _publish(self, output: Output) -> None:
+        self._open(output.topic)
+        super()._publish(output)
+
+    def _is_wanted(self, topic: str) -> bool:
+        self._open(topic)
+        return super()._is_wanted(topic)
+
+    def _open(self, topic: str) -> None:
+        """Opens a topic of a person, once."""
+        if topic in self._outputs:
+            return
+        with self._opening:
+            published = published_topic(topic)
+            publisher = self.create_lifecycle_publisher(
+                message_class(published.msgtype),
+                topic,
+                LATCHED if published.latched else RELIABLE,
+                event_callbacks=self._events.of_publisher(self.resolve_topic_name(topic)),
+            )
+            publisher.on_activate(None)
+            # Others may be going through the old ones.
+            self._outputs = {**self._outputs, topic: publisher}
+
+    # Called by the thread of the executor.
+
+    def _diagnose_period(self) -> None:
+        super()._diagnose_period()
+        followed = set() if self._session is None else set(self._session.state.followed)
+        open_now = {name for topic in self._outputs if (name := person_of(topic))}
+        self._left = {name: self._left.get(name, 0) + 1 for name in open_now - followed}
+        self._close_topics({name for name, periods in self._left.items() if periods >= STAYS_OPEN})
+
+    def _close_topics(self, people: set[str]) -> None:
+        """Closes the topics of people who have left."""
+        if not people:
+            return
+        with self._opening:
+            closed = {topic: x for topic, x in self._outputs.items() if person_of(topic) in people}
+            self._outputs = {
+                topic: publisher
+                for topic, publisher in self._outputs.items()
+                if topic not in closed
+            }
+            for publisher in closed.values():
+                self.destroy_lifecycle_publisher(publisher)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Runs the node until a signal stops it; returns 0, or 1 if it could not start."""
+    return run(PeopleNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

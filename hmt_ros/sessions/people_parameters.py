@@ -1,0 +1,63 @@
+"""Parameters of the people node: those of the filter node, for each person, and its own.
+
+`hmt_ros/config/people_node.yaml` lists them with their defaults; it is written by
+
+    python -m hmt_ros.sessions.people_parameters > hmt_ros/config/people_node.yaml
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.sessions.declared_parameters import AT_ONCE, NEXT_CONFIGURE, parameter_field
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.parameter_file import parameter_file_text
+from msg_tools.messages.detections import BOXES, FLOATS, PEOPLE_2D, YOLO
+
+# Types of the messages by value of the parameter `source`.
+SOURCES = {'people': PEOPLE_2D, 'yolo': YOLO, 'boxes': BOXES, 'floats': FLOATS}
+# Inputs of one person, of whom a topic can not say who it is.
+_OF_ONE = {
+    'subject_file': '', 'use_predictions': False, 'use_keypoints_3d': False, 'use_depth': False,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PeopleParameters(FilterParameters):
+    """All parameters of the people node.
+
+    Attributes:
+        source: Type of the messages on the topic detections, 'people' (hmt_msgs/People2D), 'yolo'
+            (yolo_msgs/DetectionArray), 'boxes' (vision_msgs/Detection2DArray) or 'floats'
+            (std_msgs/Float32MultiArray).
+        scheme: Scheme whose order the keypoints of 'yolo' and 'floats' follow: 'coco17', 'halpe26',
+            'body25', 'mediapipe33', 'h36m17' or 'skeleton2d'.
+        max_people: Maximum number of people who are followed at the same time; of those who come at
+            the same time the largest in the image are taken.
+        use_keypoints: If true, keypoints of the detections are a measurement and start tracks; if
+            false, only their boxes are used.
+    """
+
+    source: str = parameter_field('people', NEXT_CONFIGURE)
+    scheme: str = parameter_field('coco17', NEXT_CONFIGURE)
+    max_people: int = parameter_field(4, AT_ONCE, (1, 20))
+    use_keypoints: bool = parameter_field(True, AT_ONCE)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.source not in SOURCES:
+            raise ValueError(f'source must be one of {tuple(SOURCES)}, saw {self.source!r}')
+        if self.scheme not in schemes():
+            raise ValueError(f'scheme must be one of {tuple(schemes())}, saw {self.scheme!r}')
+        for name, unused in _OF_ONE.items():
+            if getattr(self, name) != unused:
+                raise ValueError(
+                    f'{name} is {getattr(self, name)!r}, but people_node takes no input of one '
+                    f'person: wanted {unused!r}, or filter_node'
+                )
+
+
+if __name__ == '__main__':
+    sys.stdout.write(parameter_file_text('people_node', PeopleParameters()))

@@ -1,0 +1,133 @@
+"""Which of the people whom a detector sees in an image is which of those who are followed.
+
+    cost(i, j) = median_k |u_ik + v_i dt - p_jk| / s_i        over the joints k that both have
+
+u_i are the joints of person i where they were last seen, v_i is the velocity of the person in the
+image, s_i the size of the person, and p_j are the joints of detection j; where they have no joints
+in common the middles of their boxes count. A pair is possible below a cost that grows with the time
+for which the person was not seen. The assignment has the least sum of costs, of which somebody
+without a detection costs as much as the worst possible pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array
+
+# Costs below which a pair is possible: from one image to the next, and after a second or more.
+GATE, WIDEST_GATE = 0.4, 0.8
+# A second detection of somebody who has one lies nearer than this.
+SAME = 0.15
+# Time for which a person is taken to go on as before, s, and the time constant of the velocity.
+GOES_ON = 1.0
+MEMORY = 0.25
+# What remains a second of the size of a person of whom less is seen now.
+SIZE_KEPT = 0.6
+# Fewer joints in common do not tell how far a person has moved.
+FEWEST_IN_COMMON = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """Where somebody is in an image.
+
+    Attributes:
+        joints: pixels (2,) by the name of the joint, of those that were seen.
+        corners: (2, 2) left top and right bottom of the box around the person, px.
+    """
+
+    joints: dict[str, Array]
+    corners: Array
+
+    @classmethod
+    def of(cls, keypoints: Keypoints, corners: Array) -> Sighting:
+        """Of keypoints, maybe none, and a box."""
+        seen = np.flatnonzero(keypoints.seen)
+        return cls({keypoints.names[i]: keypoints.pixels[i] for i in seen}, corners)
+
+    @property
+    def middle(self) -> Array:
+        """(2,) of the box, px."""
+        return np.asarray(self.corners.mean(0))
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the box, px; 1 at least."""
+        return max(float(np.hypot(*(self.corners[1] - self.corners[0]))), 1.0)
+
+    def shifts_to(self, other: Sighting) -> Array:
+        """Ways (n, 2) of the joints in common to where another has them; of the middle, else."""
+        common = [name for name in self.joints if name in other.joints]
+        if len(common) < FEWEST_IN_COMMON:
+            return np.asarray((other.middle - self.middle)[None])
+        return np.array([other.joints[name] - self.joints[name] for name in common])
+
+
+class ImageTrack:
+    """Where a person was last seen in the images, and how fast the person moves there.
+
+    Args:
+        sighting: the first.
+        stamp: of its image, ns.
+
+    Attributes:
+        sighting: the last one.
+        stamp: of its image, ns.
+        velocity: (2,) px/s.
+        size: of the person, px; what is hidden for a while does not make it smaller at once.
+    """
+
+    def __init__(self, sighting: Sighting, stamp: int) -> None:
+        self.sighting, self.stamp = sighting, stamp
+        self.velocity = np.zeros(2)
+        self.size = sighting.size
+        self._known_for = 0.0
+
+    def update(self, sighting: Sighting, stamp: int) -> None:
+        """Takes the next sighting, of a later image."""
+        dt = 1e-9 * (stamp - self.stamp)
+        moved = np.median(self.sighting.shifts_to(sighting), axis=0)
+        self._known_for += dt
+        # At first the mean of what was seen, later that of the last moments.
+        gain = min(dt / min(self._known_for, MEMORY), 1.0)
+        self.velocity += gain * (moved / dt - self.velocity)
+        self.size = max(sighting.size, self.size * SIZE_KEPT**dt)
+        self.sighting, self.stamp = sighting, stamp
+
+    def shift(self, stamp: int) -> Array:
+        """Way (2,) that the person is expected to have moved since then, px."""
+        dt = min(1e-9 * (stamp - self.stamp), GOES_ON)
+        return np.asarray(dt * self.velocity)
+
+    def cost(self, sighting: Sighting, stamp: int) -> float:
+        """Distance of a sighting from where the person is expected, in sizes of the person."""
+        off = self.sighting.shifts_to(sighting) - self.shift(stamp)
+        return float(np.median(np.hypot(*off.T))) / self.size
+
+    def gate(self, stamp: int) -> float:
+        """Cost from which a sighting is of somebody else."""
+        unseen = min(1e-9 * (stamp - self.stamp), 1.0)
+        return GATE + (WIDEST_GATE - GATE) * unseen
+
+
+def assigned(
+    tracks: Sequence[ImageTrack], sightings: Sequence[Sighting], stamp: int
+) -> dict[int, int]:
+    """Number of the sighting in an image that each track goes on with; those that have one."""
+    if not tracks or not sightings:
+        return {}
+    costs = np.array([[track.cost(each, stamp) for each in sightings] for track in tracks])
+    gates = np.array([track.gate(stamp) for track in tracks])[:, None]
+    # An impossible pair costs as much as to have none.
+    rows, columns = linear_sum_assignment(np.where(costs < gates, costs, gates))
+    return {
+        int(row): int(column)
+        for row, column in zip(rows, columns, strict=True)
+        if costs[row, column] < gates[row, 0]
+    }

@@ -1,0 +1,117 @@
+"""What others cover speaks neither for a pose nor against it."""
+
+import cv2
+import numpy as np
+import pytest
+
+from hmt_ros.body.camera import Camera, Viewpoint
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.likelihood import ImageLikelihood
+from hmt_ros.image.observation import observe
+from hmt_ros.image.texture import capture_textures
+from hmt_ros.motion.procedural_motion import procedural_motion
+from hmt_ros.rendering.renderer import render, render_people
+from hmt_ros.rendering.scene import Scene
+
+VIEW = Viewpoint(distance=3.2)
+SCENE = Scene(viewpoint=VIEW, seed=2)
+
+
+@pytest.fixture(scope='module')
+def camera():
+    return Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
+
+
+@pytest.fixture(scope='module')
+def pose(human32):
+    return procedural_motion('reach', human32, 0.2, 10.0, 3, viewpoint=VIEW)[0]
+
+
+@pytest.fixture(scope='module')
+def seen(human32, camera, pose):
+    """Image and silhouette of a person, and the half of the image that is unknown."""
+    picture = render(human32, pose, camera, SCENE)
+    others = np.zeros(picture.mask.shape, bool)
+    middle = int(np.nonzero(picture.mask)[1].mean())
+    others[:, :middle] = True
+    return picture.image, picture.mask, others
+
+
+def energies(human32, camera, poses, image, mask, others, last=None):
+    likelihood = ImageLikelihood(human32, camera)
+    silhouette = mask if others is None else mask & ~others
+    observation = observe(image, silhouette, last_image=image, others=others)
+    frames = forward(human32.skeleton, poses)
+    captured = observe(image if last is None else last, mask).intensity
+    textures = capture_textures(human32, camera, frames, captured)
+    rows = np.zeros(len(poses), dtype=np.intp)
+    return likelihood.energies(frames, observation, textures, rows, derivatives=False)
+
+
+def test_nothing_changes_where_others_change(human32, camera, pose, seen):
+    """Any picture in the unknown half gives the same energies."""
+    image, mask, others = seen
+    poses = np.tile(pose, (3, 1))
+    poses[1, 0] += 0.1
+    poses[2, 7] += 0.3
+    found = []
+    for fill in (0, 255):
+        other = image.copy()
+        # Blurs and edges reach a little over the border of what is unknown.
+        inner = cv2.erode(others.astype(np.uint8), np.ones((25, 25), np.uint8)) > 0
+        other[inner] = fill
+        observation = energies(human32, camera, poses, other, mask, others, image)
+        found.append(np.stack([observation.terms[name] for name in ('edges', 'intensity')]))
+    np.testing.assert_allclose(*found, rtol=1e-6)
+    assert (np.ptp(found[0], axis=1) > 0.1).all()
+
+
+def test_half_a_silhouette_does_not_punish_the_other_half(human32, camera, pose, seen):
+    image, mask, others = seen
+    known = energies(human32, camera, pose[None], image, mask & ~others, None).terms
+    unknown = energies(human32, camera, pose[None], image, mask, others).terms
+    assert known['containment'] > 20 * max(unknown['containment'][0], 0.05)
+    whole = energies(human32, camera, pose[None], image, mask, None).terms
+    assert unknown['containment'] <= whole['containment'] + 0.05
+    # The cut through the person is no outline.
+    assert unknown['coverage'] - whole['coverage'] < 0.2 * (known['coverage'] - whole['coverage'])
+
+
+def test_hidden_textures_cost_what_is_usual(human32, camera, pose, seen):
+    image, mask, _ = seen
+    everything = np.ones(mask.shape, bool)
+    hidden = energies(human32, camera, pose[None], image, mask, everything).terms
+    weight, scale = 4.0, 2.0
+    usual = weight * 0.5 / (1.0 + 1.0 / scale**2)
+    assert hidden['intensity'][0] == pytest.approx(usual, rel=0.05)
+    captured = capture_textures(
+        human32, camera, forward(human32.skeleton, pose[None]),
+        observe(image, mask, others=everything).intensity,
+    )  # fmt: skip
+    assert captured.counts[0] == 0
+
+
+def test_a_silhouette_without_others(human32, camera, pose, seen):
+    image, _, others = seen
+    empty = np.rint(SCENE.background(camera)).astype(np.uint8)
+    model = BackgroundModel.from_image(empty)
+    whole, part = model.split(image).foreground, model.split(image, None, others).foreground
+    assert (whole & ~others).sum() > 0.9 * part.sum() > 0
+    assert not part[others].any()
+    # The same image again costs no subtraction, another one does.
+    changed = model.changed
+    model.split(empty)
+    assert model.changed < changed
+
+
+def test_people_hide_each_other_as_a_whole(human32, camera, pose):
+    behind = pose.copy()
+    behind[2] += 1.0
+    for order in ([pose, behind], [behind, pose]):
+        image, owners = render_people([human32] * 2, order, camera, SCENE)
+        near = [np.array_equal(x, pose) for x in order].index(True)
+        alone = render(human32, pose, camera, SCENE).mask
+        np.testing.assert_array_equal(owners == near, alone)
+        assert image.shape == (240, 320, 3)
+        assert (owners == 1 - near).any()

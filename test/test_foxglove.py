@@ -1,0 +1,137 @@
+"""The layouts for Lichtblick and Foxglove: every panel has a topic that is there, and fields of it.
+
+A panel that names another topic stays empty, without a word.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hmt_ros.app.replay.command import main
+from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
+from msg_tools import BagReader
+from msg_tools.messages.message_types import typestore
+from test.app.replay.test_command import PERSON, recorded, still, write
+
+__all__ = ['still']
+
+ROOT = Path(__file__).parent.parent
+LIVE, OF_BAGS = 'hmt.json', 'hmt_bag.json'
+PERSON_1 = '/humans/bodies/p1'
+# Type of the messages that a panel shows, by the name of the panel.
+SHOWN = {
+    'Image': 'sensor_msgs/msg/CompressedImage',
+    'DiagnosticSummary': 'diagnostic_msgs/msg/DiagnosticArray',
+    'RosOut': 'rcl_interfaces/msg/Log',
+}
+NODE_TOPICS = {
+    **track_messages.TOPICS,
+    **smoothed_messages.TOPICS,
+    **bme_session.TOPICS,
+}
+
+
+def read(name: str) -> dict[str, Any]:
+    layout: dict[str, Any] = json.loads((ROOT / 'foxglove' / name).read_text('utf-8'))
+    return layout
+
+
+def panels(layout: Any) -> set[str]:
+    """Panels that the tree of a layout names."""
+    if isinstance(layout, str):
+        return {layout}
+    assert layout['direction'] in ('row', 'column')
+    return panels(layout['first']) | panels(layout['second'])
+
+
+def topics_of(name: str, settings: dict[str, Any]) -> dict[str, str]:
+    """Topics of a panel, with the type that it wants, and the fields that it plots behind it."""
+    kind = name.partition('!')[0]
+    if kind == '3D':
+        found = dict.fromkeys(settings['topics'], 'visualization_msgs/msg/MarkerArray')
+        urdfs = (x for x in settings['layers'].values() if x['layerId'] == 'foxglove.Urdf')
+        return found | {layer['topic']: 'std_msgs/msg/String' for layer in urdfs}
+    if kind == 'Image':
+        return {settings['imageMode']['imageTopic']: SHOWN[kind]}
+    if kind == 'Plot':
+        paths = (path['value'].partition('.') for path in settings['paths'])
+        return {topic: field for topic, _, field in paths}
+    if kind == 'DiagnosticSummary':
+        return {settings['topicToRender']: SHOWN[kind]}
+    assert kind == 'RosOut', f'{name}: a panel whose topic this test does not know'
+    return {'/rosout': SHOWN[kind]}
+
+
+def check_field(msgtype: str, path: str) -> None:
+    """Asserts that a type has the field that a plot shows."""
+    definitions = typestore().fielddefs
+    for part in re.sub(r'\[-?\d+\]', '', path).split('.'):
+        fields = dict(definitions[msgtype][1])
+        assert part in fields, f'{msgtype} has no field {part}'
+        described = str(fields[part])
+        inner = re.search(r'[a-z_]+/msg/\w+', described)
+        msgtype = inner.group() if inner else ''
+
+
+def check_layout(name: str, there: dict[str, str], frames: set[str]) -> None:
+    """Asserts that no panel of a layout stays empty.
+
+    Args:
+        name: of the layout.
+        there: type of each topic that has messages.
+        frames: that exist.
+    """
+    layout = read(name)
+    assert panels(layout['layout']) == layout['configById'].keys()
+    for panel, settings in layout['configById'].items():
+        wanted = topics_of(panel, settings)
+        assert wanted, panel
+        for topic, kind in wanted.items():
+            assert topic in there, f'{name}: {panel} shows {topic}, which is not there'
+            if panel.startswith('Plot!'):
+                check_field(there[topic], kind)
+            else:
+                assert there[topic] == kind, f'{name}: {panel} can not show {topic}'
+        if 'followTf' in settings:
+            assert {settings['followTf'], settings['layers']['grid']['frameId']} <= frames
+
+
+def test_live_layout_shows_topics_of_the_nodes() -> None:
+    there = {
+        topic if topic.startswith('/') else f'{PERSON_1}/{topic}': published.msgtype
+        for topic, published in NODE_TOPICS.items()
+    }
+    there |= {'/diagnostics': SHOWN['DiagnosticSummary'], '/rosout': SHOWN['RosOut']}
+    check_layout(LIVE, there, {'camera_upright'})
+
+
+def test_layout_of_bags_shows_what_replay_writes(still: Any, tmp_path: Path) -> None:
+    bag = write(tmp_path / 'bag', recorded())
+    assert main([str(bag), '-o', str(tmp_path / 'out'), *PERSON, '--quiet']) == 0
+    with BagReader(tmp_path / 'out') as reader:
+        there = {x.name: x.msgtype for x in reader.topics.values() if x.message_count}
+        transforms = next(reader.messages(['/tf'])).message.transforms
+    check_layout(OF_BAGS, there, {str(one.header.frame_id) for one in transforms})
+
+
+@pytest.mark.parametrize(('layout', 'other'), [(LIVE, OF_BAGS), (OF_BAGS, LIVE)])
+def test_both_show_the_same_of_the_person(layout: str, other: str) -> None:
+    own, shown = (
+        {
+            topic.removeprefix(PERSON_1)
+            for panel, settings in read(name)['configById'].items()
+            for topic in topics_of(panel, settings)
+        }
+        for name in (layout, other)
+    )
+    assert own - shown <= {'/diagnostics', '/rosout'}
+
+
+def test_nothing_is_shown_of_the_robot_itself() -> None:
+    for name in (LIVE, OF_BAGS):
+        assert '/robot_description' not in (ROOT / 'foxglove' / name).read_text('utf-8')

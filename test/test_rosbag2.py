@@ -1,0 +1,94 @@
+"""The lines for `ros2 bag` in the documentation, by the rule by which rosbag2 finds topics.
+
+rosbag2 is not among the wheels. Its player expands the names that it is given, as every node does,
+and compares them with the names in the bag; overrides of the quality of service and the recorder
+compare them as they are.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import yaml
+from mcap.reader import make_reader
+
+from hmt_ros.sessions import smoothed_messages, track_messages
+from msg_tools.bags.contents import absolute_name
+
+ROOT = Path(__file__).parent.parent
+PAGES = ('README.md', 'docs/bags.md', 'docs/views.md')
+# What a bag of replay has; a test of the command compares.
+REPLAYED = {absolute_name(x) for x in (*track_messages.TOPICS, *smoothed_messages.TOPICS)}
+
+
+def lines(verb: str) -> list[list[str]]:
+    """Words of the commands behind `ros2 bag <verb>` in the documentation."""
+    text = '\n'.join((ROOT / page).read_text('utf-8') for page in PAGES)
+    found = re.findall(rf'(?:^|`)ros2 bag {verb} ([^`\n]*)', text, re.MULTILINE)
+    return [shlex.split(line) for line in found]
+
+
+def arguments(words: list[str], option: str) -> list[str]:
+    """What follows an option, up to the next."""
+    rest = words[words.index(option) + 1 :] if option in words else []
+    end = next((i for i, word in enumerate(rest) if word.startswith('-')), len(rest))
+    return rest[:end]
+
+
+def recorded(bag: str) -> set[str]:
+    """Names of the topics of a bag, in its metadata and in its file, which must be the same."""
+    if bag == 'tracked':
+        return REPLAYED
+    folder = ROOT / bag
+    content = yaml.safe_load((folder / 'metadata.yaml').read_text('utf-8'))
+    topics = content['rosbag2_bagfile_information']['topics_with_message_count']
+    names = {one['topic_metadata']['name'] for one in topics}
+    with next(folder.glob('*.mcap')).open('rb') as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert names == {channel.topic for channel in summary.channels.values()}
+    return names
+
+
+def expanded(name: str) -> str:
+    """A name as rclcpp expands it for the player, whose node is in the root."""
+    return name if name.startswith('/') else f'/{name}'
+
+
+@pytest.mark.parametrize('words', lines('play'), ids=' '.join)
+def test_played_topics_are_in_the_bag(words: list[str]) -> None:
+    there = recorded(words[0])
+    for option in ('--topics', '--exclude-topics'):
+        for name in arguments(words, option):
+            assert expanded(name) in there
+    for rule in arguments(words, '--remap'):
+        old, _, new = rule.partition(':=')
+        assert {old, new} & there == {old}
+
+
+def test_lines_for_playing_and_recording_are_there() -> None:
+    played, stored = lines('play'), lines('record')
+    for option in ('--topics', '--exclude-topics', '--remap'):
+        assert any(option in words for words in played)
+    names = [name for words in stored for name in arguments(words, '--topics')]
+    assert names
+    assert all(name.startswith('/') for name in names)
+    (pattern,) = (rule for words in stored for rule in arguments(words, '--regex'))
+    # The recorder searches, the player matches the whole name.
+    for topic in track_messages.TOPICS.keys() - {'/tf'}:
+        assert re.fullmatch(pattern, f'/humans/bodies/p1/{topic}')
+    assert not re.search(pattern, '/camera/image_raw')
+
+
+def test_overrides_name_topics_of_the_bag() -> None:
+    page = (ROOT / 'docs' / 'bags.md').read_text('utf-8')
+    (text,) = re.findall(r'```yaml\n(/.*?)```', page, re.DOTALL)
+    assert yaml.safe_load(text).keys() <= recorded('bags/reach')
+
+
+@pytest.mark.parametrize('folder', sorted((ROOT / 'bags').glob('*/')), ids=lambda x: x.name)
+def test_bags_of_the_repository_have_absolute_names(folder: Path) -> None:
+    assert all(name.startswith('/') for name in recorded(f'bags/{folder.name}'))
