@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.image.terms.depth import FURTHEST, NEAREST, usable_depths
 from hmt_ros.inference.arrays import Image
-from hmt_ros.sessions.camera_session import StampedInputs
+from hmt_ros.sessions.camera_session import StampedInputs, WaitingImage
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from msg_tools.messages.depth_images import decode_depth
 from msg_tools.messages.images import ImageError
@@ -54,16 +54,18 @@ class DepthInputs:
             depth = None
         self.images.put(stamp_ns, depth)
 
-    def take(
-        self, image: Image, stamp_ns: int, dropped: Container[int] = ()
-    ) -> NDArray[np.float32] | None:
-        """The depths of an image; None where there are none that fit.
+    def added_to(self, waiting: WaitingImage, dropped: Container[int] = ()) -> WaitingImage:
+        """An image with its depths, where there are some that fit.
 
         Args:
-            image: (H, W, 3).
-            stamp_ns: of the image.
+            waiting: the image.
             dropped: stamps of images that were dropped, whose depth is not missed.
         """
+        return waiting._replace(depth=self._take(waiting.image, waiting.stamp_ns, dropped))
+
+    def _take(
+        self, image: Image, stamp_ns: int, dropped: Container[int]
+    ) -> NDArray[np.float32] | None:
         for each in self.images.before(stamp_ns):
             if each in dropped:
                 continue

@@ -28,7 +28,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body import Body, Camera
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -255,10 +254,9 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if p.use_keypoints:
             keypoints = self._keypoints.take(stamp, p, self.start.body)
         prediction = self._prediction_of(stamp) if p.use_predictions else None
-        depth = None
         if p.use_depth:
-            depth = self._depths.take(waiting.image, stamp, self._dropped)
-        self._follow(waiting, camera, keypoints, prediction, depth=depth)
+            waiting = self._depths.added_to(waiting, self._dropped)
+        self._follow(waiting, camera, keypoints, prediction)
 
     def _new_tracker(self, camera: Camera) -> Tracker:
         return self.start.tracker(camera, self._known_ground())
@@ -273,7 +271,6 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         keypoints: Keypoints | None,
         prediction: PosePrediction | Status | None,
         others: Mask | None = None,
-        depth: NDArray[np.float32] | None = None,
     ) -> None:
         """Takes an image with its inputs; see `Tracker.step`."""
         stamp = waiting.stamp_ns
@@ -298,11 +295,11 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 waiting.mask,
                 nobody_predicted=prediction is Status.NOBODY,
                 others=others,
-                depth=depth,
+                depth=waiting.depth,
             )
             if trusted and self._tracker.silhouettes.doubted:
                 self._report_background(self._tracker.silhouettes.share, stamp)
-            if depth is not None and not self._tracker.depth.believed:
+            if waiting.depth is not None and not self._tracker.depth.believed:
                 self._log.note(Fault.DEPTH_ELSEWHERE, depth_elsewhere(stamp))
             if starts and posterior is not None:
                 self._report_start(self._tracker, stamp)

@@ -19,9 +19,7 @@ from msg_tools.messages.detections import BOXES, FLOATS, PEOPLE_2D, YOLO
 # Types of the messages by value of the parameter `source`.
 SOURCES = {'people': PEOPLE_2D, 'yolo': YOLO, 'boxes': BOXES, 'floats': FLOATS}
 # Inputs of one person, of whom a topic can not say who it is.
-_OF_ONE = {
-    'subject_file': '', 'use_predictions': False, 'use_keypoints_3d': False, 'use_depth': False,
-}  # fmt: skip
+_OF_ONE = {'subject_file': '', 'use_predictions': False, 'use_keypoints_3d': False}
 
 
 @dataclass(frozen=True)

@@ -301,3 +301,15 @@ def test_without_depth_nothing_changes(shot):
 def test_depth_of_another_size_is_refused(shot):
     with pytest.raises(ValueError, match=r'depth \(3, 4\) for an image'):
         seen(shot, np.ones((3, 4)))
+
+
+def test_depth_of_somebody_else_says_nothing(shot, sensed):
+    """Where others cover the person, their depth is not that of the person."""
+    others = np.zeros(shot.masks[1].shape, dtype=bool)
+    others[:, 100:180] = True
+    nearer = np.where(others, 0.5 * sensed, sensed)
+    found = seen(shot, nearer, others=others).evidence['depth']
+    values = found.values[0][:, 100 - found.left : 180 - found.left]
+    assert values.size
+    assert not values.any()
+    assert found.values.any()

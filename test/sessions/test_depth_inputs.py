@@ -7,7 +7,11 @@ from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_session import DEPTH, FilterSession
+from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.people_session import DETECTIONS, PeopleSession
 from msg_tools.messages.depth_images import depth_message
+from msg_tools.messages.detections import PEOPLE_2D
+from msg_tools.messages.headers import header_message
 
 
 @pytest.fixture
@@ -117,3 +121,24 @@ def test_depth_of_something_else_is_told_once(session, small_camera, stub_tracke
         assert len(warnings) == (index == 2)
         stub_tracker.made[0].depth.believed = index == 0
     assert one.state.faults == {'depth of something else': 2}
+
+
+def test_several_people_are_seen_with_the_same_depth(small_camera, monkeypatch):
+    """Images wait for the depth as for the detections, and go on without."""
+    seen = []
+    monkeypatch.setattr(
+        PeopleSession, '_follow_all', lambda self, waiting, *_, **__: seen.append(waiting.depth)
+    )
+    values = {'use_depth': True, 'input_timeout': 0.25}
+    one = PeopleSession(with_values(PeopleParameters(), values), lambda output: None)
+    one.take(CAMERA_INFO, small_camera.info())
+    for index in range(5):
+        one.take(IMAGE, small_camera.image(index))
+        header = header_message(small_camera.messages, small_camera.stamp(index), 'lens')
+        one.take(DETECTIONS, small_camera.messages.create(PEOPLE_2D, header=header))
+        if index == 0:
+            assert seen == []
+            one.take(DEPTH, small_camera.depth(index))
+    assert seen[0].max() == 3.0
+    assert seen[1] is None
+    assert one.state.faults['no depth'] >= 1

@@ -195,6 +195,7 @@ def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> Peopl
     sources = {kind: source for source, kind in SOURCES.items()}
     values['source'] = sources[recorded.detections.msgtype]
     values.setdefault('use_mask', recorded.mask is not None)
+    values.setdefault('use_depth', recorded.depth is not None)
     values['image_transport'] = recorded.transport
     return with_values(PeopleParameters(), values)
 
