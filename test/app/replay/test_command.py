@@ -78,7 +78,9 @@ class StandingStill:
 
     made = []  # noqa: RUF012
 
-    def __init__(self, body, camera, settings, background, seed, known_ground=None):
+    def __init__(
+        self, body, camera, settings, background, seed, known_ground=None, shared_background=False
+    ):
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
         self.track_id, self.started_from = 1, None
@@ -103,8 +105,9 @@ class StandingStill:
         return self.body.prior_mean
 
     def step(
-        self, image, stamp, keypoints=None, prediction=None, mask=None, *, nobody_predicted=False
-    ):
+        self, image, stamp, keypoints=None, prediction=None, mask=None, *, nobody_predicted=False,
+        others=None,
+    ):  # fmt: skip
         self.keypoints.append(None if keypoints is None else keypoints.names)
         self.positions.append(None if keypoints is None else keypoints.positions)
         self.predictions.append(prediction)
