@@ -28,7 +28,9 @@ from launch_ros.actions import Node
 PACKAGE = 'hmt_ros'
 USUAL_NODES = ('filter_node', 'smoother_node', 'bme_node')
 DETECTORS = ('keypoints_node', 'keypoints_adapter_node')
-NODES = (*USUAL_NODES, *DETECTORS)
+# Several people: its topics are in the root namespace.
+PEOPLE = 'people_node'
+NODES = (*USUAL_NODES, *DETECTORS, PEOPLE)
 # Default frame of images in the nodes; and the frame for views, which need z up.
 OPTICAL, UPRIGHT = 'camera_optical_frame', 'camera_upright'
 # Rotation from (x right, y down, z forward) to (x forward, y left, z up).
@@ -52,14 +54,23 @@ ARGUMENTS = (
         'nodes',
         ' '.join(USUAL_NODES),
         f'nodes to start, separated by blanks; besides these {" or ".join(DETECTORS)}, whose '
-        'keypoints the filter then uses',
+        f'keypoints the filter then uses; {PEOPLE} alone tracks several people',
     ),
     ('image', '/camera/image_raw', 'topic of the images, without /compressed'),
     ('camera_info', '', 'topic of the calibration; empty: camera_info beside the images'),
     ('image_transport', 'raw', "'raw', or 'compressed' for images on <image>/compressed"),
     ('keypoints', '', 'topic of the keypoints of a 2D detector; empty: none'),
-    ('detections', 'detections', 'topic of another detector, for keypoints_adapter_node'),
-    ('detections_source', 'skeleton2d', "their type: 'skeleton2d', 'yolo' or 'floats'"),
+    (
+        'detections',
+        'detections',
+        'topic of another detector, for keypoints_adapter_node or people_node',
+    ),
+    (
+        'detections_source',
+        'skeleton2d',
+        "their type: 'skeleton2d', 'yolo' or 'floats'; for people_node 'people' (which replaces "
+        "'skeleton2d'), 'yolo', 'boxes' or 'floats'",
+    ),
     ('mask', '', 'topic of the masks of a segmenter, without /compressed; empty: none'),
     (
         'gravity_frame',
@@ -138,7 +149,11 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
     info = given['camera_info'] or f'{image.rpartition("/")[0]}/camera_info'
     remappings = [('image', image), ('image/compressed', f'{image}/compressed')]
     remappings.append(('camera_info', info))
-    if 'keypoints_adapter_node' in names:
+    if PEOPLE in names and len(names) > 1:
+        raise ValueError(f'nodes: {PEOPLE} stands alone, saw {given["nodes"]!r}')
+    if PEOPLE in names:
+        namespace = given['namespace']
+    if 'keypoints_adapter_node' in names or PEOPLE in names:
         remappings.append(('detections', given['detections']))
     if given['keypoints']:
         remappings.append(('keypoints', given['keypoints']))
@@ -173,6 +188,12 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
         },
         'keypoints_node': {**common, 'image_transport': transport},
         'keypoints_adapter_node': {**common, 'source': given['detections_source']},
+        PEOPLE: {
+            **camera,
+            **_named(given, 'gravity_frame'),
+            **_named(given, 'fixed_frame'),
+            'source': given['detections_source'].replace('skeleton2d', 'people'),
+        },
     }
     own = [given['params_file']] if given['params_file'] else []
     env = _room_for_images(share) if transport == 'raw' else {}

@@ -31,6 +31,7 @@ from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
 from hmt_ros.sessions.parameter_file import read_parameter_file
+from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from msg_tools import BagReader
 
@@ -146,6 +147,10 @@ def test_three_nodes_in_the_namespace_of_a_person(actions):
     }
     assert set(made['filter_node']['remappings']) == wanted
     assert set(made['bme_node']['remappings']) == wanted
+    # The filter tells when predictions may be rare; without it they are all there is.
+    assert parameters(made['bme_node'])['tracked_interval'] == 0.2
+    alone = parameters(actions(nodes='bme_node')['bme_node'])
+    assert alone['tracked_interval'] == 0.0
     assert made['smoother_node']['remappings'] == []
 
 
@@ -172,6 +177,20 @@ def test_nodes_that_find_keypoints(actions):
     }
     assert f'{NAMESPACE}/keypoints_3d' in allowed['filter_node']['subscribe']
     assert f'{NAMESPACE}/detections' in allowed['keypoints_adapter_node']['subscribe']
+
+
+def test_several_people(actions):
+    made = actions(nodes='people_node', detections='/yolo', detections_source='yolo')
+    (node,) = made.values()
+    assert (node['executable'], node['namespace']) == ('people_node', '')
+    own = parameters(node)
+    assert own.pop('use_sim_time') is False
+    assert with_values(PeopleParameters(), own).source == 'yolo'
+    assert dict(node['remappings'])['detections'] == '/yolo'
+    own = parameters(actions(nodes='people_node', namespace='/lab')['people_node'])
+    assert own['source'] == 'people'
+    with pytest.raises(ValueError, match='people_node stands alone'):
+        actions(nodes='filter_node people_node')
 
 
 def test_rep_155(actions):

@@ -4,7 +4,7 @@ The rules:
 
 - A track of a person is a body. Its identity is the name of the person, the namespace without
   /humans/bodies/, and the number of the track: p1_2 is the second track in /humans/bodies/p1. A
-  person who was lost and is found again by a new track is a new body, as the REP wants it.
+  person who is found again by a new track is a new body; no identity is used twice.
 - /humans/bodies/tracked lists the bodies that are tracked. A body that the filter calls lost is not
   in the list until the same track goes on; it ends with the track, with a mixture without
   components, and `longest_silence` after its last mixture.
@@ -108,7 +108,8 @@ class _Person:
         name: of the person.
         identity: of the body; '' while there is none.
         tracked: whether the body is neither lost nor silent.
-        tracks: number of the newest track.
+        track: number of its track; 0: it has none.
+        bodies: number in the newest identity.
         newest: stamp of the newest mixture, ns.
         heard: time at which it came, by the stamps of camera_info, ns.
         mode: identity of the mode that is shown; 0: none.
@@ -119,7 +120,8 @@ class _Person:
     name: str
     identity: str = ''
     tracked: bool = False
-    tracks: int = 0
+    track: int = 0
+    bodies: int = 0
     newest: int | None = None
     heard: int = 0
     mode: int = 0
@@ -130,14 +132,18 @@ class _Person:
         """The track has ended."""
         self.identity, self.tracked = '', False
 
+    def goes_on(self, track: int) -> bool:
+        """Whether the body of the last mixture is that of a track; 0: it has no number."""
+        return bool(self.identity) and track == self.track
+
     def begin(self, track: int) -> None:
-        """A track goes on, or another one begins; 0: it has no number."""
-        if not track:
-            track = self.tracks if self.identity else self.tracks + 1
-        identity = f'{self.name}_{track}'
-        if identity != self.identity:
+        """A track goes on, or another one begins, whose number is larger than those before."""
+        if not self.goes_on(track):
+            # A filter that was started again counts from 1 again.
+            self.bodies = max(track, self.bodies + 1)
+            self.identity = f'{self.name}_{self.bodies}'
             self.mode, self.angles, self.described = 0, {}, ()
-        self.identity, self.tracked, self.tracks = identity, True, track
+        self.track, self.tracked = track, True
 
 
 @dataclass(frozen=True)
@@ -195,14 +201,17 @@ class HriSession(Session[HriParameters, HriState]):
     def finish(self) -> Handled:
         """Tells that nobody is tracked any more."""
         self._log.begin()
-        if any(person.tracked for person in self._people.values()):
-            self._people.clear()
-            self._tell_tracked(self._now)
+        tracked = bool(self._tracked())
         self.restart()
+        if tracked:
+            self._tell_tracked(self._now)
         return self._handled(FINISH, self._now)
 
     def _forget(self) -> None:
-        self._people.clear()
+        # The numbers of their bodies are not given again.
+        for person in self._people.values():
+            person.end()
+            person.newest = None
         self._images.clear()
 
     # Inputs.
@@ -286,8 +295,8 @@ class HriSession(Session[HriParameters, HriState]):
             ValueError: joint positions that are those of no person.
         """
         p, stamp = self.parameters, content.stamp_ns
-        shown = _shown_mode(content, person.mode if content.track_id == person.tracks else 0)
-        before = person.angles
+        shown = _shown_mode(content, person.mode if person.goes_on(content.track_id) else 0)
+        before = person.angles if person.goes_on(content.track_id) else None
         human = fit_reference_human(
             content.joint_names, content.joint_positions[shown], before, additions=p.added_joints
         )

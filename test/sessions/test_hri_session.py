@@ -14,6 +14,8 @@ from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.sessions import hri_session
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
 from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.filter_session import FilterSession
 from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.hri_session import (
     FRAMES,
@@ -114,6 +116,40 @@ def test_tracks_without_a_number_are_counted(session, outputs, people):
     for index, state in enumerate(states):
         one.take(mixture_source('/'), people(index, 0, state))
     assert tracked(outputs) == [['body_1'], ['body_1'], [], ['body_2']]
+
+
+def test_no_identity_is_used_twice(session, outputs, people):
+    """A filter that was started again counts its tracks from 1 again."""
+    one = session()
+    one.take(P1, people(0, 3))
+    one.take(P1, people(1, 3, TrackState.NOBODY))
+    one.take(P1, people(2, 1))
+    one.take(P1, people(3, 1))
+    one.take(P1, people(4, 2))
+    assert tracked(outputs) == [['p1_3'], [], ['p1_4'], ['p1_4'], ['p1_5']]
+
+
+def test_what_the_filter_publishes_is_a_body(
+    session, outputs, small_camera, stub_tracker, subject_file
+):
+    one = session()
+    one.take(CAMERA_INFO, small_camera.info())
+    parameters = with_values(FilterParameters(), {'subject_file': str(subject_file)})
+
+    def forward(output):
+        if output.topic == 'pose_mixture':
+            one.take(P1, deserialise(output.data, 'hmt_msgs/msg/PoseMixture'))
+
+    tracks = FilterSession(parameters, forward)
+    tracks.take(CAMERA_INFO, small_camera.info())
+    stub_tracker.empty.add(small_camera.stamp(2))
+    for index in range(3):
+        one.take(IMAGE, small_camera.image(index))
+        tracks.take(IMAGE, small_camera.image(index))
+    assert tracked(outputs) == [['p1_1'], ['p1_1'], []]
+    for name in ('roi', 'skeleton2d', 'cropped', 'joint_states'):
+        stamps = [o.stamp_ns for o in outputs if o.topic == body_topic('p1_1', name)]
+        assert stamps == [small_camera.stamp(i) for i in (0, 1)]
 
 
 def test_several_people(session, outputs, people):
@@ -364,7 +400,8 @@ def test_time_that_jumps_back(session, outputs, people):
     one.take(P2, people(9))
     one.take(P1, people(9))
     one.take(P1, people(0))
-    assert tracked(outputs)[-1] == ['p1_1']
+    # Another body, as the track before has ended.
+    assert tracked(outputs)[-1] == ['p1_2']
 
 
 def test_the_same_messages_give_the_same_bytes(session, outputs, people, small_camera):

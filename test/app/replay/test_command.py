@@ -78,9 +78,7 @@ class StandingStill:
 
     made = []  # noqa: RUF012
 
-    def __init__(
-        self, body, camera, settings, background, seed, known_ground=None, shared_background=False
-    ):
+    def __init__(self, body, camera, settings, background, seed, **others):
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
         self.track_id, self.started_from = 1, None
@@ -104,10 +102,7 @@ class StandingStill:
     def point_estimate(self):
         return self.body.prior_mean
 
-    def step(
-        self, image, stamp, keypoints=None, prediction=None, mask=None, *, nobody_predicted=False,
-        others=None,
-    ):  # fmt: skip
+    def step(self, image, stamp, keypoints=None, prediction=None, mask=None, **others):
         self.keypoints.append(None if keypoints is None else keypoints.names)
         self.positions.append(None if keypoints is None else keypoints.positions)
         self.predictions.append(prediction)

@@ -1,0 +1,102 @@
+"""Two people from a bag into a bag."""
+
+import numpy as np
+import pytest
+
+from benchmarks.people import scores, tracks_in
+from hmt_ros.app.crossing_bag import PEOPLE, crossing_takes
+from hmt_ros.app.make_bag import main as make_bag
+from hmt_ros.app.replay.command import main
+from hmt_ros.app.truth import read_truth
+from hmt_ros.body import load_body
+from hmt_ros.body.camera import Viewpoint
+from msg_tools import BagReader
+from msg_tools.messages.detections import people_of_message
+
+SMALL = [
+    'candidates=6',
+    'max_hypotheses=4',
+    'searched_chains=1',
+    'facing_trial=0',
+    'shape_images=0',
+]
+
+
+@pytest.fixture(scope='module')
+def crossing(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('people') / 'crossing'
+    arguments = ['--duration', '3', '--fps', '8', '--size', '240x180', '--seed', '1', '--quiet']
+    assert make_bag(['crossing', '-o', str(folder), *arguments]) == 0
+    return folder
+
+
+def test_a_bag_of_two_people(crossing):
+    with BagReader(crossing) as bag:
+        assert set(bag.topics) == {
+            '/image/compressed', '/camera_info', '/detections',
+            *(f'/humans/bodies/{name}/ground_truth' for name in PEOPLE),
+        }  # fmt: skip
+        messages = [x.message for x in bag.messages(['/detections'])]
+    people = [people_of_message(message, 0.0) for message in messages]
+    assert len(people) == 24
+    assert all(person.name == '' for found in people for person in found)
+    assert {len(found) for found in people} <= {1, 2}
+    assert sum(len(found) == 2 for found in people) > 18
+    # Neither the order nor the number of joints tells who is who.
+    first = [found[0].keypoints.pixels[found[0].keypoints.seen, 0].mean() for found in people[:8]]
+    assert np.ptp(first) > 60
+    hidden = min(person.keypoints.seen.sum() for found in people for person in found)
+    assert hidden < 15
+
+
+def test_two_people_pass_at_half_the_time():
+    takes = crossing_takes(load_body('human37'), 2.0, 10.0, 3, Viewpoint())
+    paths = [take.poses[:, :3] for take in takes]
+    assert paths[0][10, 2] < paths[1][10, 2] - 0.5
+    apart = paths[0][:, 0] - paths[1][:, 0]
+    assert apart[0] * apart[-1] < 0
+    assert abs(apart[10]) < 0.3
+
+
+def test_both_keep_their_tracks(crossing, tmp_path, capsys):
+    settings = [word for each in [*SMALL, 'overlay_modes=0'] for word in ('--set', each)]
+    target = tmp_path / 'tracked'
+    command = [str(crossing), '-o', str(target), '--people', '--quiet', *settings]
+    background = ['--background', str(crossing / 'background.png')]
+    assert main([*command, *background]) == 0, capsys.readouterr().err
+    truths = [read_truth(crossing / f'truth_{name}.npz') for name in PEOPLE]
+    found = scores(truths, tracks_in(target))
+    assert (found['kept'], found['tracks']) == (True, 2)
+    assert found['best, after, mm'] < 120
+    with BagReader(target) as bag:
+        assert {'/people', '/detections', '/humans/bodies/p2/body', '/tf'} <= set(bag.topics)
+        latched = bag.topics['/humans/bodies/p2/body']
+        assert latched.message_count >= 1
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'text'),
+    [
+        (['--live'], '--live does not go with --people'),
+        (['--subject', 'x.yaml'], '--subject does not go with --people'),
+        (['--set', 'use_predictions=true'], 'people_node takes no input of one person'),
+        (['--set', 'max_people=0'], 'max_people must lie between 1 and 20'),
+    ],
+)
+def test_what_does_not_go_with_people(crossing, tmp_path, capsys, arguments, text):
+    assert main([str(crossing), '-o', str(tmp_path / 'x'), '--people', *arguments]) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert text in line
+
+
+def test_a_bag_without_detections(tmp_path, capsys, monkeypatch):
+    from test.test_docs import ROOT
+
+    assert main([str(ROOT / 'bags' / 'reach'), '-o', str(tmp_path / 'x'), '--people']) == 1
+    assert '--people needs the topic detections' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('option', ['--heading', '--stature'])
+def test_what_does_not_go_with_a_crossing(tmp_path, capsys, option):
+    assert make_bag(['crossing', '-o', str(tmp_path / 'x'), option, '1.7']) == 1
+    assert 'does not go with crossing' in capsys.readouterr().err

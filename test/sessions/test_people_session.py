@@ -1,0 +1,362 @@
+"""The rules of several people, with trackers that cost nothing."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.sessions import track_start
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.people_session import DETECTIONS, PEOPLE, PeopleSession, published_topic
+from hmt_ros.tracking import Status
+from hmt_ros.tracking.beginning import Source
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.detections import (
+    NO_KEYPOINTS,
+    PEOPLE_2D,
+    DetectedPerson,
+    people_message,
+    people_of_message,
+)
+from msg_tools.messages.headers import header_message
+from test.sessions.conftest import StubTracker
+
+NAMES = (
+    'left_shoulder', 'right_shoulder', 'left_hip', 'right_hip', 'left_knee', 'right_knee',
+    'left_ankle', 'right_ankle',
+)  # fmt: skip
+SHAPE = np.array([[3, -10], [-3, -10], [2, 0], [-2, 0], [2, 7], [-2, 7], [2, 14], [-2, 14.0]])
+
+
+class Follower(StubTracker):
+    """Stands where its keypoints are, 4 m away, and leaves when it had none for three images."""
+
+    missed = 0
+    pose = None
+    others = None
+
+    @property
+    def modes(self):
+        return SimpleNamespace(
+            poses=np.stack([self.pose] * 2), log_weights=np.log([0.75, 0.25]),
+            log_likelihoods=np.array([-1.0, -2.0]), identities=np.arange(2),
+        )  # fmt: skip
+
+    @property
+    def point_estimate(self):
+        return self.pose
+
+    def step(self, image, stamp, keypoints=None, *args, others=None, **inputs):
+        self.others = others
+        self.image = image
+        seen = keypoints is not None and keypoints.seen.any()
+        self.missed = 0 if seen else self.missed + (keypoints is not None)
+        if not seen and (self.pose is None or self.missed > 2):
+            self.status = Status.NOBODY if self.pose is not None else Status.WAITING
+            return None, None
+        if self.pose is None:
+            self.pose, self.started_from = self.body.prior_mean.copy(), Source.KEYPOINTS
+        if seen:
+            middle = keypoints.pixels[keypoints.seen].mean(0)
+            away = 4.0 if middle[0] < 32 else 5.0
+            ray = self.camera.rays(middle[None])[0]
+            self.pose[:3] = away * ray / ray[2]
+        self._start = SimpleNamespace(means=self.pose[None])
+        return super().step(image, stamp, keypoints, *args, **inputs)
+
+
+@pytest.fixture
+def session(outputs, monkeypatch):
+    monkeypatch.setattr(track_start, 'Tracker', Follower)
+    monkeypatch.setattr(StubTracker, 'made', [])
+
+    def make(**values):
+        return PeopleSession(with_values(PeopleParameters(), values), outputs.append)
+
+    return make
+
+
+def somebody_at(column, name='', row=24.0, names=NAMES, scale=1.0, box=None):
+    pixels = scale * SHAPE[: len(names)] + np.array([column, row])
+    unknown = np.full((len(names), 2, 2), np.nan)
+    keypoints = Keypoints(tuple(names), pixels, unknown, np.full(len(names), 0.9))
+    return DetectedPerson(name, keypoints, box)
+
+
+def seen(camera, index, *people):
+    return people_message(camera.messages, people, camera.stamp(index), 'lens')
+
+
+def show(one, camera, index, *people):
+    """An image and its detections; what became of both."""
+    first = one.take(DETECTIONS, seen(camera, index, *people))
+    second = one.take(IMAGE, camera.image(index))
+    return [*first.warnings, *second.warnings]
+
+
+def listed(outputs):
+    """Identities in the messages about all."""
+    return [
+        [person.name for person in people_of_message(deserialise(x.data, PEOPLE_2D), 0.0)]
+        for x in outputs
+        if x.topic == PEOPLE
+    ]
+
+
+def started(one, camera):
+    one.take(CAMERA_INFO, camera.info())
+    return one
+
+
+def test_two_people_have_topics_of_their_own(session, outputs, small_camera):
+    one = started(session(), small_camera)
+    told = show(one, small_camera, 0, somebody_at(15), somebody_at(50))
+    assert [text.partition(':')[0] for text in told] == ['p1', 'p2']
+    topics = {output.topic for output in outputs}
+    for name in ('p1', 'p2'):
+        for topic in ('body', 'pose_mixture', 'human_joint_states', 'markers'):
+            assert f'humans/bodies/{name}/{topic}' in topics
+    assert '/tf' in topics
+    assert published_topic('humans/bodies/p1/overlay/compressed').msgtype.endswith('ssedImage')
+    assert published_topic('/tf').msgtype == 'tf2_msgs/msg/TFMessage'
+    frames = {
+        each.child_frame_id.partition('/')[0]
+        for x in outputs
+        if x.topic == '/tf'
+        for each in deserialise(x.data, 'tf2_msgs/msg/TFMessage').transforms
+    }
+    assert frames == {'body_p1', 'body_p2'}
+    assert listed(outputs) == [['p1', 'p2']]
+    assert one.state.counts == {'received': 1, 'tracked': 1, 'skipped': 0}
+    assert (one.state.people, one.state.status) == (('p1', 'p2'), 'tracking')
+    # One image, decoded once, and one background.
+    first, second = StubTracker.made
+    assert first.image is second.image
+    assert first.background is second.background
+
+
+def test_identities_stay_through_a_crossing(session, outputs, small_camera):
+    one = started(session(), small_camera)
+    for i in range(11):
+        people = [somebody_at(12 + 4 * i), somebody_at(52 - 4 * i)]
+        show(one, small_camera, i, *(people if i % 2 else people[::-1]))
+    found = people_of_message(deserialise(outputs[-1].data, PEOPLE_2D), 0.0)
+    columns = {x.name: float(np.nanmean(x.keypoints.pixels[:, 0])) for x in found}
+    # In the first image the second one came first.
+    assert columns['p1'] == pytest.approx(12, abs=4)
+    assert columns['p2'] == pytest.approx(52, abs=4)
+    assert len(StubTracker.made) == 2
+
+
+def test_who_is_nearer_hides_who_is_farther(session, small_camera):
+    one = started(session(), small_camera)
+    for i in range(3):
+        show(one, small_camera, i, somebody_at(28), somebody_at(34))
+    near, far = StubTracker.made
+    assert near.pose[2] < far.pose[2]
+    # All that the nearer one covers is unknown to the other, who leaves a part to the nearer one.
+    assert far.others.sum() > 2 * near.others.sum() > 0
+    assert (near.others & far.others).sum() < 0.2 * near.others.sum()
+
+
+def test_an_identity_of_the_detector_is_kept(session, outputs, small_camera):
+    one = started(session(), small_camera)
+    show(one, small_camera, 0, somebody_at(15, 'anna'), somebody_at(50, '7'))
+    # They change places at once: the detector says so.
+    show(one, small_camera, 1, somebody_at(15, '7'), somebody_at(50, 'anna'))
+    assert listed(outputs) == [['anna', 'p7']] * 2
+    columns = [person.pose[0] for person in StubTracker.made]
+    assert columns[0] > 0 > columns[1]
+
+
+def test_somebody_whom_the_detector_gives_another_identity_stays_the_same(
+    session, outputs, small_camera
+):
+    one = started(session(), small_camera)
+    show(one, small_camera, 0, somebody_at(15, '7'), somebody_at(50, 'anna'))
+    show(one, small_camera, 1, somebody_at(16, '9'), somebody_at(50, 'anna'))
+    show(one, small_camera, 2, somebody_at(17, '9'), somebody_at(50, 'anna'))
+    assert listed(outputs) == [['p7', 'anna']] * 3
+
+
+def test_who_leaves_ends_and_who_comes_begins(session, outputs, small_camera):
+    one = started(session(), small_camera)
+    show(one, small_camera, 0, somebody_at(12), somebody_at(50))
+    for i in range(1, 5):
+        show(one, small_camera, i, somebody_at(12))
+    last = [x for x in outputs if x.topic == 'humans/bodies/p2/pose_mixture'][-1]
+    assert not deserialise(last.data, 'hmt_msgs/msg/PoseMixture').components
+    show(one, small_camera, 30, somebody_at(12), somebody_at(50))
+    assert listed(outputs) == [['p1', 'p2']] * 3 + [['p1']] * 2 + [['p1', 'p3']]
+    for i in range(31, 35):
+        show(one, small_camera, i)
+    assert listed(outputs)[-1] == []
+    assert one.state.status == 'nobody'
+
+
+def test_the_largest_are_followed_and_the_others_are_told_once(session, outputs, small_camera):
+    one = started(session(max_people=2), small_camera)
+    crowd = [somebody_at(3 * i, scale=1.0 + 0.05 * i) for i in range(20)]
+    (text,) = [x for x in show(one, small_camera, 0, *crowd) if 'max_people' in x]
+    assert text.startswith('20 people are detected in the image of 17000')
+    assert 'max_people is 2: the others are not followed' in text
+    assert not any('max_people' in x for x in show(one, small_camera, 1, *crowd))
+    assert len(StubTracker.made) == 2
+    # Who stands as near to the largest as those in between may be the same person.
+    assert {round(x.pose[0] * 60 / x.pose[2] + 31.5) for x in StubTracker.made} == {57, 48}
+
+
+@pytest.mark.parametrize(
+    ('people', 'text'),
+    [
+        ([somebody_at(15, 'x'), somebody_at(50, 'x')], "the id 'x' twice, wanted each id once"),
+        ([somebody_at(15), somebody_at(50, names=('left_hip', 'tail', 'nostril', *NAMES[3:]))],
+         "keypoints ['nostril', 'tail'] are not used"),
+    ],
+)  # fmt: skip
+def test_bad_people_are_told_once(session, outputs, small_camera, people, text):
+    one = started(session(), small_camera)
+    assert sum(text in x for x in show(one, small_camera, 0, *people)) == 1
+    assert sum(text in x for x in show(one, small_camera, 1, *people)) == 0
+    assert len(one.state.people) == 2
+
+
+def test_messages_that_contradict_themselves_are_no_detections(session, small_camera):
+    one = started(session(), small_camera)
+    message = seen(small_camera, 0, somebody_at(15))
+    message.ids.append('b')
+    (fault,) = one.take(DETECTIONS, message).faults
+    assert 'people: 2 ids with 1 keypoints, wanted 2 or none' in fault
+    assert one.take(IMAGE, small_camera.image(0)).faults == ()
+    assert StubTracker.made == []
+
+
+def test_detections_without_an_image_and_images_without_detections(session, small_camera):
+    one = started(session(), small_camera)
+    show(one, small_camera, 0, somebody_at(15))
+    one.take(DETECTIONS, seen(small_camera, 0.5, somebody_at(15)))
+    told = show(one, small_camera, 1, somebody_at(15))
+    assert [x for x in told if 'belong to no image' in x]
+    # The image of 2 waits for its detections, until those of 3 come.
+    assert one.take(IMAGE, small_camera.image(2)).published == ()
+    told = show(one, small_camera, 3, somebody_at(15))
+    assert [x for x in told if 'no detections have come for the image' in x]
+    assert one.state.counts['tracked'] == 4
+
+
+def test_a_few_joints_start_nobody(session, small_camera):
+    one = started(session(), small_camera)
+    show(one, small_camera, 0, somebody_at(15, names=NAMES[:4]))
+    assert one.state.followed == ()
+
+
+def test_the_same_person_twice_is_one(session, small_camera):
+    one = started(session(), small_camera)
+    show(one, small_camera, 0, somebody_at(15))
+    show(one, small_camera, 1, somebody_at(15), somebody_at(16))
+    assert one.state.followed == ('p1',)
+
+
+def test_boxes_start_tracks(session, monkeypatch, small_camera):
+    boxes = []
+    monkeypatch.setattr(Follower, 'reset', lambda self, start=None, box=None: boxes.append(box))
+    one = started(session(source='boxes'), small_camera)
+
+    def box(name, column, kind):
+        position = SimpleNamespace(x=column, y=20.0)
+        hypothesis = SimpleNamespace(hypothesis=SimpleNamespace(class_id=kind))
+        return SimpleNamespace(
+            id=name, results=[hypothesis],
+            bbox=SimpleNamespace(
+                center=SimpleNamespace(position=position), size_x=8.0, size_y=60.0
+            ),
+        )  # fmt: skip
+
+    header = header_message(small_camera.messages, small_camera.stamp(0), 'lens')
+    detections = [box('1', 20.0, 'person'), box('2', 40.0, 'dog')]
+    one.take(DETECTIONS, SimpleNamespace(header=header, detections=detections))
+    one.take(IMAGE, small_camera.image(0))
+    assert boxes == [(16, 0, 24, 48)]
+    detections[0].bbox.size_x = 0.0
+    header = header_message(small_camera.messages, small_camera.stamp(1), 'lens')
+    (fault,) = one.take(DETECTIONS, SimpleNamespace(header=header, detections=detections)).faults
+    assert 'wanted a box of px' in fault
+
+
+def test_arrays_of_people(session, small_camera):
+    one = started(session(source='floats'), small_camera)
+    coco = schemes()['coco17'].names
+    rows = np.zeros((2, 17, 3), np.float32)
+    for number, column in enumerate((15, 50)):
+        for name, place in zip(NAMES, SHAPE + np.array([column, 24.0]), strict=True):
+            rows[number, coco.index(name)] = *place, 0.9
+    sizes = zip((str(small_camera.stamp(0)), '', ''), rows.shape, strict=True)
+    layout = small_camera.messages.create(
+        'std_msgs/msg/MultiArrayLayout',
+        dim=[
+            small_camera.messages.create('std_msgs/msg/MultiArrayDimension', label=label, size=size)
+            for label, size in sizes
+        ],
+    )
+    one.take(DETECTIONS, SimpleNamespace(layout=layout, data=rows.ravel()))
+    one.take(IMAGE, small_camera.image(0))
+    assert one.state.people == ('p1', 'p2')
+
+
+def test_an_empty_scene_is_learned_until_somebody_comes(session, small_camera):
+    one = started(session(), small_camera)
+    for i in range(3):
+        show(one, small_camera, i)
+    show(one, small_camera, 3, somebody_at(15))
+    show(one, small_camera, 4, somebody_at(15))
+    assert StubTracker.made[0].background.frames == 3
+
+
+def test_a_jump_back_and_a_reset_begin_anew(session, outputs, small_camera):
+    one = started(session(reset_on_time_jump=True), small_camera)
+    for i in (5, 6, 1, 2, 3):
+        show(one, small_camera, i, somebody_at(15), somebody_at(50))
+    # The detections that came before the image with which time jumps went with the old ones.
+    assert listed(outputs) == [['p1', 'p2']] * 4
+    assert len(StubTracker.made) == 4
+    one.restart()
+    assert one.state.people == ()
+
+
+def test_the_end_of_a_bag_waits_for_nothing(session, small_camera):
+    one = started(session(), small_camera)
+    show(one, small_camera, 0, somebody_at(15))
+    one.take(IMAGE, small_camera.image(1))
+    assert 'pose_mixture' in str(one.finish().published)
+
+
+@pytest.mark.parametrize(
+    ('values', 'text'),
+    [
+        ({'source': 'openpose'}, "source must be one of ('people', 'yolo', 'boxes', 'floats')"),
+        ({'scheme': 'coco'}, "saw 'coco'"),
+        ({'use_predictions': True}, 'people_node takes no input of one person'),
+        ({'subject_file': 'x.yaml'}, "subject_file is 'x.yaml'"),
+    ],
+)
+def test_parameters_of_one_person_are_refused(values, text):
+    with pytest.raises(ValueError, match=r'.') as error:
+        with_values(PeopleParameters(), values)
+    assert text in str(error.value)
+
+
+def test_a_message_and_its_people():
+    from msg_tools import RosbagsMessages
+
+    people = [somebody_at(15, 'a', box=(1.0, 2.0, 30.0, 40.0)), DetectedPerson('b', NO_KEYPOINTS)]
+    message = people_message(RosbagsMessages(), people, 5, 'lens')
+    again = people_of_message(message, 0.0)
+    assert [x.name for x in again] == ['a', 'b']
+    assert again[0].box == (1.0, 2.0, 30.0, 40.0)
+    np.testing.assert_array_equal(again[0].keypoints.pixels, people[0].keypoints.pixels)
+    assert again[1].box is None
+    assert again[1].extent is None
