@@ -121,7 +121,9 @@ def _errors(bag: Path, truth: Truth) -> dict[str, Any]:
     """Errors of the mixtures in a bag, mm."""
     found = score_bag(bag, truth, topics=[POSTERIOR, SMOOTHED])
     return {
-        name: {what: scores.scores.summary()[what] for what in ('heaviest_mm', 'best_mm')}
+        name.strip('/'): {
+            what: scores.scores.summary()[what] for what in ('heaviest_mm', 'best_mm')
+        }
         for name, scores in found.items()
     }
 

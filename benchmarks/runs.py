@@ -29,6 +29,7 @@ from tqdm import tqdm
 
 from benchmarks.clips import ROOT, Clip, at_size, read_clip, read_detections, resized
 from benchmarks.tracker_changes import changed
+from hmt_ros.app.progress import show_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import (
     EVALUATED_JOINTS,
@@ -345,7 +346,7 @@ def in_processes(
     turn = context.Value('i', 0)
     count = min(processes or len(cores), len(items))
     with (
-        tqdm(total=len(items), unit='run', desc=what, disable=None) as bar,
+        show_progress(what, 'runs', len(items)) as bar,
         ProcessPoolExecutor(count, context, _own_a_core, (turn, cores)) as pool,
     ):
         jobs = [pool.submit(work, item) for item in items]

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from itertools import islice
 from typing import Any
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 from benchmarks.clips import Clip, table
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.runs import new_tracker
 from benchmarks.stages import StageClock
+from hmt_ros.app.progress import with_progress
 from hmt_ros.body import load_body
 from hmt_ros.tracking import TrackerSettings
 
@@ -85,9 +84,7 @@ def memory(clip: Clip, frames: int) -> dict[str, Any]:
     every = max(frames // 50, 1)
     seen: list[tuple[int, float]] = []
     images = clip.back_and_forth(frames)
-    for i, (stamp, image) in enumerate(
-        tqdm(images, total=frames, unit='image', desc='memory', disable=not sys.stderr.isatty())
-    ):
+    for i, (stamp, image) in enumerate(with_progress(images, 'memory', 'images', frames)):
         tracker.step(image, stamp)
         if i % every == every - 1:
             seen.append((i + 1, resident_memory()))

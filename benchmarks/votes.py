@@ -11,20 +11,19 @@ up to four.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
 from benchmarks.flips import random_poses
 from benchmarks.machine import description
 from benchmarks.runs import keypoints_only
+from hmt_ros.app.progress import show_progress
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score
@@ -86,10 +85,8 @@ def measure(
 ) -> dict[str, Any]:
     """Everything that was asked for."""
     result: dict[str, Any] = {'machine': description(), 'films': films, 'seeds': seeds}
-    hidden = not sys.stderr.isatty()
     if 'minima' in parts:
-        bar = tqdm(total=len(BODIES) * len(VOTES) * seeds, desc='minima', disable=hidden)
-        with bar:
+        with show_progress('minima', 'runs', len(BODIES) * len(VOTES) * seeds) as bar:
             result['minima'] = {}
             for name in BODIES:
                 found: dict[str, Any] = {}
@@ -104,7 +101,7 @@ def measure(
         runs_of: dict[str, dict[str, list[dict[str, float]]]] = {}
         votes = (*VOTES, ALL)
         total = len(PROCEDURAL_MOTIONS) * films * len(votes)
-        with tqdm(total=total, desc='tracking', disable=hidden) as bar:
+        with show_progress('tracking', 'runs', total) as bar:
             for motion in PROCEDURAL_MOTIONS:
                 for seed in range(films):
                     film = filmed(motion, seed, images)

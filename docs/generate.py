@@ -24,9 +24,11 @@ PAGES = {
     'keypoints_node': 'nodes.md',
     'keypoints_adapter_node': 'nodes.md',
     'hri_node': 'nodes.md',
+    'people_adapter_node': 'nodes.md',
     'people_node': 'nodes.md',
     'bags': 'bags.md',
     'nodes': 'nodes.md',
+    'live': 'nodes.md',
     'soak': 'robustness.md',
     'flips': 'flips.md',
     'kernels': 'likelihood.md',
@@ -88,6 +90,7 @@ def parameter_table(node: str) -> str:
     from hmt_ros.sessions.hri_parameters import HriParameters
     from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
     from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+    from hmt_ros.sessions.people_adapter_parameters import PeopleAdapterParameters
     from hmt_ros.sessions.people_parameters import PeopleParameters
     from hmt_ros.sessions.smoother_parameters import SmootherParameters
 
@@ -98,6 +101,7 @@ def parameter_table(node: str) -> str:
         'keypoints_node': KeypointsParameters(),
         'keypoints_adapter_node': KeypointsAdapterParameters(),
         'hri_node': HriParameters(),
+        'people_adapter_node': PeopleAdapterParameters(),
         'people_node': PeopleParameters(),
     }
     lines = ['| parameter | default | range | takes effect | what |', '|---|---|---|---|---|']

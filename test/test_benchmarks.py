@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import bags, contour_noise, flips, kernels, keypoint_noise, kjs, nodes, votes
+from benchmarks import bags, contour_noise, flips, kernels, keypoint_noise, kjs, live, nodes, votes
 from benchmarks.__main__ import main
 from benchmarks.clips import find_clips, read_clip, table
 from benchmarks.command import run_stages
@@ -274,7 +274,7 @@ def test_command_line(capsys, tmp_path):
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
         "benchmarks: no 'flops', wanted one of bags, contour_noise, experts, flips, "
-        'keypoint_noise, kernels, kjs, motion_prior, nodes, smoothing, soak, tracking, votes'
+        'keypoint_noise, kernels, kjs, live, motion_prior, nodes, smoothing, soak, tracking, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
@@ -339,3 +339,26 @@ def test_correlation_of_keypoints_over_images():
         found = keypoint_noise.correlation(errors, images, apart)
         assert found == pytest.approx(0.8**apart, abs=0.05)
     assert np.isnan(keypoint_noise.correlation(errors[:1], [np.arange(0, 8000, 2)], 1))
+
+
+# live
+
+
+def test_live_tells_of_a_camera_that_does_not_wait():
+    errors = {
+        topic: {'heaviest_mm': 80.4, 'best_mm': 60.6}
+        for topic in ('pose_mixture', 'smoothed_pose_mixture')
+    }
+    found = {
+        'images': 480, 'lost': 2, 'answered': 120, 'latency_ms': {'median': 151.2, '95 %': 190.0},
+        'age_s': {'median': 0.75, '95 %': 0.9}, 'cpu_ms_per_pose': 210.0, **errors,
+    }  # fmt: skip
+    text = live.as_text(
+        {'offline': {'images': 480, **errors}, 'newest': found, 'queue': 'skipped: no ROS'}
+    )
+    offline, newest, queue = (' '.join(line.split()) for line in text.splitlines()[-3:])
+    assert offline == 'offline, every image 480 0 100 % 80 mm 61 mm 80 mm'
+    assert newest == (
+        'newest complete image 480 2 25 % 151 ms 190 ms 210 ms 0.75 s 0.90 s 80 mm 61 mm 80 mm'
+    )
+    assert queue == 'queue_size 5 skipped: no ROS'

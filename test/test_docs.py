@@ -24,6 +24,7 @@ from hmt_ros.sessions import (
     hri_session,
     keypoints_adapter_session,
     keypoints_session,
+    people_adapter_session,
     people_session,
     smoothed_messages,
     track_messages,
@@ -34,6 +35,7 @@ from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.hri_parameters import HriParameters
 from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
 from hmt_ros.sessions.keypoints_parameters import KeypointsParameters
+from hmt_ros.sessions.people_adapter_parameters import PeopleAdapterParameters
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.tracking.subject import parse_subject
@@ -52,9 +54,10 @@ BLOCK = re.compile(r'^(<!-- run -->\n)?```(\w+)\n(.*?)^```$', re.MULTILINE | re.
 NODES = {
     'filter_node': (FilterParameters(), track_messages.TOPICS),
     'smoother_node': (SmootherParameters(), smoothed_messages.TOPICS),
-    'bme_node': (BmeParameters(), bme_session.TOPICS),
+    'bme_node': (BmeParameters(), bme_session.BmeSession.TOPICS),
     'keypoints_node': (KeypointsParameters(), keypoints_session.TOPICS),
     'keypoints_adapter_node': (KeypointsAdapterParameters(), keypoints_adapter_session.TOPICS),
+    'people_adapter_node': (PeopleAdapterParameters(), people_adapter_session.TOPICS),
     'people_node': (PeopleParameters(), people_session.PeopleSession.TOPICS),
     'hri_node': (
         HriParameters(),

@@ -147,6 +147,10 @@ def test_three_nodes_in_the_namespace_of_a_person(actions):
     }
     assert set(made['filter_node']['remappings']) == wanted
     assert set(made['bme_node']['remappings']) == wanted
+    # The filter tells when predictions may be rare; without it they are all there is.
+    assert parameters(made['bme_node'])['tracked_interval'] == 0.2
+    alone = parameters(actions(nodes='bme_node')['bme_node'])
+    assert alone['tracked_interval'] == 0.0
     assert made['smoother_node']['remappings'] == []
 
 

@@ -1,7 +1,7 @@
 """A rendered bag of two people who walk past each other, one before the other.
 
-The bag has the topics `image/compressed`, `camera_info`, `detections` (hmt_msgs/People2D: COCO
-keypoints of both, without identities) and `humans/bodies/a/ground_truth`, `.../b/ground_truth`
+The bag has the topics `/image/compressed`, `/camera_info`, `/detections` (hmt_msgs/People2D: COCO
+keypoints of both, without identities) and `/humans/bodies/a/ground_truth`, `.../b/ground_truth`
 (hmt_msgs/PoseMixture). A keypoint that the other person hides is not detected, and somebody of whom
 fewer than `FEWEST` keypoints are seen is not detected at all. The order of the people in a message
 is random. Beside the bag are `background.png`, and `truth_a.npz` and `truth_b.npz` as those of
@@ -16,8 +16,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
+from hmt_ros.app.progress import show_progress
 from hmt_ros.app.rendered_bag import FRAME_ID, Take, ground_truth
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.camera import Viewpoint
@@ -82,12 +82,11 @@ def write_crossing(
     """
     messages = RosbagsMessages()
     rng = np.random.default_rng([scene.seed, OF_DETECTIONS])
-    hidden = None if progress else True
     count = len(takes[0].poses)
     joints = [take.body.joint_positions(take.poses) for take in takes]
     with (
         BagWriter(folder) as bag,
-        tqdm(total=count, unit='image', desc=folder.name, disable=hidden) as bar,
+        show_progress(folder.name, 'images', count, quiet=not progress) as bar,
     ):
         for frame in range(count):
             stamp = takes[0].stamp_ns(frame)

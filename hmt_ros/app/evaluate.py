@@ -64,7 +64,7 @@ def _parser() -> CommandParser:
         help='seed of the samples from which coverage is estimated (default: 0)',
     )
     parser.add_argument('--json', action='store_true', help='print one JSON object')
-    parser.add_argument('--quiet', action='store_true', help='show no progress bar')
+    parser.add_argument('--quiet', action='store_true', help='show no progress')
     return parser
 
 

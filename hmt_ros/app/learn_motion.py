@@ -83,7 +83,7 @@ def _parser() -> CommandParser:
         '--acknowledgement', default='', metavar='TEXT', help='what the file says of the sources'
     )
     parser.add_argument('--overwrite', action='store_true', help='replace an existing file')
-    parser.add_argument('--quiet', action='store_true', help='no progress bar, no summary')
+    parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
     return parser
 
 

@@ -51,7 +51,7 @@ def _parser() -> CommandParser:
         '-o', '--output', type=Path, required=True, metavar='PRIOR.npz', help='file of the prior'
     )
     parser.add_argument('--overwrite', action='store_true', help='replace an existing file')
-    parser.add_argument('--quiet', action='store_true', help='no progress bar, no summary')
+    parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
     parser.add_argument('--body', default='human37', help='body model: a name or a YAML file')
     parser.add_argument(
         '--without', nargs='+', default=[], metavar='NAME',

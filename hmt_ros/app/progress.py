@@ -11,6 +11,7 @@ stdout is left to results.
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Generator, Iterable
@@ -59,10 +60,10 @@ class ProgressLines:
         self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._ended.set()
         self._thread.join()
-        if self._printed:
+        if self._printed and kind is None:
             counted = f'{self._count} {self._unit} in ' if self._unit else ''
             self._print(f'{counted}{_duration(self._clock() - self._start)}')
 
@@ -76,17 +77,15 @@ class ProgressLines:
         so_far = f'{_duration(spent)} so far'
         if not self._unit:
             return so_far
-        known = self.total is not None and self.total >= self._count
-        parts = [f'{self._count} of {self.total:g} {self._unit}' if known else '']
-        parts[0] = parts[0] or f'{self._count} {self._unit}'
-        rate = self._count / spent if spent > 0 else 0.0
-        if rate:
-            parts.append(f'{rate:.3g} a second')
-        if rate and known and self.total is not None:
-            parts.append(f'{_duration((self.total - self._count) / rate)} left')
-        else:
-            parts.append(so_far)
-        return ', '.join(parts)
+        count, total = self._count, self.total
+        if total is not None and total < count:
+            total = None  # a bag may have more than it tells
+        done = f'{count} {self._unit}' if total is None else f'{count} of {total:.0f} {self._unit}'
+        if not count or not spent:
+            return f'{done}, {so_far}'
+        rate = count / spent
+        rest = so_far if total is None else f'{_duration((total - count) / rate)} left'
+        return f'{done}, {rate:.3g} a second, {rest}'
 
     def _print_lines(self) -> None:
         while not self._ended.wait(INTERVAL):
@@ -111,7 +110,7 @@ def show_progress(
         total: number of units of the whole; None if unknown.
         quiet: whether nothing is shown.
     """
-    if quiet or sys.stderr.isatty():
+    if quiet or _is_wide_terminal():
         # One bar below another is removed at its end.
         return tqdm(desc=what, unit=f' {unit}', total=total, disable=quiet, leave=None)
     return ProgressLines(what, unit, total)
@@ -135,6 +134,14 @@ def with_progress(
 def tell_user(command: str, text: str) -> None:
     """Prints a line for the user on stderr, above the bar of `show_progress`."""
     tqdm.write(f'{command}: {text}', file=sys.stderr)
+
+
+def _is_wide_terminal() -> bool:
+    """Whether stderr is a terminal with room for a bar; those of containers may have no columns."""
+    try:
+        return sys.stderr.isatty() and os.get_terminal_size(sys.stderr.fileno()).columns > 0
+    except (OSError, ValueError):
+        return False
 
 
 def _duration(seconds: float) -> str:

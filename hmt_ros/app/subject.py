@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
+from hmt_ros.app.progress import with_progress
 from hmt_ros.app.replay.inputs import recorded_input
 from hmt_ros.body import Body, load_body
 from hmt_ros.image.keypoint_schemes import landmarks_of
@@ -143,7 +144,8 @@ def find_start(
         if topic is None:
             raise ValueError(f'{path} has no keypoints: import them with the video')
         first: int | None = None
-        for stored in bag.messages([topic.name]):
+        messages = bag.messages([topic.name])
+        for stored in with_progress(messages, str(path), 'messages', topic.message_count):
             stamp = time_ns(stored.message.header.stamp)
             first = stamp if first is None else first
             names = stored.message.names

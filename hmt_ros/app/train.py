@@ -87,7 +87,7 @@ def _parser() -> CommandParser:
         '-o', '--output', type=Path, required=True, metavar='MODEL.npz', help='file of the model'
     )
     parser.add_argument('--overwrite', action='store_true', help='replace an existing file')
-    parser.add_argument('--quiet', action='store_true', help='no progress bar, no summary')
+    parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
     parser.add_argument(
         '--seed', type=whole_number(0), default=0, help='seed of all random choices (0)'
     )

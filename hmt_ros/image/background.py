@@ -142,6 +142,11 @@ class BackgroundModel:
         """Pixels (H, W) that have not been seen without the person since `forget`; None: none."""
         return None if self._parts is None else self._parts.unknown
 
+    @property
+    def empty(self) -> Image:
+        """The empty scene (H, W, 3), as far as it is known."""
+        return np.asarray(self._model.getBackgroundImage(), dtype=np.uint8)
+
     def foreground(self, image: Image) -> Mask:
         """Pixels (H, W) that differ from the background and are no shadow.
 
@@ -214,7 +219,7 @@ class BackgroundModel:
     def _is_beside(self, image: Image) -> Mask:
         """Pixels (H, W) whose colour the background has beside them: its edges, slightly moved."""
         if self._nearby is None:
-            empty = np.asarray(self._model.getBackgroundImage(), dtype=np.uint8)
+            empty = self.empty
             square = np.ones((3, 3), np.uint8)
             darkest, brightest = cv2.erode(empty, square), cv2.dilate(empty, square)
             margin = np.full_like(empty, BESIDE)

@@ -15,6 +15,9 @@ from typing import Any
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.qos import qos_policy_name_from_kind
 
+from hmt_ros.nodes.silent_topics import SilentTopics
+from hmt_ros.sessions.session import SessionState
+
 
 class Rates:
     """Rates in the last period of the diagnostics.
@@ -24,26 +27,35 @@ class Rates:
         done: what those are called that were used, 'tracked'.
 
     Attributes:
+        name: of the messages.
         dropped, faults, lost: of the period.
+        computing: how long a message takes, in words.
     """
 
     def __init__(self, name: str, done: str) -> None:
         self.dropped = 0
         self.faults = 0
         self.lost = 0
-        self._name, self._done = name, done
+        self.computing = 'computing takes too long'
+        self.name, self._done = name, done
         self._received = self._used = 0.0
         self._latencies: list[float] = []
         self._counts: Counter[str] = Counter()
         self._began = time.monotonic()
 
-    def next_period(self, counts: Counter[str], latencies: list[float]) -> None:
+    def next_period(
+        self, counts: Counter[str], latencies: list[float], durations: list[float]
+    ) -> None:
         """Ends a period.
 
         Args:
             counts: 'received', 'dropped', 'faults', 'lost' and those used, since the start.
             latencies: of the period, s.
+            durations: of the computations in the period, s.
         """
+        if durations:
+            mean = 1e3 * sum(durations) / len(durations)
+            self.computing = f'computing takes {mean:.0f} ms for one of the {self.name}'
         now = time.monotonic()
         # A node that was configured anew counts anew.
         change = counts - self._counts
@@ -58,8 +70,8 @@ class Rates:
         """Keys and values of the diagnostics."""
         known = self._latencies or [math.nan]
         return [
-            (f'{self._name} received a second', f'{self._received:.1f}'),
-            (f'{self._name} {self._done} a second', f'{self._used:.1f}'),
+            (f'{self.name} received a second', f'{self._received:.1f}'),
+            (f'{self.name} {self._done} a second', f'{self._used:.1f}'),
             ('latency, mean, ms', f'{1e3 * sum(known) / len(known):.1f}'),
             ('latency, largest, ms', f'{1e3 * max(known):.1f}'),
         ]
@@ -72,9 +84,26 @@ class Rates:
             latency = f', latency {mean:.0f} ms'
         dropped = f', {self.dropped} dropped' if self.dropped else ''
         return (
-            f'{self._received:.1f} {self._name} a second, {self._used:.1f} {self._done}'
+            f'{self._received:.1f} {self.name} a second, {self._used:.1f} {self._done}'
             f'{latency}{dropped}'
         )
+
+
+def trouble_of_period(state: SessionState, rates: Rates, silent: SilentTopics) -> str:
+    """What went wrong in the last period, the reason first; '' if nothing did."""
+    name, why = rates.name, '; '.join(silent.texts.values())
+    if rates.dropped:
+        held_up = f'waits for {state.held_up}' if state.held_up else rates.computing
+        return f'{why or held_up}; late: {rates.dropped} {name} dropped in a second'
+    if rates.faults:
+        return state.last_fault
+    if rates.lost:
+        return f'{rates.lost} messages lost on their way in a second'
+    if silent.silence:
+        return f'no {name} for {silent.silence:.0f} s; {why}'.removesuffix('; ')
+    if state.wants:
+        return f'waits for {state.wants}; {why}'.removesuffix('; ')
+    return why
 
 
 class MiddlewareEvents:

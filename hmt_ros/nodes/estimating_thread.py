@@ -191,6 +191,7 @@ class EstimatingThread:
         self._tell, self._tell_change = tell, tell_change
         self._inner_faults, self._log_error = inner_faults, log_error
         self._latencies: deque[float] = deque(maxlen=1000)
+        self._durations: deque[float] = deque(maxlen=1000)
         self._arrivals: dict[int, float] = {}
         self._thread = threading.Thread(target=self._work, name='estimate', daemon=True)
         self._thread.start()
@@ -221,6 +222,10 @@ class EstimatingThread:
     def take_latencies(self) -> list[float]:
         """Times from the arrival of messages to their estimates, s, since the last call."""
         return [self._latencies.popleft() for _ in range(len(self._latencies))]
+
+    def take_durations(self) -> list[float]:
+        """Times that estimates took by themselves, s, since the last call."""
+        return [self._durations.popleft() for _ in range(len(self._durations))]
 
     def stop(self, timeout: float | None = None) -> bool:
         """Ends the thread after the present message; drops what waits, except a restart.
@@ -268,7 +273,7 @@ class EstimatingThread:
             self._tell_change()
 
     def _handle(self, waiting: Waiting, *, more: bool) -> None:
-        session = self._session
+        session, began = self._session, time.monotonic()
         if waiting.source == _RESTART:
             waiting.content()
             return
@@ -288,9 +293,11 @@ class EstimatingThread:
             handled = session.refuse(waiting.source, error_line(error), more=more)
         else:
             handled = session.take(waiting.source, message, more=more)
-        if session.state.counts[session.DONE] > done:
+        if more_done := session.state.counts[session.DONE] - done:
             # An image may have waited for this message, which came later.
             newest = max((stamp for _, stamp in handled.published), default=0)
             arrival = self._arrivals.get(newest, waiting.arrival)
-            self._latencies.append(time.monotonic() - arrival)
+            now = time.monotonic()
+            self._latencies.append(now - arrival)
+            self._durations.append((now - began) / more_done)
         self._tell(handled)

@@ -63,6 +63,7 @@ class FilterNode(SessionNode[FilterSession, FilterParameters]):
             )
         except ValueError as error:
             response.success, response.message = False, error_line(error)
+            self.get_logger().warn(f'~/reset is refused: {response.message}')
             return response
         thread.restart(lambda: session.restart(start))
         response.success = True
@@ -76,6 +77,7 @@ class FilterNode(SessionNode[FilterSession, FilterParameters]):
                 'the track is dropped; nothing starts a new one without subject_file, '
                 'use_keypoints, use_mask or use_predictions'
             )
+        self.get_logger().info(f'~/reset: {response.message}')
         return response
 
 

@@ -13,7 +13,9 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
+from hmt_ros.nodes.node_parameters import files_for_others
 from hmt_ros.nodes.session_node import SessionNode
+from hmt_ros.nodes.usage import usage, wants_help
 from msg_tools.files.error_line import error_line
 
 # Environment variable with the id of the process without which a node ends.
@@ -25,6 +27,10 @@ _LAST_ESTIMATE = 5.0
 
 def run(kind: type[SessionNode[Any, Any]], args: list[str] | None = None) -> int:
     """Runs a node until a signal stops it; returns 0, or 1 if it could not start."""
+    arguments = sys.argv[1:] if args is None else args
+    if wants_help(arguments):
+        sys.stdout.write(usage(kind))
+        return 0
     # The handlers of rclpy end the context in the middle of the work; ours let the work finish.
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -38,6 +44,8 @@ def run(kind: type[SessionNode[Any, Any]], args: list[str] | None = None) -> int
         return 1
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    for text in files_for_others(arguments, node.get_fully_qualified_name()):
+        node.get_logger().warn(text)
     node.start()
     # A process that started a node and was killed can not end it any more.
     owner = os.environ.get(OWNER)

@@ -17,12 +17,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, ClassVar, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidHandle
@@ -30,8 +25,16 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates
+from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates, trouble_of_period
 from hmt_ros.nodes.estimating_thread import EstimatingThread, InnerFaults
+from hmt_ros.nodes.node_parameters import (
+    QOS_OVERRIDES,
+    as_in_ros,
+    descriptor,
+    next_step,
+    unknown_parameters,
+)
+from hmt_ros.nodes.silent_topics import SilentTopics
 from hmt_ros.nodes.subscribed_topic import (
     ANSWERS,
     LATCHED,
@@ -40,11 +43,7 @@ from hmt_ros.nodes.subscribed_topic import (
     message_class,
 )
 from hmt_ros.sessions.declared_parameters import (
-    AT_LAUNCH,
-    EFFECTS,
-    DeclaredParameter,
     NodeParameters,
-    Value,
     declared_parameters,
     with_values,
 )
@@ -57,9 +56,6 @@ from msg_tools.messages.cdr import serialise
 
 AnySession = TypeVar('AnySession', bound=Session[Any, Any])
 Parameters = TypeVar('Parameters', bound=NodeParameters)
-
-# An active node that is sent nothing for so long says so, s.
-_SILENCE = 3.0
 
 
 class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
@@ -85,11 +81,12 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         super().__init__(self.NAME, **options)
         declared = declared_parameters(defaults := self._defaults())
         self.declare_parameters(
-            '', [(p.name, _as_in_ros(p.default), _descriptor(p)) for p in declared]
+            '', [(p.name, as_in_ros(p.default), descriptor(p)) for p in declared]
         )
         values = {p.name: self.get_parameter(p.name).value for p in declared}
         self._settings: Parameters = with_values(defaults, values)
         self._names = values.keys()
+        self._warn_of_unknown(qos=False)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._refuse_impossible_transitions()
         self._session: AnySession | None = None
@@ -103,9 +100,9 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._own = OwnMessages()
         self._failure = ''
         self._inner_faults = InnerFaults()
-        self._last_arrival: float | None = None
         self._ticks, self._told_at = 0, 0
         self._events = MiddlewareEvents(self.get_logger().warn)
+        self._silent = SilentTopics(self, self.get_logger().warn)
         self._counted = f'{self.SESSION.UNIT}s'
         self._rates = Rates(self._counted, self.SESSION.DONE)
         self._diagnostics = self.create_publisher(
@@ -161,7 +158,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         try:
             self._session = self.SESSION(self._settings, self._publish, self._is_wanted)
         except ValueError as error:
-            self._failure = error_line(error)
+            self._failure = f'{error_line(error)}; {next_step(self, error, self.SESSION.CHECKED)}'
             self.get_logger().error(self._failure)
             self._diagnose()
             return TransitionCallbackReturn.FAILURE
@@ -201,8 +198,11 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             log_error=self.get_logger().error,
         )
         self._heard = {one.topic for one in inputs} & self._outputs.keys()
+        session.topic_names = {one.source: self.resolve_topic_name(one.topic) for one in inputs}
+        self._silent.listen(inputs, self.SESSION.COUNTED)
         for one in inputs:
             self._subscribe(one)
+        self._warn_of_unknown(qos=True)
         topic = self._inputs[-1].topic_name
         wants = session.state.wants
         self.get_logger().info(f'{self._counted} from {topic}; waits for {wants}')
@@ -239,8 +239,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             if wanted.topic in self._heard and self._own.is_own(data):
                 return
             now = time.monotonic()
-            if wanted.source == self.SESSION.COUNTED:
-                self._last_arrival = now
+            self._silent.arrived(wanted.source, now)
             thread.put(wanted.source, data, now)
 
         events = self._events.of_subscription(self.resolve_topic_name(wanted.topic))
@@ -261,7 +260,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             self.destroy_subscription(subscription)
         self._inputs.clear()
         self._events.forget()
-        self._last_arrival = None
+        self._silent.listen(())
 
     def _deaf_topic(self) -> str:
         """A topic whose publishers all have a quality of service that does not fit, and why."""
@@ -307,6 +306,16 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
 
     # Parameters.
 
+    def _warn_of_unknown(self, *, qos: bool) -> None:
+        """Warns of values for parameters that the node does not have.
+
+        Args:
+            qos: of those of subscriptions, which are declared with these, or of the others.
+        """
+        given = [x for x in self._parameter_overrides if x.startswith(QOS_OVERRIDES) == qos]
+        for text in unknown_parameters(given, self._parameters):
+            self.get_logger().warn(text)
+
     def _on_set_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         changed = {p.name: p.value for p in parameters if p.name in self._names}
         if not changed:
@@ -327,6 +336,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     # Called by the thread that estimates.
 
     def _tell(self, handled: Handled) -> None:
+        for text in handled.events:
+            self.get_logger().info(text)
         for text in handled.warnings:
             self.get_logger().warn(f'{text} (more of the kind are counted in /diagnostics)')
         if self._handled.get_subscription_count():
@@ -350,7 +361,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             counts['faults'] = state.faults.total()
         counts['lost'] = self._events.lost
         latencies = [] if self._thread is None else self._thread.take_latencies()
-        self._rates.next_period(counts, latencies)
+        durations = [] if self._thread is None else self._thread.take_durations()
+        self._rates.next_period(counts, latencies, durations)
+        if self._session is not None and self._inputs:
+            self._silent.look(self._session.needed_inputs())
         self._diagnose()
         self._log_status(counts)
 
@@ -372,26 +386,20 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             return DiagnosticStatus.ERROR, self._failure
         if state is None or label != 'active':
             return DiagnosticStatus.OK, label
-        trouble = state.trouble() or self._deaf_topic() or self._trouble_of_period(state)
+        trouble = (
+            state.trouble()
+            or self._deaf_topic()
+            or trouble_of_period(state, self._rates, self._silent)
+        )
         if trouble:
             return DiagnosticStatus.WARN, trouble
         return DiagnosticStatus.OK, f'{state.status}, {state.summary()}'
 
-    def _trouble_of_period(self, state: SessionState) -> str:
-        rates = self._rates
-        if rates.dropped:
-            return f'late: {rates.dropped} {self._counted} dropped in a second'
-        if rates.faults:
-            return state.last_fault
-        if rates.lost:
-            return f'{rates.lost} messages lost on their way in a second'
-        if state.wants:
-            return f'waits for {state.wants}'
-        if self._last_arrival is not None:
-            silence = time.monotonic() - self._last_arrival
-            if silence > _SILENCE:
-                return f'no {self._counted} for {silence:.0f} s'
-        return ''
+    def _hardware(self, state: SessionState | None) -> str:
+        """The camera: the frame that its messages name, or else the topic that they come on."""
+        if state is not None and state.frame_id:
+            return state.frame_id
+        return self._inputs[-1].topic_name if self._inputs else ''
 
     def _diagnose(self) -> None:
         label = self._state_machine.current_state[1]
@@ -399,6 +407,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         name = f'{self.get_fully_qualified_name().strip("/")}: {self.SUBJECT}'
         level, text = self._judgement(label, state)
         status = DiagnosticStatus(name=name, level=level, message=text)
+        status.hardware_id = self._hardware(state)
         values = [('lifecycle', label)]
         if state is not None:
             values += [
@@ -412,6 +421,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
                 ('last fault', state.last_fault),
                 ('errors of the node itself', str(self._inner_faults.count)),
                 ('last error of the node itself', self._inner_faults.last),
+                *((f'nothing on {topics}', why) for topics, why in self._silent.texts.items()),
                 *self._events.values(),
                 *self._rates.values(),
                 *(
@@ -423,27 +433,3 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
-
-
-def _as_in_ros(value: Value) -> Any:
-    """A value of a parameter as ROS takes it."""
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
-    """How a parameter is declared to ROS: description, limits, whether it can change."""
-    descriptor = ParameterDescriptor(
-        description=f'{parameter.description} {EFFECTS[parameter.effect]}',
-        read_only=parameter.effect == AT_LAUNCH,
-        # ROS gives an empty list, and one of whole numbers, another type than one of numbers.
-        dynamic_typing=isinstance(parameter.default, tuple),
-    )
-    if parameter.limits is not None:
-        low, high = parameter.limits
-        if isinstance(parameter.default, int):
-            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
-        else:
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=float(low), to_value=float(high))
-            ]
-    return descriptor

@@ -11,6 +11,9 @@ order give the same bytes. The rules, besides those of `CameraSession`:
   person is tracked, images within `tracked_interval` after the last prediction are not looked at.
   What is then published has no components and the state of the track, so that who waits for a
   prediction goes on: not looked at, which is not the same as nobody seen.
+- The silhouette of every image is published if somebody subscribes to it: that of the background
+  subtraction, empty while the background is being learned. An image that is left to the track has
+  one, too. With `use_mask` there is none besides the mask.
 - An image that is not younger than the one before is skipped, or is the first of a new sequence
   with `reset_on_time_jump`.
 - With `propagate` a prediction takes the one before into account, unless this is older than
@@ -41,6 +44,7 @@ from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
+    CAMERA_MOVED,
     FRAME_ID,
     IMAGE,
     CameraSession,
@@ -52,7 +56,7 @@ from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.session import PublishedTopic, SessionState, everything
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.headers import SECOND_NS, time_ns
-from msg_tools.messages.images import decode_image
+from msg_tools.messages.images import decode_image, image_message
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,
@@ -63,8 +67,10 @@ from msg_tools.messages.pose_mixtures import (
 __all__ = ['CAMERA_INFO', 'IMAGE', 'PREDICTION', 'TOPICS', 'TRACK', 'BmeSession', 'BmeState']
 
 PREDICTION = 'pose_prediction'
-TRACK = 'pose_mixture'
+TRACK, SILHOUETTE = 'pose_mixture', 'silhouette'
 TOPICS = {PREDICTION: PublishedTopic('hmt_msgs/msg/PoseMixture')}
+# Silhouettes are large: bags have none.
+_TOPICS_OF_NODE = {**TOPICS, SILHOUETTE: PublishedTopic('sensor_msgs/msg/Image')}
 
 
 # Time after which a track that is not heard of is not relied on any more.
@@ -84,15 +90,21 @@ class BmeState(SessionState):
         modes: components of the last prediction.
         height: of the last silhouette, px.
         support: 0 to 1, how far the silhouette is like those of the training set.
+        moved: whether the camera has moved since the background was taken.
     """
 
     modes: int = 0
     height: int = 0
     support: float = math.nan
+    moved: bool = False
 
     def summary(self) -> str:
         """The present estimate in a few words."""
         return f'{self.modes} modes'
+
+    def trouble(self) -> str:
+        """Whether the background is of no use."""
+        return CAMERA_MOVED if self.moved else ''
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
@@ -117,7 +129,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
     `predict_once` may be called by any thread.
     """
 
-    TOPICS = TOPICS
+    TOPICS = _TOPICS_OF_NODE
     DONE = 'predicted'
     ESTIMATE = 'the sequence'
     CHECKED = ('model_file', 'background_file', 'stature')
@@ -158,24 +170,33 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._tracked = stamp if tracked else None
 
     def _take_image(self, message: Any, stamp: int) -> None:
-        if not self._is_left_to_track(stamp):
+        in_turn = not self._waiting and self._newest is not None and stamp > self._newest
+        if not in_turn or not self._is_left_to_track(stamp) or self._wanted(SILHOUETTE):
             super()._take_image(message, stamp)
             return
+        # Not even decoded.
         self._newest = stamp
-        self._log.counts['left'] += 1
-        if self._wanted(PREDICTION):
-            frame = str(message.header.frame_id) or self._frame or FRAME_ID
-            made = self._message(None, stamp, frame, TrackState.TRACKING)
-            self._publish(PREDICTION, stamp, made)
+        self._leave_to_track(stamp, str(message.header.frame_id) or self._frame or FRAME_ID)
 
     def _is_left_to_track(self, stamp: int) -> bool:
-        """Whether an image need not be looked at, nor decoded."""
+        """Whether an image need not be predicted from."""
         interval = self.parameters.tracked_interval * SECOND_NS
-        if self._waiting or self._looked is None or self._tracked is None or self._newest is None:
+        if self._looked is None or self._tracked is None:
             return False
-        return self._newest < stamp < self._looked + interval and stamp - self._tracked <= _SURE_NS
+        return stamp < self._looked + interval and stamp - self._tracked <= _SURE_NS
+
+    def _leave_to_track(self, stamp: int, frame_id: str) -> None:
+        self._log.counts['left'] += 1
+        if self._wanted(PREDICTION):
+            made = self._message(None, stamp, frame_id, TrackState.TRACKING)
+            self._publish(PREDICTION, stamp, made)
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
+        if self._is_left_to_track(waiting.stamp_ns):
+            if waiting.mask is None and not self._images_to_learn():
+                self._publish_silhouette(self._silhouette(waiting.image), waiting)
+            self._leave_to_track(waiting.stamp_ns, waiting.frame_id)
+            return
         self._looked = waiting.stamp_ns
         try:
             mixture = self._mixture_of(waiting, camera)
@@ -202,9 +223,15 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if self._images_to_learn() and (given is None or not given.any()):
             with self._background_in_use:
                 self._background.learn(waiting.image)
+            if given is None:
+                self._publish_silhouette(np.zeros(waiting.image.shape[:2], np.bool_), waiting)
             return None
-        background = p.background
-        mask = self._silhouette(waiting.image) if given is None else one_person(given, background)
+        if given is None:
+            self._watch_scene(waiting)
+            mask = self._silhouette(waiting.image)
+            self._publish_silhouette(mask, waiting)
+        else:
+            mask = one_person(given, p.background)
         self._height = _height(mask)
         if self._height < p.least_height:
             return None
@@ -216,6 +243,10 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         for text in found.place.remarks:
             self._log.note(Fault.SILHOUETTE, f'image of {waiting.stamp_ns} ns: {text}')
         return found.mixture
+
+    def _watch_scene(self, waiting: WaitingImage) -> None:
+        with self._background_in_use:
+            self._look_at_scene(waiting, self._background, 'configure the node anew')
 
     def _one_step_before(self, stamp_ns: int) -> GaussianMixture | None:
         """The poses one step of the dynamics before an image, as far as they are known."""
@@ -238,6 +269,12 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             max_components=self.parameters.max_hypotheses,
             size_spread=self._size_spread,
         )
+
+    def _publish_silhouette(self, mask: Mask, of: WaitingImage) -> None:
+        if self._wanted(SILHOUETTE):
+            picture = np.where(mask, np.uint8(255), np.uint8(0))
+            made = image_message(self._messages, picture, of.stamp_ns, of.frame_id)
+            self._publish(SILHOUETTE, of.stamp_ns, made)
 
     def _silhouette(self, image: NDArray[np.uint8]) -> Mask:
         with self._background_in_use:
@@ -303,6 +340,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             modes=len(self._weights),
             height=self._height,
             support=self._support,
+            moved=self._watch.moved,
         )
 
     def _status(self) -> tuple[str, str]:

@@ -46,6 +46,7 @@ class CameraFrames:
     Attributes:
         gravity: what was seen of it last; None: nothing yet.
         newest: whether that was at the image that was looked up last.
+        heard: whether any transform has come.
         pose: of the camera in `fixed_frame` at the image that was looked up last; None: unknown.
     """
 
@@ -56,6 +57,7 @@ class CameraFrames:
         self.newest = False
         self.pose: Transform | None = None
         self._floor = floor
+        self.heard = False
         self._transforms = TransformBuffer()
 
     @property
@@ -65,6 +67,7 @@ class CameraFrames:
 
     def take(self, message: Any, *, static: bool) -> list[str]:
         """Takes a tf2_msgs/TFMessage; see `TransformBuffer.put`."""
+        self.heard = True
         return self._transforms.put(message, static=static)
 
     def forget_after(self, stamp_ns: int) -> None:

@@ -11,6 +11,7 @@ zero says that nobody was seen.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable
@@ -18,19 +19,23 @@ from itertools import takewhile
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from hmt_ros.body import Camera
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.scene_watch import SceneWatch
 from hmt_ros.inference.arrays import Image, Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.declared_parameters import CameraNodeParameters
 from hmt_ros.sessions.handled import Fault, Handled, Output
-from hmt_ros.sessions.session import Order, Session, State, everything
+from hmt_ros.sessions.named_frames import NamedFrames
+from hmt_ros.sessions.session import NeededInput, Order, Session, State, everything
 from msg_tools.files.bounded_file import read_bytes
-from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
+from msg_tools.messages.camera_info import CameraInfoError, UncalibratedError, camera_from_info
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.images import ImageError, decode_image, decode_mask, decode_picture
 
 CAMERA_INFO, IMAGE = 'camera_info', 'image'
 MASK, COMPRESSED_MASK = 'mask', 'mask/compressed'
 MASKS = (MASK, COMPRESSED_MASK)
+CAMERA_MOVED = 'the camera has moved since the background was taken'
 FRAME_ID = 'camera_optical_frame'  # where neither image nor camera_info names a frame
 
 T = TypeVar('T')
@@ -74,6 +79,9 @@ class CameraSession(Session[CameraParameters, State]):
         super().__init__(parameters, publish, wanted)
         self._camera: Camera | None = None
         self._frame = ''
+        self._frames = NamedFrames(IMAGE, CAMERA_INFO)
+        self._uncalibrated = ''
+        self._watch = SceneWatch()
         self._waiting: deque[WaitingImage] = deque()
         self._newest: int | None = None
         self._masks: StampedInputs[Mask] = StampedInputs(_REMEMBERED_MASKS)
@@ -82,6 +90,15 @@ class CameraSession(Session[CameraParameters, State]):
         self._fresh = 0
         self._left = False
         self._dropped: deque[int] = deque(maxlen=_REMEMBERED)
+
+    def needed_inputs(self) -> list[NeededInput]:
+        """What has to come at present; may be called by any thread."""
+        needed = super().needed_inputs()
+        if self._camera is None and not self._uncalibrated:
+            needed.append(NeededInput((CAMERA_INFO,)))
+        if self.parameters.use_mask:
+            needed.append(NeededInput(MASKS, with_each=True))
+        return needed
 
     @abstractmethod
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
@@ -147,11 +164,15 @@ class CameraSession(Session[CameraParameters, State]):
             self._take_image(message, stamp)
 
     def _take_camera_info(self, message: Any) -> None:
+        self._see_frame(CAMERA_INFO, message)
         try:
             camera = camera_from_info(message)
         except CameraInfoError as error:
-            self._log.fault(Fault.CAMERA_INFO, str(error))
+            text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
+            self._uncalibrated = text if self._camera is None else ''
+            self._log.fault(Fault.CAMERA_INFO, text)
             return
+        self._uncalibrated = ''
         self._frame = str(message.header.frame_id)
         known, self._camera = self._camera, camera
         if known is not None and camera != known:
@@ -159,7 +180,13 @@ class CameraSession(Session[CameraParameters, State]):
             self._log.note(Fault.CALIBRATION, text)
             self._start_anew()
 
+    def _see_frame(self, source: str, message: Any) -> None:
+        """Warns of a camera whose messages do not agree on its frame, once for each frame."""
+        for text in self._frames.see(source, str(message.header.frame_id), self._on_topic):
+            self._log.note(Fault.FRAME, text, warn=True)
+
     def _take_image(self, message: Any, stamp: int) -> None:
+        self._see_frame(IMAGE, message)
         order = self._order(stamp, self._newest)
         if order is Order.SKIPPED:
             return
@@ -218,6 +245,16 @@ class CameraSession(Session[CameraParameters, State]):
         )
         return None
 
+    def _look_at_scene(
+        self, waiting: WaitingImage, background: BackgroundModel, remedy: str
+    ) -> None:
+        """Warns once when the camera has moved; see `camera_moved_fault` for the remedy."""
+        before = self._watch.moved
+        self._watch.look(waiting.image, background)
+        if self._watch.moved and not before:
+            text = camera_moved_fault(self._watch.shift, waiting.stamp_ns, remedy)
+            self._log.note(Fault.CAMERA_MOVED, text, warn=True)
+
     def _start_anew(self) -> None:
         self.restart()
 
@@ -249,17 +286,18 @@ class CameraSession(Session[CameraParameters, State]):
         while len(self._waiting) > most:
             stamp = self._waiting.popleft().stamp_ns
             self._dropped.append(stamp)
-            self._log.counts['dropped'] += 1
             if self._camera is None:
                 # An uncalibrated camera_info has been reported already.
-                self._log.fault(
+                self._log.give_up(
                     Fault.CAMERA_INFO,
+                    'a calibrated camera_info',
                     f'image of {stamp} ns is dropped: it waited for a calibrated camera_info',
                 )
             else:
                 kind = self._missing_input(stamp)
-                self._log.fault(
+                self._log.give_up(
                     kind,
+                    kind.value.removeprefix('no '),
                     f'image of {stamp} ns is dropped: {kind.value} of its stamp has come, and '
                     f'{most} newer images wait',
                 )
@@ -283,8 +321,32 @@ class CameraSession(Session[CameraParameters, State]):
 
     def _status_and_wants(self) -> tuple[str, str]:
         if self._camera is None:
-            return 'no camera', 'a calibrated camera_info'
+            why = f'; {self._uncalibrated}' if self._uncalibrated else ''
+            return 'no camera', f'a calibrated camera_info{why}'
         return self._status()
+
+
+def camera_info_fault(error: CameraInfoError, source: str) -> str:
+    """What is wrong with a camera_info, and what to do."""
+    text = f'{source}{str(error).removeprefix("camera info")}'
+    if isinstance(error, UncalibratedError):
+        return f'{text}; calibrate the camera, and let its driver publish the result'
+    return text
+
+
+def camera_moved_fault(shift: float, stamp_ns: int, remedy: str) -> str:
+    """Where the scene is after the camera has moved, and what to do.
+
+    Args:
+        shift: of the scene, px; NaN: unknown.
+        stamp_ns: of the image.
+        remedy: how a new background is taken.
+    """
+    far = 'elsewhere' if math.isnan(shift) else f'{shift:.0f} px away'
+    return (
+        f'{CAMERA_MOVED}: at the image of {stamp_ns} ns the scene is {far}; fix the camera, take '
+        f'background_file anew, or let the background be learned, and {remedy}'
+    )
 
 
 class StampedInputs(Generic[T]):

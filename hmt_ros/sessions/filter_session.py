@@ -43,11 +43,11 @@ from hmt_ros.sessions.camera_session import (
     WaitingImage,
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
-from hmt_ros.sessions.filter_state import IN_BACKGROUND, FilterState
+from hmt_ros.sessions.filter_state import FilterState
 from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KEYPOINTS_3D, KeypointInputs
-from hmt_ros.sessions.session import everything
+from hmt_ros.sessions.session import NeededInput, everything
 from hmt_ros.sessions.track_messages import (
     TOPICS,
     Presentation,
@@ -55,13 +55,14 @@ from hmt_ros.sessions.track_messages import (
     nobody_messages,
     track_messages,
 )
+from hmt_ros.sessions.track_reports import TrackCondition, report_change
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
-from hmt_ros.tracking import PosePrediction, Status, Subject, Tracker
+from hmt_ros.tracking import PosePrediction, Status, Tracker
 from hmt_ros.tracking.ground import KnownGround
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
-from msg_tools.messages.headers import SECOND_NS, time_ns
+from msg_tools.messages.headers import time_ns
 from msg_tools.messages.pose_mixtures import TrackState, pose_mixture_of
 
 __all__ = [
@@ -80,8 +81,6 @@ PREDICTION = 'pose_prediction'
 
 # Change of a length above which a body is described anew, m.
 RESHAPED = 0.005
-# A person hardly moves meanwhile.
-_SAME_MOMENT_NS = SECOND_NS // 5
 
 
 class FilterSession(CameraSession[FilterParameters, FilterState]):
@@ -128,6 +127,19 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         """
         self.start = prepare_start(self.parameters) if start is None else start
         super().restart()
+
+    def needed_inputs(self) -> list[NeededInput]:
+        """What has to come at present; may be called by any thread."""
+        p, frames, needed = self.parameters, self.frames, super().needed_inputs()
+        wanted = (
+            (p.use_keypoints, KEYPOINTS),
+            (p.use_keypoints_3d, KEYPOINTS_3D),
+            (p.use_predictions, PREDICTION),
+        )
+        needed += [NeededInput((name,), with_each=True) for used, name in wanted if used]
+        if frames.wanted and not frames.heard:
+            needed.append(NeededInput(TRANSFORMS))
+        return needed
 
     # Inputs.
 
@@ -262,7 +274,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     ) -> None:
         """Takes an image with its inputs; see `Tracker.step`."""
         stamp = waiting.stamp_ns
-        starts = self._tracker is None or self._tracker.status is Status.WAITING
+        before = TrackCondition.of(self._tracker)
+        starts = before.status is Status.WAITING
         try:
             self._look_at_frames(waiting)
             if self._tracker is None:
@@ -274,7 +287,6 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 self._tracker.set_gravity(seen.up, seen.camera_height)
             if (pose := self.frames.pose) is not None:
                 self._tracker.set_camera(pose.translation, pose.rotation)
-            trusted = not self._tracker.silhouettes.doubted
             posterior, likelihood = self._tracker.step(
                 waiting.image,
                 stamp,
@@ -284,10 +296,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 nobody_predicted=prediction is Status.NOBODY,
                 others=others,
             )
-            if trusted and self._tracker.silhouettes.doubted:
-                self._report_background(self._tracker.silhouettes.share, stamp)
-            if starts and posterior is not None:
-                self._report_start(self._tracker, stamp)
+            report_change(self._log, before, self._tracker, self.start.initial, stamp)
             if posterior is not None and likelihood is not None:
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
             elif len(self._weights):
@@ -305,25 +314,6 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         """Looks up what transforms tell of gravity and of the camera at an image."""
         for kind, text in self.frames.look(waiting.frame_id, waiting.stamp_ns):
             self._log.note(kind, text)
-
-    def _report_background(self, share: float, stamp_ns: int) -> None:
-        self._log.note(
-            Fault.BACKGROUND,
-            f'{IN_BACKGROUND}, of whom only {share:.0%} are foreground in the image of {stamp_ns} '
-            'ns: silhouettes are not used until the scene has been seen where the person is now; '
-            'give background_file, or begin with the empty scene',
-        )
-
-    def _report_start(self, tracker: Tracker, stamp_ns: int) -> None:
-        initial, source = self.start.initial, tracker.started_from
-        if initial is None and source is not None:
-            self._log.tell(f'the track starts from {source.value} at the image of {stamp_ns} ns')
-        if isinstance(initial, Subject) and stamp_ns - initial.stamp_ns > _SAME_MOMENT_NS:
-            age = (stamp_ns - initial.stamp_ns) / SECOND_NS
-            self._log.note(
-                Fault.OLD_START,
-                f'the joints that start the track were seen {age:.1f} s before its first image',
-            )
 
     def _publish_track(
         self,
@@ -423,6 +413,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             evaluations=0 if tracker is None else tracker.evaluations,
             background='unknown' if silhouettes is None else silhouettes.known,
             doubted=silhouettes is not None and silhouettes.doubted,
+            moved=silhouettes is not None and silhouettes.watch.moved,
             track_id=self._tracks if self._tracker is None else self._tracker.track_id,
             started_from='' if source is None else source.value,
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hmt_ros.body import Body
+from hmt_ros.sessions.camera_session import CAMERA_MOVED
 from hmt_ros.sessions.session import SessionState
 from hmt_ros.tracking import Status
 
@@ -22,6 +23,7 @@ class FilterState(SessionState):
         evaluations: of the likelihood in the last image.
         background: what is known of it, in a few words.
         doubted: whether it was learned with the person in it, and is not known again.
+        moved: whether the camera has moved since it was taken.
         track_id: number of the present track, or of the last one; 0 before the first.
         started_from: what that track began from; '' before the first.
     """
@@ -32,6 +34,7 @@ class FilterState(SessionState):
     evaluations: int = 0
     background: str = 'unknown'
     doubted: bool = False
+    moved: bool = False
     track_id: int = 0
     started_from: str = ''
 
@@ -44,7 +47,10 @@ class FilterState(SessionState):
         if self.status == Status.NOBODY.value:
             return 'nobody in view'
         if self.status == Status.LOST.value:
-            return f'lost: misfit {self.misfit:.2f}'
+            lost = f'lost: misfit {self.misfit:.2f}'
+            return f'{lost}; {CAMERA_MOVED}' if self.moved else lost
+        if self.moved:
+            return CAMERA_MOVED
         return f'{IN_BACKGROUND}; {self.background}' if self.doubted else ''
 
     def values(self) -> list[tuple[str, str]]:

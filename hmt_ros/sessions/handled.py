@@ -53,6 +53,9 @@ class Fault(Enum):
     NEW_BODY = 'new body'
     MIXTURE_KIND = 'kind of mixture'
     GAP = 'gap'
+    FRAME = 'frame_id'
+    LOST = 'loss of the track'
+    CAMERA_MOVED = 'camera moved'
     HUMAN = 'reference model'
     NO_IMAGE = 'no image'
     OTHER_CAMERA = 'other camera'
@@ -80,8 +83,10 @@ class Handled:
         source: where it came from.
         stamp_ns: of the message.
         faults: why it, or something that waited for it, could not be used; empty if it was used.
-        warnings: for the log: the first fault of each kind, and where an estimate starts.
+        warnings: for the log: the first fault of each kind.
         published: (topic, stamp) of all messages that were published, in their order.
+        events: for the log of a node, and no faults: start and end of a track, say; not in the
+            message.
     """
 
     source: str
@@ -89,6 +94,7 @@ class Handled:
     faults: tuple[str, ...]
     warnings: tuple[str, ...]
     published: tuple[tuple[str, int], ...]
+    events: tuple[str, ...] = ()
 
 
 class HandlingLog:
@@ -99,6 +105,7 @@ class HandlingLog:
             'dropped' and what the session counts.
         faults: number by kind.
         last_fault: the newest; '' before the first.
+        held_up: what the last dropped message waited for here; '' if it was dropped before.
         prefix: what texts begin with: of whom they are.
     """
 
@@ -107,12 +114,14 @@ class HandlingLog:
         self.counts: Counter[str] = Counter()
         self.faults: Counter[str] = Counter()
         self.last_fault = ''
+        self.held_up = ''
         self.begin()
 
     def begin(self) -> None:
         """Starts the report on the next message."""
         self._told: list[str] = []
         self._warned: list[str] = []
+        self._events: list[str] = []
         self._published: list[tuple[str, int]] = []
 
     def fault(self, kind: Fault | MessageFault, text: str) -> None:
@@ -129,7 +138,7 @@ class HandlingLog:
 
     def tell(self, text: str) -> None:
         """Logs something that is no fault."""
-        self._warned.append(one_line(f'{self.prefix}{text}'))
+        self._events.append(one_line(f'{self.prefix}{text}'))
 
     def skip(self, kind: Fault | MessageFault, text: str) -> None:
         """Reports a message that was to be estimated from and can not be used."""
@@ -139,12 +148,26 @@ class HandlingLog:
     def drop(self, text: str) -> None:
         """Reports a message that is not estimated from because the node is late; no fault of it."""
         self.counts['dropped'] += 1
+        self.held_up = ''
         self._told.append(one_line(text))
 
     def count_dropped(self, messages: int) -> None:
         """Counts messages that were dropped before they came here."""
         self.counts['received'] += messages
         self.counts['dropped'] += messages
+        self.held_up = ''
+
+    def give_up(self, kind: Fault, held_up: str, text: str) -> None:
+        """Reports a message that waited here in vain and is dropped.
+
+        Args:
+            kind: of the fault.
+            held_up: what it waited for.
+            text: of the fault.
+        """
+        self.counts['dropped'] += 1
+        self.held_up = held_up
+        self.fault(kind, text)
 
     def published(self, topic: str, stamp_ns: int) -> None:
         """Reports a message that was published."""
@@ -153,7 +176,12 @@ class HandlingLog:
     def handled(self, source: str, stamp_ns: int) -> Handled:
         """The report on the present message."""
         return Handled(
-            source, stamp_ns, tuple(self._told), tuple(self._warned), tuple(self._published)
+            source,
+            stamp_ns,
+            tuple(self._told),
+            tuple(self._warned),
+            tuple(self._published),
+            tuple(self._events),
         )
 
 

@@ -28,10 +28,17 @@ import numpy as np
 from hmt_ros.body import Camera
 from hmt_ros.body.reference_human import Joint, ReferenceHuman, fit_reference_human
 from hmt_ros.inference.arrays import Array
-from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE
+from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, camera_info_fault
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.hri_parameters import HriParameters
-from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState, everything
+from hmt_ros.sessions.session import (
+    NeededInput,
+    Order,
+    PublishedTopic,
+    Session,
+    SessionState,
+    everything,
+)
 from msg_tools import MessageError
 from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
 from msg_tools.messages.detections import SKELETON_2D
@@ -187,6 +194,10 @@ class HriSession(Session[HriParameters, HriState]):
         """The bodies that have topics: those that are tracked, or lost but not given up."""
         return {person.identity for person in self._people.values() if person.identity}
 
+    def needed_inputs(self) -> list[NeededInput]:
+        """What has to come at present; may be called by any thread."""
+        return [NeededInput((mixture_source(name),)) for name in self.parameters.named]
+
     def finish(self) -> Handled:
         """Tells that nobody is tracked any more."""
         self._log.begin()
@@ -220,7 +231,8 @@ class HriSession(Session[HriParameters, HriState]):
         try:
             self._camera, self._frame = camera_from_info(message), str(message.header.frame_id)
         except CameraInfoError as error:
-            self._log.fault(Fault.CAMERA_INFO, str(error))
+            text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
+            self._log.fault(Fault.CAMERA_INFO, text)
         longest = self.parameters.longest_silence * SECOND_NS
         silent = [p for p in self._people.values() if p.identity and stamp - p.heard > longest]
         for person in silent:

@@ -20,12 +20,19 @@ import numpy as np
 from hmt_ros.body import Camera
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.sessions.camera_session import CAMERA_INFO
+from hmt_ros.sessions.camera_session import CAMERA_INFO, camera_info_fault
 from hmt_ros.sessions.chosen_person import ChosenPerson
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.keypoint_inputs import KEYPOINTS
 from hmt_ros.sessions.keypoints_adapter_parameters import KeypointsAdapterParameters
-from hmt_ros.sessions.session import Order, PublishedTopic, Session, SessionState, everything
+from hmt_ros.sessions.session import (
+    NeededInput,
+    Order,
+    PublishedTopic,
+    Session,
+    SessionState,
+    everything,
+)
 from msg_tools import MessageError
 from msg_tools.messages import keypoints
 from msg_tools.messages.camera_info import CameraInfoError, camera_from_info
@@ -95,6 +102,11 @@ class KeypointsAdapterSession(Session[KeypointsAdapterParameters, KeypointsAdapt
         self._seen = False
         self.state = self._present_state()
 
+    def needed_inputs(self) -> list[NeededInput]:
+        """What has to come at present; may be called by any thread."""
+        needed = super().needed_inputs()
+        return [*needed, NeededInput((CAMERA_INFO,))] if self._wants() else needed
+
     def _forget(self) -> None:
         self._newest = None
         self._chosen.forget()
@@ -139,7 +151,8 @@ class KeypointsAdapterSession(Session[KeypointsAdapterParameters, KeypointsAdapt
         try:
             self._camera = camera_from_info(message)
         except CameraInfoError as error:
-            self._log.fault(Fault.CAMERA_INFO, str(error))
+            text = camera_info_fault(error, self._on_topic(CAMERA_INFO))
+            self._log.fault(Fault.CAMERA_INFO, text)
 
     def _person_in(self, message: Any, stamp: int) -> Keypoints | None:
         """The keypoints of the person who is tracked; None: not seen."""

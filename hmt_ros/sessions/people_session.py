@@ -25,15 +25,22 @@ import numpy as np
 
 from hmt_ros.body import Camera
 from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.scene_watch import SceneWatch
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
-from hmt_ros.sessions.camera_session import IMAGE, CameraSession, StampedInputs, WaitingImage
+from hmt_ros.sessions.camera_session import (
+    CAMERA_MOVED,
+    IMAGE,
+    CameraSession,
+    StampedInputs,
+    WaitingImage,
+)
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.people_inputs import Found, PeopleInputs
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.person_session import BODIES, PersonSession, person_of
-from hmt_ros.sessions.session import PublishedTopic, SessionState, everything
+from hmt_ros.sessions.session import NeededInput, PublishedTopic, SessionState, everything
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
@@ -68,15 +75,21 @@ class PeopleState(SessionState):
         people: identities of those who are tracked.
         followed: identities of those who are tracked, or about to be.
         detected: number of people in the last detections.
+        moved: whether the camera has moved since the background was taken.
     """
 
     people: tuple[str, ...] = ()
     followed: tuple[str, ...] = ()
     detected: int = 0
+    moved: bool = False
 
     def summary(self) -> str:
         """The present estimate in a few words."""
         return f'{len(self.people)} of {self.detected} people'
+
+    def trouble(self) -> str:
+        """Whether the background is of no use."""
+        return CAMERA_MOVED if self.moved else ''
 
     def values(self) -> list[tuple[str, str]]:
         """Keys and values of the diagnostics."""
@@ -153,6 +166,7 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
     def _forget(self) -> None:
         self._people: list[_Person] = []
         self._background = None
+        self._watch = SceneWatch()
         self._next, self._detected, self._begun = 1, 0, False
 
     def _start_anew(self) -> None:
@@ -164,6 +178,13 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
 
     def _start_again(self) -> None:
         super().restart()
+
+    def needed_inputs(self) -> list[NeededInput]:
+        """What has to come at present; may be called by any thread."""
+        needed = [*super().needed_inputs(), NeededInput((DETECTIONS,), with_each=True)]
+        if self.frames.wanted and not self.frames.heard:
+            needed.append(NeededInput(TRANSFORMS))
+        return needed
 
     # Inputs.
 
@@ -244,6 +265,8 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
             self._detected = len(detected)
             if not detected and not self._people and not self._start.parameters.background_file:
                 self._background.learn(waiting.image)
+        if self._background.frames:
+            self._look_at_scene(waiting, self._background, 'call ~/reset')
         skipped, tracked = self._log.counts['skipped'], self._log.counts['tracked']
         self._follow_all(waiting, camera, own, left, answered=detected is not None)
         # Those are counts of images, not of people.
@@ -410,6 +433,7 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
             people=tuple(person.name for person in self._people if person.session.begun),
             followed=tuple(person.name for person in self._people),
             detected=self._detected,
+            moved=self._watch.moved,
         )
 
     def _status(self) -> tuple[str, str]:

@@ -35,6 +35,18 @@ class PublishedTopic(NamedTuple):
     latched: bool = False
 
 
+class NeededInput(NamedTuple):
+    """Messages without which a session does not go on.
+
+    Attributes:
+        sources: any of which is enough.
+        with_each: whether they have to come with every message that is estimated from.
+    """
+
+    sources: tuple[str, ...]
+    with_each: bool = False
+
+
 class Order(Enum):
     """How the stamp of a message relates to those before."""
 
@@ -55,6 +67,8 @@ class SessionState(ABC):
             'dropped' and what the session counts.
         faults: number of faults by kind.
         last_fault: the newest; '' before the first.
+        held_up: what the last dropped message waited for; '' if it had only to wait its turn.
+        frame_id: of the newest message that is estimated from; '' before the first.
     """
 
     status: str
@@ -63,6 +77,8 @@ class SessionState(ABC):
     counts: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
     last_fault: str = ''
+    held_up: str = ''
+    frame_id: str = ''
 
     @abstractmethod
     def summary(self) -> str:
@@ -121,6 +137,7 @@ class Session(ABC, Generic[Parameters, State]):
         parameters: a new value takes effect as `declared_parameters` says.
         interrupted: whether messages have come during an estimate; a node sets it.
         state: replaced with every message.
+        topic_names: full names of the topics by source, for faults; empty without topics.
     """
 
     TOPICS: ClassVar[Mapping[str, PublishedTopic]]
@@ -145,6 +162,8 @@ class Session(ABC, Generic[Parameters, State]):
         self._messages = RosbagsMessages()
         self._log = HandlingLog()
         self._weights = np.empty(0)
+        self._frame_id = ''
+        self.topic_names: Mapping[str, str] = {}
 
     @property
     def most_waiting(self) -> int:
@@ -161,11 +180,17 @@ class Session(ABC, Generic[Parameters, State]):
         """
         self._log.begin()
         stamp = self._stamp_of(source, message)
-        self._log.counts['received'] += kind_of(source) == self.COUNTED
+        if kind_of(source) == self.COUNTED:
+            self._log.counts['received'] += 1
+            self._frame_id = _frame_id(message)
         self._take(source, message, stamp)
         if not more:
             self._use_what_has_come()
         return self._handled(source, stamp)
+
+    def needed_inputs(self) -> list[NeededInput]:
+        """What has to come at present; may be called by any thread."""
+        return [NeededInput((self.COUNTED,))]
 
     def restart(self) -> None:
         """Starts the estimate anew."""
@@ -240,7 +265,14 @@ class Session(ABC, Generic[Parameters, State]):
             'counts': Counter(log.counts),
             'faults': Counter(log.faults),
             'last_fault': log.last_fault,
+            'held_up': log.held_up,
+            'frame_id': self._frame_id,
         }
+
+    def _on_topic(self, source: str) -> str:
+        """Names a source and its topic, for faults."""
+        topic = self.topic_names.get(source)
+        return f'{source} on {topic}' if topic else source
 
     def _order(self, stamp: int, newest: int | None) -> Order:
         """How a stamp relates to the newest before; faults are reported here."""
@@ -262,6 +294,12 @@ class Session(ABC, Generic[Parameters, State]):
     def _publish(self, topic: str, stamp: int, message: Any) -> None:
         self._log.published(topic, stamp)
         self._publish_output(Output(topic, stamp, serialise(message)))
+
+
+def _frame_id(message: Any) -> str:
+    """The frame that a message names; '' where it names none."""
+    header = getattr(message, 'header', None)
+    return '' if header is None else str(header.frame_id)
 
 
 def entropy(weights: NDArray[np.float64]) -> float:

@@ -231,6 +231,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._end_window()
         self._nobody = True
         if of is not None and smooths:
+            self._log.tell(f'nobody in view at the mixture of {stamp} ns: the window ends')
             nobody_messages(
                 self._messages,
                 of,

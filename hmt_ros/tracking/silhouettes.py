@@ -21,6 +21,7 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.image.background import BackgroundModel, Silhouette, one_person
 from hmt_ros.image.observation import Box
+from hmt_ros.image.scene_watch import SceneWatch
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking.camera_motion import SHIFTED, CameraPose
@@ -46,6 +47,7 @@ class Silhouettes:
     Attributes:
         background: as it is known so far.
         share: f, the share of the person that was foreground when it was last asked; NaN: never.
+        watch: tells whether the camera has moved since the background was taken.
         doubted: whether the background was learned with the person in it, and is not known again.
     """
 
@@ -53,6 +55,7 @@ class Silhouettes:
         self.background = background
         self.share = np.nan
         self.doubted = False
+        self.watch = SceneWatch()
         self._shared = shared
         self._learning = background.frames == 0 and not shared
         self._seen_from: CameraPose | None = None
@@ -69,6 +72,7 @@ class Silhouettes:
         """Begins anew without a background: the camera sees another scene."""
         self.background = BackgroundModel(self.background.settings)
         self.share, self.doubted, self._learning = np.nan, False, not self._shared
+        self.watch = SceneWatch()
 
     def see_from(self, pose: CameraPose, camera: Camera) -> None:
         """Takes the pose of the camera at an image; from another view the scene is another."""
@@ -103,6 +107,8 @@ class Silhouettes:
             return Silhouette(one_person(mask, self.background.settings, region))
         if self.doubted or not self.background.frames:
             return None
+        if not self._shared:
+            self.watch.look(image, self.background)
         return self.background.split(image, region, others)
 
     def check(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:

@@ -29,6 +29,10 @@ class CameraInfoError(ValueError):
     """A camera info that gives no camera, in one line: what was seen and what was wanted."""
 
 
+class UncalibratedError(CameraInfoError):
+    """A camera info of a camera that is not calibrated."""
+
+
 def camera_from_info(message: Any, image_size: tuple[int, int] | None = None) -> Camera:
     """The camera that took the pictures.
 
@@ -45,7 +49,7 @@ def camera_from_info(message: Any, image_size: tuple[int, int] | None = None) ->
     if len(k) != 9:
         raise CameraInfoError(f'camera info: K has {len(k)} values, wanted 9')
     if k[0] == 0.0:
-        raise CameraInfoError('camera info: the camera is not calibrated (K is zero)')
+        raise UncalibratedError('camera info has k[0] = 0: uncalibrated')
     if not all(math.isfinite(value) for value in (*k, *d)):
         raise CameraInfoError('camera info: K or D has values that are not finite')
     if k[0] < 0.0 or k[4] <= 0.0:

@@ -85,9 +85,9 @@ def window_message(body, poses, last, rng):
     return trajectory_mixture_message(MESSAGES, content)
 
 
-def write_out(path, body, poses, *, truth=True, overlay=False, change=None):
+def write_out(path, body, poses, *, truth=True, overlay=False, change=None, namespace=''):
     rng = np.random.default_rng(0)
-    with BagWriter(path) as bag:
+    with BagWriter(path, namespace=namespace) as bag:
         bag.write('body', START_NS, message_of_body(MESSAGES, body, START_NS, FRAME_ID))
         for i, stamp in enumerate(STAMPS):
             for topic, kind, modes in (

@@ -1,8 +1,11 @@
 """Progress of commands: a bar on a terminal, lines elsewhere, stdout left to results."""
 
 import io
+import os
 import queue
+import select
 import sys
+import time
 
 import pytest
 
@@ -71,6 +74,8 @@ def test_without_a_total_or_anything_to_count(clock):
     shown.update(3)
     clock.now = 6.0
     assert shown.line() == '3 messages, 0.5 a second, 00:06 so far'
+    shown.total = 2_000_000
+    assert shown.line().startswith('3 of 2000000 messages, ')
     shown.total = 2  # fewer than there were: not believed
     assert shown.line() == '3 messages, 0.5 a second, 00:06 so far'
     assert lines(clock, '').line() == '00:00 so far'
@@ -84,19 +89,30 @@ def test_a_short_command_prints_nothing(clock):
 
 
 def test_an_error_ends_the_lines(clock):
+    """The line about the error is the last."""
     shown = lines(clock)
     with pytest.raises(ValueError, match='bad'), shown:
+        clock.pass_to(10.0)
         raise ValueError('bad')
     assert not shown._thread.is_alive()
+    assert shown._file.getvalue() == 'out: 0 of 120 images, 00:10 so far\n'
 
 
-def test_bar_on_a_terminal(monkeypatch):
-    terminal = io.StringIO()
-    terminal.isatty = lambda: True
-    monkeypatch.setattr(sys, 'stderr', terminal)
-    assert list(with_progress('abc', 'reading', 'motions', 3)) == ['a', 'b', 'c']
-    assert 'reading: 100%' in terminal.getvalue()
-    assert '3/3' in terminal.getvalue()
+@pytest.mark.parametrize('columns', [100, 0])
+def test_bar_on_a_terminal_that_has_room(monkeypatch, columns):
+    monkeypatch.setattr(progress, 'INTERVAL', 1e-3)
+    monkeypatch.setattr(os, 'get_terminal_size', lambda _: os.terminal_size((columns, 24)))
+    reading, writing = os.openpty()
+    with os.fdopen(writing, 'w', encoding='utf-8') as terminal:
+        monkeypatch.setattr(sys, 'stderr', terminal)
+        items = [time.sleep(0.02) or x for x in with_progress('abc', 'reading', 'motions', 3)]
+        shown = ''
+        while select.select([reading], [], [], 0)[0]:
+            shown += os.read(reading, 65536).decode()
+    os.close(reading)
+    assert items == ['a', 'b', 'c']
+    assert ('reading: 100%' in shown) == (columns > 0)
+    assert ('reading: 3 motions in 00:00' in shown) == (columns == 0)
 
 
 def test_quiet_shows_nothing(capsys, monkeypatch):

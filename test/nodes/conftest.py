@@ -218,12 +218,16 @@ class World:
 
 
 @pytest.fixture
-def world_of(capfd):
-    """Makes worlds, and ends them."""
+def world_of(capfd, monkeypatch):
+    """Makes worlds, and ends them; their nodes do not tell of silence until `patience` says so."""
     worlds = []
 
     def make(*arguments, **values):
+        from hmt_ros.nodes import silent_topics
+
+        monkeypatch.setattr(silent_topics, 'SILENCE', 1e6)
         worlds.append(World(capfd, *arguments, **values))
+        worlds[-1].patience = lambda s: monkeypatch.setattr(silent_topics, 'SILENCE', s)
         return worlds[-1]
 
     yield make

@@ -88,7 +88,12 @@ def test_one_warning_for_each_kind_and_the_node_lives(running, somebody):
             assert len(running.send('image', make(index)).faults) == 1
     running.send('camera_info', somebody.uncalibrated())
     assert running.send('image', somebody.image(9)).faults == ()
-    wanted = ('32x24 pixels', 'stamps that increase', 'reset_on_time_jump', 'not calibrated')
+    wanted = (
+        '32x24 pixels',
+        'stamps that increase',
+        'reset_on_time_jump',
+        'k[0] = 0: uncalibrated',
+    )
     running.spin_until(lambda: len(running.warnings()) >= len(wanted))
     for text, part in zip(running.warnings(), wanted, strict=True):
         assert part in text

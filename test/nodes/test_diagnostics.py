@@ -146,9 +146,11 @@ def test_lost_messages_are_in_the_diagnostics(running, small_camera):
 def test_silence_is_told(running, small_camera):
     running.send('camera_info', small_camera.info())
     running.send('image', small_camera.image(0))
-    running.node._last_arrival = time.monotonic() - 20
+    running.patience(3.0)
+    running.node._silent.arrived('image', time.monotonic() - 20)
     running.spin_until(
-        lambda: re.fullmatch(r'no images for 2\d s', running.diagnosis()[1]), 'a warning'
+        lambda: re.match(r'no images for 2\d s; nothing on /image ', running.diagnosis()[1]),
+        'a warning',
     )
     assert running.diagnosis()[0] == 1
     running.send('image', small_camera.image(1))
@@ -185,7 +187,8 @@ def test_status_line(running, small_camera):
     running.send('image', small_camera.image(0))
     for _ in range(3):
         period()
-    (line,) = status_lines(running)
+    start, line = status_lines(running)
+    assert start.startswith('track 1 starts from ')
     number = r'\d+\.\d'
     assert re.fullmatch(
         rf'tracking, 2 modes; {number} images a second, {number} tracked, latency \d+ ms', line
@@ -194,11 +197,11 @@ def test_status_line(running, small_camera):
     for index in range(1, 7):
         running.send('image', small_camera.image(index))
         period()
-    assert len(status_lines(running)) == 3
+    assert len(status_lines(running)) == 4
     assert running.set(status_interval=0) == (True, '')
     running.send('image', small_camera.image(7))
     period()
-    assert len(status_lines(running)) == 3
+    assert len(status_lines(running)) == 4
 
 
 def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):
@@ -211,6 +214,7 @@ def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):
     events.incompatible_qos(SimpleNamespace(total_count_change=1, last_policy_kind=16))
     events = running.node._events.of_publisher('/tf')
     events.incompatible_qos(SimpleNamespace(total_count_change=1, last_policy_kind=2))
+    running.patience(0.0)
     page = (ROOT / 'docs' / 'nodes.md').read_text('utf-8')
     table = page.partition('## Diagnostics')[2].partition('| key |')[2]
     cells = [line.split('|')[1] for line in table.partition('\n\n')[0].splitlines()[2:]]
@@ -221,7 +225,7 @@ def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):
     }
     # What this node alone tells.
     own = {'misfit', 'evaluations of the likelihood'}
-    running.spin_until(lambda: 'messages lost of /image' in running.diagnosis()[2], 'all of it')
+    running.spin_until(lambda: 'nothing on /image' in running.diagnosis()[2], 'all of it')
     keys = running.diagnosis()[2].keys() - own
     assert [key for key in keys if not any(p.fullmatch(key) for p in patterns.values())] == []
     assert [key for key, p in patterns.items() if not any(map(p.fullmatch, keys))] == []

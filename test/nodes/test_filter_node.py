@@ -1,5 +1,6 @@
 """The node itself, over DDS; with a tracker that costs nothing."""
 
+import re
 import signal
 import threading
 import time
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hmt_ros.sessions.camera_session import MOST_INCOMPLETE
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from msg_tools.messages.cdr import serialise
 from test.nodes.conftest import PATIENCE
@@ -182,7 +184,7 @@ def test_one_warning_for_each_kind_and_the_node_lives(running, small_camera, stu
     assert faults(running.send('image', small_camera.image(11))) == []
     assert stub_tracker.made[-1].masks[-1].sum() == 240
     wanted = (
-        'camera is not calibrated',
+        'camera_info on /camera_info has k[0] = 0: uncalibrated; calibrate the camera',
         'wanted stamps that increase',
         'with reset_on_time_jump the track would start anew',
         "encoding 'yuv9' is not known",
@@ -268,7 +270,11 @@ def test_node_without_its_subject_lives(world, subject_file, small_camera):
     one.node.start()
     assert one.state == 'unconfigured'
     one.spin_until(lambda: len(one.warnings()) == 1)
-    assert one.warnings() == [f'{missing}: can not be read (No such file or directory)']
+    assert one.warnings() == [
+        f'{missing}: can not be read (No such file or directory); set subject_file to a file that '
+        'can be used, then: ros2 lifecycle set /filter_node configure; ros2 lifecycle set '
+        '/filter_node activate'
+    ]
     assert one.diagnosis()[:2] == (2, one.warnings()[0])
     assert one.set(subject_file=str(subject_file)) == (True, '')
     assert one.change_state('configure')
@@ -365,10 +371,22 @@ def test_late_node_drops_the_oldest_and_answers_meanwhile(
     assert [h.stamp_ns for h in dropped] == [small_camera.stamp(i) for i in range(1, 10)]
     assert 'is dropped: newer ones came before its turn' in dropped[0].faults[0]
     assert not any(h.warnings for h in dropped)
-    one.spin_until(lambda: any('late: 9 images' in d.status[0].message for d in one.diagnostics))
+    late = re.compile(r'computing takes \d+ ms for one of the images; late: 9 images dropped in a')
+    one.spin_until(lambda: any(late.match(d.status[0].message) for d in one.diagnostics))
     level, _, values = one.diagnosis()
     assert values['images dropped'] == '9'
     assert level in (0, 1)
+
+
+def test_what_images_waited_for_comes_before_that_they_are_late(world, small_camera):
+    one = world(use_keypoints=True, input_timeout=60.0).start()
+    one.send('camera_info', small_camera.info())
+    told = 'waits for keypoints; late: 3 images dropped in a second'
+    one.node._timer.cancel()
+    for index in range(MOST_INCOMPLETE + 3):
+        one.send('image', small_camera.image(index))
+    one.node._diagnose_period()
+    one.spin_until(lambda: any(d.status[0].message == told for d in one.diagnostics), told)
 
 
 def test_late_node_goes_on_with_the_newest_complete_image(
@@ -417,17 +435,46 @@ def test_diagnostics(running, small_camera):
     level, message, values = running.diagnosis()
     assert (level, message) == (1, 'waits for a calibrated camera_info')
     assert values['lifecycle'] == 'active'
+    # Before an image names the frame of the camera, its topic tells which it is.
+    assert running.diagnostics[-1].status[0].hardware_id == '/image'
     running.send('camera_info', small_camera.info())
     running.send('image', small_camera.image(0))
     # Told at once, when the status changes.
     running.spin_until(lambda: running.diagnostics[-1].status[0].message == 'tracking, 2 modes')
     _, _, values = running.diagnosis()
     assert running.diagnostics[-1].status[0].name == 'filter_node: track'
+    assert running.diagnostics[-1].status[0].hardware_id == 'lens'
     assert values['status'] == 'tracking'
     assert np.isclose(float(values['entropy of the weights, nats']), 0.562, atol=1e-3)
     assert values['misfit'] == '0.125'
     assert values['evaluations of the likelihood'] == '7'
     assert {'latency, mean, ms', 'images tracked a second', 'last fault'} <= values.keys()
+
+
+def informed(one, *parts):
+    """Whether the node has logged one line of information for each of some parts, and no more."""
+    one.warnings()
+    lines = re.findall(r'^\[INFO\] \[[0-9.]+\] \[filter_node\]: (.*)$', one.logged, re.M)
+    return [sum(part in line for line in lines) for part in parts] == len(parts) * [1]
+
+
+def test_a_track_leaves_lines_in_the_log(running, small_camera, stub_tracker):
+    from hmt_msgs.srv import Reset
+
+    running.node._timer.cancel()
+    running.send('camera_info', small_camera.info())
+    stub_tracker.empty |= {small_camera.stamp(2), small_camera.stamp(3)}
+    for index in range(6):
+        running.send('image', small_camera.image(index))
+    start = 'track 1 starts from what was given at the image of'
+    wanted = (start, 'nobody in view at the image of', 'track 2 starts')
+    assert informed(running, *wanted)
+    assert running.call(Reset, 'reset').success
+    running.send('image', small_camera.image(6))
+    text = '~/reset: the next image starts a new track'
+    running.spin_until(lambda: informed(running, text), text)
+    (warning,) = running.warnings()
+    assert 'were seen 0.6 s before' in warning
 
 
 # The executable.

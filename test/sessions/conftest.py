@@ -42,7 +42,12 @@ class StubTracker:
         self.body, self.camera, self.seed = body, camera, seed
         self.settings = settings or TrackerSettings()
         self.background = background
-        self.silhouettes = SimpleNamespace(doubted=False, share=0.9, known='known')
+        self.silhouettes = SimpleNamespace(
+            doubted=False,
+            share=0.9,
+            known='known',
+            watch=SimpleNamespace(moved=False, shift=0.0),
+        )
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.track_id, self.started_from = 0, None
         self.log_likelihoods = np.array([-1.5, -2.5])

@@ -8,12 +8,12 @@ import pytest
 from hmt_ros.body import Camera
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.sessions.bme_parameters import BmeParameters
-from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, TRACK, BmeSession
+from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, SILHOUETTE, TOPICS, TRACK, BmeSession
 from hmt_ros.sessions.camera_session import MASK
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Handled
 from msg_tools.messages.cdr import deserialise
-from msg_tools.messages.images import compressed_image_message, image_message
+from msg_tools.messages.images import compressed_image_message, decode_mask, image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, TrackState, pose_mixture_of
 
 FRAME_NS = 100_000_000
@@ -21,7 +21,7 @@ FRAME_NS = 100_000_000
 
 @pytest.fixture
 def session(stub_predictor, background_file, outputs):
-    def make(wanted=lambda topic: True, **values):
+    def make(wanted=TOPICS.__contains__, **values):
         values = {'background_file': str(background_file), 'least_height': 10, **values}
         return BmeSession(with_values(BmeParameters(), values), outputs.append, wanted)
 
@@ -289,6 +289,27 @@ def test_model_file_that_can_not_be(background_file, tmp_path):
             BmeSession(parameters, lambda output: None)
 
 
+def test_a_moved_camera_is_told_once(session, somebody):
+    """A pillar and the edge of a wall, which the background has 8 px further left."""
+    wall = np.full((48, 64, 3), 90, np.uint8)
+    wall[:, 40:] = 160
+    wall[30:, :] = 40
+    one = session(background_file='', background_images=3)
+    one.take(CAMERA_INFO, somebody.info())
+    told = []
+    for index in range(60):
+        picture = np.roll(wall, 8, axis=1) if index >= 20 else wall
+        message = image_message(somebody.messages, picture, somebody.stamp(index), 'lens')
+        texts = one.take(IMAGE, message).warnings
+        told.append([text for text in texts if 'camera' in text])
+    (first,) = (index for index, texts in enumerate(told) if texts)
+    assert 30 <= first <= 50
+    (text,) = told[first]
+    assert text.startswith('the camera has moved since the background was taken: at the image of')
+    assert text.endswith('or let the background be learned, and configure the node anew')
+    assert one.state.trouble() == 'the camera has moved since the background was taken'
+
+
 def track(likelihoods, index, state=TrackState.TRACKING):
     message = (
         likelihoods.nobody(index) if state == TrackState.NOBODY else likelihoods.message(index)
@@ -358,3 +379,38 @@ def test_track_counts_no_more_after_time_has_jumped(session, somebody, stub_pred
     one.take(TRACK, track(likelihoods, 2))
     one.parameters = replace(one.parameters, reset_on_time_jump=False)
     assert 'comes after one of' in one.take(IMAGE, somebody.image(1)).faults[0]
+
+
+def test_every_image_has_a_silhouette_that_is_a_mask(
+    session, outputs, somebody, stub_predictor, likelihoods
+):
+    one = session(lambda topic: topic == SILHOUETTE, tracked_interval=100.0)
+    one.take(CAMERA_INFO, somebody.info())
+    one.take(IMAGE, somebody.image(0))
+    one.take(TRACK, track(likelihoods, 0))
+    one.take(IMAGE, somebody.image(1))
+    one.take(IMAGE, somebody.empty(2))
+    assert len(stub_predictor.asked) == 1
+    assert one.state.counts['left'] == 2
+    assert [output.topic for output in outputs] == [SILHOUETTE] * 3
+    messages = [deserialise(output.data, 'sensor_msgs/msg/Image') for output in outputs]
+    assert [(m.encoding, m.header.frame_id) for m in messages] == [('mono8', 'lens')] * 3
+    masks = [decode_mask(message) for message in messages]
+    ((asked, *_),) = stub_predictor.asked
+    assert np.array_equal(masks[0], asked)
+    assert [int(mask.sum()) for mask in masks[1:]] == [masks[0].sum(), 0]
+    # Another predictor that takes it as its mask says the same.
+    other = session(use_mask=True)
+    other.take(CAMERA_INFO, somebody.info())
+    other.take(IMAGE, somebody.image(0))
+    other.take(MASK, messages[0])
+    assert np.array_equal(stub_predictor.asked[1][0], asked)
+
+
+def test_silhouettes_are_empty_while_the_background_is_learned(session, outputs, somebody):
+    one = session(lambda topic: topic == SILHOUETTE, background_file='', background_images=2)
+    one.take(CAMERA_INFO, somebody.info())
+    for index in range(2):
+        one.take(IMAGE, somebody.empty(index))
+    messages = [deserialise(output.data, 'sensor_msgs/msg/Image') for output in outputs]
+    assert [decode_mask(message).any() for message in messages] == [False, False]

@@ -2,7 +2,6 @@
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -187,10 +186,13 @@ def test_uncalibrated_camera_is_told_once(session, outputs, small_camera):
         handled.append(one.take(CAMERA_INFO, small_camera.uncalibrated(index)))
         handled.append(one.take(IMAGE, small_camera.image(index)))
     warnings = [text for h in handled for text in h.warnings]
-    assert warnings == ['camera info: the camera is not calibrated (K is zero)']
+    assert warnings == [
+        'camera_info has k[0] = 0: uncalibrated; calibrate the camera, and let its driver publish '
+        'the result'
+    ]
     # Three messages that are no calibration, and two images that waited in vain.
     assert one.state.faults == {'camera_info': 5}
-    assert one.state.wants == 'a calibrated camera_info'
+    assert one.state.wants == f'a calibrated camera_info; {warnings[0]}'
     one.take(CAMERA_INFO, small_camera.info(3))
     one.take(CAMERA_INFO, small_camera.uncalibrated(3))
     one.take(IMAGE, small_camera.image(3))
@@ -623,7 +625,8 @@ def test_a_person_in_the_background_is_told(session, small_camera, stub_tracker)
     step = stub_tracker.step
 
     def doubts(self, *arguments, **named):
-        self.silhouettes = SimpleNamespace(doubted=True, share=0.123, known='forgotten')
+        self.silhouettes.doubted, self.silhouettes.share = True, 0.123
+        self.silhouettes.known = 'forgotten'
         return step(self, *arguments, **named)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -796,9 +799,9 @@ def test_what_a_track_starts_from_is_told(session, small_camera, likelihoods, st
     one = session(subject_file='', use_predictions=True)
     one.take(CAMERA_INFO, small_camera.info())
     one.take(PREDICTION, likelihoods.message(1, kind=MixtureKind.PREDICTION))
-    (text,) = one.take(IMAGE, small_camera.image(1)).warnings
+    (text,) = one.take(IMAGE, small_camera.image(1)).events
     stamp = small_camera.stamp(1)
-    assert text == f'the track starts from a pose prediction at the image of {stamp} ns'
+    assert text == f'track 1 starts from a pose prediction at the image of {stamp} ns'
     assert dict(one.state.values())['started from'] == 'a pose prediction'
     assert not one.state.faults
 

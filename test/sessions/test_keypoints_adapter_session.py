@@ -82,6 +82,15 @@ def test_a_skeleton_needs_the_size_of_the_image(session, outputs, small_camera):
     assert one.state.status == 'following'
 
 
+def test_a_camera_is_needed_until_it_is_known(session, small_camera):
+    one = session(source='skeleton2d')
+    assert [each.sources for each in one.needed_inputs()] == [('detections',), ('camera_info',)]
+    (text,) = one.take(CAMERA_INFO, small_camera.uncalibrated()).warnings
+    assert text.startswith('camera_info has k[0] = 0: uncalibrated; calibrate the camera')
+    one.take(CAMERA_INFO, small_camera.info())
+    assert [each.sources for each in one.needed_inputs()] == [('detections',)]
+
+
 def test_a_person_by_nearness(session, outputs, small_camera):
     one = session('yolo')
     one.take(DETECTIONS, yolo(small_camera, 0, a=(10.0, 20.0), b=(100.0, 30.0)))

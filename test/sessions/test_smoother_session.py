@@ -265,6 +265,8 @@ def test_nobody_in_view_ends_the_window(session, outputs, likelihoods):
     nobody = change(likelihoods.message(4), components=[])
     handled = one.take(MIXTURE, nobody)
     assert handled.faults == handled.warnings == ()
+    stamp = likelihoods.stamp(4)
+    assert handled.events == (f'nobody in view at the mixture of {stamp} ns: the window ends',)
     # The poses that were still open, and that there are no more.
     assert smoothed(outputs) == [likelihoods.stamp(index) for index in (1, 2, 4)]
     *_, last = read(outputs, 'smoothed_pose_mixture')
@@ -273,7 +275,8 @@ def test_nobody_in_view_ends_the_window(session, outputs, likelihoods):
     assert {marker.action for marker in markers.markers} == {2}
     assert (one.state.status, one.state.trouble()) == ('nobody', 'nobody in view')
     # A second one tells nothing new, and what comes after a while is no gap to bridge.
-    assert one.take(MIXTURE, change(likelihoods.message(5), components=[])).published == ()
+    handled = one.take(MIXTURE, change(likelihoods.message(5), components=[]))
+    assert handled.published == handled.events == ()
     handled = one.take(MIXTURE, likelihoods.message(30))
     assert handled.faults == handled.warnings == ()
     assert (one.state.status, one.state.window, one.state.gaps) == ('smoothing', 1, 0)

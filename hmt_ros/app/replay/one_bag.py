@@ -98,10 +98,10 @@ def replay_bag(
             hidden = options.quiet if shows is None else not shows
             with (
                 WriteBehind() as behind,
-                _track(options, parameters, out, behind) as track,
                 show_progress(
                     str(target), 'images', recorded.image.message_count, quiet=hidden
                 ) as bar,
+                _track(options, parameters, out, behind) as track,
             ):
                 result = _play(options, bag, recorded, track, out, behind, bar, tell)
             if not result.tracked:

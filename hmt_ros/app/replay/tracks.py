@@ -63,7 +63,7 @@ class OfflineTrack(PlayedTrack):
         self._handed: list[Output] = []
         self._bme = self._smoother = None
         if parameters.bme is not None:
-            self._bme = BmeSession(parameters.bme, self._predict)
+            self._bme = BmeSession(parameters.bme, self._predict, bme_session.TOPICS.__contains__)
         self._heard = _heard_by_bme(parameters)
         self._filter = FilterSession(parameters.filter, self._filtered)
         if parameters.smoother is not None:

@@ -96,7 +96,7 @@ IMAGE, INFO = ('image', image(0)), ('camera_info', info(0))
         pytest.param([IMAGE], 'has images on /image, but no camera_info', id='no camera_info'),
         pytest.param(
             [('camera_info', info(0, k=np.zeros(9))), IMAGE],
-            'the camera is not calibrated (K is zero)',
+            'camera_info has k[0] = 0: uncalibrated',
             id='uncalibrated',
         ),
         pytest.param(
@@ -342,10 +342,15 @@ def test_going_on_nevertheless(tmp_path, capsys):
     streams = capsys.readouterr()
     assert streams.out == f'{out}: 2 of 6 images tracked\n'
     told = streams.err.splitlines()
-    assert len(told) == 4
-    for text, part in zip(
-        told, ('not calibrated', 'breaks off', 'stamps that increase', 'bag.mcap'), strict=True
-    ):
+    wanted = (
+        'uncalibrated',
+        'camera_info has messages of the frames',
+        'breaks off',
+        'image has messages of the frames',
+        'stamps that increase',
+        'bag.mcap',
+    )
+    for text, part in zip(told, wanted, strict=True):
         assert text.startswith('replay: ')
         assert part in text
     with BagReader(out) as reader:

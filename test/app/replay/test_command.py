@@ -78,13 +78,15 @@ class StandingStill:
 
     made = []  # noqa: RUF012
 
-    def __init__(self, body, camera, settings, background, seed, known_ground=None):
+    def __init__(self, body, camera, settings, background, seed, **others):
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
         self.track_id, self.started_from = 1, None
         self.keypoints, self.positions, self.predictions, self.masks = [], [], [], []
         self.ground, self.contacts = Ground(np.array([0.0, -1.0, 0.0]), 0.3, None, np.inf), {}
-        self.silhouettes = SimpleNamespace(doubted=False, known='known')
+        self.silhouettes = SimpleNamespace(
+            doubted=False, known='known', watch=SimpleNamespace(moved=False, shift=0.0)
+        )
         StandingStill.made.append(self)
 
     def reset(self, start, *, box=None):
@@ -100,9 +102,7 @@ class StandingStill:
     def point_estimate(self):
         return self.body.prior_mean
 
-    def step(
-        self, image, stamp, keypoints=None, prediction=None, mask=None, *, nobody_predicted=False
-    ):
+    def step(self, image, stamp, keypoints=None, prediction=None, mask=None, **others):
         self.keypoints.append(None if keypoints is None else keypoints.names)
         self.positions.append(None if keypoints is None else keypoints.positions)
         self.predictions.append(prediction)

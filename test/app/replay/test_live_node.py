@@ -162,7 +162,7 @@ def test_same_of_raw_images_with_keypoints_masks_and_faults(tmp_path, capsys):
                 names=['right_wrist', 'left_wrist'],
                 **{axis: np.array([0.1, -0.1]) for axis in 'xyz'},
             )
-            half = image_message(MESSAGES, picture[::2].copy(), stamp + 5000, 'lens')
+            half = image_message(MESSAGES, picture[::2].copy(), stamp + 5000, '')
             entries.append(('image', time, image_message(MESSAGES, picture, stamp, '')))
             entries.append(('image', time + 5000, half))
             entries.append(('keypoints', time + 9000, seen))

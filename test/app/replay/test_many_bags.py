@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from hmt_ros.app import progress
 from hmt_ros.app.make_bag import main as make_bag
 from hmt_ros.app.replay import many_bags
 from hmt_ros.app.replay.command import main
@@ -82,6 +83,26 @@ def test_bags_that_are_done_are_skipped(archive, tracked, monkeypatch, capsys):
     # In `day` this one is b.
     assert other == 'replay: b: AssertionError: AssertionError'
     (tracked / 'b.replay.json').unlink()
+
+
+def test_progress_of_all_and_of_each(archive, tracked, tmp_path, monkeypatch, capsys):
+    """Lines on stderr; on stdout what there is without them."""
+    monkeypatch.setattr(progress, 'INTERVAL', 1e-3)
+    out = tmp_path / 'out'
+    assert main([str(archive), '-o', str(out), *PERSON]) == 0
+    streams = capsys.readouterr()
+    assert streams.out.splitlines() == [
+        'a: 2 of 2 images tracked',
+        'day/b: 2 of 2 images tracked',
+        f'{out}: 2 replayed, 0 done before, 0 failed',
+    ]
+    lines = streams.err.splitlines()
+    assert f'{out}: 0 of 2 bags, 00:00 so far' in lines
+    assert lines[-1].startswith(f'{out}: 2 bags in ')
+    for name in ('a', 'day/b'):
+        assert any(line.startswith(f'{out / name}: 2 images in ') for line in lines)
+    assert main([str(archive), '-o', str(tmp_path / 'quiet'), *PERSON, '--quiet']) == 0
+    assert capsys.readouterr() == ('', '')
 
 
 def test_what_was_left_half_done_is_done_anew(archive, tracked, tmp_path, monkeypatch, capsys):

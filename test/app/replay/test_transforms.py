@@ -178,6 +178,6 @@ def test_fixed_frame_alone_reads_transforms(entries, tmp_path, capsys):
     assert main([*arguments, '--no-smoother']) == 0
     streams = capsys.readouterr()
     assert '2 of 2 images tracked' in streams.out
-    lines = [line for line in streams.err.splitlines() if 'fixed_frame' in line]
+    lines = [line for line in streams.err.splitlines() if 'to fixed_frame' in line]
     assert len(lines) == 1
     assert "to fixed_frame 'odom' at the image of" in lines[0]

@@ -217,6 +217,16 @@ def test_chosen_topics_and_fewer_times(made, tmp_path):
     assert found['notes'] == [f'4 of {FRAMES} times are shown']
 
 
+def test_bag_in_a_namespace(body, poses, tmp_path):
+    """The topics of a person are found in the person's namespace; a relative name is enough."""
+    place = '/humans/bodies/anna'
+    out = write_out(tmp_path / 'out', body, poses, overlay=True, namespace=place)
+    found = data_of(make(out, tmp_path / 'report', '--topic', 'pose_mixture'))
+    assert [layer['topic'] for layer in found['layers']] == [f'{place}/pose_mixture']
+    assert found['truth']['source'].endswith(f'({place}/ground_truth)')
+    assert len(found['images']['jpegs']) == FRAMES  # of the overlay
+
+
 def test_one_window_over_the_whole_time(body, poses, tmp_path):
     """Trajectories that stand alone: their own times are shown."""
     rng = np.random.default_rng(0)

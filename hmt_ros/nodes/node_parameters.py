@@ -1,0 +1,132 @@
+"""Parameters of a node as ROS has them: how they are declared, and which were given in vain."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+
+from hmt_ros.sessions.declared_parameters import AT_LAUNCH, EFFECTS, DeclaredParameter, Value
+from msg_tools.files.plain_yaml import read_plain_yaml
+
+QOS_OVERRIDES = 'qos_overrides.'
+_LARGEST_FILE = 1_000_000  # bytes
+_KEY = 'ros__parameters'
+# How alike a name must be to be meant; that of a node more, or one of ours would be another's.
+_ALIKE, _ALIKE_NODE = 0.5, 0.8
+
+
+def as_in_ros(value: Value) -> Any:
+    """A value of a parameter as ROS takes it."""
+    return list(value) if isinstance(value, tuple) else value
+
+
+def descriptor(parameter: DeclaredParameter) -> ParameterDescriptor:
+    """How a parameter is declared to ROS: description, limits, whether it can change."""
+    result = ParameterDescriptor(
+        description=f'{parameter.description} {EFFECTS[parameter.effect]}',
+        read_only=parameter.effect == AT_LAUNCH,
+        # ROS gives an empty list, and one of whole numbers, another type than one of numbers.
+        dynamic_typing=isinstance(parameter.default, tuple),
+    )
+    if parameter.limits is not None:
+        low, high = parameter.limits
+        if isinstance(parameter.default, int):
+            result.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+        else:
+            result.floating_point_range = [
+                FloatingPointRange(from_value=float(low), to_value=float(high))
+            ]
+    return result
+
+
+def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
+    """Warnings of names that a node was given and does not have.
+
+    Args:
+        given: names from the command line and from parameter files.
+        known: names that the node has.
+    """
+    names = sorted(known)
+    texts = []
+    for name in sorted(set(given) - set(names)):
+        near = difflib.get_close_matches(name, names, n=1, cutoff=_ALIKE)
+        hint = f'; did you mean {near[0]!r}?' if near else ', it is ignored'
+        texts.append(f'unknown parameter {name!r}{hint}')
+    return texts
+
+
+def next_step(node: Node, error: ValueError, checked: Iterable[str]) -> str:
+    """What to do after a configuration that failed.
+
+    Args:
+        node: that was configured.
+        error: why it failed.
+        checked: names of parameters that may be the cause.
+    """
+    values = {name: node.get_parameter(name).value for name in checked}
+    wrong = [name for name, value in values.items() if value and str(value) in str(error)]
+    advice = 'mend that'
+    if wrong:
+        kind = 'file' if wrong[0].endswith('_file') else 'value'
+        advice = f'set {wrong[0]} to a {kind} that can be used'
+    change = f'ros2 lifecycle set {node.get_fully_qualified_name()}'
+    return f'{advice}, then: {change} configure; {change} activate'
+
+
+def files_for_others(arguments: Iterable[str], node: str) -> list[str]:
+    """Warnings of parameter files in which a node is not named as it is called.
+
+    A file for other nodes is none: one file may serve many nodes.
+
+    Args:
+        arguments: of the command line.
+        node: its full name.
+    """
+    words, texts = list(arguments), []
+    for option, path in itertools.pairwise(words):
+        if option != '--params-file':
+            continue
+        try:
+            document = read_plain_yaml(Path(path), _LARGEST_FILE)
+        except ValueError:
+            # ROS has read it: it is no plain YAML, but nothing is wrong with it.
+            continue
+        sections = list(_sections(document, '')) if isinstance(document, Mapping) else []
+        if any(re.fullmatch(_pattern(section), node) for section in sections):
+            continue
+        near = next((section for section in sections if _is_meant(section, node)), None)
+        if near is not None:
+            texts.append(
+                f'{path}: its parameters are for {near!r}, and this node is {node!r}: none is '
+                f'used; name the section {"/**/" + node.rpartition("/")[2]!r}'
+            )
+    return texts
+
+
+def _sections(document: Mapping[Any, Any], prefix: str) -> Iterator[str]:
+    """Names of the nodes that a parameter file is for, with namespaces."""
+    for key, value in document.items():
+        name = f'{prefix}/{str(key).strip("/")}'
+        if key == _KEY:
+            yield prefix
+        elif isinstance(value, Mapping):
+            yield from _sections(value, name)
+
+
+def _pattern(section: str) -> str:
+    """What a section matches, as a regular expression over full names of nodes."""
+    parts = {'*': '/[^/]+', '**': '(/[^/]+)*'}
+    return ''.join(parts.get(part, f'/{re.escape(part)}') for part in section.split('/')[1:])
+
+
+def _is_meant(section: str, node: str) -> bool:
+    """Whether somebody who writes this section means the node."""
+    name, own = section.rpartition('/')[2], node.rpartition('/')[2]
+    return difflib.SequenceMatcher(None, name, own).ratio() >= _ALIKE_NODE

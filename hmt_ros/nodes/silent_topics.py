@@ -1,0 +1,207 @@
+"""Why nothing arrives: what a node waits for, who publishes it, and what there is instead.
+
+Everything here runs in the executor's thread, once a period of the diagnostics, and asks the graph
+only about topics on which nothing arrives.
+"""
+
+from __future__ import annotations
+
+import difflib
+import time
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
+
+from rclpy.node import Node
+
+from hmt_ros.nodes.subscribed_topic import SubscribedTopic
+from hmt_ros.sessions.session import NeededInput, kind_of
+
+# Time without a message after which a topic is silent, and between two warnings of one text, s.
+SILENCE, REPEAT = 3.0, 30.0
+# Topics that are named as meant instead, and how alike their names are at least.
+_MOST_NAMED, _ALIKE = 3, 0.6
+_IMAGE, _COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
+_SUFFIX = '/compressed'
+_OTHER = {_IMAGE: _COMPRESSED, _COMPRESSED: _IMAGE}
+
+
+class Publication(NamedTuple):
+    """That somebody else publishes on a topic.
+
+    Attributes:
+        topic: its full name.
+        msgtype: for example 'sensor_msgs/msg/Image'.
+        by: full name of a node.
+    """
+
+    topic: str
+    msgtype: str
+    by: str
+
+
+class SilentTopics:
+    """Watches the topics that a node subscribes to.
+
+    Args:
+        node: that subscribes.
+        warn: takes the text of a warning.
+
+    Attributes:
+        texts: of the silent topics, as the last look has found them: the topics, and why.
+    """
+
+    def __init__(self, node: Node, warn: Callable[[str], None]) -> None:
+        self.texts: Mapping[str, str] = {}
+        self._node, self._warn = node, warn
+        self._inputs: dict[str, SubscribedTopic] = {}
+        self._arrivals: dict[str, float] = {}
+        self._began = time.monotonic()
+        self._pace = ''
+        self._warned: dict[str, tuple[str, float]] = {}
+
+    @property
+    def silence(self) -> float:
+        """Time since the last message that was to be estimated from, s; 0 while they come."""
+        last = self._arrivals.get(self._pace)
+        since = 0.0 if last is None else time.monotonic() - last
+        return since if since > SILENCE else 0.0
+
+    def listen(self, inputs: Iterable[SubscribedTopic], pace: str = '') -> None:
+        """Begins anew with other subscriptions; without any, nothing is silent.
+
+        Args:
+            inputs: the subscriptions.
+            pace: source of the messages that are estimated from.
+        """
+        self._pace = pace
+        self._inputs = {one.source: one for one in inputs}
+        self.texts = {}
+        self._arrivals.clear()
+        self._warned.clear()
+        self._began = time.monotonic()
+
+    def arrived(self, source: str, now: float) -> None:
+        """Takes note of a message."""
+        self._arrivals[source] = self._arrivals[kind_of(source)] = now
+
+    def look(self, needed: Iterable[NeededInput]) -> None:
+        """Looks for silent topics among those that are needed, and warns of them."""
+        now = time.monotonic()
+        newest = self._arrivals.get(self._pace, self._began)
+        silent = [one for one in needed if self._is_silent(one, newest if one.with_each else now)]
+        texts = {}
+        for one in silent:
+            wanted = [self._inputs[source] for source in one.sources if source in self._inputs]
+            names = [self._node.resolve_topic_name(each.topic) for each in wanted]
+            if wanted:
+                texts[' or '.join(names)] = why_silent(wanted, names, self._like(wanted, names))
+        self.texts = texts
+        for topics, text in texts.items():
+            before, at = self._warned.get(topics, ('', 0.0))
+            if text != before or now - at >= REPEAT:
+                self._warned[topics] = text, now
+                self._warn(text)
+        for topics in self._warned.keys() - texts.keys():
+            del self._warned[topics]
+
+    def _is_silent(self, needed: NeededInput, now: float) -> bool:
+        last = max(self._arrivals.get(source, self._began) for source in needed.sources)
+        return now - last >= SILENCE
+
+    def _like(self, wanted: list[SubscribedTopic], names: list[str]) -> list[Publication]:
+        """What others publish on topics that are like some, by type or by name."""
+        own = self._node.get_fully_qualified_name()
+        types = {one.msgtype for one in wanted}
+        types |= {_OTHER[each] for each in types & _OTHER.keys()}
+        found = []
+        for topic, kinds in self._node.get_topic_names_and_types():
+            if not types & set(kinds) and all(_likeness(topic, x) < _ALIKE for x in names):
+                continue
+            for info in self._node.get_publishers_info_by_topic(topic):
+                by = f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+                if by != own:
+                    found.append(Publication(topic, info.topic_type, by))
+        return found
+
+
+def why_silent(
+    wanted: list[SubscribedTopic], names: list[str], published: list[Publication]
+) -> str:
+    """Why nothing arrives on topics any of which is enough, and what to do.
+
+    Args:
+        wanted: the topics.
+        names: their full names.
+        published: what others publish.
+    """
+    topics = ' or '.join(
+        f'{name} ({_short(one.msgtype)})' for one, name in zip(wanted, names, strict=True)
+    )
+    here = [each for each in published if each.topic in names]
+    types = {one.msgtype for one in wanted}
+    fitting = sorted({each.by for each in here if each.msgtype in types})
+    if fitting:
+        why = f'{" and ".join(fitting)} publishes it but sends nothing that arrives'
+        return f'nothing on {topics}; {why}: see "ros2 topic info --verbose {names[0]}"'
+    others = sorted({f'{each.by} publishes it as {_short(each.msgtype)}' for each in here})
+    why = ' and '.join(others) or f'nobody publishes {"it" if len(names) == 1 else "either"}'
+    hints = [_instead(one, name, published) for one, name in zip(wanted, names, strict=True)]
+    return '; '.join([f'nothing on {topics}', why, *dict.fromkeys(filter(None, hints))])
+
+
+def _instead(wanted: SubscribedTopic, name: str, published: list[Publication]) -> str:
+    """What there is in place of a topic; '' if nothing is like it."""
+    kinds = {each.topic: each.msgtype for each in published}
+    transport = _other_transport(wanted, name, kinds)
+    if transport:
+        return transport
+    same = [topic for topic, kind in kinds.items() if kind == wanted.msgtype and topic != name]
+    alike = [
+        topic
+        for topic, kind in kinds.items()
+        if kind != wanted.msgtype and topic != name and _likeness(topic, name) >= _ALIKE
+    ]
+    other = [topic for topic in kinds if kinds[topic] == _OTHER.get(wanted.msgtype)]
+    near = [*_nearest(same, name), *_nearest(alike if same else [*alike, *other], name)]
+    found = list(dict.fromkeys(near))[:_MOST_NAMED]
+    if not found:
+        return ''
+    verb = 'is' if len(found) == 1 else 'are'
+    named = ', '.join(f'{topic} ({_short(kinds[topic])})' for topic in found)
+    return f'there {verb} {named}{_remedy(wanted, found[0], kinds[found[0]])}'
+
+
+def _other_transport(wanted: SubscribedTopic, name: str, kinds: Mapping[str, str]) -> str:
+    """Whether the images of a topic are published in the other transport."""
+    if wanted.topic == 'image' and kinds.get(f'{name}{_SUFFIX}') == _COMPRESSED:
+        return f'{name}{_SUFFIX} is published: set image_transport to compressed'
+    raw = name.removesuffix(_SUFFIX)
+    if wanted.topic == f'image{_SUFFIX}' and kinds.get(raw) == _IMAGE:
+        return f'{raw} is published: set image_transport to raw'
+    return ''
+
+
+def _remedy(wanted: SubscribedTopic, found: str, kind: str) -> str:
+    """How the node gets the messages of another topic; '' if it can not."""
+    if kind == wanted.msgtype:
+        return f': remap with -r {wanted.topic}:={found}'
+    if wanted.topic in ('image', f'image{_SUFFIX}') and kind == _OTHER[wanted.msgtype]:
+        transport, topic = ('raw', 'image') if kind == _IMAGE else ('compressed', f'image{_SUFFIX}')
+        return f': set image_transport to {transport} and remap with -r {topic}:={found}'
+    return ''
+
+
+def _nearest(topics: Iterable[str], name: str) -> list[str]:
+    """Topics, those with the most similar names first."""
+    return sorted(topics, key=lambda topic: (-_likeness(topic, name), topic))
+
+
+def _likeness(topic: str, name: str) -> float:
+    """How alike two names are, 0 to 1: as a whole, or in their last parts."""
+    pairs = ((topic, name), (topic.rpartition('/')[2], name.rpartition('/')[2]))
+    return max(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
+
+
+def _short(msgtype: str) -> str:
+    """A type as users write it."""
+    return msgtype.replace('/msg/', '/')

@@ -1,0 +1,102 @@
+"""What becomes of a track, for the log: each change is told once, when it comes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.sessions.camera_session import camera_moved_fault
+from hmt_ros.sessions.filter_state import IN_BACKGROUND
+from hmt_ros.sessions.handled import Fault, HandlingLog
+from hmt_ros.tracking import Status, Subject, Tracker
+from msg_tools.messages.headers import SECOND_NS
+
+# A person hardly moves meanwhile.
+_SAME_MOMENT_NS = SECOND_NS // 5
+
+
+class TrackCondition(NamedTuple):
+    """What is compared from image to image.
+
+    Attributes:
+        status: of the tracker.
+        doubted: whether the background was learned with the person in it.
+        moved: whether the camera has moved since the background was taken.
+    """
+
+    status: Status = Status.WAITING
+    doubted: bool = False
+    moved: bool = False
+
+    @classmethod
+    def of(cls, tracker: Tracker | None) -> TrackCondition:
+        """The condition of a tracker; None: it waits."""
+        if tracker is None:
+            return cls()
+        silhouettes = tracker.silhouettes
+        return cls(tracker.status, silhouettes.doubted, silhouettes.watch.moved)
+
+
+def report_change(
+    log: HandlingLog,
+    before: TrackCondition,
+    tracker: Tracker,
+    initial: Subject | GaussianMixture | None,
+    stamp_ns: int,
+) -> None:
+    """Tells what has changed with an image.
+
+    Args:
+        log: takes the texts.
+        before: the condition before the image.
+        tracker: after the image.
+        initial: what the track was given to start from.
+        stamp_ns: of the image.
+    """
+    now = TrackCondition.of(tracker)
+    if now.doubted and not before.doubted:
+        log.note(
+            Fault.BACKGROUND,
+            f'{IN_BACKGROUND}, of whom only {tracker.silhouettes.share:.0%} are foreground in the '
+            f'image of {stamp_ns} ns: silhouettes are not used until the scene has been seen where '
+            'the person is now; give background_file, or begin with the empty scene',
+        )
+    if now.moved and not before.moved:
+        remedy = 'call ~/reset; a camera that is to move needs fixed_frame or use_mask'
+        text = camera_moved_fault(tracker.silhouettes.watch.shift, stamp_ns, remedy)
+        log.note(Fault.CAMERA_MOVED, text, warn=True)
+    if now.status is not before.status:
+        _report_status(log, before.status, tracker, initial, stamp_ns)
+
+
+def _report_status(
+    log: HandlingLog,
+    before: Status,
+    tracker: Tracker,
+    initial: Subject | GaussianMixture | None,
+    stamp_ns: int,
+) -> None:
+    now, track = tracker.status, f'track {tracker.track_id}'
+    at = f'at the image of {stamp_ns} ns'
+    if now is Status.NOBODY:
+        log.tell(f'nobody in view {at}: {track} ends, another starts when somebody comes')
+    elif before is Status.LOST:
+        log.tell(f'{track} is found again {at}')
+    elif before is not Status.TRACKING:
+        origin = 'what was given' if tracker.started_from is None else tracker.started_from.value
+        log.tell(f'{track} starts from {origin} {at}')
+        if isinstance(initial, Subject) and before is Status.WAITING:
+            _report_age(log, stamp_ns - initial.stamp_ns)
+    if now is Status.LOST:
+        text = f'{track} is lost {at}: no mode explains {tracker.misfit:.0%} of what is seen'
+        log.note(Fault.LOST, f'{text}; it is searched for', warn=True)
+
+
+def _report_age(log: HandlingLog, age_ns: int) -> None:
+    """Warns of a start from joints that were seen long before."""
+    if age_ns > _SAME_MOMENT_NS:
+        log.note(
+            Fault.OLD_START,
+            f'the joints that start the track were seen {age_ns / SECOND_NS:.1f} s before its '
+            'first image',
+        )

@@ -1,0 +1,95 @@
+"""Parameters that are given in vain are named, and so are files for another node."""
+
+import pytest
+
+pytestmark = pytest.mark.ros
+
+
+def warnings_of(process, until='[filter_node]: images from'):
+    """Texts of the warnings of a node that is stopped once it says a text."""
+    lines = process.stop_at(until)
+    return [line.partition('[filter_node]: ')[2].strip() for line in lines if '[WARN]' in line]
+
+
+def test_unknown_names_are_told_with_the_nearest():
+    from hmt_ros.nodes.node_parameters import unknown_parameters
+
+    known = ['max_hypotheses', 'likelihood.edges.weight', 'tails']
+    given = ['max_hypothesis', 'edges.weight', 'tails', 'zzz']
+    assert unknown_parameters(given, known) == [
+        "unknown parameter 'edges.weight'; did you mean 'likelihood.edges.weight'?",
+        "unknown parameter 'max_hypothesis'; did you mean 'max_hypotheses'?",
+        "unknown parameter 'zzz', it is ignored",
+    ]
+
+
+def test_unknown_names_from_command_line_and_file(executable, tmp_path):
+    file = tmp_path / 'own.yaml'
+    file.write_text(
+        '/**/filter_node:\n  ros__parameters:\n    subjekt_file: a\n    use_mask: true\n'
+    )
+    quality = 'qos_overrides./{}.subscription.reliability:=reliable'
+    node = executable(
+        'filter_node', '-p', 'max_hypothesis:=3', '-p', 'use_sim_time:=false',
+        '-p', quality.format('imgae'), '-p', quality.format('camera_info'),
+        '--params-file', str(file),
+    )  # fmt: skip
+    assert warnings_of(node) == [
+        "unknown parameter 'max_hypothesis'; did you mean 'max_hypotheses'?",
+        "unknown parameter 'subjekt_file'; did you mean 'subject_file'?",
+        "unknown parameter 'qos_overrides./imgae.subscription.reliability'; did you mean "
+        "'qos_overrides./image.subscription.reliability'?",
+    ]
+
+
+@pytest.mark.parametrize(
+    ('section', 'meant'),
+    [
+        ('filter_nod', True),
+        ('/p1/filter_node', True),
+        ('/**/filter_node', False),
+        ('filter_node', False),
+        ('/**', False),
+        ('/*', False),
+        # Another node of ours, or one of others: the file is for several.
+        ('smoother_node', False),
+        ('/camera/driver', False),
+    ],
+)
+def test_a_file_whose_sections_do_not_match(section, meant, tmp_path):
+    from hmt_ros.nodes.node_parameters import files_for_others
+
+    file = tmp_path / 'own.yaml'
+    file.write_text(f'{section!r}:\n  ros__parameters:\n    use_mask: true\n')
+    texts = files_for_others(['--ros-args', '--params-file', str(file)], '/filter_node')
+    assert len(texts) == meant
+    if meant:
+        wanted = f"its parameters are for '/{section.strip('/')}', and this node is '/filter_node'"
+        assert texts[0].startswith(f'{file}: {wanted}: none is used; name the section ')
+
+
+def test_namespaces_of_a_file(tmp_path):
+    """The patterns match as those of ROS: a nested section, a namespace, wildcards for parts."""
+    from hmt_ros.nodes.node_parameters import files_for_others
+
+    file = tmp_path / 'own.yaml'
+    matching = {
+        'a/b/filter_node': ['/a/b/filter_node', '/**/filter_node', '/a/**', '/a/*/filter_node'],
+        'filter_node': ['filter_node', '/*', '/**/*'],
+    }
+    others = {'a/b/filter_node': ['/a/filter_node', '/*/filter_node', 'filter_node']}
+    for wanted, count in ((matching, 0), (others, 1)):
+        for node, sections in wanted.items():
+            for section in sections:
+                file.write_text(f'{section!r}: {{ros__parameters: {{use_mask: true}}}}\n')
+                texts = files_for_others(['--params-file', str(file)], f'/{node}')
+                assert len(texts) == count, (node, section)
+    file.write_text('a: {b: {filter_node: {ros__parameters: {use_mask: true}}}}\n')
+    assert files_for_others(['--params-file', str(file)], '/a/b/filter_node') == []
+
+
+def test_a_file_for_another_namespace_is_told_by_the_node(executable, tmp_path):
+    file = tmp_path / 'own.yaml'
+    file.write_text('/p1/filter_node:\n  ros__parameters:\n    use_mask: true\n')
+    (text,) = warnings_of(executable('filter_node', '--params-file', str(file)), 'its parameters')
+    assert text.endswith("none is used; name the section '/**/filter_node'")

@@ -1,0 +1,179 @@
+"""What a node says of topics on which nothing arrives: who publishes, and what there is."""
+
+import time
+
+import pytest
+
+pytestmark = pytest.mark.ros
+
+RAW, JPEG, INFO = (f'sensor_msgs/msg/{name}' for name in ('Image', 'CompressedImage', 'CameraInfo'))
+
+
+def silent(transport, *published, name='/image'):
+    """Why nothing arrives where others publish (topic, type)."""
+    from hmt_ros.nodes.silent_topics import Publication, why_silent
+    from hmt_ros.nodes.subscribed_topic import image_topic
+
+    found = [Publication(topic, kind, '/driver') for topic, kind in published]
+    return why_silent([image_topic(transport)], [name], found)
+
+
+@pytest.mark.parametrize(
+    ('transport', 'published', 'end'),
+    [
+        ('raw', [], '; nobody publishes it'),
+        ('raw', [('/scan', 'sensor_msgs/msg/LaserScan')], '; nobody publishes it'),
+        (
+            'raw',
+            [('/camera/image_raw', RAW), ('/camera/camera_info', INFO)],
+            '; nobody publishes it; there is /camera/image_raw (sensor_msgs/Image): remap with '
+            '-r image:=/camera/image_raw',
+        ),
+        (
+            'raw',
+            [('/image/compressed', JPEG), ('/other/image', RAW)],
+            '; nobody publishes it; /image/compressed is published: set image_transport to '
+            'compressed',
+        ),
+        (
+            'raw',
+            [('/cam/image/compressed', JPEG)],
+            '; nobody publishes it; there is /cam/image/compressed (sensor_msgs/CompressedImage): '
+            'set image_transport to compressed and remap with -r '
+            'image/compressed:=/cam/image/compressed',
+        ),
+        (
+            'raw',
+            [('/image', JPEG)],
+            '; /driver publishes it as sensor_msgs/CompressedImage; there is /image '
+            '(sensor_msgs/CompressedImage): set image_transport to compressed and remap with '
+            '-r image/compressed:=/image',
+        ),
+        (
+            'raw',
+            [('/image', RAW)],
+            '; /driver publishes it but sends nothing that arrives: see "ros2 topic info --verbose '
+            '/image"',
+        ),
+        (
+            'raw',
+            [(f'/{side}/{what}', RAW) for side in ('left', 'right') for what in ('image', 'mono')],
+            '; nobody publishes it; there are /left/image (sensor_msgs/Image), /right/image '
+            '(sensor_msgs/Image), /right/mono (sensor_msgs/Image): remap with -r '
+            'image:=/left/image',
+        ),
+    ],
+)
+def test_the_reason_and_what_there_is_instead(transport, published, end):
+    assert silent(transport, *published) == f'nothing on /image (sensor_msgs/Image){end}'
+
+
+def test_raw_images_instead_of_compressed_ones():
+    text = silent('compressed', ('/a/image', RAW), name='/a/image/compressed')
+    assert text == (
+        'nothing on /a/image/compressed (sensor_msgs/CompressedImage); nobody publishes it; '
+        '/a/image is published: set image_transport to raw'
+    )
+
+
+def test_a_near_name_of_another_type_is_named_without_a_remedy():
+    from hmt_ros.nodes.silent_topics import Publication, why_silent
+    from hmt_ros.nodes.subscribed_topic import SubscribedTopic
+
+    wanted = SubscribedTopic('keypoints', 'keypoints', 'hmt_msgs/msg/Keypoints2D')
+    found = [Publication('/keypoint', 'hri_msgs/msg/Skeleton2D', '/pose')]
+    assert why_silent([wanted], ['/keypoints'], found) == (
+        'nothing on /keypoints (hmt_msgs/Keypoints2D); nobody publishes it; there is /keypoint '
+        '(hri_msgs/Skeleton2D)'
+    )
+
+
+@pytest.fixture
+def world(stub_tracker, subject_file, world_of):
+    """A filter to which nobody publishes, and the warnings that a topic is named in."""
+    from hmt_ros.nodes.filter_node import FilterNode
+
+    def make(inputs=(), **values):
+        from importlib import import_module
+
+        kinds = {topic: kind.split('/') for topic, kind in dict(inputs).items()}
+        classes = {t: getattr(import_module(f'{k[0]}.msg'), k[2]) for t, k in kinds.items()}
+        values.setdefault('subject_file', str(subject_file))
+        return world_of(FilterNode, 'filter_node', classes, **values).start()
+
+    return make
+
+
+def of_topic(one, topic):
+    return [text for text in one.warnings() if text.startswith(f'nothing on {topic} ')]
+
+
+def test_nobody_publishes(world):
+    from sensor_msgs.msg import Image
+
+    one = world()
+    elsewhere = one.other.create_publisher(Image, '/camera/image_raw', 5)
+    one.patience(0.5)
+    wanted = 'there is /camera/image_raw (sensor_msgs/Image): remap with -r image:='
+    one.spin_until(lambda: any(wanted in text for text in of_topic(one, '/image')), 'the hint')
+    one.spin_until(lambda: of_topic(one, '/camera_info'), 'the other hint')
+    # In the diagnostics, too, by topic and as the reason.
+    level, message, values = one.diagnosis()
+    assert level == 1
+    assert message.startswith('waits for a calibrated camera_info; nothing on /image (')
+    assert 'nothing on /camera_info (sensor_msgs/CameraInfo); nobody publishes it' in message
+    assert values['nothing on /image'] in of_topic(one, '/image')
+    # Again only after a while.
+    count = len(of_topic(one, '/image'))
+    for _ in range(3):
+        one.diagnosis()
+    assert len(of_topic(one, '/image')) == count
+    one.other.destroy_publisher(elsewhere)
+
+
+def test_what_arrives_is_not_told(world, small_camera):
+    one = world({'image': RAW, 'camera_info': INFO})
+    one.send('camera_info', small_camera.info())
+    one.send('image', small_camera.image(0))
+    one.patience(1.5)
+    end, index = time.monotonic() + 4.0, 1
+    while time.monotonic() < end:
+        one.send('image', small_camera.image(index))
+        index += 1
+    assert of_topic(one, '/image') == of_topic(one, '/camera_info') == []
+    assert one.diagnosis()[0] == 0
+
+
+def test_keypoints_that_are_wanted_and_do_not_come(world, small_camera):
+    one = world({'image': RAW, 'camera_info': INFO}, use_keypoints=True, input_timeout=0.05)
+    one.send('camera_info', small_camera.info())
+    one.patience(0.5)
+    index = 0
+    while not of_topic(one, '/keypoints'):
+        one.send('image', small_camera.image(index))
+        index += 1
+        assert index < 500
+        one.executor.spin_once(timeout_sec=0.05)
+    assert of_topic(one, '/keypoints')[0] == (
+        'nothing on /keypoints (hmt_msgs/Keypoints2D); nobody publishes it'
+    )
+    # Nobody wants masks.
+    assert of_topic(one, '/mask') == []
+
+
+def test_a_publisher_that_sends_nothing(world):
+    one = world({'image': RAW})
+    one.patience(0.5)
+    one.spin_until(
+        lambda: any('/other publishes it but sends nothing' in t for t in of_topic(one, '/image')),
+        'the warning',
+    )
+
+
+def test_a_node_that_does_not_listen_misses_nothing(world):
+    one = world()
+    assert one.change_state('deactivate')
+    one.patience(0.0)
+    for _ in range(2):
+        one.diagnosis()
+    assert [text for text in one.warnings() if text.startswith('nothing on')] == []

@@ -1,0 +1,52 @@
+"""Each node explains itself: usage and all parameters, wherever --help stands."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.ros
+
+ROOT = Path(__file__).resolve().parents[2]
+NODES = [path.stem for path in sorted((ROOT / 'hmt_ros' / 'nodes').glob('*_node.py'))]
+NODES = [name for name in NODES if name not in ('run_node', 'session_node')]
+
+
+def helped(node, *arguments):
+    done = subprocess.run(
+        [sys.executable, '-m', f'hmt_ros.nodes.{node}', *arguments],
+        cwd=ROOT, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, '')
+    return done.stdout
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_help_lists_usage_and_all_parameters(node):
+    from importlib import import_module
+
+    from hmt_ros.sessions.declared_parameters import declared_parameters
+
+    module = import_module(f'hmt_ros.nodes.{node}')
+    (kind,) = (x for x in vars(module).values() if getattr(x, 'NAME', '') == node)
+    text = helped(node, '--help')
+    assert text.startswith(f'usage: ros2 run hmt_ros {node} [--ros-args')
+    assert max(map(len, text.splitlines())) <= 100
+    words = ' '.join(text.split())
+    declared = declared_parameters(kind.DEFAULTS)
+    assert len(declared) >= 5
+    for parameter in declared:
+        assert re.search(rf'^  {re.escape(parameter.name)} \(\w.*; default .*\)$', text, re.M)
+        assert ' '.join(parameter.description.split()) in words
+
+
+@pytest.mark.parametrize(
+    'arguments',
+    [('-h',), ('--ros-args', '--help'), ('--ros-args', '-p', 'max_hypotheses:=3', '--', '--help')],
+)
+def test_wherever_it_stands(arguments):
+    text = helped('filter_node', *arguments)
+    assert '  max_hypotheses (int; ' in text
+    assert text == helped('filter_node', '--help')
