@@ -36,12 +36,15 @@ class PeopleParameters(FilterParameters):
             the same time the largest in the image are taken.
         use_keypoints: If true, keypoints of the detections are a measurement and start tracks; if
             false, only their boxes are used.
+        frame_prefix: Prefix of the names of all frames on /tf and in human_description, before
+            body_<id>/, which tells several robots apart.
     """
 
     source: str = parameter_field('people', NEXT_CONFIGURE)
     scheme: str = parameter_field('coco17', NEXT_CONFIGURE)
     max_people: int = parameter_field(4, AT_ONCE, (1, 20))
     use_keypoints: bool = parameter_field(True, AT_ONCE)
+    frame_prefix: str = parameter_field('', AT_ONCE)
 
     def __post_init__(self) -> None:
         super().__post_init__()

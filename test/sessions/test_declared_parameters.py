@@ -21,6 +21,7 @@ from hmt_ros.sessions.declared_parameters import (
     with_values,
 )
 from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 
 ALL = (FilterParameters(), SmootherParameters(), BmeParameters())
@@ -186,7 +187,9 @@ def test_nodes_have_few_parameters():
     assert parameters.tracker.candidates == 20
 
 
-@pytest.mark.parametrize('settings', ALL, ids=lambda settings: type(settings).__name__)
+@pytest.mark.parametrize(
+    'settings', [*ALL, PeopleParameters()], ids=lambda settings: type(settings).__name__
+)
 def test_descriptions_are_sentences_that_stand_alone(settings):
     parameters = declared_parameters(settings)
     names = [p.name for p in parameters]
@@ -198,7 +201,9 @@ def test_descriptions_are_sentences_that_stand_alone(settings):
         assert not text.lower().startswith(('of ', 'whether ', 'so many ', 'their ')), parameter
 
 
-@pytest.mark.parametrize('settings', ALL, ids=lambda settings: type(settings).__name__)
+@pytest.mark.parametrize(
+    'settings', [*ALL, PeopleParameters()], ids=lambda settings: type(settings).__name__
+)
 def test_defaults_lie_between_limits(settings):
     for parameter in declared_parameters(settings):
         assert parameter.effect in EFFECTS
