@@ -95,7 +95,7 @@ def show(one, camera, index, *people):
     """An image and its detections; what became of both."""
     first = one.take(DETECTIONS, seen(camera, index, *people))
     second = one.take(IMAGE, camera.image(index))
-    return [*first.warnings, *second.warnings]
+    return [*first.events, *first.warnings, *second.events, *second.warnings]
 
 
 def listed(outputs):
