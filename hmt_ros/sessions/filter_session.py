@@ -134,14 +134,9 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
 
     def needed_inputs(self) -> list[NeededInput]:
         """What has to come at present; may be called by any thread."""
-        p, frames, needed = self.parameters, self.frames, super().needed_inputs()
-        wanted = (
-            (p.use_keypoints, KEYPOINTS),
-            (p.use_keypoints_3d, KEYPOINTS_3D),
-            (p.use_predictions, PREDICTION),
-        )
-        needed += [NeededInput((name,), with_each=True) for used, name in wanted if used]
-        if frames.wanted and not frames.heard:
+        needed = super().needed_inputs()
+        needed += [NeededInput((source,), with_each=True) for source, _, _ in self._stamped()]
+        if self.frames.wanted and not self.frames.heard:
             needed.append(NeededInput(TRANSFORMS))
         return needed
 
@@ -212,14 +207,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             return None
 
     def _waits_for_inputs(self) -> bool:
-        p = self.parameters
-        return (
-            super()._waits_for_inputs()
-            or p.use_keypoints
-            or p.use_depth
-            or p.use_predictions
-            or self.frames.wanted
-        )
+        return super()._waits_for_inputs() or bool(self._stamped()) or self.frames.wanted
 
     def _is_ready(self, waiting: WaitingImage) -> bool:
         return (
@@ -245,17 +233,21 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
 
     def _missing_here(self, stamp: int) -> Fault | None:
         """What an image is waiting for, of the inputs that have its stamp besides masks."""
-        p = self.parameters
-        wanted = (
-            (p.use_keypoints, self._keypoints.plane, Fault.NO_KEYPOINTS),
-            (p.use_keypoints_3d, self._keypoints.space, Fault.NO_KEYPOINTS_3D),
-            (p.use_depth, self._depths.images, Fault.NO_DEPTH),
-            (p.use_predictions, self._predictions, Fault.NO_PREDICTION),
-        )
-        for used, inputs, fault in wanted:
-            if used and not self._has(inputs, stamp, p.input_timeout):
+        for _, inputs, fault in self._stamped():
+            if not self._has(inputs, stamp, self.parameters.input_timeout):
                 return fault
         return None
+
+    def _stamped(self) -> list[tuple[str, StampedInputs[Any], Fault]]:
+        """The inputs besides masks that each image waits for, and what it is to have none."""
+        p, known = self.parameters, self._keypoints
+        inputs = (
+            (p.use_keypoints, KEYPOINTS, known.plane, Fault.NO_KEYPOINTS),
+            (p.use_keypoints_3d, KEYPOINTS_3D, known.space, Fault.NO_KEYPOINTS_3D),
+            (p.use_depth, DEPTH, self._depths.images, Fault.NO_DEPTH),
+            (p.use_predictions, PREDICTION, self._predictions, Fault.NO_PREDICTION),
+        )
+        return [(source, those, fault) for used, source, those, fault in inputs if used]
 
     # Outputs.
 
@@ -435,21 +427,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
 
     def _status(self) -> tuple[str, str]:
         status = Status.WAITING if self._tracker is None else self._tracker.status
-        return status.value, self._wants() if status is Status.WAITING else ''
-
-    def _wants(self) -> str:
-        initial = self.start.initial
-        sources = self.parameters.sources
-        if self.start.box is not None or isinstance(initial, GaussianMixture):
-            return 'an image'
-        if initial is None and sources:
-            return ' or '.join(sources)
-        if initial is None:
-            return (
-                'subject_file, use_keypoints, use_mask, use_predictions, or ~/reset with a mixture '
-                'or a box'
-            )
-        return f'an image of {initial.stamp_ns} ns or later, where the subject was seen'
+        wants = self.start.wants(self.parameters.sources) if status is Status.WAITING else ''
+        return status.value, wants
 
 
 def _looks_like(body: Body, shown: Body) -> bool:

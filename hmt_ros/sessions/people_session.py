@@ -30,7 +30,6 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.camera_frames import CameraFrames
 from hmt_ros.sessions.camera_session import (
-    CAMERA_MOVED,
     IMAGE,
     CameraSession,
     StampedInputs,
@@ -40,8 +39,9 @@ from hmt_ros.sessions.depth_inputs import DEPTH, DepthInputs
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.people_inputs import Found, PeopleInputs
 from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.people_state import PeopleState
 from hmt_ros.sessions.person_session import BODIES, PersonSession, person_of
-from hmt_ros.sessions.session import NeededInput, PublishedTopic, SessionState, everything
+from hmt_ros.sessions.session import NeededInput, PublishedTopic, everything
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
@@ -66,35 +66,6 @@ def published_topic(topic: str) -> PublishedTopic:
     if topic in PeopleSession.TOPICS:
         return PeopleSession.TOPICS[topic]
     return TOPICS[topic.removeprefix(f'{BODIES}/{person_of(topic)}/')]
-
-
-@dataclass(frozen=True)
-class PeopleState(SessionState):
-    """State of the node: its status is 'no camera', 'waiting', 'nobody' or 'tracking'.
-
-    Attributes:
-        people: identities of those who are tracked.
-        followed: identities of those who are tracked, or about to be.
-        detected: number of people in the last detections.
-        moved: whether the camera has moved since the background was taken.
-    """
-
-    people: tuple[str, ...] = ()
-    followed: tuple[str, ...] = ()
-    detected: int = 0
-    moved: bool = False
-
-    def summary(self) -> str:
-        """The present estimate in a few words."""
-        return f'{len(self.people)} of {self.detected} people'
-
-    def trouble(self) -> str:
-        """Whether the background is of no use."""
-        return CAMERA_MOVED if self.moved else ''
-
-    def values(self) -> list[tuple[str, str]]:
-        """Keys and values of the diagnostics."""
-        return [('people', ' '.join(self.people)), ('people detected', str(self.detected))]
 
 
 @dataclass(eq=False)
@@ -184,6 +155,8 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
     def needed_inputs(self) -> list[NeededInput]:
         """What has to come at present; may be called by any thread."""
         needed = [*super().needed_inputs(), NeededInput((DETECTIONS,), with_each=True)]
+        if self.parameters.use_depth:
+            needed.append(NeededInput((DEPTH,), with_each=True))
         if self.frames.wanted and not self.frames.heard:
             needed.append(NeededInput(TRANSFORMS))
         return needed

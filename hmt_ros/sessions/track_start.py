@@ -40,6 +40,24 @@ class TrackStart:
     initial: Subject | GaussianMixture | None
     box: Box | None = None
 
+    def wants(self, sources: tuple[str, ...]) -> str:
+        """What has to come before the track starts.
+
+        Args:
+            sources: that may start a track where nothing is given.
+        """
+        if self.box is not None or isinstance(self.initial, GaussianMixture):
+            return 'an image'
+        if self.initial is not None:
+            stamp = self.initial.stamp_ns
+            return f'an image of {stamp} ns or later, where the subject was seen'
+        if sources:
+            return ' or '.join(sources)
+        return (
+            'subject_file, use_keypoints, use_mask, use_predictions, or ~/reset with a mixture or '
+            'a box'
+        )
+
     def tracker(
         self,
         camera: Camera,

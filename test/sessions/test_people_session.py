@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -114,8 +115,10 @@ def started(one, camera):
 
 def test_two_people_have_topics_of_their_own(session, outputs, small_camera):
     one = started(session(), small_camera)
-    told = show(one, small_camera, 0, somebody_at(15), somebody_at(50))
+    one.take(DETECTIONS, seen(small_camera, 0, somebody_at(15), somebody_at(50)))
+    told = one.take(IMAGE, small_camera.image(0)).events
     assert [text.partition(':')[0] for text in told] == ['p1', 'p2']
+    assert all(' starts from keypoints at the image of ' in text for text in told)
     topics = {output.topic for output in outputs}
     for name in ('p1', 'p2'):
         for topic in ('body', 'pose_mixture', 'human_joint_states', 'markers'):
@@ -360,3 +363,31 @@ def test_a_message_and_its_people():
     np.testing.assert_array_equal(again[0].keypoints.pixels, people[0].keypoints.pixels)
     assert again[1].box is None
     assert again[1].extent is None
+
+
+def test_what_is_needed(session, small_camera):
+    one = session(fixed_frame='odom')
+    needed = [(each.sources, each.with_each) for each in one.needed_inputs()]
+    assert needed == [
+        (('image',), False),
+        (('camera_info',), False),
+        (('detections',), True),
+        (('tf', 'tf_static'), False),
+    ]
+    started(one, small_camera)
+    assert ('camera_info',) not in [each.sources for each in one.needed_inputs()]
+
+
+def test_a_moved_camera_is_told_once_for_all(session, small_camera, tmp_path):
+    wall = np.full((48, 64, 3), 90, np.uint8)
+    wall[:, 40:] = 160
+    wall[30:, :] = 40
+    file = tmp_path / 'background.png'
+    assert cv2.imwrite(str(file), wall)
+    one, told = started(session(background_file=str(file)), small_camera), []
+    small_camera.picture = lambda index, size=None: np.roll(wall, 8, axis=1)
+    for index in range(30):
+        people = [somebody_at(15), somebody_at(50)]
+        told += [x for x in show(one, small_camera, index, *people) if 'camera has moved' in x]
+    assert len(told) == 1
+    assert one.state.trouble() == 'the camera has moved since the background was taken'
