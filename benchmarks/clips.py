@@ -18,6 +18,7 @@ from hmt_ros.app.truth import read_truth
 from hmt_ros.body import Camera, load_body
 from hmt_ros.evaluation.track_scores import Truth
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.sessions.depth_inputs import DEPTH
 from msg_tools import BagReader
 from msg_tools.files.array_file import read_archive
 from msg_tools.messages.camera_info import camera_from_info
@@ -189,7 +190,10 @@ def read_messages(
         ValueError: a bag that can not be read, or with no such topics.
     """
     with BagReader(folder) as bag:
-        topic = bag.find_topic(kinds).name
+        # Beside the images there may be depths.
+        named = [name for name, topic in bag.topics.items() if topic.msgtype in kinds]
+        pictures = [name for name in named if name.strip('/') != DEPTH]
+        topic = bag.find_topic(kinds, pictures[0] if len(pictures) == 1 else None).name
         info = next(bag.messages([bag.find_topic(['sensor_msgs/msg/CameraInfo']).name])).message
         return info, [stored.message for stored in islice(bag.messages([topic]), frames)]
 

@@ -33,6 +33,7 @@ PAGES = {
     'flips': 'flips.md',
     'kernels': 'likelihood.md',
     'contour_noise': 'likelihood.md',
+    'depth': 'likelihood.md',
     'keypoint_noise': 'keypoints.md',
     'motion_prior': 'motion_prior.md',
     'people': 'people.md',

@@ -72,6 +72,7 @@ ARGUMENTS = (
         "'skeleton2d'), 'yolo', 'boxes' or 'floats'",
     ),
     ('mask', '', 'topic of the masks of a segmenter, without /compressed; empty: none'),
+    ('depth', '', 'topic of depth images that are registered to the images; empty: none'),
     (
         'gravity_frame',
         '',
@@ -161,6 +162,9 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
     if mask:
         remappings += [('mask', mask), ('mask/compressed', f'{mask}/compressed')]
 
+    if given['depth']:
+        remappings.append(('depth', given['depth']))
+
     common = {'use_sim_time': sim_time, 'autostart': _truth(given, 'autostart')}
     camera = {
         **common,
@@ -175,6 +179,7 @@ def actions_of(given: Mapping[str, str], share: Path) -> list[Any]:
             **_named(given, 'gravity_frame'),
             **_named(given, 'fixed_frame'),
             'use_predictions': 'bme_node' in names,
+            'use_depth': bool(given['depth']),
             'use_keypoints': bool(given['keypoints']) or any(name in names for name in DETECTORS),
             **({'use_keypoints_3d': True} if 'keypoints_node' in names else {}),
             'frame_prefix': f'{_frame(namespace)}/',

@@ -137,6 +137,7 @@ def test_three_nodes_in_the_namespace_of_a_person(actions):
         'image_transport': 'raw',
         'use_mask': False,
         'use_predictions': True,
+        'use_depth': False,
         'use_keypoints': False,
         'frame_prefix': 'body_p1/',
     }
@@ -231,6 +232,7 @@ def test_arguments(actions, tmp_path):
         image_transport='compressed',
         keypoints='/pose2d',
         mask='/segmented/compressed',
+        depth='/aligned/image_raw',
         subject_file='12',
         background_file='wall.png',
         model_file='m.npz',
@@ -250,6 +252,7 @@ def test_arguments(actions, tmp_path):
         'background_file': 'wall.png',
         'subject_file': '12',
         'use_predictions': True,
+        'use_depth': True,
         'use_keypoints': True,
         'frame_prefix': 'body_anna/',
     }
@@ -262,6 +265,7 @@ def test_arguments(actions, tmp_path):
         'keypoints': '/pose2d',
         'mask': '/segmented',
         'mask/compressed': '/segmented/compressed',
+        'depth': '/aligned/image_raw',
     }
     # What the user's own file says goes before all else.
     assert tracks['parameters'][-1] == 'own.yaml'

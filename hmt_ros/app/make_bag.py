@@ -143,6 +143,11 @@ def _parser() -> CommandParser:
         help='draw the shadow of the person on the floor (default: yes)',
     )
     camera.add_argument(
+        '--depth',
+        action='store_true',
+        help='add depth images with the noise and the holes of a sensor, registered to the images',
+    )
+    camera.add_argument(
         '--jpeg-quality',
         type=whole_number(1, 100),
         default=90,
@@ -180,7 +185,8 @@ def _make_bag(arguments: argparse.Namespace) -> int:
         if options.name == CROSSING and options.mocap is None:
             write_crossing(folder, _crossing(options, viewpoint), camera, scene, **given)
         else:
-            write_bag(folder, _take(options, viewpoint), camera, scene, **given)
+            take = motion_of(options, viewpoint)
+            write_bag(folder, take, camera, scene, with_depth=arguments.depth, **given)
     return 0
 
 
@@ -208,7 +214,12 @@ def _body(name: str) -> Body:
     return body
 
 
-def _take(options: MotionOptions, viewpoint: Viewpoint) -> Take:
+def motion_of(options: MotionOptions, viewpoint: Viewpoint) -> Take:
+    """The motion that options choose, before a camera.
+
+    Raises:
+        ValueError: options that do not go together, or a file that can not be used.
+    """
     body = _body(options.body)
     heading = None if options.heading is None else math.radians(options.heading)
     if options.mocap is not None:

@@ -1,9 +1,9 @@
 """Rendered bags: images of a moving person, with ground truth, as a bag and files beside it.
 
 The bag has the topics `/image/compressed`, `/camera_info`, `/ground_truth` (hmt_msgs/PoseMixture)
-and `/body` (hmt_msgs/Body, latched). Its folder also has the files that replay and evaluate need:
-`background.png` (the empty scene), `subject.yaml` (joints as clicked in the first image) and
-`truth.npz` (joints, pixels and silhouettes).
+and `/body` (hmt_msgs/Body, latched), and `/depth` (sensor_msgs/Image, 16UC1) on request. Its folder
+also has the files that replay and evaluate need: `background.png` (the empty scene), `subject.yaml`
+(joints as clicked in the first image) and `truth.npz` (joints, pixels and silhouettes).
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ import numpy as np
 from hmt_ros.app.progress import show_progress
 from hmt_ros.body import Body, Camera
 from hmt_ros.inference.arrays import Array
+from hmt_ros.rendering.depth_sensor import sensed_depth
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.files.new_folder import FolderKind
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.depth_images import depth_message
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
@@ -70,6 +72,7 @@ def write_bag(
     scene: Scene,
     *,
     quality: int = 90,
+    with_depth: bool = False,
     progress: bool = False,
 ) -> None:
     """Renders a motion into a new bag folder, with its files beside.
@@ -80,6 +83,7 @@ def write_bag(
         camera: camera of the images.
         scene: surroundings of the person; its seed is also that of the clicks.
         quality: JPEG quality of the images, 1 to 100.
+        with_depth: whether a depth camera sees the scene as well.
         progress: whether to show progress on stderr.
 
     Raises:
@@ -101,6 +105,10 @@ def write_bag(
             stamp = take.stamp_ns(frame)
             image = compressed_image_message(messages, shown.image, stamp, FRAME_ID, quality)
             bag.write('image/compressed', stamp, image)
+            if with_depth:
+                true = np.minimum(shown.depth, scene.depth(camera))
+                seen = sensed_depth(true, camera, scene.seed, frame)
+                bag.write('depth', stamp, depth_message(messages, seen, stamp, FRAME_ID))
             info = camera_info_message(messages, camera, stamp, FRAME_ID)
             bag.write('camera_info', stamp, info)
             truth = ground_truth(messages, take.body, take.poses[frame], joints[frame], stamp)

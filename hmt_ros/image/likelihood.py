@@ -236,7 +236,7 @@ class ImageLikelihood:
         return ImageEnergy(result, costs, gradient, hessian)
 
     def residuals(self, frames: Frames, observation: Observation) -> Array:
-        """The residuals of the contour terms at the frames of one pose.
+        """The residuals of the terms of contours and depths at the frames of one pose.
 
         Returns:
             (M, RECORDED) their points and derivatives; see `residuals.add_residual`.
@@ -244,7 +244,7 @@ class ImageLikelihood:
         inputs = self._inputs(observation, 1, None, textured=False)
         outline = observation.outline
         samples = 0 if outline is None else len(outline.pixels)
-        most = 1 + 4 * len(self._model.flesh.ring_parts) + 2 * samples
+        most = 1 + 6 * len(self._model.flesh.ring_parts) + 2 * samples
         result = np.zeros((most, RECORDED))
         if any(x.term.weight > 0 for x in inputs):
             columns, origins = frames.by_pose()
@@ -269,8 +269,9 @@ class ImageLikelihood:
             on = evidence is not None and (textured or not term.needs_texture)
             weight = float(s.weight) if on else 0.0
             weighting = Weighting(
-                weight, float(s.sigma), float(s.scale), float(observation.magnification)
-            )
+                weight, float(s.sigma), float(s.scale), float(observation.magnification),
+                float(s.growth),
+            )  # fmt: skip
             result.append(term.inputs(weighting, evidence, request))
         return tuple(result)
 

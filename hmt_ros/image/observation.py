@@ -8,6 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.image_term import ImageWindow
@@ -63,6 +64,7 @@ def observe(
     wanted: Collection[str] | None = None,
     unsure: Mask | None = None,
     others: Mask | None = None,
+    depth: NDArray[np.floating] | None = None,
 ) -> Observation:
     """The evidence that an image gives to the terms of the likelihood.
 
@@ -76,6 +78,8 @@ def observe(
         wanted: names of terms; None: all.
         unsure: (H, W) pixels that may belong to the silhouette; None: none.
         others: (H, W) pixels that somebody else covers; None: none.
+        depth: (H, W) depth along the axis of the camera, m; None: unknown. 0, NaN and what is out
+            of range says nothing.
 
     Raises:
         ValueError: shapes that contradict each other.
@@ -84,6 +88,8 @@ def observe(
         raise ValueError(f'image must be (H, W, 3) uint8, saw {image.shape} {image.dtype}')
     if silhouette is not None and silhouette.shape != image.shape[:2]:
         raise ValueError(f'silhouette {silhouette.shape} for an image {image.shape[:2]}')
+    if depth is not None and depth.shape != image.shape[:2]:
+        raise ValueError(f'depth {depth.shape} for an image {image.shape[:2]}')
     known = silhouette if silhouette is not None and silhouette.any() else None
     box = window
     if known is not None:
@@ -100,10 +106,14 @@ def observe(
     hidden = None
     if others is not None:
         hidden = np.ascontiguousarray(others[rows, columns]).view(np.uint8)
+    measured = depth
+    if depth is not None and others is not None:
+        measured = np.where(others, 0.0, depth)
     before = None if last_image is None else np.ascontiguousarray(last_image[rows, columns])
     part = ImageWindow(
-        np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful, hidden
-    )
+        np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful, hidden,
+        None if measured is None else measured[rows, columns],
+    )  # fmt: skip
     evidence = {
         term.name: found
         for term in TERMS

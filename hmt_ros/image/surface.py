@@ -236,8 +236,8 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
             if e == 1.0:
                 outline_x, outline_y, lateral_x, lateral_y = c, sn, c, sn
             else:
-                outline_x, outline_y = _signed_power(c, e), _signed_power(sn, e)
-                lateral_x, lateral_y = _signed_power(c, 2.0 - e), _signed_power(sn, 2.0 - e)
+                outline_x, outline_y = signed_power(c, e), signed_power(sn, e)
+                lateral_x, lateral_y = signed_power(c, 2.0 - e), signed_power(sn, 2.0 - e)
             across, ahead = c * flesh.ring_noise[r, 0], sn * flesh.ring_noise[r, 1]
             contour.noise[r + side * rings] = np.sqrt(across * across + ahead * ahead)
             px, py = cx + rx * outline_x, cy + ry * outline_y
@@ -260,7 +260,8 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
 
 
 @njit(cache=True, nogil=True, inline='always')
-def _signed_power(x, exponent):  # type: ignore[no-untyped-def]
+def signed_power(x, exponent):  # type: ignore[no-untyped-def]
+    """sgn(x) |x|^exponent."""
     return np.sign(x) * np.abs(x) ** exponent
 
 
@@ -301,7 +302,7 @@ def _bracketed_roots(bx, by, uz, kx, ky, power, cosines, sines):  # type: ignore
 @njit(cache=True, nogil=True, inline='always')
 def _condition(w, bx, by, uz, kx, ky, power):  # type: ignore[no-untyped-def]
     c, s = np.cos(w), np.sin(w)
-    turned = bx * _signed_power(c, power) + by * _signed_power(s, power)
+    turned = bx * signed_power(c, power) + by * signed_power(s, power)
     return 1.0 + turned - uz * (kx * c * c + ky * s * s)
 
 

@@ -13,6 +13,7 @@ from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
     CAMERA_INFO_TOPIC,
+    DEPTH_TOPIC,
     MASK_TOPICS,
     RELIABLE,
     TRANSFORM_TOPICS,
@@ -48,6 +49,7 @@ class FilterNode(SessionNode[FilterSession, FilterParameters]):
         yield SubscribedTopic(KEYPOINTS_3D, KEYPOINTS_3D, keypoints.KEYPOINTS_3D)
         yield SubscribedTopic(PREDICTION, 'pose_prediction', 'hmt_msgs/msg/PoseMixture', RELIABLE)
         yield from MASK_TOPICS
+        yield DEPTH_TOPIC
         if self._session is not None and self._session.frames.wanted:
             yield from TRANSFORM_TOPICS
         yield image_topic(self._settings.image_transport)

@@ -17,6 +17,7 @@ from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
     CAMERA_INFO_TOPIC,
+    DEPTH_TOPIC,
     LATCHED,
     MASK_TOPICS,
     RELIABLE,
@@ -83,6 +84,7 @@ class PeopleNode(SessionNode[PeopleSession, PeopleParameters]):
         yield CAMERA_INFO_TOPIC
         yield SubscribedTopic(DETECTIONS, DETECTIONS, SOURCES[self._settings.source])
         yield from MASK_TOPICS
+        yield DEPTH_TOPIC
         if self._session is not None and self._session.frames.wanted:
             yield from TRANSFORM_TOPICS
         yield image_topic(self._settings.image_transport)

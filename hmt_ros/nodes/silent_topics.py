@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import time
 from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 from typing import NamedTuple
 
 from rclpy.node import Node
@@ -196,6 +197,7 @@ def _nearest(topics: Iterable[str], name: str) -> list[str]:
     return sorted(topics, key=lambda topic: (-_likeness(topic, name), topic))
 
 
+@lru_cache(maxsize=4096)
 def _likeness(topic: str, name: str) -> float:
     """How alike two names are, 0 to 1: as a whole, or in their last parts."""
     pairs = ((topic, name), (topic.rpartition('/')[2], name.rpartition('/')[2]))

@@ -10,6 +10,7 @@ from ament_index_python.packages import PackageNotFoundError, get_package_share_
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK
+from hmt_ros.sessions.depth_inputs import DEPTH
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS_TYPE
 from msg_tools.messages.images import MAX_PIXELS
 from msg_tools.messages.message_types import register_definitions
@@ -28,6 +29,7 @@ LATCHED = QoSProfile(
 LARGEST_MESSAGE = 2**24
 LARGEST_IMAGE = 8 * MAX_PIXELS + 2**16
 LARGEST_MASK = MAX_PIXELS + 2**16
+LARGEST_DEPTH = 4 * MAX_PIXELS + 2**16
 # Messages that wait while an estimate is made: small ones, masks, and transforms of a whole robot.
 SMALL_QUEUE, MASK_QUEUE, TF_QUEUE = 100, 20, 2000
 
@@ -69,6 +71,9 @@ MASK_TOPICS = (
         largest=LARGEST_MASK,
         waiting=MASK_QUEUE,
     ),
+)
+DEPTH_TOPIC = SubscribedTopic(
+    DEPTH, 'depth', 'sensor_msgs/msg/Image', largest=LARGEST_DEPTH, waiting=MASK_QUEUE
 )
 # As the listener of tf2 has them.
 _TF_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)

@@ -94,6 +94,10 @@ class Scene:
         """The empty place, BGR (H, W, 3) in grey levels 0 to 255, without noise."""
         return _empty_place(self, camera)[0]
 
+    def depth(self, camera: Camera) -> Array:
+        """Depth (H, W) of the empty place along the axis of the camera, m; inf: nothing."""
+        return _empty_depth(self, camera)
+
     def floor(self, camera: Camera) -> Picture:
         """Share (H, W) of each pixel that shows the floor and nothing in front of it."""
         return _empty_place(self, camera)[1]
@@ -208,9 +212,7 @@ def _empty_place(scene: Scene, camera: Camera) -> tuple[Picture, Picture]:
     base = np.array([[0.62, 0.66, 0.68], [0.30, 0.34, 0.40], [0.36, 0.42, 0.50]])
     base = np.clip(base + rng.uniform(-0.08, 0.08, base.shape), 0.05, 0.95)
 
-    wall = -scene.clear - 5.0
-    t_wall = np.where(rays[:, 1] < -1e-6, (wall - eye[1]) / np.minimum(rays[:, 1], -1e-6), np.inf)
-    t_floor = np.where(rays[:, 2] < -1e-6, -eye[2] / np.minimum(rays[:, 2], -1e-6), np.inf)
+    t_wall, t_floor = _wall_and_floor(scene, eye, rays)
     things = _things(scene)
     t_box, box, normal, place = things.hit(np.broadcast_to(eye, rays.shape), rays)
     on_box = t_box < np.minimum(t_wall, t_floor)
@@ -252,6 +254,28 @@ def _empty_place(scene: Scene, camera: Camera) -> tuple[Picture, Picture]:
     for picture in result:
         picture.setflags(write=False)
     return result[0], result[1]
+
+
+def _wall_and_floor(scene: Scene, eye: Array, rays: Array) -> tuple[Array, Array]:
+    """Distances (N,) at which rays (N, 3) of the world meet the wall and the floor; inf: never."""
+    wall = -scene.clear - 5.0
+    t_wall = np.where(rays[:, 1] < -1e-6, (wall - eye[1]) / np.minimum(rays[:, 1], -1e-6), np.inf)
+    t_floor = np.where(rays[:, 2] < -1e-6, -eye[2] / np.minimum(rays[:, 2], -1e-6), np.inf)
+    return t_wall, t_floor
+
+
+@lru_cache(maxsize=8)
+def _empty_depth(scene: Scene, camera: Camera) -> Array:
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = camera.rays(np.stack([u, v], axis=-1).reshape(-1, 2))
+    world = rays @ scene.viewpoint.rotation
+    eye = np.array([0.0, scene.viewpoint.distance, scene.viewpoint.height])
+    t_wall, t_floor = _wall_and_floor(scene, eye, world)
+    t_box, *_ = _things(scene).hit(np.broadcast_to(eye, world.shape), world)
+    nearest = np.minimum(np.minimum(t_wall, t_floor), t_box)
+    result: Array = (nearest * rays[:, 2]).reshape(camera.height, camera.width)
+    result.setflags(write=False)
+    return result
 
 
 def _unit(vector: Array) -> Array:

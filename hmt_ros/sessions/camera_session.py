@@ -18,6 +18,9 @@ from collections.abc import Callable
 from itertools import takewhile
 from typing import Any, Generic, NamedTuple, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hmt_ros.body import Camera
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.scene_watch import SceneWatch
@@ -56,12 +59,14 @@ class WaitingImage(NamedTuple):
         stamp_ns: of the image.
         frame_id: optical frame of the camera.
         mask: (H, W) where a segmenter sees the person; None: no mask has come.
+        depth: (H, W) of what each pixel shows, m; None: unknown.
     """
 
     image: Image
     stamp_ns: int
     frame_id: str
     mask: Mask | None = None
+    depth: NDArray[np.float32] | None = None
 
 
 class CameraSession(Session[CameraParameters, State]):

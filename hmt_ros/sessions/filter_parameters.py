@@ -79,6 +79,8 @@ class FilterParameters(CameraNodeParameters):
         keypoint_sigma_px: Standard deviation of keypoints that come without a covariance, px; 0
             selects the one that is learned, which depends on confidence and on the size of the
             person.
+        use_depth: If true, depth images that are registered to the images (topic depth) are a
+            measurement, and an image waits for the depth image of its stamp.
         use_predictions: If true, poses that bme_node predicts from the image start the track where
             there is no subject_file, and are among the hypotheses; an image then waits for the
             prediction of its stamp.
@@ -114,6 +116,7 @@ class FilterParameters(CameraNodeParameters):
     keypoint_scheme: str = parameter_field(AUTO, AT_ONCE)
     use_keypoints_3d: bool = parameter_field(False, AT_ONCE)
     keypoint_sigma_px: float = parameter_field(0.0, AT_ONCE, (0.0, 1000.0))
+    use_depth: bool = parameter_field(False, AT_ONCE)
     use_predictions: bool = parameter_field(False, AT_ONCE)
     gravity: tuple[float, ...] = parameter_field((), NEXT_TRACK)
     camera_height: float = parameter_field(0.0, NEXT_TRACK, (0.0, 100.0))

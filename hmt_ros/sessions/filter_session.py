@@ -7,7 +7,8 @@ order give the same bytes. The rules, besides those of `CameraSession`:
   `reset_on_time_jump`.
 - With `use_keypoints` an image waits for keypoints of exactly its stamp, for keypoints of a later
   stamp, or for an image that is `input_timeout` younger; with `use_keypoints_3d` for keypoints_3d,
-  and with `use_predictions` for a pose_prediction, in the same way. Of several of one stamp the
+  with `use_depth` for a depth image, and with `use_predictions` for a pose_prediction, in the same
+  way. Of several of one stamp the
   last counts; keypoints without names, and mixtures without components, say that nobody was seen.
 - With `gravity_frame` or `fixed_frame` an image waits for the transforms of its stamp, or for an
   image or a transform that is `input_timeout` younger, and never so long that it would be
@@ -42,6 +43,7 @@ from hmt_ros.sessions.camera_session import (
     StampedInputs,
     WaitingImage,
 )
+from hmt_ros.sessions.depth_inputs import DEPTH, DepthInputs, depth_elsewhere
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.filter_state import FilterState
 from hmt_ros.sessions.fixed_frame import FixedFrame
@@ -68,6 +70,7 @@ from msg_tools.messages.pose_mixtures import TrackState, pose_mixture_of
 __all__ = [
     'CAMERA_INFO',
     'COMPRESSED_MASK',
+    'DEPTH',
     'IMAGE',
     'KEYPOINTS',
     'KEYPOINTS_3D',
@@ -111,6 +114,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         self._shown_body: Body | None = None
         self._shown_frames: tuple[str, str] | None = None
         self._keypoints = KeypointInputs(self._log)
+        self._depths = DepthInputs(self._log)
         self._predictions: StampedInputs[PosePrediction | Status] = StampedInputs()
         # Of an image that was left out since the last estimate.
         self._late_prediction: PosePrediction | None = None
@@ -148,6 +152,9 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             self._keypoints.put(message, stamp, self.parameters, self.start.body)
         elif source == KEYPOINTS_3D:
             self._keypoints.put_3d(message, stamp)
+        elif source == DEPTH:
+            if self.parameters.use_depth:
+                self._depths.put(message, stamp)
         elif source == PREDICTION:
             self._predictions.put(stamp, self._prediction_in(message))
         elif source in TRANSFORMS:
@@ -166,6 +173,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         # Where time begins again, so do the numbers of the tracks.
         self._tracker, self._tracks = None, 0
         self._keypoints.clear()
+        self._depths.images.clear()
         self._predictions.clear()
         self._late_prediction = None
         self.frames.forget_after(stamp)
@@ -208,6 +216,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         return (
             super()._waits_for_inputs()
             or p.use_keypoints
+            or p.use_depth
             or p.use_predictions
             or self.frames.wanted
         )
@@ -240,6 +249,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         wanted = (
             (p.use_keypoints, self._keypoints.plane, Fault.NO_KEYPOINTS),
             (p.use_keypoints_3d, self._keypoints.space, Fault.NO_KEYPOINTS_3D),
+            (p.use_depth, self._depths.images, Fault.NO_DEPTH),
             (p.use_predictions, self._predictions, Fault.NO_PREDICTION),
         )
         for used, inputs, fault in wanted:
@@ -256,6 +266,8 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         if p.use_keypoints:
             keypoints = self._keypoints.take(stamp, p, self.start.body)
         prediction = self._prediction_of(stamp) if p.use_predictions else None
+        if p.use_depth:
+            waiting = self._depths.added_to(waiting, self._dropped)
         self._follow(waiting, camera, keypoints, prediction)
 
     def _new_tracker(self, camera: Camera) -> Tracker:
@@ -295,8 +307,11 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 waiting.mask,
                 nobody_predicted=prediction is Status.NOBODY,
                 others=others,
+                depth=waiting.depth,
             )
             report_change(self._log, before, self._tracker, self.start.initial, stamp)
+            if waiting.depth is not None and not self._tracker.depth.believed:
+                self._log.note(Fault.DEPTH_ELSEWHERE, depth_elsewhere(stamp))
             if posterior is not None and likelihood is not None:
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
             elif len(self._weights):

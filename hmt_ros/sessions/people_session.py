@@ -36,6 +36,7 @@ from hmt_ros.sessions.camera_session import (
     StampedInputs,
     WaitingImage,
 )
+from hmt_ros.sessions.depth_inputs import DEPTH, DepthInputs
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.people_inputs import Found, PeopleInputs
 from hmt_ros.sessions.people_parameters import PeopleParameters
@@ -147,6 +148,7 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         self.frames = CameraFrames(p.gravity_frame, p.fixed_frame, floor=p.floor_in_gravity_frame)
         self._start = prepare_start(p)
         self._detections: StampedInputs[list[DetectedPerson]] = StampedInputs()
+        self._depths = DepthInputs(self._log)
         self._info_stamp = 0
         self._forget()
         self.state = self._present_state()
@@ -204,6 +206,9 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         if source == DETECTIONS:
             people = self._inputs.people(message, stamp, self.parameters.keypoint_sigma_px)
             self._detections.put(stamp, people)
+        elif source == DEPTH:
+            if self.parameters.use_depth:
+                self._depths.put(message, stamp)
         elif source in TRANSFORMS:
             if self.frames.wanted:
                 for text in self.frames.take(message, static=source == TF_STATIC):
@@ -218,6 +223,7 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
     def _forget_inputs(self, stamp: int) -> None:
         super()._forget_inputs(stamp)
         self._detections.clear()
+        self._depths.images.clear()
         self.frames.forget_after(stamp)
 
     def _waits_for_inputs(self) -> bool:
@@ -228,6 +234,7 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         return (
             super()._is_ready(waiting)
             and self._has(self._detections, waiting.stamp_ns, timeout)
+            and self._has_depth(waiting.stamp_ns)
             and self._has_transforms(self.frames, waiting)
         )
 
@@ -235,7 +242,13 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         p = self.parameters
         if not self._has(self._detections, stamp, p.input_timeout):
             return Fault.NO_DETECTIONS
+        if not self._has_depth(stamp):
+            return Fault.NO_DEPTH
         return super()._missing_input(stamp)
+
+    def _has_depth(self, stamp: int) -> bool:
+        p = self.parameters
+        return not p.use_depth or self._has(self._depths.images, stamp, p.input_timeout)
 
     # Estimates.
 
@@ -254,6 +267,8 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
             self._log.note(
                 Fault.NO_DETECTIONS, f'no detections have come for the image of {stamp} ns'
             )
+        if self.parameters.use_depth:
+            waiting = self._depths.added_to(waiting, self._dropped)
         for kind, text in self.frames.look(waiting.frame_id, stamp):
             self._log.note(kind, text)
         if self._scene is None:

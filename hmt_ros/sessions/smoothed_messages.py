@@ -35,7 +35,6 @@ TOPICS = {
 TRACED = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
 # The heaviest trajectories that are drawn.
 DRAWN = 8
-_TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,19 +194,20 @@ def nobody_messages(
 
 
 def _followed(pose: FinalPose, reduced: GaussianMixture) -> dict[str, Array | None]:
-    """Identities and velocities of components: those of the trajectories that they stand for."""
-    densities = pose.mixture.component_log_densities(reduced.means)
-    stands_for = np.argmax(densities + np.log(np.maximum(pose.mixture.weights, _TINY)), axis=1)
-    identities = np.zeros(len(reduced))
-    taken: set[int] = set()
+    """Identities and velocities of components: those of the trajectories that they stand for.
+
+    Each stands for the nearest trajectory, in its standard deviations, that no heavier one has.
+    """
+    trajectories = pose.mixture
+    offsets = reduced.means[:, None] - trajectories.means
+    solved = np.linalg.solve(trajectories.covariances, offsets[..., None])[..., 0]
+    distances = np.einsum('kid,kid->ki', offsets, solved)
+    stands_for = np.zeros(len(reduced), dtype=np.intp)
     for k in np.argsort(-reduced.weights, kind='stable'):
-        # Of components that stand for one trajectory, the heaviest has its identity.
-        trajectory = int(stands_for[k])
-        if trajectory not in taken:
-            taken.add(trajectory)
-            identities[k] = 1 + pose.identities[trajectory]
+        stands_for[k] = np.argmin(distances[k])
+        distances[:, stands_for[k]] = np.inf
     velocities = None if pose.velocities is None else pose.velocities[stands_for]
-    return {'identities': identities, 'velocities': velocities}
+    return {'identities': 1 + np.array(pose.identities)[stands_for], 'velocities': velocities}
 
 
 def _joints(means: Array, body: Body) -> Array:

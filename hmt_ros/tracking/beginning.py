@@ -29,6 +29,8 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.mirror import reverse_depth
 from hmt_ros.image.observation import Box, Observation
+from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
@@ -48,6 +50,7 @@ from hmt_ros.tracking.presence import (
     sees_person,
 )
 from hmt_ros.tracking.proposals import PosePrediction
+from hmt_ros.tracking.start_depth import depths_of, moved_to_depth
 from hmt_ros.tracking.subject import Subject
 
 # A new track starts when somebody has been seen for so long, s; if a side of the image may cut the
@@ -60,6 +63,8 @@ SURE_KEYPOINTS, KEYPOINTS_OF_A_PART = 0.1, 0.4
 # where the person is and how the person is turned, as a fraction of all.
 CONFIDENT = 0.5
 MOST_OF_THE_TRUNK = 0.75
+# A person hardly moves in so long a time, ns.
+SAME_MOMENT_NS = 200_000_000
 # Number of the best poses from keypoints whose reversals in depth are searched, too.
 REVERSED = 24
 
@@ -74,6 +79,10 @@ class Source(Enum):
     MASK = 'a mask'
     BOX = 'a box'
     ARRIVAL = 'who has come into view'
+
+
+# Starts whose best pose is near that of the person.
+FROM_JOINTS = (Source.SUBJECT, Source.KEYPOINTS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +241,10 @@ class Starts:
         if given is not None and self.box is None:
             if isinstance(given, Subject) and stamp < given.stamp_ns:
                 return None
-            return beginning_given(given, model, body, camera, upright)
+            depths = None
+            if isinstance(given, Subject) and stamp - given.stamp_ns <= SAME_MOMENT_NS:
+                depths = depths_of(view.depth)
+            return beginning_given(given, model, body, camera, upright, depths)
         if self.box is None:
             wanted = time_to_first(view, model, prediction, masked=masked)
             if not self.arrival.lasts(stamp, wanted):
@@ -242,7 +254,7 @@ class Starts:
 
 def beginning_given(
     start: Subject | GaussianMixture, model: Body, body: Body, camera: Camera,
-    upright: Gravity | None,
+    upright: Gravity | None, depths: ImageMap | None = None,
 ) -> Beginning:  # fmt: skip
     """The body and the poses that a track begins with, of a start that was given.
 
@@ -252,10 +264,11 @@ def beginning_given(
         body: that the poses of a mixture are of.
         camera: that sees the person.
         upright: what is known of gravity.
+        depths: of the image that a subject's joints were seen in; None: unknown.
     """
     if isinstance(start, GaussianMixture):
         return Beginning(Source.MIXTURE, body, start, both_ways=False)
-    begun = start_from_keypoints(model, camera, start, upright=upright)
+    begun = start_from_keypoints(model, camera, start, upright=upright, depths=depths)
     return Beginning(
         Source.SUBJECT, begun.body, begun.poses, both_ways=False, clicked=start.keypoints
     )
@@ -286,24 +299,39 @@ def beginning_seen(
     """
     keypoints = view.keypoints
     enough = suffices(keypoints, model)
+    depths = depths_of(view.depth)
     if keypoints is not None and (
         enough or (prediction is None and _shows_a_part(keypoints, model))
     ):
-        begun = start_from_keypoints(model, camera, Subject(0, keypoints, {}), upright=upright)
+        begun = start_from_keypoints(
+            model, camera, Subject(0, keypoints, {}), upright=upright, depths=depths
+        )
         poses = [with_reversals(begun.body, begun.poses)]
         if prediction is not None:
-            poses.append(prediction.seen_as(begun.body).means)
+            predicted = prediction.seen_as(begun.body).means
+            poses.append(moved_to_depth(begun.body, camera, predicted, depths))
         return Beginning(Source.KEYPOINTS, begun.body, np.concatenate(poses), both_ways=True)
     if prediction is not None:
-        both = prediction.both_ways(prediction.body)
+        both = _mixture_at(prediction.both_ways(prediction.body), prediction.body, camera, depths)
         return Beginning(Source.PREDICTION, prediction.body, both, both_ways=view.keypoints is None)
     if box is not None:
-        start = mixture_from_box(model, camera, box)
+        start = _mixture_at(mixture_from_box(model, camera, box), model, camera, depths)
         return Beginning(Source.BOX, model, start, both_ways=True)
     outline = observed().outline
     if outline is None:
         return None
-    return Beginning(Source.MASK, model, poses_from_outline(model, camera, outline), both_ways=True)
+    outlined = moved_to_depth(model, camera, poses_from_outline(model, camera, outline), depths)
+    return Beginning(Source.MASK, model, outlined, both_ways=True)
+
+
+def _mixture_at(
+    mixture: GaussianMixture, body: Body, camera: Camera, depths: ImageMap | None
+) -> GaussianMixture:
+    """A mixture over poses, moved to where a depth image shows their trunks."""
+    if depths is None:
+        return mixture
+    means = moved_to_depth(body, camera, mixture.means, depths)
+    return GaussianMixture(mixture.weights, means, mixture.covariances)
 
 
 def poses_to_search(
@@ -319,12 +347,13 @@ def poses_to_search(
     a silhouette mean poses of several headings at its place, and what was predicted.
     """
     found = []
-    keypoints = observation.keypoints
+    keypoints, depths = observation.keypoints, observation.evidence.get(DEPTH.name)
     if keypoints is not None and keypoints.seen.sum() >= FEWEST_KEYPOINTS:
-        explained = poses_from_keypoints(body, camera, keypoints, upright)
+        explained = poses_from_keypoints(body, camera, keypoints, upright, depths)
         found.append(with_reversals(body, explained))
     elif observation.outline is not None:
-        found.append(poses_from_outline(body, camera, observation.outline))
+        poses = poses_from_outline(body, camera, observation.outline)
+        found.append(moved_to_depth(body, camera, poses, depths))
     if prediction is not None:
         found.append(prediction.both_ways(body).means)
     return np.concatenate(found) if found else None

@@ -4,14 +4,15 @@
 
 u_j projects joint j of the pose x with the lengths l, which was seen at p_j; the norm is that of
 the keypoint's covariance. From several headings the pose is fitted together with the lengths, each
-length held by what was measured or by its spread over people, and upright against gravity as far
-as that is known. The lengths are then fixed, the flips
-of all limbs that the image and the limits allow are enumerated and fitted again, and the best are
-the first mixture.
+length held by what was measured or by its spread over people, upright against gravity as far as
+that is known, and at the depths of a depth image, if there is one. The lengths are then fixed, the
+flips of all limbs that the image and the limits allow are enumerated and fitted again, and the best
+are the first mixture.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +27,8 @@ from hmt_ros.flips.best_combinations import distinct_poses
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Box, Observation
+from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import NOT_EXCHANGED, Keypoints, KeypointTerm
 from hmt_ros.image.terms.silhouette import Outline
@@ -33,14 +36,20 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import Derivatives, EnergyFunction, EnergyTerm, Quadratic
 from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.depth_belief import LARGEST_MISFIT, depth_misfits
 from hmt_ros.tracking.gravity import Gravity
+from hmt_ros.tracking.start_depth import FEWEST, JointDepths, joint_depths
 from hmt_ros.tracking.subject import Subject
 
 # Standard deviation of a length that was measured on the person, and of the stature, which also has
 # a skull and a heel that are not the model's, m.
 MEASURED, STATURE_MEASURED = 0.01, 0.02
+# A stature this many standard deviations from the usual one is not believed.
+MOST_UNUSUAL = 4.0
 HEADINGS = 8
 LEAST_SQUARES = TermSettings(1.0, 1.0, np.inf)
+# Axis of the camera, along which depths are measured.
+AXIS = np.array([0.0, 0.0, 1.0])
 # Standard deviation of the place of a person of whom a box is known, as a share of the distance.
 BOX_SIGMA = 0.15
 
@@ -69,6 +78,7 @@ def start_from_keypoints(
     *,
     prior_weight: float = 1.0,
     upright: Gravity | None = None,
+    depths: ImageMap | None = None,
 ) -> Start:
     """All poses that explain the joints of a subject, and the body with the subject's lengths.
 
@@ -78,13 +88,30 @@ def start_from_keypoints(
         subject: joints, and what was measured of the person.
         prior_weight: factor on the soft prior of the body.
         upright: what is known of gravity; None: the root leans little against the camera's axes.
+        depths: of the image that the joints were seen in; None: unknown. They are not used where
+            they make a stature that people do not have, or do not show the surface of any pose.
 
     Raises:
         ValueError: joints from which no pose can be fitted.
     """
+    if depths is not None:
+        start = _start(body, camera, subject, prior_weight, upright, depths)
+        misfits = depth_misfits(start.body, camera, start.poses[:1], depths)
+        sized = _sized(body, subject)
+        if _is_a_stature(sized, start.body.skeleton.lengths) and misfits[0] <= LARGEST_MISFIT:
+            return start
+    return _start(body, camera, subject, prior_weight, upright, None)
+
+
+def _start(
+    body: Body, camera: Camera, subject: Subject, prior_weight: float, upright: Gravity | None,
+    depths: ImageMap | None,
+) -> Start:  # fmt: skip
+    """See `start_from_keypoints`."""
     body = _sized(body, subject)
     keypoints = subject.keypoints
-    fits = _fit_with_lengths(body, camera, keypoints, upright)
+    measured = joint_depths(body, keypoints, depths)
+    fits = _fit_with_lengths(body, camera, keypoints, upright, measured)
     best = np.argsort(fits.value, kind='stable')[:3]
     if not np.isfinite(fits.value[best[0]]):
         raise ValueError('no pose of the body explains the keypoints: are they in the image?')
@@ -95,11 +122,13 @@ def start_from_keypoints(
     spread = np.linalg.inv(fits.hessian[best[0]])[d:, d:]
     body = replace(body, length_covariance=0.5 * (spread + spread.T))
 
-    least_squares = LikelihoodSettings.of_terms(keypoints=LEAST_SQUARES)
+    least_squares = LikelihoodSettings.of_terms(keypoints=LEAST_SQUARES, depth=DEPTH.settings)
     settings = replace(least_squares, prior_weight=prior_weight)
     leaning = body if upright is None else without_root_lean(body)
     likelihood = ImageLikelihood(leaning, camera, settings)
-    image = likelihood.given(Observation(keypoints=keypoints), exchanges=NOT_EXCHANGED)
+    evidence = {} if depths is None else {DEPTH.name: depths}
+    observation = Observation(keypoints=keypoints, evidence=evidence)
+    image = likelihood.given(observation, exchanges=NOT_EXCHANGED)
     energy = image if upright is None else Posed(body.skeleton, (*image.terms, upright.term(body)))
 
     heads = _distinct(_solve(energy, fits.x[:, :d], body), body, 4)
@@ -113,11 +142,15 @@ def start_from_keypoints(
 
 
 def poses_from_keypoints(
-    body: Body, camera: Camera, keypoints: Keypoints, upright: Gravity | None = None
+    body: Body,
+    camera: Camera,
+    keypoints: Keypoints,
+    upright: Gravity | None = None,
+    depths: ImageMap | None = None,
 ) -> Array:
     """Poses (M, d) of a body of known lengths that explain the joints of an image."""
     subject = Subject(0, keypoints, dict(body.segment_lengths))
-    return start_from_keypoints(body, camera, subject, upright=upright).poses
+    return start_from_keypoints(body, camera, subject, upright=upright, depths=depths).poses
 
 
 def poses_from_outline(body: Body, camera: Camera, outline: Outline) -> Array:
@@ -194,9 +227,18 @@ def _sized(body: Body, subject: Subject) -> Body:
     return replace(body, length_covariance=covariance)
 
 
+def _is_a_stature(body: Body, lengths: Array) -> bool:
+    """Whether a person of a body's kind may have lengths (L,)."""
+    rates = body.stature_rates
+    change = float(rates @ (lengths - body.skeleton.lengths))
+    variance = float(rates @ body.length_covariance @ rates) + STATURE_MEASURED**2
+    return abs(change) <= MOST_UNUSUAL * math.sqrt(variance)
+
+
 def _fit_with_lengths(
-    body: Body, camera: Camera, keypoints: Keypoints, upright: Gravity | None
-) -> Minimum:
+    body: Body, camera: Camera, keypoints: Keypoints, upright: Gravity | None,
+    measured: JointDepths,
+) -> Minimum:  # fmt: skip
     """Fits (pose, lengths) to the joints from several headings; x is (HEADINGS, d + L)."""
     skeleton = body.skeleton
     d, count = body.dimension, len(skeleton.length_names)
@@ -225,6 +267,12 @@ def _fit_with_lengths(
             if len(error) < residuals:
                 value[i], gradient[i], hessian[i] = np.inf, 0.0, np.eye(d + count)
                 continue
+            # Rows of the keypoints, then of the depths of joints.
+            far = frames.joints()[measured.joints, :, 0]
+            cost, pull, curvature = measured.residuals(far[:, 2])
+            joints = np.concatenate([joints, measured.joints])
+            places = np.concatenate([places, far])
+            directions = np.concatenate([directions, np.tile(AXIS, (len(far), 1))])
             lengthened = joint_length_jacobians(own, poses[i : i + 1])[0][joints]
             jacobian = np.concatenate(
                 [
@@ -235,9 +283,10 @@ def _fit_with_lengths(
                 ],
                 axis=1,
             )
-            value[i] = 0.5 * error @ error
-            gradient[i] = error @ jacobian
-            hessian[i] = jacobian.T @ jacobian
+            value[i] = 0.5 * error @ error + cost.sum()
+            gradient[i] = np.concatenate([error, pull]) @ jacobian
+            curvature = np.concatenate([np.ones(len(error)), curvature])
+            hessian[i] = (jacobian * curvature[:, None]).T @ jacobian
             if lean is not None:
                 of_lean = lean.energy(frames, rows[i : i + 1])
                 slope, curvature = of_lean.derivatives()
@@ -256,7 +305,11 @@ def _fit_with_lengths(
         return value, gradient, hessian
 
     starts = np.concatenate(
-        [_first_guesses(body, camera, keypoints, upright), np.tile(default, (HEADINGS, 1))], axis=1
+        [
+            _first_guesses(body, camera, keypoints, upright, measured),
+            np.tile(default, (HEADINGS, 1)),
+        ],
+        axis=1,
     )
     lower = np.concatenate([body.lower, np.minimum(default - 5 * sigma, 0.5 * default)])
     upper = np.concatenate([body.upper, np.maximum(default + 5 * sigma, 2.0 * default)])
@@ -276,8 +329,9 @@ def _fit_with_lengths(
 
 
 def _first_guesses(
-    body: Body, camera: Camera, keypoints: Keypoints, upright: Gravity | None
-) -> Array:
+    body: Body, camera: Camera, keypoints: Keypoints, upright: Gravity | None,
+    measured: JointDepths,
+) -> Array:  # fmt: skip
     """Mean poses at several headings, where the joints are and as far as their spread says."""
     seen = keypoints.seen
     pixels = keypoints.pixels[seen]
@@ -293,6 +347,8 @@ def _first_guesses(
     if not extent > 0:
         raise ValueError('the keypoints all lie on one point')
     depth = float(np.clip(spread / extent, 0.5, 40.0))
+    if len(measured.depths) >= FEWEST:
+        depth = float(np.median(measured.depths))
     middle = rays.mean(0) * depth
     result = np.tile(pose, (HEADINGS, 1))
     turn = body.dof_names.index('root_z')

@@ -11,6 +11,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.image.likelihood import LikelihoodSettings
@@ -18,6 +21,7 @@ from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.tracking.depth_belief import DepthBelief
 from hmt_ros.tracking.presence import View
 from hmt_ros.tracking.silhouettes import Silhouettes, region_of
 
@@ -32,12 +36,14 @@ class Observer:
 
     Attributes:
         last_image: (H, W, 3) that the optical flow starts from; None: there is no flow.
+        depth: belief in depth images.
     """
 
     def __init__(
         self, camera: Camera, settings: LikelihoodSettings, silhouettes: Silhouettes
     ) -> None:
         self.last_image: Image | None = None
+        self.depth = DepthBelief(camera)
         self._camera = camera
         self._settings = settings
         self._silhouettes = silhouettes
@@ -52,6 +58,7 @@ class Observer:
         *,
         nobody_predicted: bool,
         others: Mask | None = None,
+        depth: NDArray[np.floating] | None = None,
     ) -> View:
         """What an image may show of a person.
 
@@ -63,6 +70,7 @@ class Observer:
             poses: (K, d) in the image before; None: the person may be anywhere.
             nobody_predicted: whether a predictor saw nobody.
             others: (H, W) pixels that somebody else covers; None: none.
+            depth: (H, W) of a depth camera, m, if any.
         """
         s = self._settings
         found, changed = None, 0.0
@@ -72,7 +80,7 @@ class Observer:
             if found is not None and mask is None:
                 changed = self._silhouettes.background.changed
         foreground, unsure = (None, None) if found is None else found
-        return View(image, foreground, changed, keypoints, nobody_predicted, unsure, others)
+        return View(image, foreground, changed, keypoints, nobody_predicted, unsure, others, depth)
 
     def observation(self, view: View, pose: Array | None, *, believed: bool) -> Observation:
         """What an image says of a person.
@@ -93,6 +101,7 @@ class Observer:
             view.image, view.silhouette if believed else None, keypoints,
             last_image=self.last_image, wanted=wanted, unsure=view.unsure,
             others=view.others,
+            depth=view.depth if self.depth.believed else None,
         )  # fmt: skip
         magnification = 0.0 if pose is None else self._camera.magnification(float(pose[2]))
         return replace(found, foreground=view.silhouette, magnification=magnification)

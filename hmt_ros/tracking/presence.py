@@ -92,6 +92,7 @@ class View(NamedTuple):
         nobody_predicted: whether a predictor saw nobody.
         unsure: (H, W) what may be the person or a shadow; None: nothing.
         others: (H, W) what somebody else covers; None: nothing.
+        depth: (H, W) depth along the axis of the camera, m; None: unknown.
     """
 
     image: Image
@@ -101,6 +102,7 @@ class View(NamedTuple):
     nobody_predicted: bool = False
     unsure: Mask | None = None
     others: Mask | None = None
+    depth: NDArray[np.floating] | None = None
 
 
 class Presence:

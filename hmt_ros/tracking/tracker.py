@@ -13,7 +13,7 @@ from dataclasses import replace
 from enum import Enum
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
@@ -24,6 +24,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.beginning import (
+    FROM_JOINTS,
     Arrival,
     Beginning,
     Source,
@@ -77,6 +78,7 @@ class Tracker:
 
     Attributes:
         silhouettes: where those of the images come from.
+        depth: belief in depth images.
         ground: the present estimate of gravity and of the floor.
         contacts: probabilities that the feet stand on the floor, by name.
         evaluations: of the likelihood in the last image.
@@ -103,6 +105,7 @@ class Tracker:
         self.camera = camera
         self.silhouettes = Silhouettes(background or BackgroundModel(), shared=shared_background)
         self._observer = Observer(camera, self.settings.likelihood, self.silhouettes)
+        self.depth = self._observer.depth
         self.evaluations = 0
         self.log_likelihoods: Array = np.empty(0)
         self.track_id = 0
@@ -160,6 +163,7 @@ class Tracker:
         *,
         nobody_predicted: bool = False,
         others: Mask | None = None,
+        depth: NDArray[np.floating] | None = None,
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """Takes the next image.
 
@@ -177,6 +181,8 @@ class Tracker:
             nobody_predicted: whether that regression saw nobody in this image.
             others: (H, W) pixels that somebody else covers or may cover: they speak neither for a
                 pose nor against it; None: there are none.
+            depth: (H, W) depth of what each pixel shows, along the axis of the camera, m; 0, NaN
+                and what is out of range says nothing. None: unknown.
 
         Returns:
             The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses,
@@ -184,17 +190,17 @@ class Tracker:
             the first or because nobody is in view.
 
         Raises:
-            ValueError: an image or a mask of another size, a stamp that does not increase, or a
-                prediction of a body with other degrees of freedom.
+            ValueError: an image, mask or depth of another size, a stamp that does not increase, or
+                a prediction of a body with other degrees of freedom.
         """
         if prediction is not None:
             prediction.seen_as(self.body)
         size = (self.camera.height, self.camera.width)
         if image.shape[:2] != size:
             raise ValueError(f'the camera gives images of {size}, saw {image.shape[:2]}')
-        for each in (mask, others):
+        for each, name in ((mask, 'a mask'), (others, 'a mask'), (depth, 'depths')):
             if each is not None and each.shape != size:
-                raise ValueError(f'the camera gives images of {size}, saw a mask of {each.shape}')
+                raise ValueError(f'the camera gives images of {size}, saw {name} of {each.shape}')
         if self._last_stamp is not None and stamp <= self._last_stamp:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
         self.evaluations = 0
@@ -204,7 +210,7 @@ class Tracker:
         near = self.modes.poses if self._track.begun and not self._track.lost else None
         view = self._observer.view(
             image, keypoints, mask, self.body, near,
-            nobody_predicted=nobody_predicted, others=others,
+            nobody_predicted=nobody_predicted, others=others, depth=depth,
         )  # fmt: skip
         found = self._take(view, stamp, prediction, masked=mask is not None)
         self._last_stamp = stamp
@@ -342,6 +348,7 @@ class Tracker:
         self._ground.reset()
         self._starts.arrival = Arrival()
         self._observer.last_image, self._followed = None, None
+        self.depth.reset()
 
     def _take(
         self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool
@@ -372,6 +379,7 @@ class Tracker:
             self._ground.update(self.body, self.modes, resting, dt)
         self._point.update(self.body, self.modes.poses, np.exp(self.modes.log_weights), dt)
         self._observer.last_image, self._followed = view.image, stamp
+        self.depth.update(self.body, self.modes.poses[0], view.depth)
         self.evaluations = self._track.evaluations
         return self.posterior, self._likelihood(observation)
 
@@ -407,6 +415,8 @@ class Tracker:
                 self.silhouettes.check(view.image, beginning.body, self.camera, beginning.best)
                 if self.silhouettes.doubted:
                     view = view._replace(silhouette=None, unsure=None)
+            if beginning.source in FROM_JOINTS:
+                self.depth.update(beginning.body, beginning.best[0], view.depth)
             observation = self._observe(view, beginning.best[0])
             self._begin(observation, beginning, stamp)
             if not self._track.believes_silhouettes:

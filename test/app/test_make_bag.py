@@ -13,6 +13,7 @@ from hmt_ros.rendering.renderer import render_silhouettes
 from hmt_ros.tracking.subject import read_subject
 from msg_tools import BagReader
 from msg_tools.messages.camera_info import camera_from_info
+from msg_tools.messages.depth_images import decode_depth
 from msg_tools.messages.images import decode_image
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -59,6 +60,34 @@ def test_topics_and_stamps(bag, content, truth):
         assert {message.header.frame_id for message in content[topic]} == {'camera_optical_frame'}
     assert list(np.diff(truth['stamps'])) == [200_000_000] * 3
     assert stamp_ns(content['body'][0]) == truth['stamps'][0]
+
+
+def test_depth_is_what_a_sensor_measures(tmp_path, content):
+    options = [*SMALL, '--seed', '3', '--stature', '1.8', '--depth']
+    found = []
+    for name in ('once', 'again'):
+        assert main(['reach', '-o', str(tmp_path / name), *options]) == 0
+        messages = {}
+        with BagReader(tmp_path / name) as reader:
+            for message in reader.messages():
+                messages.setdefault(message.topic.lstrip('/'), []).append(message.message)
+        found.append(messages)
+    once, again = found
+    assert set(once) - set(content) == {'depth'}
+    for one, other in zip(once['image/compressed'], content['image/compressed']):
+        assert np.array_equal(one.data, other.data)
+    for one, other in zip(once['depth'], again['depth']):
+        assert np.array_equal(one.data, other.data)
+    truth = np.load(tmp_path / 'once' / 'truth.npz')
+    masks = np.unpackbits(truth['masks'], axis=2)[:, :, :160].astype(bool)
+    pelvis = truth['joints'][:, list(truth['joint_names']).index('pelvis'), 2]
+    assert len(once['depth']) == len(pelvis)
+    for message, mask, distance in zip(once['depth'], masks, pelvis):
+        assert message.encoding == '16UC1'
+        depth = decode_depth(message)
+        assert np.median(depth[mask & (depth > 0)]) == pytest.approx(distance, abs=0.3)
+        assert 0.5 < (depth[mask] > 0).mean() < 1.0
+        assert (depth[~mask] > distance + 0.5).any()
 
 
 def test_camera(content, truth):

@@ -91,9 +91,13 @@ def test_a_short_command_prints_nothing(clock):
 def test_an_error_ends_the_lines(clock):
     """The line about the error is the last."""
     shown = lines(clock)
-    with pytest.raises(ValueError, match='bad'), shown:
+
+    def work():
         clock.pass_to(10.0)
         raise ValueError('bad')
+
+    with pytest.raises(ValueError, match='bad'), shown:
+        work()
     assert not shown._thread.is_alive()
     assert shown._file.getvalue() == 'out: 0 of 120 images, 00:10 so far\n'
 

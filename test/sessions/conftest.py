@@ -18,6 +18,7 @@ from hmt_ros.tracking.beginning import Source
 from hmt_ros.tracking.ground import Ground
 from msg_tools import RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.depth_images import depth_message
 from msg_tools.messages.headers import header_message
 from msg_tools.messages.images import compressed_image_message, image_message
 from msg_tools.messages.message_types import register_definitions
@@ -48,6 +49,7 @@ class StubTracker:
             known='known',
             watch=SimpleNamespace(moved=False, shift=0.0),
         )
+        self.depth = SimpleNamespace(believed=True)
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.track_id, self.started_from = 0, None
         self.log_likelihoods = np.array([-1.5, -2.5])
@@ -60,6 +62,7 @@ class StubTracker:
         self.seen: list[tuple[int, Any]] = []
         self.predictions: list[PosePrediction | None] = []
         self.masks: list[Any] = []
+        self.depths: list[Any] = []
         self.nobody_predicted: list[bool] = []
         self._start = None
         StubTracker.made.append(self)
@@ -94,7 +97,7 @@ class StubTracker:
 
     def step(
         self, image, stamp, keypoints=None, prediction=None, mask=None, *, nobody_predicted=False,
-        others=None,
+        others=None, depth=None,
     ):  # fmt: skip
         assert image.shape == (self.camera.height, self.camera.width, 3)
         if self.fault is not None:
@@ -109,6 +112,7 @@ class StubTracker:
         self.seen.append((stamp, keypoints))
         self.predictions.append(prediction)
         self.masks.append(mask)
+        self.depths.append(depth)
         self.nobody_predicted.append(nobody_predicted)
         if stamp in self.empty:
             self.status = Status.NOBODY
@@ -163,6 +167,12 @@ class SmallCamera:
         message = image_message(self.messages, pixels, self.stamp(index), 'lens')
         message.encoding = encoding
         return message
+
+    def depth(self, index, size=(64, 48), metres=3.0):
+        """A depth image, 16UC1, of a wall with a hole."""
+        depth = np.full((size[1], size[0]), 1000 * metres, np.uint16)
+        depth[:4, :4] = 0
+        return depth_message(self.messages, depth, self.stamp(index), 'lens')
 
     def nobody(self, index):
         message = self.mask(index)

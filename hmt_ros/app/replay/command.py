@@ -171,6 +171,11 @@ def _parser() -> CommandParser:
         help='topic of the masks (default: mask, else mask/compressed)',
     )
     topics.add_argument(
+        '--depth-topic',
+        metavar='NAME',
+        help='topic of depth images that are registered to the images (default: depth)',
+    )
+    topics.add_argument(
         '--keypoints-topic',
         metavar='NAME',
         help='topic of the 2D keypoints (default: keypoints)',

@@ -1,4 +1,4 @@
-"""The input of the filter in a bag: images, calibration, masks, keypoints, transforms."""
+"""The input of the filter in a bag: images, calibration, masks, depth, keypoints, transforms."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
-from hmt_ros.sessions.filter_session import KEYPOINTS, KEYPOINTS_3D
+from hmt_ros.sessions.filter_session import DEPTH, KEYPOINTS, KEYPOINTS_3D
 from hmt_ros.sessions.people_parameters import SOURCES
 from hmt_ros.sessions.people_session import DETECTIONS
 from hmt_ros.sessions.transform_buffer import TRANSFORMS, TRANSFORMS_TYPE
@@ -34,6 +34,7 @@ class RecordedInput:
         image: topic of the images.
         camera_info: topic of their calibration.
         mask: topic of masks of the person; None if the bag has none.
+        depth: topic of depth images; None if the bag has none.
         keypoints: topic of 2D keypoints; None if the bag has none.
         keypoints_3d: topic of their positions in space; None if the bag has none.
         ground_truth: topic of the ground truth; None if the bag has none.
@@ -45,6 +46,7 @@ class RecordedInput:
     image: Topic
     camera_info: Topic
     mask: Topic | None
+    depth: Topic | None
     keypoints: Topic | None
     keypoints_3d: Topic | None
     ground_truth: Topic | None
@@ -66,6 +68,8 @@ class RecordedInput:
         if self.mask is not None:
             raw = self.mask.msgtype == RAW
             sources[self.mask.name] = MASK if raw else COMPRESSED_MASK
+        if self.depth is not None:
+            sources[self.depth.name] = DEPTH
         if self.keypoints is not None:
             sources[self.keypoints.name] = KEYPOINTS
         if self.keypoints_3d is not None:
@@ -85,6 +89,7 @@ def recorded_input(
     camera_info_topic: str | None = None,
     *,
     mask_topic: str | None = None,
+    depth_topic: str | None = None,
     keypoints_topic: str | None = None,
     namespace: str = '',
 ) -> RecordedInput:
@@ -92,12 +97,13 @@ def recorded_input(
 
     Images come from `image/compressed`, else from `image`, else from the only topic of images.
     Calibration comes from `camera_info` beside the images, else from the only topic of its type.
-    Masks come from `mask`, else from `mask/compressed`, transforms from `/tf` and `/tf_static`.
+    Masks come from `mask`, else from `mask/compressed`, depths from `depth`, transforms from `/tf`
+    and `/tf_static`.
 
     Args:
         bag: an open bag.
-        image_topic, camera_info_topic, mask_topic, keypoints_topic: names that replace the
-            automatic choice.
+        image_topic, camera_info_topic, mask_topic, depth_topic, keypoints_topic: names that
+            replace the automatic choice.
         namespace: topics in it are preferred to those in the root, '/humans/bodies/p1' for example.
 
     Raises:
@@ -111,13 +117,17 @@ def recorded_input(
     joints = named(KEYPOINTS, kinds)
     if keypoints_topic is not None:
         joints = bag.find_topic(kinds, keypoints_topic)
-    besides = () if mask is None else (mask.name.lstrip('/'),)
-    image = _image_topic(bag, image_topic, namespace, (*MASKS, *besides))
+    depth = named(DEPTH, (RAW,))
+    if depth_topic is not None:
+        depth = bag.find_topic((RAW,), depth_topic)
+    besides = [topic.name.lstrip('/') for topic in (mask, depth) if topic is not None]
+    image = _image_topic(bag, image_topic, namespace, (*MASKS, DEPTH, *besides))
     found = {source: _named(bag, source, (TRANSFORMS_TYPE,)) for source in TRANSFORMS}
     return RecordedInput(
         image,
         _camera_info_topic(bag, image, camera_info_topic),
         mask,
+        depth,
         joints,
         named(KEYPOINTS_3D, (keypoints.KEYPOINTS_3D,)),
         named(GROUND_TRUTH, (POSE_MIXTURE,)),

@@ -18,7 +18,7 @@ from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PeopleTrack, Play
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, MASK
 from hmt_ros.sessions.declared_parameters import LONGEST_TIMEOUT
-from hmt_ros.sessions.filter_session import KEYPOINTS, KEYPOINTS_3D
+from hmt_ros.sessions.filter_session import DEPTH, KEYPOINTS, KEYPOINTS_3D
 from hmt_ros.sessions.handled import Handled
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import DETECTIONS
@@ -28,6 +28,7 @@ from hmt_ros.tracking import Subject
 from msg_tools import BagError, BagMessage, BagReader, BagWriter, RosbagsMessages
 from msg_tools.bags.contents import absolute_name
 from msg_tools.messages import keypoints
+from msg_tools.messages.depth_images import depth_message
 from msg_tools.messages.headers import SECOND_NS, header_message, time_ns
 from msg_tools.messages.images import ImageError, decode_image, image_message
 from msg_tools.messages.states import transforms_message
@@ -132,6 +133,8 @@ def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
     mask, bme = parameters.filter.use_mask, parameters.bme
     if not mask and (bme is None or not bme.use_mask):
         recorded = replace(recorded, mask=None)
+    if not parameters.filter.use_depth:
+        recorded = replace(recorded, depth=None)
     if isinstance(parameters.filter, PeopleParameters):
         return replace(recorded, keypoints=None, keypoints_3d=None, ground_truth=None)
     recorded = replace(recorded, detections=None)
@@ -191,6 +194,8 @@ def _play(
             check(track.take(KEYPOINTS_3D, _nobody(keypoints.KEYPOINTS_3D, result.last_stamp)))
         if recorded.mask is not None:
             check(track.take(MASK, _mask_after(result.last_stamp)))
+        if recorded.depth is not None:
+            check(track.take(DEPTH, _depth_after(result.last_stamp)))
         if recorded.transforms is not None:
             check(track.take(TF, _transform_after(result.last_stamp)))
         check(track.finish())
@@ -248,6 +253,11 @@ def _nobody(msgtype: str, stamp_ns: int) -> Any:
 def _mask_after(stamp_ns: int) -> Any:
     """sensor_msgs/Image with a mask of an image after the last: no mask of an earlier one comes."""
     return image_message(RosbagsMessages(), np.zeros((1, 1), np.uint8), stamp_ns + 1, '')
+
+
+def _depth_after(stamp_ns: int) -> Any:
+    """sensor_msgs/Image with a depth image after the last: no depth of an earlier one comes."""
+    return depth_message(RosbagsMessages(), np.ones((1, 1), np.float32), stamp_ns + 1, '')
 
 
 def _transform_after(stamp_ns: int) -> Any:

@@ -53,6 +53,7 @@ class ReplayOptions:
     image_topic: str | None = None
     camera_info_topic: str | None = None
     mask_topic: str | None = None
+    depth_topic: str | None = None
     keypoints_topic: str | None = None
     namespace: str = ''
     with_images: bool = False
@@ -69,6 +70,7 @@ class ReplayOptions:
             self.image_topic,
             self.camera_info_topic,
             mask_topic=self.mask_topic,
+            depth_topic=self.depth_topic,
             keypoints_topic=self.keypoints_topic,
             namespace=self.namespace,
         )
@@ -161,6 +163,7 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
     has_depth = recorded.keypoints_3d is not None and values['use_keypoints'] is True
     values.setdefault('use_keypoints_3d', has_depth)
     values.setdefault('use_mask', recorded.mask is not None)
+    values.setdefault('use_depth', recorded.depth is not None)
     values['image_transport'] = recorded.transport
     return with_values(FilterParameters(), values)
 
@@ -192,6 +195,7 @@ def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> Peopl
     sources = {kind: source for source, kind in SOURCES.items()}
     values['source'] = sources[recorded.detections.msgtype]
     values.setdefault('use_mask', recorded.mask is not None)
+    values.setdefault('use_depth', recorded.depth is not None)
     values['image_transport'] = recorded.transport
     return with_values(PeopleParameters(), values)
 

@@ -19,7 +19,13 @@ from hmt_ros.app.replay.player import Player
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
 from hmt_ros.sessions.bme_session import TRACK, BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
-from hmt_ros.sessions.filter_session import KEYPOINTS, KEYPOINTS_3D, PREDICTION, FilterSession
+from hmt_ros.sessions.filter_session import (
+    DEPTH,
+    KEYPOINTS,
+    KEYPOINTS_3D,
+    PREDICTION,
+    FilterSession,
+)
 from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.people_parameters import PeopleParameters
 from hmt_ros.sessions.people_session import PeopleSession, published_topic
@@ -174,6 +180,7 @@ class LiveTrack(PlayedTrack):
                 KEYPOINTS: (KEYPOINTS, keypoints.KEYPOINTS_2D),
                 KEYPOINTS_3D: (KEYPOINTS_3D, keypoints.KEYPOINTS_3D),
                 MASK: ('mask', 'sensor_msgs/msg/Image'),
+                DEPTH: (DEPTH, 'sensor_msgs/msg/Image'),
                 COMPRESSED_MASK: ('mask/compressed', 'sensor_msgs/msg/CompressedImage'),
                 IMAGE: (topic, f'sensor_msgs/msg/{kind}'),
             }
@@ -190,7 +197,7 @@ class LiveTrack(PlayedTrack):
                 self._parameters.filter,
                 inputs=inputs,
                 topics=track_messages.TOPICS,
-                sensors=(*sensors, f'/{KEYPOINTS}', f'/{KEYPOINTS_3D}'),
+                sensors=(*sensors, f'/{KEYPOINTS}', f'/{KEYPOINTS_3D}', f'/{DEPTH}'),
             )
             if self._parameters.smoother is not None:
                 self._smoother = live(

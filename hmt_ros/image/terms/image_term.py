@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.image.sampling import ImageMap
-from hmt_ros.image.surface import Contour, Lens
+from hmt_ros.image.surface import Contour, FleshTable, Lens
 from hmt_ros.image.texture import Textures
 from hmt_ros.inference.arrays import Array, Image, Mask
 
@@ -32,17 +32,21 @@ class TermSettings:
             keypoints); 0 switches the term off.
         sigma: Standard deviation of one measurement, px (grey levels for the intensity, a factor on
             the detector's own deviation for keypoints); that of a contour comes on top of what
-            contours of people differ from the model's, in metres.
+            contours of people differ from the model's, in metres. Of depths, m.
         scale: Width of the Geman-McClure kernel, in standard deviations.
+        growth: What the square of a depth adds to the standard deviation of the depth, 1/m.
     """
 
     weight: float
     sigma: float
     scale: float
+    growth: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (self.weight >= 0 and self.sigma > 0 and self.scale > 0):
-            raise ValueError(f'a term needs weight >= 0, sigma > 0 and scale > 0, saw {self}')
+        if not (self.weight >= 0 and self.sigma > 0 and self.scale > 0 and self.growth >= 0):
+            raise ValueError(
+                f'a term needs weight >= 0, sigma > 0, scale > 0 and growth >= 0, saw {self}'
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +61,7 @@ class ImageWindow:
         last_image: (h, w, 3) the same part of the image before; None: there is none.
         others: (h, w) pixels that show or may show somebody else, 0 or 1: they neither speak for a
             pose nor against it; None: there are none.
+        depth: (h, w) the same part of the depth image, m; None: there is none.
     """
 
     image: Image
@@ -66,6 +71,7 @@ class ImageWindow:
     last_image: Image | None
     unsure: Image | None = None
     others: Image | None = None
+    depth: NDArray[np.floating] | None = None
 
     @cached_property
     def signed_distance(self) -> NDArray[np.float32] | None:
@@ -105,6 +111,7 @@ class Weighting(NamedTuple):
     sigma: float
     scale: float
     magnification: float
+    growth: float = 0.0
 
 
 class PoseView(NamedTuple):
@@ -120,6 +127,8 @@ class PoseView(NamedTuple):
         textured: (S,) segments whose texture is compared.
         lens: the camera.
         columns, origins: (S, 3, 3), (S, 3) frames of the segments.
+        flesh: parts and rings, for terms that trace more than the contour.
+        traced, occluders: (B,) parts that are compared with the image, and that can hide others.
     """
 
     number: int
@@ -132,6 +141,9 @@ class PoseView(NamedTuple):
     lens: Lens
     columns: Array
     origins: Array
+    flesh: FleshTable
+    traced: Mask
+    occluders: Mask
 
 
 @dataclass(frozen=True, eq=False)

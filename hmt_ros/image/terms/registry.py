@@ -19,6 +19,7 @@ from hmt_ros.image.surface import (
     mark_visibility,
     trace_contour,
 )
+from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.edges import EDGES
 from hmt_ros.image.terms.image_term import ImageTerm, PoseView
 from hmt_ros.image.terms.residuals import Tree, assemble_pose
@@ -26,7 +27,7 @@ from hmt_ros.image.terms.silhouette import CONTAINMENT, COVERAGE
 from hmt_ros.image.terms.texture import INTENSITY, MOTION
 from hmt_ros.inference.arrays import Array, Mask
 
-TERMS: tuple[ImageTerm, ...] = (CONTAINMENT, COVERAGE, EDGES, INTENSITY, MOTION)
+TERMS: tuple[ImageTerm, ...] = (CONTAINMENT, COVERAGE, EDGES, DEPTH, INTENSITY, MOTION)
 
 
 class Model(NamedTuple):
@@ -98,7 +99,7 @@ def _view(n, model, textures, texture_row, shape, contour, columns, origins):  #
         )  # fmt: skip
     return PoseView(
         n, texture_row, textures, contour, model.contour_points, model.flesh.part_segments,
-        model.textured, model.lens, columns, origins,
+        model.textured, model.lens, columns, origins, model.flesh, model.traced, model.occluders,
     )  # fmt: skip
 
 

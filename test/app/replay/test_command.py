@@ -1,6 +1,7 @@
 """replay, offline."""
 
 import sys
+from operator import itemgetter
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,6 +24,7 @@ from hmt_ros.tracking.ground import Ground
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.bags.contents import absolute_name
 from msg_tools.messages.bodies import body_of
+from msg_tools.messages.depth_images import depth_message
 from msg_tools.messages.headers import header_message, time_ns
 from msg_tools.messages.images import decode_image, image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
@@ -83,10 +85,12 @@ class StandingStill:
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
         self.track_id, self.started_from = 1, None
         self.keypoints, self.positions, self.predictions, self.masks = [], [], [], []
+        self.depths = []
         self.ground, self.contacts = Ground(np.array([0.0, -1.0, 0.0]), 0.3, None, np.inf), {}
         self.silhouettes = SimpleNamespace(
             doubted=False, known='known', watch=SimpleNamespace(moved=False, shift=0.0)
         )
+        self.depth = SimpleNamespace(believed=True)
         StandingStill.made.append(self)
 
     def reset(self, start, *, box=None):
@@ -102,11 +106,12 @@ class StandingStill:
     def point_estimate(self):
         return self.body.prior_mean
 
-    def step(self, image, stamp, keypoints=None, prediction=None, mask=None, **others):
+    def step(self, image, stamp, keypoints=None, prediction=None, mask=None, depth=None, **others):
         self.keypoints.append(None if keypoints is None else keypoints.names)
         self.positions.append(None if keypoints is None else keypoints.positions)
         self.predictions.append(prediction)
         self.masks.append(None if mask is None else int(mask.sum()))
+        self.depths.append(None if depth is None else float(depth.max()))
         if stamp < self.start.stamp_ns:
             return None, None
         mean = self.body.prior_mean[None].copy()
@@ -447,6 +452,29 @@ def test_masks_of_the_bag_are_used(still, entries, tmp_path, topic):
     assert len(read(tmp_path / 'out')['/pose_mixture']) == IMAGES
     assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_mask=false']) == 0
     assert still[-1].masks == [None] * IMAGES
+
+
+@pytest.mark.parametrize('kind', [np.uint16, np.float32])
+def test_depth_of_the_bag_is_used(still, entries, tmp_path, capsys, kind):
+    """The depth camera drops the last image; --set switches it off."""
+    pictures = [entry for entry in entries if entry[0] == 'image/compressed']
+    stamp = pictures[0][1]
+    unit = 1000 if kind is np.uint16 else 1
+    depth = np.full(decode_image(pictures[0][2]).shape[:2], 3 * unit, kind)
+    extra = [('depth', stamp + 1000, depth_message(MESSAGES, depth, stamp, ''))]
+    at = itemgetter(1)
+    bag = write(tmp_path / 'bag', sorted(entries + extra, key=at))
+    options = [*SUBJECT, '--quiet', '-o']
+    assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
+    assert still[-1].depths == [3.0, *[None] * (IMAGES - 1)]
+    assert len(read(tmp_path / 'out')['pose_mixture']) == IMAGES
+    assert 'no depth has come for the image of' in capsys.readouterr().err
+    aligned = '/camera/aligned_depth_to_color/image_raw'
+    bag = write(tmp_path / 'robot', renamed(sorted(entries + extra, key=at), {'depth': aligned}))
+    assert main([str(bag), *options, str(tmp_path / 'named'), '--depth-topic', aligned]) == 0
+    assert still[-1].depths == [3.0, *[None] * (IMAGES - 1)]
+    assert main([str(bag), *options, str(tmp_path / 'off'), '--set', 'use_depth=false']) == 0
+    assert still[-1].depths == [None] * IMAGES
 
 
 def renamed(entries, names):

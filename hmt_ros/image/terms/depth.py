@@ -1,0 +1,219 @@
+"""Depth: visible points of the model's surface lie where a depth image sees a surface.
+
+    E(x) = w / V sum_i rho((D(u_i(x)) - z_i(x)) / sigma_i)
+    sigma_i^2 = sigma^2 + (growth D^2)^2 + (noise_i / cos a_i)^2
+
+over the V visible points i of the flesh: on every ring the two on either side of what faces the
+camera. D is the depth image, registered to the colour image, z the depth of the point, both along
+the axis of the camera, m. The error of a sensor that triangulates grows with the square of the
+distance [Khoshelham and Elberink, Sensors 2012]; that of the flesh, `noise`, is one along the
+normal of the surface, which the ray meets at the angle a. The gradient is that of points that stay
+on the skin, with their deviations.
+
+Where nothing was measured a point costs as much as one that errs by its deviation, whatever the
+pose. What lies before a point, or far behind it, costs at most what the kernel allows.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.surface import mark_visibility, project, signed_power
+from hmt_ros.image.terms.image_term import (
+    ImageTerm,
+    ImageWindow,
+    Request,
+    TermSettings,
+    Weighting,
+)
+from hmt_ros.image.terms.residuals import add_residual, geman_mcclure
+
+# Depths that sensors measure, m; what is nearer or further says nothing.
+NEAREST, FURTHEST = 0.2, 20.0
+# Angle around a ring between what faces the camera and a point, rad.
+ASIDE = np.pi / 4
+COS, SIN = float(np.cos(ASIDE)), float(np.sin(ASIDE))
+# Points whose normal is further from the ray than this are not compared, as a cosine.
+LEAST_COSINE = 0.3
+# Neighbouring depths that differ by more, as a share of the depth, lie on two surfaces.
+JUMP = 0.03
+# Fewer visible points than this do not make each of them count more.
+FEWEST = 20
+
+
+class DepthInputs(NamedTuple):
+    """Weighting, and the depths, m, 0 where nothing was measured."""
+
+    term: Weighting
+    depths: ImageMap
+
+
+NO_DEPTHS = ImageMap(np.zeros((1, 2, 2), np.float32))
+
+
+def usable_depths(depth: NDArray[np.floating]) -> NDArray[np.float32]:
+    """A depth image (H, W), m, with 0 for what says nothing: holes, and what is out of range."""
+    with np.errstate(invalid='ignore'):
+        good = (depth >= NEAREST) & (depth <= FURTHEST)
+    result: NDArray[np.float32] = np.where(good, depth, 0.0).astype(np.float32)
+    return result
+
+
+def depth_map(window: ImageWindow) -> ImageMap | None:
+    """The depths of a window; None: nothing was measured there."""
+    if window.depth is None:
+        return None
+    depths = usable_depths(window.depth)
+    return window.as_map(depths[None]) if depths.any() else None
+
+
+def _inputs(term: Weighting, evidence: Any, _request: Request) -> DepthInputs:
+    return DepthInputs(term, evidence or NO_DEPTHS)
+
+
+@njit(cache=True, nogil=True, inline='always')
+def sample_depth(depths, u, v):  # type: ignore[no-untyped-def]
+    """Depth at a pixel and its derivatives by u and v; 0 where nothing was measured.
+
+    Between four depths of one surface it is bilinear, else that of the nearest pixel.
+    """
+    values = depths.values
+    h, w = values.shape[1], values.shape[2]
+    x, y = u - depths.left, v - depths.top
+    if not (0.0 <= x <= w - 1.0 and 0.0 <= y <= h - 1.0):
+        return 0.0, 0.0, 0.0
+    i, j = min(int(y), h - 2), min(int(x), w - 2)
+    dv, du = y - i, x - j
+    a, b = float(values[0, i, j]), float(values[0, i, j + 1])
+    p, q = float(values[0, i + 1, j]), float(values[0, i + 1, j + 1])
+    least, most = min(min(a, b), min(p, q)), max(max(a, b), max(p, q))
+    if least <= 0.0 or most - least > JUMP * least:
+        near, far = (a, b) if dv < 0.5 else (p, q)
+        return (near if du < 0.5 else far), 0.0, 0.0
+    top = a + (b - a) * du
+    bottom = p + (q - p) * du
+    return top + (bottom - top) * dv, (b - a) * (1.0 - dv) + (q - p) * dv, bottom - top
+
+
+@njit(cache=True, nogil=True)
+def trace_front(flesh, wanted, lens, columns, origins, parts, points, cosines, noise, valid):  # type: ignore[no-untyped-def]
+    """Fills in the points of one pose that face the camera, two on each of R rings.
+
+    Args:
+        flesh, wanted, lens, columns, origins: as for `surface.trace_contour`.
+        parts, points: (2R,), (2R, 3) their parts, and places in the camera frame, m.
+        cosines: (2R,) of the angle between normal and ray.
+        noise: (2R,) deviation of the flesh of people along the normal, m.
+        valid: (2R,) whether the point faces the camera.
+    """
+    rings = len(flesh.ring_parts)
+    for r in range(rings):
+        part = flesh.ring_parts[r]
+        s = flesh.part_segments[part]
+        x0, x1, x2 = columns[s, 0, 0], columns[s, 0, 1], columns[s, 0, 2]
+        y0, y1, y2 = columns[s, 1, 0], columns[s, 1, 1], columns[s, 1, 2]
+        z0, z1, z2 = columns[s, 2, 0], columns[s, 2, 1], columns[s, 2, 2]
+        o0, o1, o2 = origins[s, 0], origins[s, 1], origins[s, 2]
+        cx, cy, cz = flesh.ring_centres[r, 0], flesh.ring_centres[r, 1], flesh.ring_centres[r, 2]
+        ux = x0 * o0 + x1 * o1 + x2 * o2 + cx
+        uy = y0 * o0 + y1 * o1 + y2 * o2 + cy
+        uz = z0 * o0 + z1 * o1 + z2 * o2 + cz
+        rx, ry = flesh.ring_radii[r, 0], flesh.ring_radii[r, 1]
+        kx, ky = flesh.ring_slopes[r, 0], flesh.ring_slopes[r, 1]
+        lx, ly = flesh.ring_leans[r, 0], flesh.ring_leans[r, 1]
+        e = flesh.ring_exponents[r]
+        fx, fy = -(ux - uz * lx) / rx, -(uy - uz * ly) / ry
+        size = max(np.sqrt(fx * fx + fy * fy), 1e-12)
+        fx, fy = fx / size, fy / size
+        for side in range(2):
+            i = r + side * rings
+            parts[i] = part
+            valid[i] = False
+            if not wanted[part]:
+                continue
+            turn = -SIN if side == 0 else SIN
+            c, sn = fx * COS - fy * turn, fy * COS + fx * turn
+            outline_x, outline_y, lateral_x, lateral_y = c, sn, c, sn
+            if e != 1.0:
+                outline_x, outline_y = signed_power(c, e), signed_power(sn, e)
+                lateral_x, lateral_y = signed_power(c, 2.0 - e), signed_power(sn, 2.0 - e)
+            px, py = cx + rx * outline_x, cy + ry * outline_y
+            nx, ny = lateral_x / rx, lateral_y / ry
+            nz = -(kx * c * c + ky * sn * sn) - (nx * lx + ny * ly)
+            p0 = o0 + x0 * px + y0 * py + z0 * cz
+            p1 = o1 + x1 * px + y1 * py + z1 * cz
+            p2 = o2 + x2 * px + y2 * py + z2 * cz
+            points[i, 0], points[i, 1], points[i, 2] = p0, p1, p2
+            n0 = x0 * nx + y0 * ny + z0 * nz
+            n1 = x1 * nx + y1 * ny + z1 * nz
+            n2 = x2 * nx + y2 * ny + z2 * nz
+            sizes = np.sqrt((n0 * n0 + n1 * n1 + n2 * n2) * (p0 * p0 + p1 * p1 + p2 * p2))
+            cosines[i] = -(n0 * p0 + n1 * p1 + n2 * p2) / max(sizes, 1e-12)
+            across, ahead = c * flesh.ring_noise[r, 0], sn * flesh.ring_noise[r, 1]
+            noise[i] = np.sqrt(across * across + ahead * ahead)
+            valid[i] = cosines[i] > LEAST_COSINE
+
+
+@njit(cache=True, nogil=True)
+def add_depth(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
+    """Depths of visible points against those that were measured; see `ImageTerm.kernel`."""
+    term, depths, flesh = inputs.term, inputs.depths, view.flesh
+    count = 2 * len(flesh.ring_parts)
+    parts, points = np.empty(count, np.int64), np.empty((count, 3))
+    cosines, noise = np.empty(count), np.empty(count)
+    valid, covered = np.empty(count, np.bool_), np.empty(count, np.bool_)
+    hidden = np.empty(count, np.bool_)
+    trace_front(
+        flesh, view.traced, view.lens, view.columns, view.origins,
+        parts, points, cosines, noise, valid,
+    )  # fmt: skip
+    pixel, j = np.empty((count, 2)), np.empty((count, 2, 3))
+    for i in range(count):
+        if valid[i]:
+            valid[i] = project(view.lens, points[i, 0], points[i, 1], points[i, 2], i, pixel, j)
+    mark_visibility(
+        flesh, view.occluders, view.columns, view.origins, parts, points, valid, covered, hidden
+    )
+    visible = view.contour_points * 5 // 10
+    if visible == 0:
+        for i in range(count):
+            if valid[i] and not hidden[i]:
+                visible += 1
+    each = term.weight / max(visible, FEWEST)
+    unknown, _, _ = geman_mcclure(1.0, term.scale, each)
+    energy = 0.0
+    for i in range(count):
+        if not valid[i] or hidden[i]:
+            continue
+        value, gu, gv = sample_depth(depths, pixel[i, 0], pixel[i, 1])
+        if value <= 0.0:
+            energy += unknown
+            continue
+        own, flesh_error = term.growth * value * value, noise[i] / cosines[i]
+        inverse = 1.0 / np.sqrt(term.sigma * term.sigma + own * own + flesh_error * flesh_error)
+        error = (value - points[i, 2]) * inverse
+        rho, pull, curvature = geman_mcclure(error, term.scale, each)
+        energy += rho
+        add_residual(
+            wrenches, stiffnesses, view.owners[parts[i]], points[i, 0], points[i, 1], points[i, 2],
+            (gu * j[i, 0, 0] + gv * j[i, 1, 0]) * inverse,
+            (gu * j[i, 0, 1] + gv * j[i, 1, 1]) * inverse,
+            (gu * j[i, 0, 2] + gv * j[i, 1, 2] - 1.0) * inverse,
+            pull, curvature,
+        )  # fmt: skip
+    return energy
+
+
+DEPTH = ImageTerm(
+    'depth',
+    'Depth of visible points of the surface from the depth image.',
+    TermSettings(30.0, 0.01, 4.0, growth=0.002),
+    depth_map,
+    _inputs,
+    add_depth,
+)

@@ -1,0 +1,217 @@
+"""Starts with a depth image: distance and stature, which one image alone hardly tells."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import load_body
+from hmt_ros.body.camera import Viewpoint
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.motion.procedural_motion import procedural_motion
+from hmt_ros.rendering.depth_sensor import sensed_depth
+from hmt_ros.rendering.renderer import render_frames
+from hmt_ros.rendering.scene import Scene
+from hmt_ros.tracking import Subject, Tracker
+from hmt_ros.tracking.beginning import Starts
+from hmt_ros.tracking.depth_belief import DepthBelief
+from hmt_ros.tracking.initialisation import start_from_keypoints
+from hmt_ros.tracking.presence import View
+from hmt_ros.tracking.start_depth import depths_of, joint_depths, moved_to_depth
+
+STATURE, AWAY = 1.9, 3.5
+MS = 1_000_000
+
+
+@pytest.fixture(scope='module')
+def tall(camera):
+    """A tall person: body, poses, images, depth images, m, and the empty scene."""
+    body, view = load_body('human37').with_stature(STATURE), Viewpoint(distance=AWAY)
+    poses = procedural_motion('reach', body, 0.6, 10.0, 2, viewpoint=view)
+    scene = Scene(viewpoint=view, seed=3)
+    shown = list(render_frames(body, poses, camera, scene))
+    empty = np.rint(scene.background(camera)).astype(np.uint8)
+    depths = [
+        1e-3 * sensed_depth(np.minimum(one.depth, scene.depth(camera)), camera, 3, i)
+        for i, one in enumerate(shown)
+    ]
+    return body, poses, [one.image for one in shown], depths, empty
+
+
+def subject_of(keypoints: Keypoints) -> Subject:
+    return Subject(0, keypoints, {})
+
+
+def best(start):
+    """The most probable pose of a start, and the stature of its body."""
+    return start.poses[0], start.body.stature
+
+
+def test_joints_lie_behind_the_skin(tall, keypoints_of):
+    body, poses, _, depths, _ = tall
+    found = joint_depths(body, keypoints_of(body, poses[0], 1.0), depths_of(depths[0]))
+    true = body.joint_positions(poses[:1])[0, found.joints, 2]
+    error = (found.depths - true) / found.sigma
+    assert len(true) > 15
+    assert np.median(np.abs(error)) < 1.0
+    assert np.median(np.abs(found.depths - true)) < 0.06
+    # The kernel bounds the cost of what is elsewhere.
+    cost, pull, curvature = found.residuals(found.depths + 2.0)
+    assert (cost <= 8.0).all()
+    assert (np.abs(pull) < 1.0).all()
+    assert (curvature > 0).all()
+
+
+def test_the_pull_is_the_derivative_of_the_energy(tall, keypoints_of):
+    body, poses, _, depths, _ = tall
+    found = joint_depths(body, keypoints_of(body, poses[0], 1.0), depths_of(depths[0]))
+    at = body.joint_positions(poses[:1])[0, found.joints, 2] + 0.05
+    up, down = (found.residuals(at + step)[0] for step in (1e-6, -1e-6))
+    assert np.allclose(found.residuals(at)[1], (up - down) / 2e-6, rtol=1e-5)
+
+
+def test_a_start_from_keypoints_finds_distance_and_stature(tall, camera, keypoints_of):
+    body, poses, _, depths, _ = tall
+    model, seen = load_body('human37'), subject_of(keypoints_of(body, poses[0], 1.0))
+    without, _ = best(start_from_keypoints(model, camera, seen))
+    pose, stature = best(start_from_keypoints(model, camera, seen, depths=depths_of(depths[0])))
+    off, off_without = (abs(x[2] - poses[0, 2]) for x in (pose, without))
+    assert off < 0.06
+    assert off < 0.5 * off_without
+    assert stature == pytest.approx(STATURE, abs=0.05)
+
+
+def test_a_start_without_measured_depth_is_the_start_without_depth(tall, camera, keypoints_of):
+    body, poses, _, depths, _ = tall
+    assert depths_of(None) is None
+    assert depths_of(np.full_like(depths[0], np.nan)) is None
+    assert depths_of(np.zeros_like(depths[0])) is None
+    model, seen = load_body('human37'), subject_of(keypoints_of(body, poses[0], 1.0))
+    window = ImageMap(np.zeros((1, 4, 4), np.float32))
+    one, other = (start_from_keypoints(model, camera, seen, depths=x) for x in (None, window))
+    assert np.allclose(one.poses[0], other.poses[0], atol=0.02)
+
+
+@pytest.mark.parametrize('wall', [0.5, 1.0, 9.0])
+def test_depth_of_something_else_does_not_spoil_a_start(tall, camera, keypoints_of, wall):
+    """A person of the size that such a depth says does not exist."""
+    body, poses, _, depths, _ = tall
+    model, seen = load_body('human37'), subject_of(keypoints_of(body, poses[0], 1.0))
+    plain = start_from_keypoints(model, camera, seen)
+    flat = depths_of(np.full_like(depths[0], wall))
+    spoilt = start_from_keypoints(model, camera, seen, depths=flat)
+    assert spoilt.poses[0, 2] == pytest.approx(plain.poses[0, 2], rel=0.02)
+    assert spoilt.body.stature == pytest.approx(plain.body.stature, abs=0.02)
+
+
+def test_poses_move_along_their_rays(tall, camera):
+    body, poses, _, depths, _ = tall
+    wrong = np.tile(poses[0], (3, 1))
+    wrong[:, :3] *= np.array([[0.8], [1.0], [1.3]])
+    moved = moved_to_depth(body, camera, wrong, depths_of(depths[0]))
+    assert np.allclose(moved[:, 2], poses[0, 2], atol=0.08)
+    assert np.allclose(moved[:, 0] / moved[:, 2], poses[0, 0] / poses[0, 2])
+    assert np.array_equal(moved[:, 3:], wrong[:, 3:])
+    assert np.array_equal(moved_to_depth(body, camera, wrong, None), wrong)
+    beside = wrong + np.array([50.0, *np.zeros(body.dimension - 1)])
+    assert np.array_equal(moved_to_depth(body, camera, beside, depths_of(depths[0])), beside)
+
+
+def test_a_box_starts_at_the_depth_of_the_person(tall, camera):
+    body, poses, images, depths, _ = tall
+    pixels = camera.project(body.joint_positions(poses[:1]))[0]
+    model = load_body('human37')
+    starts = Starts(model, camera)
+    starts.box = (*pixels.min(0), *pixels.max(0))
+    found = {}
+    for name, depth in (('with', depths[0]), ('without', None)):
+        view = View(images[0], depth=depth)
+        beginning = starts.first(view, 0, model, None, None, lambda: None, masked=False)
+        assert isinstance(beginning.start, GaussianMixture)
+        found[name] = np.abs(beginning.start.means[:, 2] - poses[0, 2]).max()
+    assert found['with'] < 0.15 < found['without']
+
+
+def test_the_joints_of_an_older_image_are_not_looked_up_in_this_depth(tall, camera, keypoints_of):
+    """A person who was clicked in another image is elsewhere by now."""
+    body, poses, images, depths, _ = tall
+    model = load_body('human37')
+    starts = Starts(model, camera)
+    starts.given = subject_of(keypoints_of(body, poses[0], 1.0))
+    # A wall stands where the person was.
+    view = View(images[0], depth=np.full_like(depths[0], 1.5))
+    late, plain = (
+        starts.first(x, 900 * MS, model, None, None, lambda: None, masked=False)
+        for x in (view, View(images[0]))
+    )
+    assert np.array_equal(late.best, plain.best)
+
+
+@pytest.fixture(scope='module')
+def tracked(tall, camera, keypoints_of):
+    """Distance errors (T,) m and final statures, by what the tracker is given."""
+    body, poses, images, depths, empty = tall
+    true = body.joint_positions(poses)
+    found = {}
+    for name in ('depth', 'no depth', 'holes', 'shifted'):
+        background = BackgroundModel.from_image(empty)
+        tracker = Tracker(load_body('human37'), camera, background=background, seed=1)
+        tracker.reset(subject_of(keypoints_of(body, poses[0], 2.0)))
+        errors = []
+        for t, (image, depth) in enumerate(zip(images[:3], depths)):
+            given = {'depth': depth, 'no depth': None, 'holes': np.zeros_like(depth)}
+            given['shifted'] = np.roll(depth, 20, axis=1)
+            posterior, _ = tracker.step(image, 100 * t * MS, depth=given[name])
+            joints = tracker.body.joint_positions(posterior.means[:1])[0]
+            errors.append(np.linalg.norm(joints - true[t], axis=1).mean())
+        assert tracker.depth.believed == (name != 'shifted')
+        found[name] = np.array(errors), posterior
+    return found
+
+
+def test_a_track_is_nearer_with_depth(tracked):
+    assert tracked['depth'][0].mean() < 0.5 * tracked['no depth'][0].mean()
+    assert tracked['depth'][0].max() < 0.08
+
+
+def test_holes_alone_are_as_no_depth(tracked):
+    assert np.array_equal(tracked['holes'][0], tracked['no depth'][0])
+    assert np.array_equal(tracked['holes'][1].weights, tracked['no depth'][1].weights)
+
+
+def test_depth_makes_the_distance_more_certain(tracked):
+    sigma = {name: np.sqrt(mixture.covariance()[2, 2]) for name, (_, mixture) in tracked.items()}
+    assert sigma['depth'] < 0.7 * sigma['no depth']
+
+
+def test_depth_of_another_size_is_refused(tall, camera):
+    tracker = Tracker(load_body('human37'), camera)
+    with pytest.raises(ValueError, match=r'images of \(240, 320\), saw depths of \(24, 32\)'):
+        tracker.step(tall[2][0], 0, depth=np.ones((24, 32)))
+
+
+def test_depth_that_is_not_registered_is_left_out(tracked):
+    """Shifted by 20 px of a person some 50 px wide."""
+    assert np.array_equal(tracked['shifted'][0], tracked['no depth'][0])
+
+
+def test_the_belief_comes_back(tall, camera):
+    body, poses, _, depths, _ = tall
+    belief, shifted = DepthBelief(camera), np.roll(depths[0], 20, axis=1)
+    wrong = poses[0] * np.where(np.arange(body.dimension) < 3, 1.1, 1.0)
+    for depth, pose, believed in (
+        (None, wrong, True),
+        (np.zeros_like(shifted), wrong, True),
+        *[(shifted, wrong, False)] * 3,
+        *[(depths[0], wrong, None)] * 10,
+        (depths[0], wrong, True),
+    ):
+        belief.update(body, pose, depth)
+        assert believed is None or belief.believed == believed
+    belief.update(body, wrong, shifted)
+    assert belief.believed
+    belief.reset()
+    assert belief.believed
