@@ -140,6 +140,7 @@ class Track:
             poses, log_weights = start, np.zeros(len(start))
             precisions = np.zeros((len(poses), body.dimension, body.dimension))
         seen = observation if clicked is None else replace(observation, keypoints=clicked)
+        del self._filters[1:]
         solved = self._first.begin(body, poses, log_weights, precisions, seen)
         if both_ways:
             self._follow_both_ways(solved, log_weights, observation, stamp)

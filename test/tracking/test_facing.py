@@ -114,3 +114,10 @@ def test_the_same_bytes_twice(followed):
 def test_a_trial_is_not_shorter_than_nothing():
     with pytest.raises(ValueError, match='facing_trial must be at least 0, saw -1'):
         TrackerSettings(facing_trial=-1.0)
+
+
+def test_a_start_that_is_repeated_without_silhouettes_follows_two_ways(followed, monkeypatch):
+    monkeypatch.setattr('hmt_ros.tracking.facing.Track.believes_silhouettes', False)
+    tracker, posteriors = followed(0.5)
+    assert all(posterior is not None for posterior in posteriors)
+    assert len(tracker.modes.poses) <= SMALL.max_hypotheses
