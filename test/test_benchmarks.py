@@ -8,7 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import bags, contour_noise, flips, kernels, keypoint_noise, kjs, live, nodes, votes
+from benchmarks import (
+    bags,
+    contour_noise,
+    depth,
+    flips,
+    kernels,
+    keypoint_noise,
+    kjs,
+    live,
+    nodes,
+    votes,
+)
 from benchmarks.__main__ import main
 from benchmarks.clips import find_clips, read_clip, table
 from benchmarks.command import run_stages
@@ -363,3 +374,14 @@ def test_live_tells_of_a_camera_that_does_not_wait():
         'newest complete image 480 2 25 % 151 ms 190 ms 210 ms 0.75 s 0.90 s 80 mm 61 mm 80 mm'
     )
     assert queue == 'queue_size 5 skipped: no ROS'
+
+
+def test_depth_brings_tracks_nearer():
+    """Six images of one rendered clip, without depth and with it."""
+    result = depth.measure(quick=True)
+    (entry,) = result['clips']
+    for score in ('heaviest_mm', 'absolute_mm', 'start_mm'):
+        assert entry['with'][score] < 0.8 * entry['without'][score]
+    text = depth.as_text(result, markdown=True)
+    assert f'| walk 0 | {entry["without"]["heaviest_mm"]:.0f} -> ' in ' '.join(text.split())
+    assert result['speed']['with_ms'] > 0

@@ -47,7 +47,8 @@ from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
 from hmt_ros.tracking.areas import grown, hull, unknown_area
 from hmt_ros.tracking.association import SAME, ImageTrack, Sighting, assigned
-from hmt_ros.tracking.silhouettes import region_of
+from hmt_ros.tracking.camera_motion import CameraPose
+from hmt_ros.tracking.silhouettes import Silhouettes, region_of
 from msg_tools.messages.detections import (
     NO_KEYPOINTS,
     PEOPLE_2D,
@@ -66,6 +67,10 @@ def published_topic(topic: str) -> PublishedTopic:
     if topic in PeopleSession.TOPICS:
         return PeopleSession.TOPICS[topic]
     return TOPICS[topic.removeprefix(f'{BODIES}/{person_of(topic)}/')]
+
+
+# Less of somebody in the image, px, is not worth a track.
+SMALLEST = 4
 
 
 @dataclass(eq=False)
@@ -116,7 +121,6 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         self._detections: StampedInputs[list[DetectedPerson]] = StampedInputs()
         self._depths = DepthInputs(self._log)
         self._info_stamp = 0
-        self._background: BackgroundModel | None = None
         self._forget()
         self.state = self._present_state()
 
@@ -138,7 +142,7 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
 
     def _forget(self) -> None:
         self._people: list[_Person] = []
-        self._background = None
+        self._scene: Silhouettes | None = None
         self._watch = SceneWatch()
         self._next, self._detected, self._begun = 1, 0, False
 
@@ -240,21 +244,24 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
             waiting = self._depths.added_to(waiting, self._dropped)
         for kind, text in self.frames.look(waiting.frame_id, stamp):
             self._log.note(kind, text)
-        if self._background is None:
-            self._background = self._background_for(camera)
+        if self._scene is None:
+            self._scene = Silhouettes(self._background_for(camera))
+        if (pose := self.frames.pose) is not None:
+            # From another view the scene is another.
+            self._scene.see_from(CameraPose.of(pose.translation, pose.rotation), camera)
         p, found = self.parameters, []
         if detected is not None:
             found = self._inputs.found(
                 detected, self._start.body, p.keypoint_scheme, use_keypoints=p.use_keypoints
             )
         own, left = self._matched(found, stamp)
-        self._begin(left, own, camera, stamp)
+        self._begin(left, own, camera, self._scene.background, stamp)
         if detected is not None:
             self._detected = len(detected)
-            if not detected and not self._people and not self._start.parameters.background_file:
-                self._background.learn(waiting.image)
-        if self._background.frames:
-            self._look_at_scene(waiting, self._background, 'call ~/reset')
+            if not detected and not self._people:
+                self._scene.learn(waiting.image, None)
+        if self._scene.background.frames:
+            self._look_at_scene(waiting, self._scene.background, 'call ~/reset')
         skipped, tracked = self._log.counts['skipped'], self._log.counts['tracked']
         self._follow_all(waiting, camera, own, left, answered=detected is not None)
         # Those are counts of images, not of people.
@@ -298,12 +305,18 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         return own, left
 
     def _begin(
-        self, left: list[Found], own: dict[_Person, Found], camera: Camera, stamp: int
+        self,
+        left: list[Found],
+        own: dict[_Person, Found],
+        camera: Camera,
+        background: BackgroundModel,
+        stamp: int,
     ) -> None:
         """Follows the largest of those whom nobody follows; they move from `left` to `own`."""
-        p = self.parameters
+        p, size = self.parameters, (camera.width, camera.height)
         for one in sorted(left, key=lambda x: -x.sighting.size):
-            if not one.suffices:
+            corners = np.clip(np.rint(one.sighting.corners), 0, size).astype(int)
+            if not one.suffices or (corners[1] - corners[0]).min() < SMALLEST:
                 continue
             if any(x.place.cost(one.sighting, stamp) < SAME for x in own if own[x] is not one):
                 continue  # a second detection of the same person
@@ -317,11 +330,9 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
             name = self._new_name(one.detected.name)
             session = PersonSession(
                 name, p, self._publish_output, self._wanted, self._start,
-                self._background or BackgroundModel(p.background), self.frames, self._log,
+                background, self.frames, self._log,
             )  # fmt: skip
             if not one.keypoints.names:
-                size = (camera.width, camera.height)
-                corners = np.clip(np.rint(one.sighting.corners), 0, size).astype(int)
                 session.start_in((*corners[0].tolist(), *corners[1].tolist()))
             person = _Person(name, one.detected.name, ImageTrack(one.sighting, stamp), session)
             self._people.append(person)

@@ -125,6 +125,12 @@ def prepare_start(
     initial: Subject | GaussianMixture | None = None
     if mixture is not None and len(mixture.components):
         content = pose_mixture_of(mixture)
+        fixed = parameters.fixed_frame
+        if fixed and content.frame_id in (fixed, f'{fixed}_optical'):
+            raise ValueError(
+                f'the initial mixture is in the frame {content.frame_id}, which stands still: '
+                'wanted that of the camera'
+            )
         if present is not None and present.name == body.name:
             body = present
         body, initial = body_of(content, body), content.mixture

@@ -1,17 +1,15 @@
 """Whether depth images show the person: those of another camera, time or place do not.
 
     m = E_depth(x) / (w c^2 / 2)              misfit of a pose, from 0 to 1
-    M <- M + gain (min(m(x), m(x')) - M)      of the track; x' is x at the depth that was measured
+    M <- M + gain (m(x) - M)                  of the track
 
 A depth image that is not registered to the colour image, or late, shows the background where the
 model has limbs. Then most points cost what the kernel allows, whatever the pose, and the others
-pull the wrong way: such images are left out until they fit again.
+pull the wrong way: such images are left out until they fit again. A pose that does not fit is moved
+to the depth that was measured before it counts, as a track without depth is not at its distance.
 """
 
 from __future__ import annotations
-
-import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
@@ -21,7 +19,7 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.inference.arrays import Array
-from hmt_ros.tracking.start_depth import depths_of, moved_to_depth
+from hmt_ros.tracking.start_depth import moved_to_depth
 
 # Of depths that are not used; 0.03 to 0.06 where all is well, 0.3 and more where depths are shifted
 # by 8 px of a person 80 px wide.
@@ -56,14 +54,15 @@ class DepthBelief:
         """Whether depth images are used."""
         return self._misfit is None or self._misfit <= LARGEST_MISFIT
 
-    def update(self, body: Body, pose: Array, depth: NDArray[np.floating] | None) -> None:
-        """Takes in a pose (d,) and the depth image (H, W) of its time, if there is one."""
-        depths = depths_of(depth)
+    def update(self, body: Body, pose: Array, depths: ImageMap | None) -> None:
+        """Takes in a pose (d,) and the depths of its image, if there are some."""
         if depths is None:
             return
-        # A track that has left out depths is not at the distance that they show.
-        poses = np.concatenate([pose[None], moved_to_depth(body, self._camera, pose[None], depths)])
-        misfit = float(depth_misfits(body, self._camera, poses, depths).min())
+        camera, poses = self._camera, pose[None]
+        misfit = float(depth_misfits(body, camera, poses, depths)[0])
+        if misfit > LARGEST_MISFIT:
+            poses = moved_to_depth(body, camera, poses, depths)
+            misfit = min(misfit, float(depth_misfits(body, camera, poses, depths)[0]))
         if self._misfit is None:
             self._misfit = misfit
         self._misfit += GAIN * (misfit - self._misfit)

@@ -18,6 +18,8 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
@@ -37,6 +39,7 @@ class Observer:
     Attributes:
         last_image: (H, W, 3) that the optical flow starts from; None: there is no flow.
         depth: belief in depth images.
+        depths: of the last observation, believed or not; None: there were none.
     """
 
     def __init__(
@@ -44,6 +47,7 @@ class Observer:
     ) -> None:
         self.last_image: Image | None = None
         self.depth = DepthBelief(camera)
+        self.depths: ImageMap | None = None
         self._camera = camera
         self._settings = settings
         self._silhouettes = silhouettes
@@ -101,7 +105,13 @@ class Observer:
             view.image, view.silhouette if believed else None, keypoints,
             last_image=self.last_image, wanted=wanted, unsure=view.unsure,
             others=view.others,
-            depth=view.depth if self.depth.believed else None,
+            depth=view.depth,
         )  # fmt: skip
+        evidence = dict(found.evidence)
+        self.depths = evidence.get(DEPTH.name)
+        if not self.depth.believed:
+            evidence.pop(DEPTH.name, None)
         magnification = 0.0 if pose is None else self._camera.magnification(float(pose[2]))
-        return replace(found, foreground=view.silhouette, magnification=magnification)
+        return replace(
+            found, evidence=evidence, foreground=view.silhouette, magnification=magnification
+        )

@@ -161,7 +161,7 @@ class Presence:
         open_to_view = _count(model) / whole
         self.hidden = view.others is not None and open_to_view < 1.0 - HIDDEN
         self._hidden_for = self._hidden_for + dt if self.hidden else 0.0
-        if self.hidden and self._hidden_for <= LONGEST_HIDDEN:
+        if self.hidden and self._hidden_for <= LONGEST_HIDDEN + ROUNDING:
             return True
         cues = [sees_person(view.keypoints), False if view.nobody_predicted else None]
         if _inside(body, camera, pose) <= LEAST_INSIDE:

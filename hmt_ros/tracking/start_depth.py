@@ -103,17 +103,20 @@ def moved_to_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap | 
 def _depths_at(depths: ImageMap, pixels: Array) -> Array:
     """Depths (P,) of what lies in front around pixels (P, 2), m; 0 where nothing was measured."""
     values = depths.values[0]
-    result = np.zeros(len(pixels))
-    for i, pixel in enumerate(pixels):
-        if not np.isfinite(pixel).all():
-            continue
-        u, v = int(np.rint(pixel[0])) - depths.left, int(np.rint(pixel[1])) - depths.top
-        rows = slice(max(v - AROUND, 0), max(v + AROUND + 1, 0))
-        near = values[rows, max(u - AROUND, 0) : max(u + AROUND + 1, 0)]
-        near = near[near > 0]
-        if len(near):
-            result[i] = np.quantile(near, QUANTILE)
-    return result
+    height, width = values.shape
+    steps = np.arange(-AROUND, AROUND + 1)
+    # What is far outside, or behind the camera, stays outside.
+    centres = np.clip(np.nan_to_num(pixels, nan=-1e6), -1e6, 1e6)
+    columns, rows = (np.rint(centres) - [depths.left, depths.top]).astype(np.intp).T
+    rows = (rows[:, None, None] + steps[:, None]).repeat(len(steps), axis=2)
+    columns = (columns[:, None, None] + steps).repeat(len(steps), axis=1)
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    near = values[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+    near = np.where(inside & (near > 0), near, np.inf).reshape(len(pixels), -1)
+    known = np.isfinite(near).sum(1)
+    chosen = np.maximum(np.rint(QUANTILE * (known - 1)).astype(np.intp), 0)
+    found = np.sort(near, axis=1)[np.arange(len(pixels)), chosen]
+    return np.where(known > 0, found, 0.0).astype(np.float64)
 
 
 def _radii(body: Body) -> Array:

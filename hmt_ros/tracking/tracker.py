@@ -45,6 +45,7 @@ from hmt_ros.tracking.presence import Presence, View
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.silhouettes import Silhouettes
+from hmt_ros.tracking.start_depth import depths_of
 from hmt_ros.tracking.subject import Subject
 
 # The person may be where modes say that have at least this log weight, nats; the sign is changed.
@@ -379,7 +380,7 @@ class Tracker:
             self._ground.update(self.body, self.modes, resting, dt)
         self._point.update(self.body, self.modes.poses, np.exp(self.modes.log_weights), dt)
         self._observer.last_image, self._followed = view.image, stamp
-        self.depth.update(self.body, self.modes.poses[0], view.depth)
+        self.depth.update(self.body, self.modes.poses[0], self._observer.depths)
         self.evaluations = self._track.evaluations
         return self.posterior, self._likelihood(observation)
 
@@ -416,7 +417,7 @@ class Tracker:
                 if self.silhouettes.doubted:
                     view = view._replace(silhouette=None, unsure=None)
             if beginning.source in FROM_JOINTS:
-                self.depth.update(beginning.body, beginning.best[0], view.depth)
+                self.depth.update(beginning.body, beginning.best[0], depths_of(view.depth))
             observation = self._observe(view, beginning.best[0])
             self._begin(observation, beginning, stamp)
             if not self._track.believes_silhouettes:

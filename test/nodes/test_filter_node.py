@@ -109,6 +109,22 @@ def test_images_become_messages(running, small_camera):
     assert running.other.count_publishers('/robot_description') == 0
 
 
+def test_nothing_is_taken_for_a_robot(running, small_camera):
+    """Without a namespace, too."""
+    names = {name for name, _ in running.other.get_topic_names_and_types()}
+    assert '/human_joint_states' in names
+    assert names.isdisjoint({'/joint_states', '/robot_description'})
+    assert running.node.get_parameter('frame_prefix').value == 'human/'
+
+
+def test_frames_of_a_person_have_the_namespace(running):
+    from hmt_ros.nodes.filter_node import FilterNode
+
+    node = FilterNode(namespace='/humans/bodies/anna', context=running.node.context)
+    assert node.get_parameter('frame_prefix').value == 'humans/bodies/anna/'
+    node.destroy_node()
+
+
 def test_parameters_are_those_of_the_file(running):
     of_ros = ('use_sim_time', 'start_type_description_service')
     names = [

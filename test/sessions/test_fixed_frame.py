@@ -16,6 +16,7 @@ from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
 from hmt_ros.sessions.smoother_parameters import SmootherDynamics, SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.track_messages import TOPICS
+from hmt_ros.sessions.track_start import prepare_start
 from hmt_ros.sessions.transform_buffer import TF, Transform
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
@@ -196,6 +197,16 @@ def test_what_has_no_place_is_not_published(session, small_camera, outputs):
 def test_a_name_is_needed():
     with pytest.raises(ValueError, match='publish_in_fixed_frame needs the name of fixed_frame'):
         replace(FilterParameters(), publish_in_fixed_frame=True)
+
+
+def test_no_track_starts_from_a_mixture_in_the_fixed_frame(session, small_camera, outputs):
+    one = session()
+    track(one, small_camera, (0,))
+    (mixture,) = read(outputs, 'pose_mixture')
+    with pytest.raises(ValueError, match='frame odom_optical, which stands still: wanted that of'):
+        prepare_start(one.parameters, mixture)
+    mixture.header.frame_id = 'lens'
+    assert prepare_start(one.parameters, mixture).initial is not None
 
 
 def test_upright_where_gravity_is_known(session, small_camera, outputs):

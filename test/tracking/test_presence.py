@@ -267,3 +267,30 @@ def test_shapes_of_persons(film):
     small = np.zeros((240, 320), dtype=np.bool_)
     small[40:80, 100:140] = masks[0][60:100, 140:180]
     assert not looks_like_person(small & (np.arange(240) < 70)[:, None])
+
+
+def test_who_is_hidden_has_not_left_for_a_while(film, watched):
+    """Somebody else stands before the person; no cue counts, for three seconds."""
+    everything = np.ones(film[3].shape[:2], dtype=np.bool_)
+    seen, absent, presence = watched(full_views(film))
+    assert seen == [True] * 6
+    assert not presence.hidden
+    hidden = empty_views(film, 30, keypoints=NOBODY, others=everything)
+    seen, absent, _ = watched(hidden, presence=presence, first=6)
+    assert seen == [True] * 30
+    assert presence.hidden
+    assert not any(absent)
+    seen, absent, _ = watched(hidden[:8], presence=presence, first=36)
+    # Of which the first may still be within three seconds; half a second later nobody is there.
+    assert seen[1:] == [False] * 7
+    assert absent[-1]
+
+
+def test_a_part_that_others_hide_is_not_missed(film, watched):
+    """Half of the model is hidden: the share of the rest counts."""
+    views, others = full_views(film, 10), np.zeros(film[3].shape[:2], dtype=np.bool_)
+    others[:130] = True
+    part = [view._replace(silhouette=view.silhouette & ~others, others=others) for view in views]
+    seen, _, presence = watched(part)
+    assert seen == [True] * 10
+    assert not presence.hidden

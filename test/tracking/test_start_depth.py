@@ -209,9 +209,9 @@ def test_the_belief_comes_back(tall, camera):
         *[(depths[0], wrong, None)] * 10,
         (depths[0], wrong, True),
     ):
-        belief.update(body, pose, depth)
+        belief.update(body, pose, depths_of(depth))
         assert believed is None or belief.believed == believed
-    belief.update(body, wrong, shifted)
+    belief.update(body, wrong, depths_of(shifted))
     assert belief.believed
     belief.reset()
     assert belief.believed

@@ -467,7 +467,7 @@ def test_depth_of_the_bag_is_used(still, entries, tmp_path, capsys, kind):
     options = [*SUBJECT, '--quiet', '-o']
     assert main([str(bag), *options, str(tmp_path / 'out')]) == 0
     assert still[-1].depths == [3.0, *[None] * (IMAGES - 1)]
-    assert len(read(tmp_path / 'out')['pose_mixture']) == IMAGES
+    assert len(read(tmp_path / 'out')['/pose_mixture']) == IMAGES
     assert 'no depth has come for the image of' in capsys.readouterr().err
     aligned = '/camera/aligned_depth_to_color/image_raw'
     bag = write(tmp_path / 'robot', renamed(sorted(entries + extra, key=at), {'depth': aligned}))
