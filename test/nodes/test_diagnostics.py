@@ -237,6 +237,7 @@ def test_messages_beyond_the_limit_are_not_even_read(running, small_camera, monk
     wanted = list(running.node._wanted_inputs())
     assert {one.source: one.largest for one in wanted} == {
         'camera_info': 2**24,
+        'depth': 4 * 2**26 + 2**16,
         'keypoints': 2**24,
         'keypoints_3d': 2**24,
         'mask': 2**26 + 2**16,
