@@ -3,8 +3,9 @@
 from hmt_ros.tracking.ground import Ground, GroundSettings, KnownGround
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
+from hmt_ros.tracking.status import Status
 from hmt_ros.tracking.subject import Subject, SubjectError, read_subject
-from hmt_ros.tracking.tracker import Status, Tracker
+from hmt_ros.tracking.tracker import Tracker
 
 __all__ = [
     'Ground',

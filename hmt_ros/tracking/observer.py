@@ -52,6 +52,20 @@ class Observer:
         self._settings = settings
         self._silhouettes = silhouettes
 
+    def check_sizes(
+        self,
+        image: Image,
+        mask: Mask | None,
+        others: Mask | None,
+        depth: NDArray[np.floating] | None,
+    ) -> None:
+        """Raises ValueError where an array does not have the size of the camera's images."""
+        size = (self._camera.height, self._camera.width)
+        named = ((image, ''), (mask, 'a mask of '), (others, 'a mask of '), (depth, 'depths of '))
+        for each, name in named:
+            if each is not None and each.shape[:2] != size:
+                raise ValueError(f'the camera gives images of {size}, saw {name}{each.shape[:2]}')
+
     def view(
         self,
         image: Image,

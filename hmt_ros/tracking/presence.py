@@ -182,6 +182,10 @@ class Presence:
             self._colours.learn(image, model, dt)
         return seen
 
+    def hides(self, view: View) -> bool:
+        """Whether others hide the person, and no detector sees what is left."""
+        return self.hidden and (view.keypoints is None or not view.keypoints.seen.any())
+
     def _on_silhouette(
         self, view: View, model: Mask, step: int, dt: float, open_to_view: float
     ) -> bool:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from enum import Enum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,21 +45,13 @@ from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.silhouettes import Silhouettes
 from hmt_ros.tracking.start_depth import depths_of
+from hmt_ros.tracking.status import Status
 from hmt_ros.tracking.subject import Subject
 
 # The person may be where modes say that have at least this log weight, nats; the sign is changed.
 LIKELY = 4.0
 # Share of the time for which somebody stands on both feet, where contact is unknown.
 RESTING = 0.3
-
-
-class Status(Enum):
-    """What the tracker is doing."""
-
-    WAITING = 'waiting'  # for the subject's image, or for somebody
-    TRACKING = 'tracking'
-    LOST = 'lost'
-    NOBODY = 'nobody'  # is in view
 
 
 class Tracker:
@@ -196,12 +187,7 @@ class Tracker:
         """
         if prediction is not None:
             prediction.seen_as(self.body)
-        size = (self.camera.height, self.camera.width)
-        if image.shape[:2] != size:
-            raise ValueError(f'the camera gives images of {size}, saw {image.shape[:2]}')
-        for each, name in ((mask, 'a mask'), (others, 'a mask'), (depth, 'depths')):
-            if each is not None and each.shape != size:
-                raise ValueError(f'the camera gives images of {size}, saw {name} of {each.shape}')
+        self._observer.check_sizes(image, mask, others, depth)
         if self._last_stamp is not None and stamp <= self._last_stamp:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
         self.evaluations = 0
@@ -360,7 +346,7 @@ class Tracker:
             if self._presence.absent:
                 self._drop_track()
                 return None, None
-            if self._nothing_to_see(view) or (not seen and view.silhouette is not None):
+            if self._presence.hides(view) or (not seen and view.silhouette is not None):
                 # Nothing is there to fit modes to.
                 return self._expected(stamp), self._likelihood(Observation())
             observation = self._observe(view, self.modes.poses[0])
@@ -429,11 +415,6 @@ class Tracker:
         self._presence = Presence(self.settings.absence_time)
         self._is_seen(view, stamp)
         return observation
-
-    def _nothing_to_see(self, view: View) -> bool:
-        """Whether others hide the person, and no detector sees what is left."""
-        keypoints = view.keypoints
-        return self._presence.hidden and (keypoints is None or not keypoints.seen.any())
 
     def _expected(self, stamp: int) -> GaussianMixture:
         """The posterior of a time at which nothing is seen."""
