@@ -183,6 +183,8 @@ def _make_bag(arguments: argparse.Namespace) -> int:
     given = {'quality': arguments.jpeg_quality, 'progress': not arguments.quiet}
     with new_bag_folder(arguments.output, overwrite=arguments.overwrite) as folder:
         if options.name == CROSSING and options.mocap is None:
+            if arguments.depth:
+                raise ValueError(f'--depth does not go with {CROSSING}, which has no depth images')
             write_crossing(folder, _crossing(options, viewpoint), camera, scene, **given)
         else:
             take = motion_of(options, viewpoint)

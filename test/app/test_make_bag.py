@@ -214,6 +214,7 @@ def test_camera_and_scene_options(tmp_path):
         (['walk', '--duration', '0.01'], 'one frame at least'),
         (['any', '--mocap', 'nothing.bvh'], 'nothing.bvh'),
         (['any', '--mocap', 'nothing.bvh', '--stature', '1.7'], '--stature does not go with'),
+        (['crossing', '--depth'], '--depth does not go with crossing'),
         (['walk', '--start', '1'], '--start goes with --mocap only'),
         (['reach', '--camera-height', '50'], 'joints of the person, wanted 4'),
     ],
