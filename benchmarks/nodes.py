@@ -37,6 +37,8 @@ KEPT = 0.99  # share of the images whose results came
 SIZE = (640, 480)
 MEDIAN_MS, LATE_MS = 5.0, 15.0  # wanted of what ROS adds, median and 99th percentile
 HELD = 0.8  # of the rate that the filter reaches
+# Images that may wait, where every image is to be used: no node is late, but images come in bursts.
+QUEUE = 5
 PEOPLE = (1, 2, 4)
 # Room in shared memory for raw images.
 PROFILE = Path(hmt_ros.__file__).parent / 'config' / 'fastdds.xml'
@@ -296,7 +298,7 @@ def _prompt(transport: str) -> Feed:
     return Feed(
         'bme_node',
         'benchmarks.prompt_node',
-        BmeParameters(image_transport=transport),
+        BmeParameters(image_transport=transport, queue_size=QUEUE),
         bme_session.TOPICS,
         bme_session.PREDICTION,
         replace(info, width=SIZE[0], height=SIZE[1]),
@@ -335,6 +337,7 @@ def _filter() -> Feed:
             image_transport='compressed',
             background_file=str(folder / 'background.png'),
             subject_file=str(folder / 'subject.yaml'),
+            queue_size=QUEUE,
         ),
         track_messages.TOPICS,
         'pose_mixture',
