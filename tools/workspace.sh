@@ -176,7 +176,7 @@ stage_requirements() {
 
 stage_build() {
   local key
-  key=$(find package.xml setup.py setup.cfg resource hmt_ros msg_tools launch rviz foxglove security \
+  key=$(find package.xml colcon.pkg setup.py setup.cfg resource hmt_ros msg_tools launch rviz foxglove security \
     -type f -not -name '*.pyc' | LC_ALL=C sort | checksum "$(cat "$stamps/ros")")
   done_already build "$key" && [ -f install/setup.bash ] && return
   say 'building hmt_msgs and hmt_ros with colcon'
