@@ -15,6 +15,7 @@ from typing import NamedTuple
 from rclpy.node import Node
 
 from hmt_ros.nodes.subscribed_topic import SubscribedTopic
+from hmt_ros.sessions.handled import HANDLED
 from hmt_ros.sessions.session import NeededInput, kind_of
 
 # Time without a message after which a topic is silent, and between two warnings of one text, s.
@@ -23,6 +24,7 @@ SILENCE, REPEAT = 3.0, 30.0
 _MOST_NAMED, _ALIKE = 3, 0.6
 _IMAGE, _COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 _SUFFIX = '/compressed'
+_IMAGES = ('image', f'image{_SUFFIX}')
 _OTHER = {_IMAGE: _COMPRESSED, _COMPRESSED: _IMAGE}
 
 
@@ -110,17 +112,26 @@ class SilentTopics:
         return now - last >= SILENCE
 
     def _like(self, wanted: list[SubscribedTopic], names: list[str]) -> list[Publication]:
-        """What others publish on topics that are like some, by type or by name."""
+        """What others publish on topics that are like some, by type or by name.
+
+        The silhouettes and overlays of our own nodes are no images of a camera.
+        """
         own = self._node.get_fully_qualified_name()
+        topics = self._node.get_topic_names_and_types()
+        ours = {
+            topic.removesuffix('/handled')
+            for topic, kinds in topics
+            if HANDLED in kinds and any(one.topic in _IMAGES for one in wanted)
+        }
         types = {one.msgtype for one in wanted}
         types |= {_OTHER[each] for each in types & _OTHER.keys()}
         found = []
-        for topic, kinds in self._node.get_topic_names_and_types():
+        for topic, kinds in topics:
             if not types & set(kinds) and all(_likeness(topic, x) < _ALIKE for x in names):
                 continue
             for info in self._node.get_publishers_info_by_topic(topic):
                 by = f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-                if by != own:
+                if by != own and (by not in ours or topic in names):
                     found.append(Publication(topic, info.topic_type, by))
         return found
 
@@ -142,8 +153,11 @@ def why_silent(
     types = {one.msgtype for one in wanted}
     fitting = sorted({each.by for each in here if each.msgtype in types})
     if fitting:
-        why = f'{" and ".join(fitting)} publishes it but sends nothing that arrives'
-        return f'nothing on {topics}; {why}: see "ros2 topic info --verbose {names[0]}"'
+        why = f'{" and ".join(fitting)} publishes it, but no message has come'
+        return (
+            f'nothing on {topics}; {why}: it may wait for something itself, see its diagnostics '
+            f'and "ros2 topic info --verbose {names[0]}"'
+        )
     others = sorted({f'{each.by} publishes it as {_short(each.msgtype)}' for each in here})
     why = ' and '.join(others) or f'nobody publishes {"it" if len(names) == 1 else "either"}'
     hints = [_instead(one, name, published) for one, name in zip(wanted, names, strict=True)]
@@ -186,7 +200,7 @@ def _remedy(wanted: SubscribedTopic, found: str, kind: str) -> str:
     """How the node gets the messages of another topic; '' if it can not."""
     if kind == wanted.msgtype:
         return f': remap with -r {wanted.topic}:={found}'
-    if wanted.topic in ('image', f'image{_SUFFIX}') and kind == _OTHER[wanted.msgtype]:
+    if wanted.topic in _IMAGES and kind == _OTHER[wanted.msgtype]:
         transport, topic = ('raw', 'image') if kind == _IMAGE else ('compressed', f'image{_SUFFIX}')
         return f': set image_transport to {transport} and remap with -r {topic}:={found}'
     return ''

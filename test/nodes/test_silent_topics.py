@@ -52,8 +52,8 @@ def silent(transport, *published, name='/image'):
         (
             'raw',
             [('/image', RAW)],
-            '; /driver publishes it but sends nothing that arrives: see "ros2 topic info --verbose '
-            '/image"',
+            '; /driver publishes it, but no message has come: it may wait for something itself, '
+            'see its diagnostics and "ros2 topic info --verbose /image"',
         ),
         (
             'raw',
@@ -131,6 +131,22 @@ def test_nobody_publishes(world):
     one.other.destroy_publisher(elsewhere)
 
 
+def test_images_of_our_own_nodes_are_not_those_of_a_camera(world):
+    from hmt_msgs.msg import Handled
+    from sensor_msgs.msg import Image
+
+    one = world()
+    made = [
+        one.other.create_publisher(Handled, '/other/handled', 5),
+        one.other.create_publisher(Image, '/silhouette', 5),
+    ]
+    one.patience(0.5)
+    one.spin_until(lambda: of_topic(one, '/image'), 'the warning')
+    assert not any('silhouette' in text for text in of_topic(one, '/image'))
+    for publisher in made:
+        one.other.destroy_publisher(publisher)
+
+
 def test_what_arrives_is_not_told(world, small_camera):
     one = world({'image': RAW, 'camera_info': INFO})
     one.send('camera_info', small_camera.info())
@@ -165,7 +181,9 @@ def test_a_publisher_that_sends_nothing(world):
     one = world({'image': RAW})
     one.patience(0.5)
     one.spin_until(
-        lambda: any('/other publishes it but sends nothing' in t for t in of_topic(one, '/image')),
+        lambda: any(
+            '/other publishes it, but no message has come' in t for t in of_topic(one, '/image')
+        ),
         'the warning',
     )
 
