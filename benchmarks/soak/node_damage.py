@@ -23,7 +23,8 @@ def damaged_bytes(watched: Watched, amount: Amount, outcome: Outcome) -> None:
             outcome.refused += not _asked(watched, rng)
             continue
         source = sources[chosen]
-        watched.node.publish_bytes(source, damaged(valid[source], rng))
+        # A message without any byte stops a reliable topic within DDS; no ROS publisher can send it.
+        watched.node.publish_bytes(source, damaged(valid[source], rng) or b'\0')
         try:
             handled = watched.answer(SHORT)
         except Silent:
