@@ -23,7 +23,7 @@ def damaged_bytes(watched: Watched, amount: Amount, outcome: Outcome) -> None:
             outcome.refused += not _asked(watched, rng)
             continue
         source = sources[chosen]
-        # A message without any byte stops a reliable topic within DDS; no ROS publisher can send it.
+        # A message of no bytes, which no ROS publisher can send, stops a reliable topic in DDS.
         watched.node.publish_bytes(source, damaged(valid[source], rng) or b'\0')
         try:
             handled = watched.answer(SHORT)
