@@ -81,7 +81,8 @@ class ProgressLines:
         if total is not None and total < count:
             total = None  # a bag may have more than it tells
         done = f'{count} {self._unit}' if total is None else f'{count} of {total:.0f} {self._unit}'
-        if not count or not spent:
+        # The first one may have compiled the kernels: it tells nothing of those that follow.
+        if count < 2 or not spent:
             return f'{done}, {so_far}'
         rate = count / spent
         rest = so_far if total is None else f'{_duration((total - count) / rate)} left'
