@@ -9,10 +9,11 @@ import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidHandle
 from rclpy.qos import qos_policy_name_from_kind
 
 from hmt_ros.nodes.silent_topics import SilentTopics
@@ -189,6 +190,19 @@ class MiddlewareEvents:
         """The policy of the last publisher that did not fit; '' where all fit."""
         with self._lock:
             return self._policies.get(topic, '')
+
+    def deaf_topic(self, subscriptions: Iterable[Any]) -> str:
+        """A topic whose publishers all have a quality of service that does not fit, and why."""
+        try:
+            for subscription in list(subscriptions):
+                topic = subscription.topic_name
+                policy = self.refused_policy(topic)
+                if policy and not subscription.get_publisher_count():
+                    return f'{topic}: publishers offer another {policy} than is asked for'
+        except InvalidHandle:
+            # The other thread is closing them.
+            pass
+        return ''
 
     @property
     def lost(self) -> int:

@@ -7,25 +7,23 @@ looks for mixtures in namespaces that it does not know yet, and leaves those tha
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
     CAMERA_INFO_TOPIC,
-    LATCHED,
-    RELIABLE,
     SubscribedTopic,
     image_topic,
     message_class,
-    read_installed_messages,
+    mixture_topic,
+    published_with,
 )
 from hmt_ros.sessions.handled import Handled, Output
 from hmt_ros.sessions.hri_parameters import HriParameters
@@ -35,33 +33,14 @@ from hmt_ros.sessions.hri_session import (
     mixture_source,
     published_topic,
 )
-from hmt_ros.sessions.session import everything
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.humans import IDS
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
-_MIXTURES = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 _URDF = 'urdf'
 # Subscriptions at a time to people who come by themselves, and period of the search for them, s.
 _MOST_TOPICS = 64
 _SEARCH = 0.25
-
-
-class InstalledHriSession(HriSession):
-    """A bridge whose messages are installed; see `HriSession`.
-
-    Raises:
-        ValueError: the package hri_msgs is not installed.
-    """
-
-    def __init__(
-        self,
-        parameters: HriParameters,
-        publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = everything,
-    ) -> None:
-        read_installed_messages(IDS, 'hri_node')
-        super().__init__(parameters, publish, wanted)
 
 
 class HriNode(SessionNode[HriSession, HriParameters]):
@@ -72,7 +51,7 @@ class HriNode(SessionNode[HriSession, HriParameters]):
 
     NAME = 'hri_node'
     SUBJECT = 'bodies'
-    SESSION = InstalledHriSession
+    SESSION = HriSession
     DEFAULTS = HriParameters()
 
     def __init__(self, **options: Any) -> None:
@@ -81,6 +60,9 @@ class HriNode(SessionNode[HriSession, HriParameters]):
         self._of_bodies: dict[str, Any] = {}
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._search = self.create_timer(_SEARCH, self._look_for_people, clock=steady)
+
+    def _messages_of_others(self, settings: HriParameters) -> Mapping[str, str]:
+        return {IDS: 'hri_node'}
 
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         return ()
@@ -106,16 +88,15 @@ class HriNode(SessionNode[HriSession, HriParameters]):
 
     def _mixtures_in(self, namespace: str) -> SubscribedTopic:
         topic = f'{namespace.rstrip("/")}/{self._settings.mixture_topic}'
-        return SubscribedTopic(mixture_source(namespace), topic, POSE_MIXTURE, _MIXTURES)
+        return mixture_topic(mixture_source(namespace), topic)
 
     def _found(self) -> list[str]:
         """Namespaces below /humans/bodies in which somebody publishes mixtures."""
         end = f'/{self._settings.mixture_topic}'
-        kind = POSE_MIXTURE
         found = [
             topic.removesuffix(end)
             for topic, kinds in self.get_topic_names_and_types()
-            if topic.startswith(f'{BODIES}/') and topic.endswith(end) and kind in kinds
+            if topic.startswith(f'{BODIES}/') and topic.endswith(end) and POSE_MIXTURE in kinds
         ]
         return sorted(found)
 
@@ -151,11 +132,11 @@ class HriNode(SessionNode[HriSession, HriParameters]):
         if topic in self._outputs:
             return self._outputs[topic]
         if topic not in self._of_bodies:
-            published = published_topic(topic)
+            msgtype, qos = published_with(published_topic(topic))
             self._of_bodies[topic] = self.create_publisher(
-                message_class(published.msgtype),
+                message_class(msgtype),
                 topic,
-                LATCHED if published.latched else RELIABLE,
+                qos,
                 # Handlers of events would belong to the executor's thread.
                 event_callbacks=PublisherEventCallbacks(use_default_callbacks=False),
             )

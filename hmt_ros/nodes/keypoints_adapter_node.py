@@ -3,38 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
-from hmt_ros.nodes.subscribed_topic import (
-    CAMERA_INFO_TOPIC,
-    SubscribedTopic,
-    read_installed_messages,
-)
-from hmt_ros.sessions.handled import Output
+from hmt_ros.nodes.subscribed_topic import CAMERA_INFO_TOPIC, SubscribedTopic
 from hmt_ros.sessions.keypoints_adapter_parameters import SOURCES, KeypointsAdapterParameters
 from hmt_ros.sessions.keypoints_adapter_session import DETECTIONS, KeypointsAdapterSession
-from hmt_ros.sessions.session import everything
-
-
-class InstalledAdapterSession(KeypointsAdapterSession):
-    """An adapter of messages whose package is installed; see `KeypointsAdapterSession`.
-
-    Raises:
-        ValueError: the package of `source` is not installed.
-    """
-
-    def __init__(
-        self,
-        parameters: KeypointsAdapterParameters,
-        publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = everything,
-    ) -> None:
-        msgtype = SOURCES[parameters.source]
-        read_installed_messages(msgtype, f'source {parameters.source}')
-        super().__init__(parameters, publish, wanted)
 
 
 class KeypointsAdapterNode(SessionNode[KeypointsAdapterSession, KeypointsAdapterParameters]):
@@ -42,8 +18,11 @@ class KeypointsAdapterNode(SessionNode[KeypointsAdapterSession, KeypointsAdapter
 
     NAME = 'keypoints_adapter_node'
     SUBJECT = 'adapter'
-    SESSION = InstalledAdapterSession
+    SESSION = KeypointsAdapterSession
     DEFAULTS = KeypointsAdapterParameters()
+
+    def _messages_of_others(self, settings: KeypointsAdapterParameters) -> Mapping[str, str]:
+        return {SOURCES[settings.source]: f'source {settings.source}'}
 
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         return ()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from hmt_msgs.srv import Reset
@@ -18,20 +18,17 @@ from hmt_ros.nodes.session_node import SessionNode
 from hmt_ros.nodes.subscribed_topic import (
     CAMERA_INFO_TOPIC,
     DEPTH_TOPIC,
-    LATCHED,
     MASK_TOPICS,
-    RELIABLE,
     TRANSFORM_TOPICS,
     SubscribedTopic,
     image_topic,
-    message_class,
-    read_installed_messages,
+    published_with,
 )
 from hmt_ros.sessions.handled import Output
 from hmt_ros.sessions.people_parameters import SOURCES, PeopleParameters
 from hmt_ros.sessions.people_session import DETECTIONS, PeopleSession, published_topic
 from hmt_ros.sessions.person_session import person_of
-from hmt_ros.sessions.session import everything
+from hmt_ros.sessions.track_start import prepare_start
 from msg_tools.files.error_line import error_line
 
 # Periods of the diagnostics after which the topics of somebody who has left are closed: the last
@@ -39,30 +36,12 @@ from msg_tools.files.error_line import error_line
 STAYS_OPEN = 5
 
 
-class InstalledPeopleSession(PeopleSession):
-    """Several people, of detections whose package is installed; see `PeopleSession`.
-
-    Raises:
-        ValueError: the package of `source` is not installed.
-    """
-
-    def __init__(
-        self,
-        parameters: PeopleParameters,
-        publish: Callable[[Output], None],
-        wanted: Callable[[str], bool] = everything,
-    ) -> None:
-        msgtype = SOURCES[parameters.source]
-        read_installed_messages(msgtype, f'source {parameters.source}')
-        super().__init__(parameters, publish, wanted)
-
-
 class PeopleNode(SessionNode[PeopleSession, PeopleParameters]):
     """The node; its parameters are the fields of `PeopleParameters`."""
 
     NAME = 'people_node'
     SUBJECT = 'people'
-    SESSION = InstalledPeopleSession
+    SESSION = PeopleSession
     DEFAULTS = PeopleParameters()
 
     def __init__(self, **options: Any) -> None:
@@ -76,6 +55,9 @@ class PeopleNode(SessionNode[PeopleSession, PeopleParameters]):
         result = super().on_deactivate(state)
         self._close_topics({name for topic in self._outputs if (name := person_of(topic))})
         return result
+
+    def _messages_of_others(self, settings: PeopleParameters) -> Mapping[str, str]:
+        return {SOURCES[settings.source]: f'source {settings.source}'}
 
     def _offered_services(self) -> Iterable[tuple[type, str, Callable[..., Any]]]:
         yield Reset, '~/reset', self._on_reset
@@ -98,17 +80,15 @@ class PeopleNode(SessionNode[PeopleSession, PeopleParameters]):
             response.success = False
             response.message = 'a mixture or a box is of one person: wanted an empty request'
             return response
-        failed: list[str] = []
-
-        def restart() -> None:
-            try:
-                session.restart()
-            except ValueError as error:
-                failed.append(error_line(error))
-
-        thread.restart(restart)
-        response.success = not failed
-        response.message = failed[0] if failed else 'the next detections start new tracks'
+        try:
+            start = prepare_start(session.parameters)
+        except ValueError as error:
+            response.success, response.message = False, error_line(error)
+            self.get_logger().warn(f'~/reset is refused: {response.message}')
+            return response
+        thread.restart(lambda: session.restart(start))
+        response.success, response.message = True, 'the next detections start new tracks'
+        self.get_logger().info(f'~/reset: {response.message}')
         return response
 
     # Called by the thread that estimates.
@@ -126,13 +106,7 @@ class PeopleNode(SessionNode[PeopleSession, PeopleParameters]):
         if topic in self._outputs:
             return
         with self._opening:
-            published = published_topic(topic)
-            publisher = self.create_lifecycle_publisher(
-                message_class(published.msgtype),
-                topic,
-                LATCHED if published.latched else RELIABLE,
-                event_callbacks=self._events.of_publisher(self.resolve_topic_name(topic)),
-            )
+            publisher = self._new_publisher(topic, *published_with(published_topic(topic)))
             publisher.on_activate(None)
             # Others may be going through the old ones.
             self._outputs = {**self._outputs, topic: publisher}

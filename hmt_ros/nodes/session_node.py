@@ -13,16 +13,16 @@ from __future__ import annotations
 import time
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidHandle
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates, trouble_of_period
@@ -37,10 +37,11 @@ from hmt_ros.nodes.node_parameters import (
 from hmt_ros.nodes.silent_topics import SilentTopics
 from hmt_ros.nodes.subscribed_topic import (
     ANSWERS,
-    LATCHED,
     RELIABLE,
     SubscribedTopic,
     message_class,
+    published_with,
+    read_installed_messages,
 )
 from hmt_ros.sessions.declared_parameters import (
     NodeParameters,
@@ -128,6 +129,14 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
         """The topics to subscribe to, the one that sets the pace last."""
 
+    def _messages_of_others(self, settings: Parameters) -> Mapping[str, str]:
+        """Types of messages of packages that need not be installed, and what needs each.
+
+        Raises:
+            ValueError: none of those that would do is installed.
+        """
+        return {}
+
     def _finish(self, session: AnySession) -> None:
         """Publishes what is left when the node does not listen any more."""
 
@@ -151,12 +160,29 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._thread = None
         return True
 
+    def _new_session(self, settings: Parameters, *functions: Callable[..., Any]) -> AnySession:
+        """A session with these parameters.
+
+        Raises:
+            ValueError: they name something that can not be used, or that is not installed.
+        """
+        for msgtype, needed_by in self._messages_of_others(settings).items():
+            read_installed_messages(msgtype, needed_by)
+        session: AnySession = self.SESSION(settings, *functions)
+        return session
+
+    def _new_publisher(self, topic: str, msgtype: str, qos: QoSProfile) -> Any:
+        events = self._events.of_publisher(self.resolve_topic_name(topic))
+        return self.create_lifecycle_publisher(
+            message_class(msgtype), topic, qos, event_callbacks=events
+        )
+
     # Lifecycle.
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Reads files, opens topics."""
         try:
-            self._session = self.SESSION(self._settings, self._publish, self._is_wanted)
+            self._session = self._new_session(self._settings, self._publish, self._is_wanted)
         except ValueError as error:
             self._failure = f'{error_line(error)}; {next_step(self, error, self.SESSION.CHECKED)}'
             self.get_logger().error(self._failure)
@@ -164,18 +190,8 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             return TransitionCallbackReturn.FAILURE
         self._failure = ''
         for topic, published in self.SESSION.TOPICS.items():
-            self._outputs[topic] = self.create_lifecycle_publisher(
-                message_class(published.msgtype),
-                topic,
-                LATCHED if published.latched else RELIABLE,
-                event_callbacks=self._events.of_publisher(self.resolve_topic_name(topic)),
-            )
-        self._handled = self.create_lifecycle_publisher(
-            message_class(HANDLED),
-            '~/handled',
-            ANSWERS,
-            event_callbacks=self._events.of_publisher(self.resolve_topic_name('~/handled')),
-        )
+            self._outputs[topic] = self._new_publisher(topic, *published_with(published))
+        self._handled = self._new_publisher('~/handled', HANDLED, ANSWERS)
         # While a service waits for something, the others of its group would wait with it.
         group = ReentrantCallbackGroup()
         self._offered = [
@@ -262,19 +278,6 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._events.forget()
         self._silent.listen(())
 
-    def _deaf_topic(self) -> str:
-        """A topic whose publishers all have a quality of service that does not fit, and why."""
-        try:
-            for subscription in list(self._inputs):
-                topic = subscription.topic_name
-                policy = self._events.refused_policy(topic)
-                if policy and not subscription.get_publisher_count():
-                    return f'{topic}: publishers offer another {policy} than is asked for'
-        except InvalidHandle:
-            # The other thread is closing them.
-            pass
-        return ''
-
     def _close(self) -> None:
         self._unsubscribe()
         self.stop()
@@ -323,7 +326,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         try:
             settings = with_values(self._settings, changed)
             if any(name in changed for name in self.SESSION.CHECKED):
-                self.SESSION(settings, lambda output: None)
+                self._new_session(settings, lambda output: None)
         except ValueError as error:
             return SetParametersResult(successful=False, reason=error_line(error))
         self._settings = settings
@@ -388,7 +391,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
             return DiagnosticStatus.OK, label
         trouble = (
             state.trouble()
-            or self._deaf_topic()
+            or self._events.deaf_topic(self._inputs)
             or trouble_of_period(state, self._rates, self._silent)
         )
         if trouble:

@@ -13,19 +13,17 @@ from typing import Any
 
 from hmt_msgs.msg import TrajectoryMixture
 from hmt_msgs.srv import SmoothWindow
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 
 from hmt_ros.nodes.run_node import run
 from hmt_ros.nodes.session_node import SessionNode
-from hmt_ros.nodes.subscribed_topic import SubscribedTopic
+from hmt_ros.nodes.subscribed_topic import SubscribedTopic, mixture_topic
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
 
-_MIXTURES = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 # How long the executor waits for a window that is being smoothed before it serves the others.
 _TURN = 0.01  # s
 
@@ -42,8 +40,7 @@ class SmootherNode(SessionNode[SmootherSession, SmootherParameters]):
         yield SmoothWindow, '~/smooth_window', self._on_smooth_window
 
     def _wanted_inputs(self) -> Iterable[SubscribedTopic]:
-        kind = 'hmt_msgs/msg/PoseMixture'
-        yield SubscribedTopic(MIXTURE, 'likelihood_mixture', kind, _MIXTURES)
+        yield mixture_topic(MIXTURE, 'likelihood_mixture')
 
     def _finish(self, session: SmootherSession) -> None:
         self._tell(session.finish())

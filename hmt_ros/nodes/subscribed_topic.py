@@ -11,9 +11,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profi
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK
 from hmt_ros.sessions.depth_inputs import DEPTH
+from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.sessions.transform_buffer import TF, TF_STATIC, TRANSFORMS_TYPE
 from msg_tools.messages.images import MAX_PIXELS
 from msg_tools.messages.message_types import register_definitions
+from msg_tools.messages.pose_mixtures import POSE_MIXTURE
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 # For `~/handled`: who waits for an answer to each message must not miss those to a burst.
@@ -86,6 +88,7 @@ TRANSFORM_TOPICS = (
     SubscribedTopic(TF_STATIC, '/tf_static', TRANSFORMS_TYPE, _TF_STATIC_QOS, waiting=TF_QUEUE),
     SubscribedTopic(TF, '/tf', TRANSFORMS_TYPE, _TF_QOS, waiting=TF_QUEUE),
 )
+_MIXTURES = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 CAMERA_INFO_TOPIC = SubscribedTopic(CAMERA_INFO, 'camera_info', 'sensor_msgs/msg/CameraInfo')
 
 
@@ -95,6 +98,16 @@ def image_topic(image_transport: str) -> SubscribedTopic:
     if image_transport == 'compressed':
         topic, kind = ('image/compressed', 'CompressedImage')
     return SubscribedTopic(IMAGE, topic, f'sensor_msgs/msg/{kind}', largest=LARGEST_IMAGE)
+
+
+def published_with(published: PublishedTopic) -> tuple[str, QoSProfile]:
+    """Type and quality of service of a topic that a session publishes."""
+    return published.msgtype, LATCHED if published.latched else RELIABLE
+
+
+def mixture_topic(source: str, topic: str) -> SubscribedTopic:
+    """Pose mixtures of a person; who is slow for a while misses none."""
+    return SubscribedTopic(source, topic, POSE_MIXTURE, _MIXTURES)
 
 
 def message_class(msgtype: str) -> Any:

@@ -43,7 +43,7 @@ from hmt_ros.sessions.people_state import PeopleState
 from hmt_ros.sessions.person_session import BODIES, PersonSession, person_of
 from hmt_ros.sessions.session import NeededInput, PublishedTopic, everything
 from hmt_ros.sessions.track_messages import TOPICS
-from hmt_ros.sessions.track_start import prepare_start
+from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
 from hmt_ros.tracking.areas import grown, hull, unknown_area
 from hmt_ros.tracking.association import SAME, ImageTrack, Sighting, assigned
@@ -124,13 +124,16 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         self._forget()
         self.state = self._present_state()
 
-    def restart(self) -> None:
+    def restart(self, start: TrackStart | None = None) -> None:
         """Drops all tracks; people start anew.
+
+        Args:
+            start: what they start from; None: what the parameters name.
 
         Raises:
             ValueError: the parameters name a file that can not be used; the tracks go on.
         """
-        self._start = prepare_start(self.parameters)
+        self._start = prepare_start(self.parameters) if start is None else start
         super().restart()
 
     def finish(self) -> Handled:

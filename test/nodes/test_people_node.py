@@ -2,6 +2,8 @@
 
 from importlib.util import find_spec
 
+import cv2
+import numpy as np
 import pytest
 
 from hmt_ros.sessions.people_parameters import PeopleParameters
@@ -88,6 +90,22 @@ def test_reset_drops_all_tracks(world, small_camera):
     assert (answer.success, answer.message) == (True, 'the next detections start new tracks')
     show(one, small_camera, 1, somebody_at(15, 'anna'))
     assert len(StubTracker.made) == 2
+
+
+def test_a_reset_that_can_not_be_done_is_refused(world, small_camera, tmp_path):
+    from hmt_msgs.srv import Reset
+
+    file = tmp_path / 'background.png'
+    file.write_bytes(cv2.imencode('.png', np.full((48, 64, 3), 90, np.uint8))[1].tobytes())
+    one = world(small_camera, background_file=str(file))
+    show(one, small_camera, 0, somebody_at(15, 'anna'))
+    file.unlink()
+    answer = one.call(Reset, 'reset')
+    assert not answer.success
+    assert str(file) in answer.message
+    # The tracks go on.
+    show(one, small_camera, 1, somebody_at(15, 'anna'))
+    assert len(StubTracker.made) == 1
 
 
 def test_boxes_need_their_package(executable):
