@@ -1,4 +1,4 @@
-"""people: two people cross, one before the other; are they told apart afterwards?
+"""people: two people cross, one before the other; does each keep the track that was theirs?
 
 For every seed a bag is rendered (`make-bag crossing`: 320x240, 3 s at 10 Hz, COCO keypoints of both
 without identities, none where a person is hidden) and replayed (`replay --people`). A track is that
@@ -33,7 +33,7 @@ from msg_tools.messages.pose_mixtures import pose_mixture_of
 
 SEEDS, QUICK = 10, 1
 DURATION, FPS, SIZE = 3.0, 10.0, '320x240'
-# Shares of the time in which people are told apart before and after the crossing.
+# Shares of the time, before and after the crossing, in which people are compared with their tracks.
 BEFORE, AFTER = 0.33, 0.75
 
 # Positions (K, J, 3) of the joints of the modes, heaviest first, m, by stamp.

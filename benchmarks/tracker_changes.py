@@ -18,7 +18,7 @@ def changed(changes: Sequence[tuple[str, Any]]) -> TrackerSettings:
     """Settings with those that are named by their path, such as `likelihood.edges.weight`.
 
     Raises:
-        ValueError: there is no such setting, or it does not take the value.
+        ValueError: the setting does not exist, or does not take the value.
     """
     settings: Any = TrackerSettings()
     for path, value in changes:

@@ -107,6 +107,7 @@ def test_live_layout_shows_topics_of_the_nodes() -> None:
         for topic, published in NODE_TOPICS.items()
     }
     there |= {'/diagnostics': SHOWN['DiagnosticSummary'], '/rosout': SHOWN['RosOut']}
+    assert len(there) > len(NODE_TOPICS)
     check_layout(LIVE, there, {'camera_upright'})
 
 

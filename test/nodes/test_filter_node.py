@@ -403,6 +403,7 @@ def test_what_images_waited_for_comes_before_that_they_are_late(world, small_cam
         one.send('image', small_camera.image(index))
     one.node._diagnose_period()
     one.spin_until(lambda: any(d.status[0].message == told for d in one.diagnostics), told)
+    assert one.node._session.state.counts['dropped'] == 3
 
 
 def test_late_node_goes_on_with_the_newest_complete_image(

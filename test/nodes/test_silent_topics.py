@@ -186,6 +186,7 @@ def test_a_publisher_that_sends_nothing(world):
         ),
         'the warning',
     )
+    assert one.diagnosis()[0] == 1
 
 
 def test_a_node_that_does_not_listen_misses_nothing(world):
