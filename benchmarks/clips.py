@@ -110,6 +110,39 @@ def resized(clip: Clip, size: float) -> Clip:
     )
 
 
+def at_rate(clip: Clip, rate: float) -> Clip:
+    """A clip whose images come at a lower rate: some are left out.
+
+    Args:
+        clip: with all its images.
+        rate: images a second at most; see `rows_at_rate`.
+    """
+    rows = rows_at_rate(clip.stamps, rate)
+    return replace(
+        clip, stamps=[clip.stamps[i] for i in rows], images=[clip.images[i] for i in rows]
+    )
+
+
+def rows_at_rate(stamps: Sequence[int], rate: float) -> list[int]:
+    """Rows of the images that are kept at a lower rate; the first image is always kept.
+
+    An image is kept when it comes 1 / rate after the last kept one, or at most half the interval
+    between two images earlier.
+
+    Args:
+        stamps: (T,) of the images, ns.
+        rate: images a second; 0, or one that is not below that of the images: all are kept.
+    """
+    if rate <= 0 or len(stamps) < 2:
+        return list(range(len(stamps)))
+    least = 1e9 / rate - 0.5 * float(np.median(np.diff(stamps)))
+    rows = [0]
+    for i in range(1, len(stamps)):
+        if stamps[i] - stamps[rows[-1]] >= least:
+            rows.append(i)
+    return rows
+
+
 def at_size(pixels: NDArray[np.float64], factors: tuple[float, float]) -> NDArray[np.float64]:
     """Pixels (..., 2) in an image whose width and height were multiplied by factors.
 

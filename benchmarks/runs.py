@@ -2,12 +2,14 @@
 
 A run is a clip, what the tracker is given of it, a seed and changed settings. What it found is kept
 as arrays in `build/benchmarks/tracking`, under a name that depends on the run, the code and the
-clip: a benchmark that was broken off goes on where it was.
+clip: a benchmark that was broken off goes on where it was. A small JSON file beside each record
+tells which run it is, so that the records of another checkout can be compared (`records_of`).
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import multiprocessing
 import os
 import sys
@@ -16,7 +18,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,7 +29,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
-from benchmarks.clips import ROOT, Clip, at_size, read_clip, read_detections, resized
+from benchmarks.clips import (
+    ROOT,
+    Clip,
+    at_rate,
+    at_size,
+    read_clip,
+    read_detections,
+    resized,
+)
 from benchmarks.tracker_changes import changed
 from hmt_ros.app.progress import show_progress
 from hmt_ros.body import Body, load_body
@@ -54,6 +64,8 @@ STARTS = (SUBJECT, KEYPOINTS)
 KEPT = ROOT / 'build' / 'benchmarks' / 'tracking'
 # Joints of a record: the origin, then those that are scored.
 JOINTS = (ORIGIN, *EVALUATED_JOINTS)
+# Images a second of most clips.
+USUAL_RATE = 30.0
 # Streams of random numbers of a seed.
 OF_BLIND_CONTROL = 5
 
@@ -67,9 +79,10 @@ class Run:
         inputs: what the tracker is given, one of `INPUTS`.
         seed: of the tracker.
         changes: settings of the tracker, by their path, that differ from the defaults.
-        limit: number of images; None: all.
+        limit: number of images of the clip, of which `rate` may leave out some; None: all.
         size: of the images against those in the bag; other sizes go with images alone.
         start: what the track starts from, one of `STARTS`.
+        rate: images a second that the tracker is given at most; 0: all images of the clip.
     """
 
     folder: Path
@@ -79,11 +92,18 @@ class Run:
     limit: int | None = None
     size: float = 1.0
     start: str = SUBJECT
+    rate: float = 0.0
 
     @property
     def clip(self) -> str:
         """Name of the clip."""
         return self.folder.name
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What tells it from other runs, whatever the code and wherever the clip is; for JSON."""
+        changes = [[name, value] for name, value in sorted(self.changes, key=lambda x: x[0])]
+        return {**asdict(self), 'folder': None, 'clip': self.clip, 'changes': changes}
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +123,13 @@ class Record:
         seconds: (T,) a step took.
         images: (1,) number of images of the run.
         true: (T, J, 3) m, camera frame; NaN where a joint has no truth.
-        contact: (T, 2) whether the left and the right foot stand; empty: unknown.
+        contact: (T, 2) whether the left and the right foot have stood since the image before;
+            empty: unknown.
         views: (T, 3, 4) rotation and position of the camera in the world; the world is the camera's
             frame where the clip does not tell.
+        cpu_seconds: (T,) of processor time that a step took, all threads together; empty: unknown.
+        statuses: (N,) what the tracker was doing in each image of the run, the value of its status;
+            empty: unknown.
     """
 
     stamps: NDArray[np.int64]
@@ -122,6 +146,8 @@ class Record:
     true: NDArray[np.float64]
     contact: NDArray[np.bool_]
     views: NDArray[np.float64]
+    cpu_seconds: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    statuses: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, dtype='<U1'))
 
 
 def keypoints_only(settings: TrackerSettings) -> TrackerSettings:
@@ -164,6 +190,7 @@ def run(one: Run) -> Record:
         if one.inputs != IMAGES:
             raise ValueError(f'keypoints are for images of size 1, saw {one.size}')
         clip = resized(clip, one.size)
+    clip = at_rate(clip, one.rate)
     settings = changed(one.changes)
     keypoints = None if one.inputs == IMAGES else read_detections(one.folder).keypoints
     if one.inputs == KEYPOINTS:
@@ -192,16 +219,17 @@ def follow(
     mixtures: list[GaussianMixture] = []
     points: list[NDArray[np.float64]] = []
     stamps: list[int] = []
-    evaluations, seconds = [], []
+    evaluations, seconds, cpu_seconds, statuses = [], [], [], []
     for stamp, image in zip(clip.stamps, clip.images, strict=True):
-        start = time.perf_counter()
+        start, cpu_start = time.perf_counter(), time.process_time()
         seen = None if keypoints is None else keypoints.get(stamp)
         prediction = None if predict is None else predict(image)
         if stamp in clip.views:
             rotation, position = clip.views[stamp]
             tracker.set_camera(position, rotation)
         posterior, _ = tracker.step(image, stamp, seen, prediction)
-        spent = time.perf_counter() - start
+        spent, cpu_spent = time.perf_counter() - start, time.process_time() - cpu_start
+        statuses.append(tracker.status.value)
         if posterior is not None and stamp in clip.truth.joints:
             bodies.append(tracker.body)
             mixtures.append(posterior)
@@ -209,7 +237,9 @@ def follow(
             stamps.append(stamp)
             evaluations.append(float(tracker.evaluations))
             seconds.append(spent)
-    return recorded(clip, bodies, mixtures, points, stamps, evaluations, seconds, seed)
+            cpu_seconds.append(cpu_spent)
+    record = recorded(clip, bodies, mixtures, points, stamps, evaluations, seconds, seed)
+    return replace(record, cpu_seconds=np.array(cpu_seconds), statuses=np.array(statuses))
 
 
 def recorded(
@@ -222,13 +252,16 @@ def recorded(
     seconds: list[float],
     seed: int,
 ) -> Record:
-    """Mixtures and point estimates (T,) with their scores against the truth of a clip."""
+    """Mixtures and point estimates (T,) with their scores against the truth of a clip.
+
+    T may be 0: nobody was found in any image.
+    """
     origin = origin_joints(clip.truth.joint_names)
     scored = clip.truth.evaluated_joints()
     which = [JOINTS.index(name) for name in scored]
     true = true_joints(clip, stamps)
     relative_truth = true[:, which] - true[:, :1]
-    k = max(map(len, mixtures))
+    k = max(map(len, mixtures), default=1)
     joints = np.full((len(stamps), k, len(JOINTS), 3), np.nan)
     weights = np.zeros((len(stamps), k))
     point = np.empty((len(stamps), len(JOINTS), 3))
@@ -237,6 +270,12 @@ def recorded(
     found = []
     # The body changes only while its flesh is fitted: its kinematics is computed in batches.
     first = 0
+    if not bodies:
+        return Record(
+            np.array(stamps, dtype=np.int64), joints, weights, point, blind, np.empty(0),
+            np.empty((0, len(scored))), np.empty(0), np.array(evaluations), np.array(seconds),
+            np.array([len(clip.images)]), true, *_feet_and_views(clip, stamps),
+        )  # fmt: skip
     for i in range(1, len(bodies) + 1):
         if i == len(bodies) or bodies[i] is not bodies[first]:
             body = bodies[first]
@@ -267,6 +306,7 @@ def true_joints(clip: Clip, stamps: Sequence[int]) -> NDArray[np.float64]:
     """True positions (T, J, 3) of `JOINTS`; NaN where a joint has no truth."""
     names = clip.truth.joint_names
     every = np.array([clip.truth.joints[stamp] for stamp in stamps])
+    every = every.reshape(-1, len(names), 3)
     result = np.full((len(stamps), len(JOINTS), 3), np.nan)
     for j, name in enumerate(JOINTS):
         if name in names:
@@ -291,7 +331,11 @@ def _feet_and_views(clip: Clip, stamps: list[int]) -> tuple[NDArray[np.bool_], N
         row = {int(stamp): t for t, stamp in enumerate(content['stamps'])}
         rows = [row[stamp] for stamp in stamps]
         if 'contact' in content:
-            contact = content['contact'][rows].astype(np.bool_)
+            stands = content['contact'].astype(np.bool_)
+            # Images may have been left out: a foot stands that did in all of them.
+            before = [*rows[:1], *rows[:-1]]
+            since = [stands[a : b + 1].all(0) for a, b in zip(before, rows, strict=True)]
+            contact = np.array(since, dtype=np.bool_).reshape(-1, 2)
         if 'camera_quaternion' in content:
             views[:, :, :3] = Rotation.from_quat(content['camera_quaternion'][rows]).as_matrix()
             views[:, :, 3] = content['camera_position'][rows]
@@ -373,18 +417,61 @@ def _run_and_keep(item: tuple[Run, Path]) -> None:
     record = run(one)
     partial = path.with_suffix(f'.{os.getpid()}.tmp.npz')
     np.savez_compressed(
-        partial, **{field.name: getattr(record, field.name) for field in fields(record)}
+        partial, **{each.name: getattr(record, each.name) for each in fields(record)}
     )
+    path.with_suffix('.json').write_text(json.dumps(one.identity), 'utf-8')
     partial.replace(path)
 
 
 def read_record(path: Path) -> Record | None:
-    """A record that was kept; None: there is none, or it is damaged."""
+    """A record that was kept; None: there is none, or it is damaged.
+
+    What records of an older checkout lack is unknown, where it may be.
+    """
     try:
         with np.load(path) as content:
-            return Record(**{field.name: content[field.name] for field in fields(Record)})
+            wanted = [
+                x.name for x in fields(Record) if x.name in content or x.default_factory is MISSING
+            ]
+            return Record(**{name: content[name] for name in wanted})
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error):
         return None
+
+
+def records_of(runs: Sequence[Run], folder: Path) -> list[Record | None]:
+    """The newest record of each run in a folder of records, whatever code it is of.
+
+    Args:
+        runs: wanted.
+        folder: of the records of another checkout; None in the result: it has no such record.
+
+    Raises:
+        ValueError: the folder holds no records.
+    """
+    index: dict[str, list[Path]] = {}
+    for path in sorted(folder.glob('*.json'), key=lambda path: -path.stat().st_mtime_ns):
+        index.setdefault(_normalised(path.read_text('utf-8')), []).append(path)
+    index.pop('', None)
+    if not index:
+        raise ValueError(f'{folder} has no records of runs')
+    result = []
+    for one in runs:
+        found = index.get(_normalised(json.dumps(one.identity)), [])
+        kept = (read_record(path.with_suffix('.npz')) for path in found)
+        result.append(next((record for record in kept if record is not None), None))
+    return result
+
+
+def _normalised(text: str) -> str:
+    """The same text for the same identity of a run; empty: the text is damaged.
+
+    What a file of an older checkout does not tell of a run is usual there.
+    """
+    usual = {x.name: x.default for x in fields(Run) if x.default is not MISSING}
+    try:
+        return json.dumps({**usual, **json.loads(text)}, sort_keys=True)
+    except (TypeError, ValueError):
+        return ''
 
 
 def name_of(one: Run) -> str:
@@ -414,4 +501,5 @@ def code_digest() -> str:
 
 
 def _length(one: Run) -> int:
-    return sum(path.stat().st_size for path in one.folder.glob('*.mcap'))
+    share = min(one.rate, USUAL_RATE) / USUAL_RATE if one.rate > 0 else 1.0
+    return int(share * sum(path.stat().st_size for path in one.folder.glob('*.mcap')))

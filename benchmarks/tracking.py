@@ -8,7 +8,7 @@ build/benchmarks/tracking until the code changes: a benchmark that was broken of
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,25 +25,47 @@ from benchmarks.runs import (
     INPUTS,
     STARTS,
     SUBJECT,
+    USUAL_RATE,
     Run,
+    records_of,
     run_all,
 )
 from benchmarks.tracker_changes import changed, parsed_changes
+from benchmarks.tracking_means import (
+    APART,
+    CHOSEN,
+    DETECTOR,
+    OF_APART,
+    by_clip,
+    difference_entries,
+    entry_of,
+    group_of,
+    grouped,
+    means_of,
+    medians_of,
+    paired,
+)
 from benchmarks.tracking_oracle import oracle
+from benchmarks.tracking_rules import (
+    DECIDE,
+    GROUPS_OF_RULES,
+    RULES,
+    SCREEN,
+    Plan,
+    effects,
+    rules_named,
+)
 from benchmarks.tracking_scores import detector_scores, interval, scores_of
 from benchmarks.tracking_speed import memory, speed
 from benchmarks.tracking_tables import COMPARED, HEAVIEST, OF_ABLATIONS, as_text
-from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
 from hmt_ros.tracking import TrackerSettings
 
 Array = NDArray[np.float64]
 
-PARTS = ('accuracy', 'ablations', 'sizes', 'oracle', 'speed')
+USUAL_PARTS = ('accuracy', 'ablations', 'sizes', 'oracle', 'speed')
+PARTS = (*USUAL_PARTS, 'rules')
 SEEDS = (0, 1, 2)
-# Clips that settings of the tracker were chosen on.
-CHOSEN = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'follow')
-GROUPS = {True: 'Clips that settings were chosen on', False: 'Other clips'}
-DETECTOR = 'MediaPipe 3D'
+RATES = (USUAL_RATE,)
 ABLATIONS: tuple[tuple[str, Any], ...] = (
     *(('max_hypotheses', k) for k in (1, 2, 4, 8, 16)),
     ('reweighting', 'ancestry'),
@@ -68,13 +90,39 @@ def main(argv: list[str]) -> int:
         '--start', choices=STARTS, default=SUBJECT,
         help='start from the subject file of a clip, or from its keypoints where they are an input',
     )  # fmt: skip
-    parser.add_argument('--seeds', type=int, nargs='+', default=SEEDS, metavar='N')
     parser.add_argument(
-        '--parts', nargs='+', choices=PARTS, help='all, or none where settings are compared'
-    )
+        '--seeds', type=int, nargs='+', metavar='N',
+        help=f'{_listed(SEEDS)}; of rules {_listed(SCREEN.seeds)}, to decide '
+        f'{_listed(DECIDE.seeds)}',
+    )  # fmt: skip
+    parser.add_argument(
+        '--rates', type=float, nargs='+', metavar='HZ',
+        help=f'images a second at most, {USUAL_RATE:g} or more: all images ({_listed(RATES)}; of '
+        f'rules {_listed(SCREEN.rates)}, to decide {_listed(DECIDE.rates)})',
+    )  # fmt: skip
+    parser.add_argument(
+        '--parts', nargs='+', choices=PARTS,
+        help='all but rules, or none where settings or checkouts are compared',
+    )  # fmt: skip
     parser.add_argument(
         '--against', nargs='+', default=(), metavar='SETTING=VALUE',
         help='compare the tracker with itself with these settings, such as max_hypotheses=4',
+    )  # fmt: skip
+    parser.add_argument(
+        '--baseline', type=Path, metavar='DIR',
+        help='compare with the kept runs of another checkout, its build/benchmarks/tracking',
+    )  # fmt: skip
+    parser.add_argument(
+        '--rules', nargs='+', default=(), metavar='NAME',
+        help='some of the rules that the tracker is run without, by name or by group '
+        f'({_listed(GROUPS_OF_RULES)}): {_listed(rule.name for rule in RULES)}',
+    )  # fmt: skip
+    parser.add_argument(
+        '--decide', action='store_true', help='run without rules for more seeds and rates'
+    )
+    parser.add_argument(
+        '--others', action='store_true',
+        help='run without rules on the clips, too, that settings were not chosen on',
     )  # fmt: skip
     parser.add_argument(
         '--processes', type=int, default=0, metavar='N', help='of one thread each (one a core)'
@@ -84,12 +132,17 @@ def main(argv: list[str]) -> int:
         help='follow memory over so many images of a clip that is played back and forth',
     )  # fmt: skip
     options = parser.parse_args(argv)
-    parts = options.parts or (() if options.against else PARTS)
+    compared = options.against or options.baseline
+    usual = ('rules',) if options.rules else () if compared else USUAL_PARTS
+    parts = options.parts or usual
+    plan = DECIDE if options.decide else SCREEN
     try:
         result = measure(
-            options.clips, options.only, options.inputs, options.seeds, parts,
+            options.clips, options.only, options.inputs, options.seeds or SEEDS, parts,
             parsed_changes(options.against), options.processes, options.frames,
-            quick=options.quick, start=options.start,
+            quick=options.quick, start=options.start, rates=options.rates or RATES,
+            baseline=options.baseline, others=options.others, rules=options.rules,
+            plan=Plan(options.seeds or plan.seeds, options.rates or plan.rates),
         )  # fmt: skip
     except ValueError as error:
         print(f'tracking: {error}', file=sys.stderr)
@@ -102,13 +155,18 @@ def measure(
     only: Sequence[str] = (),
     inputs: Sequence[str] = INPUTS,
     seeds: Sequence[int] = SEEDS,
-    parts: Sequence[str] = PARTS,
+    parts: Sequence[str] = USUAL_PARTS,
     against: tuple[tuple[str, Any], ...] = (),
     processes: int = 0,
     frames: int = 0,
     *,
     quick: bool = False,
     start: str = SUBJECT,
+    rates: Sequence[float] = RATES,
+    baseline: Path | None = None,
+    rules: Sequence[str] = (),
+    plan: Plan = SCREEN,
+    others: bool = False,
 ) -> dict[str, Any]:
     """Everything that was asked for.
 
@@ -123,10 +181,16 @@ def measure(
         frames: over so many images memory is followed.
         quick: 20 images a clip, one seed.
         start: what tracks start from, one of `runs.STARTS`; with images alone always the subject.
+        rates: images a second at most; `USUAL_RATE` or more: all images.
+        baseline: folder of the records of another checkout; None: no comparison.
+        rules: names or groups of rules that the tracker is run without; empty: all.
+        plan: seeds and rates of the runs without rules.
+        others: whether the clips that settings were not chosen on are run without rules, too.
 
     Raises:
         ValueError: there is no such clip, or it can not be read.
     """
+    chosen_rules = rules_named(rules)
     folders, source = find_clips(clips, moving=True)
     limit, seeds = (QUICK, seeds[:1]) if quick else (None, seeds)
     if only:
@@ -134,13 +198,21 @@ def measure(
     if not folders:
         raise ValueError(f'none of the clips {list(only)} is there')
     lacking = [folder.name for folder in folders if not _has_keypoints(folder)]
-    runs = [
-        Run(folder, given, seed, limit=limit, start=SUBJECT if given == IMAGES else start)
-        for folder in folders
-        for given in inputs
-        if given == IMAGES or folder.name not in lacking
-        for seed in seeds
-    ]
+
+    def runs_of(some: Sequence[Path], seeds: Sequence[int], rates: Sequence[float]) -> list[Run]:
+        return [
+            Run(
+                folder, given, seed, limit=limit, start=SUBJECT if given == IMAGES else start,
+                rate=0.0 if rate >= USUAL_RATE else rate,
+            )
+            for folder in some
+            for rate in rates
+            for given in inputs
+            if given == IMAGES or folder.name not in lacking
+            for seed in seeds
+        ]  # fmt: skip
+
+    runs = runs_of(folders, seeds, rates)
     result: dict[str, Any] = {
         'machine': description(),
         'clips': source,
@@ -150,13 +222,20 @@ def measure(
     if 'accuracy' in parts:
         entries = accuracy(runs, processes)
         entries += [
-            _entry(folder.name, DETECTOR, [detector_scores(folder, limit)])
+            entry_of((folder.name, DETECTOR, rate), [detector_scores(folder, limit, rate)])
             for folder in folders
             if folder.name not in lacking
+            for rate in dict.fromkeys(one.rate for one in runs)
         ]
         result['accuracy'] = grouped(entries)
     if against:
         result['against'] = comparison(runs, against, processes)
+    if baseline is not None:
+        result['baseline'] = comparison_with_baseline(runs, baseline, processes)
+    if 'rules' in parts:
+        some = [x for x in folders if x.name not in APART] if others else _to_decide_on(folders)
+        own = plan.seeds[:1] if quick else plan.seeds
+        result['rules'] = effects(runs_of(some, own, plan.rates), chosen_rules, processes)
     if 'ablations' in parts:
         result['ablations'] = ablations(folders, limit, processes)
     if 'sizes' in parts:
@@ -173,6 +252,16 @@ def measure(
     return result
 
 
+def _to_decide_on(folders: Sequence[Path]) -> list[Path]:
+    """Clips that settings may be chosen on; all where none of them is there."""
+    return [folder for folder in folders if folder.name in CHOSEN] or list(folders)
+
+
+def _listed(items: Iterable[Any]) -> str:
+    """Items as words: numbers without decimals that are 0."""
+    return ', '.join(f'{x:g}' if isinstance(x, float) else str(x) for x in items)
+
+
 def _has_keypoints(folder: Path) -> bool:
     return (folder / 'keypoints_mediapipe.npz').is_file()
 
@@ -181,76 +270,9 @@ def _has_keypoints(folder: Path) -> bool:
 
 
 def accuracy(runs: Sequence[Run], processes: int = 0) -> list[dict[str, Any]]:
-    """Scores of each clip and input, means over the seeds."""
-    return [
-        _entry(clip, given, [scores for _, scores in found])
-        for (clip, given), found in _by_clip(runs, processes).items()
-    ]
-
-
-def _by_clip(
-    runs: Sequence[Run], processes: int
-) -> dict[tuple[str, str], list[tuple[Run, dict[str, Any]]]]:
-    """Scores of runs, by clip and input."""
-    result: dict[tuple[str, str], list[tuple[Run, dict[str, Any]]]] = {}
-    for one, record in zip(runs, run_all(runs, processes), strict=True):
-        result.setdefault((one.clip, one.inputs), []).append((one, scores_of(record)))
-    return result
-
-
-def _entry(clip: str, given: str, scores: list[dict[str, Any]]) -> dict[str, Any]:
-    """Scores of a clip by seed, and their means; None: unknown."""
-    numbers = {
-        key: [_known(one[key]) for one in scores] for key in scores[0] if key != 'by_joint_90'
-    }
-    result: dict[str, Any] = {'clip': clip, 'inputs': given, 'by_seed': numbers}
-    for key, values in numbers.items():
-        known = [value for value in values if value is not None]
-        result[key] = float(np.mean(known)) if len(known) == len(values) else None
-    if 'by_joint_90' in scores[0]:
-        shares = np.mean([one['by_joint_90'] for one in scores], axis=0)
-        result['by_joint_90'] = dict(zip(EVALUATED_JOINTS, map(_known, shares), strict=True))
-    return result
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def grouped(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Clips that settings were chosen on, and the others, with means over the clips."""
-    result = []
-    for chosen, title in GROUPS.items():
-        mine = [entry for entry in entries if (entry['clip'] in CHOSEN) == chosen]
-        mine.sort(key=lambda entry: (entry['clip'], _rank(entry['inputs'])))
-        if mine:
-            result.append({'group': title, 'clips': mine, 'means': means_of(mine)})
-    return result
-
-
-def _rank(given: str) -> int:
-    return (*INPUTS, DETECTOR).index(given)
-
-
-def means_of(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Means over the clips by input: mean, lower and upper end; see `tracking_scores.interval`."""
-    result = []
-    for given in sorted({entry['inputs'] for entry in entries}, key=_rank):
-        mine = [entry for entry in entries if entry['inputs'] == given]
-        means: dict[str, Any] = {'inputs': given}
-        for key in mine[0]['by_seed']:
-            values = np.array([entry['by_seed'][key] for entry in mine], dtype=float)
-            means[key] = interval(values)
-        if 'by_joint_90' in mine[0]:
-            shares = np.array([[*entry['by_joint_90'].values()] for entry in mine], dtype=float)
-            known = np.isfinite(shares)
-            sums = np.where(known, shares, 0.0).sum(0)
-            means['by_joint_90'] = {
-                name: float(total / count) if count else None
-                for name, total, count in zip(EVALUATED_JOINTS, sums, known.sum(0), strict=True)
-            }
-        result.append(means)
-    return result
+    """Scores of each clip, input and rate, means over the seeds."""
+    found = by_clip(runs, map(scores_of, run_all(runs, processes)))
+    return [entry_of(key, [scores for _, scores in mine]) for key, mine in found.items()]
 
 
 def comparison(
@@ -258,19 +280,54 @@ def comparison(
 ) -> dict[str, Any]:
     """What changed settings change on the same clips, inputs and seeds: their scores minus ours."""
     others = [replace(one, changes=changes) for one in runs]
-    entries = []
-    for (clip, given), found in _by_clip([*runs, *others], processes).items():
-        ours = [scores for one, scores in found if not one.changes]
-        theirs = [scores for one, scores in found if one.changes]
-        differences = [
-            {column.key: own[column.key] - usual[column.key] for column in COMPARED}
-            for usual, own in zip(ours, theirs, strict=True)
-        ]
-        entries.append(_entry(clip, given, differences))
+    scores = [scores_of(record) for record in run_all([*runs, *others], processes)]
+    usual, own = scores[: len(runs)], scores[len(runs) :]
     return {
         'changes': [f'{name}={value}' for name, value in changes],
+        **_compared(runs, own, usual),
+    }
+
+
+def comparison_with_baseline(
+    runs: Sequence[Run], folder: Path, processes: int = 0
+) -> dict[str, Any]:
+    """Our scores minus those of the same runs of another checkout.
+
+    Clips, inputs and rates of which the other checkout lacks a seed are left out.
+
+    Args:
+        runs: to compare.
+        folder: of the records of the other checkout.
+        processes: number of processes; 0: one a core.
+
+    Raises:
+        ValueError: the folder has no record of these runs.
+    """
+    records = dict(zip(runs, records_of(runs, folder), strict=True))
+    lacking = {(x.clip, x.inputs, x.rate) for x, record in records.items() if record is None}
+    both = [one for one in runs if (one.clip, one.inputs, one.rate) not in lacking]
+    if not both:
+        raise ValueError(f'{folder} lacks seeds of every clip and input')
+    usual = [scores_of(record) for one in both if (record := records[one]) is not None]
+    own = [scores_of(record) for record in run_all(both, processes)]
+    return {
+        'folder': str(folder),
+        'lacking': [list(key) for key in sorted(lacking)],
+        **_compared(both, own, usual),
+    }
+
+
+def _compared(
+    runs: Sequence[Run], own: Sequence[dict[str, Any]], usual: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    names = [column.key for column in COMPARED]
+    entries = difference_entries(runs, own, usual, names)
+    averaged = [entry for entry in entries if group_of(entry['clip']) != OF_APART]
+    return {
         'groups': grouped(entries),
-        'means': means_of(entries),
+        'means': means_of(averaged),
+        'medians': medians_of(averaged),
+        'paired': paired(entries, HEAVIEST.key),
     }
 
 
@@ -279,7 +336,7 @@ def ablations(folders: Sequence[Path], limit: int | None, processes: int = 0) ->
 
     On the clips that settings were chosen on; on all where none of them is there.
     """
-    folders = [folder for folder in folders if folder.name in CHOSEN] or list(folders)
+    folders = _to_decide_on(folders)
     variants = [
         # The usual setting is no change: its runs are those of the accuracy.
         () if changed((change,)) == TrackerSettings() else (change,)

@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
-from benchmarks.clips import read_detections
+from benchmarks.clips import read_detections, rows_at_rate
 from benchmarks.runs import JOINTS, Record
 from hmt_ros.app.truth import read_truth
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, HIPS, LOST
 from hmt_ros.inference.calibration import coverage
+from hmt_ros.tracking import Status
 
 Array = NDArray[np.float64]
 
@@ -23,6 +25,23 @@ ANKLES = ('left_ankle', 'right_ankle')
 # Images are consecutive when no more time passes than this, in usual intervals.
 LONGEST_INTERVAL = 1.5
 DRAWS = 2000
+# Keys of what `scores_of` returns besides `by_joint_90`.
+SCORES = (
+    'heaviest_mm', 'hips_mm', 'expected_mm', 'point_mm', 'best_mm', 'blind_mm', 'aligned_mm',
+    'root_percent', 'depth_percent', 'path_percent', 'path_length_percent', 'kept', 'weights',
+    'coverage_50', 'coverage_90', 'joint_coverage_50', 'joint_coverage_90',
+    'negative_log_likelihood', 'acceleration', 'feet', 'wrong_way', 'wrong_way_images',
+    'wrong_sign', 'nobody', 'evaluations', 'evaluations_99', 'ms', 'cpu_ms',
+)  # fmt: skip
+# Segments of limbs whose depth sign is scored, and the least angle to the image plane, rad.
+LIMBS = tuple(
+    (f'{side}_{near}', f'{side}_{far}')
+    for near, far in (
+        ('shoulder', 'elbow'), ('elbow', 'wrist'), ('hip', 'knee'), ('knee', 'ankle'),
+    )
+    for side in ('left', 'right')
+)  # fmt: skip
+SLANTED = np.radians(15.0)
 # Shortest true path of the root that is scored, m, and the steps that paths are measured in, s.
 LEAST_PATH, PATH_STEP = 1.0, 0.5
 
@@ -44,9 +63,16 @@ def scores_of(record: Record) -> dict[str, Any]:
         `coverage_50`, `coverage_90` of the region of all joints, `joint_coverage_50`,
         `joint_coverage_90` of those of single joints, `by_joint_90` (J,) of the evaluated joints,
         `negative_log_likelihood`. `weights` is the mean of log(K w), w the weight of the nearest of
-        K modes: 0 if weights are uniform. `evaluations` and `ms` count an image. What is unknown
-        is NaN.
+        K modes: 0 if weights are uniform. Of the heaviest mode `hips_mm`, its error relative to
+        the middle of the hips; `wrong_way`, the share of images in which it faces the wrong way,
+        and `wrong_way_images`, their number; `wrong_sign`, the share of slanted limbs whose slope
+        in depth has the wrong sign. `nobody` is the share of all images in which the track had
+        ended. `evaluations` is the mean number in an image, `evaluations_99` the 99th percentile;
+        `ms` the median time of a step, `cpu_ms` its mean processor time. What is unknown is NaN;
+        of a run that found nobody, only `kept` is known.
     """
+    if len(record.stamps) == 0:
+        return scores_of_nobody()
     known: NDArray[np.bool_] = np.asarray(np.isfinite(record.true).all((0, 2)))
     known[0] = False
     true = record.true[:, known] - record.true[:, :1]
@@ -63,6 +89,7 @@ def scores_of(record: Record) -> dict[str, Any]:
     by_joint[known[1:]] = [coverage(levels, 0.9) for levels in record.joint_levels.T]
     return {
         'heaviest_mm': 1e3 * heaviest.mean(),
+        'hips_mm': hips_error(record, known[1:]),
         'expected_mm': 1e3 * _distances(expected, true).mean(),
         'point_mm': 1e3 * _distances(point, true).mean(),
         'best_mm': 1e3 * error[rows, nearest].mean(),
@@ -82,17 +109,108 @@ def scores_of(record: Record) -> dict[str, Any]:
         'negative_log_likelihood': -record.log_densities.mean(),
         'acceleration': acceleration_ratio(record.stamps, point, true),
         'feet': standing_speed(record),
+        **facing_scores(record),
+        'wrong_sign': wrong_sign(record),
+        'nobody': absent_share(record),
         'evaluations': record.evaluations.mean(),
+        'evaluations_99': np.percentile(record.evaluations, 99),
         'ms': 1e3 * np.median(record.seconds),
+        'cpu_ms': 1e3 * record.cpu_seconds.mean() if len(record.cpu_seconds) else np.nan,
     }
 
 
-def detector_scores(folder: Path, limit: int | None = None) -> dict[str, Any]:
+def scores_of_nobody() -> dict[str, Any]:
+    """Scores of a run in which no image had a posterior: nothing was kept, the rest is unknown."""
+    return {
+        **dict.fromkeys(SCORES, np.nan),
+        'kept': 0.0,
+        'by_joint_90': np.full(len(EVALUATED_JOINTS), np.nan),
+    }
+
+
+def heaviest_joints(record: Record) -> Array:
+    """Joints (T, J, 3) of the heaviest mode, m, camera frame."""
+    result: Array = record.joints[np.arange(len(record.joints)), record.weights.argmax(1)]
+    return result
+
+
+def hips_error(record: Record, known: NDArray[np.bool_]) -> float:
+    """Mean error of the heaviest mode's joints relative to the middle of the hips, mm.
+
+    Args:
+        record: of a run.
+        known: (J - 1,) scored joints that have a truth.
+    """
+    hips = [JOINTS.index(name) for name in HIPS]
+    both = (heaviest_joints(record), record.true)
+    own, true = ((x - x[:, hips].mean(1, keepdims=True))[:, 1:][:, known] for x in both)
+    return float(1e3 * _distances(own, true).mean())
+
+
+def facing_scores(record: Record) -> dict[str, float]:
+    """Share and number of images in which the heaviest mode faces the wrong way.
+
+    That is by more than 90 degrees. NaN: the truth lacks hips or shoulders.
+    """
+    own, true = (facing(joints) for joints in (heaviest_joints(record), record.true))
+    agreement = (own * true).sum(1)
+    wrong = agreement[np.isfinite(agreement)] < 0
+    if len(wrong) == 0:
+        return {'wrong_way': np.nan, 'wrong_way_images': np.nan}
+    return {'wrong_way': float(wrong.mean()), 'wrong_way_images': float(wrong.sum())}
+
+
+def facing(joints: Array) -> Array:
+    """Directions (T, 3) that people face, of no certain length, from joints (T, J, 3).
+
+        (left - right) x (shoulders - hips),    left - right of hips and shoulders together
+
+    It points backwards or forwards for all alike: up to this sign, which comparisons do not need.
+    """
+    left_hip, right_hip, left_shoulder, right_shoulder = (
+        joints[:, JOINTS.index(f'{side}_{name}')]
+        for name in ('hip', 'shoulder')
+        for side in ('left', 'right')
+    )
+    across = (left_hip - right_hip) + (left_shoulder - right_shoulder)
+    up = (left_shoulder + right_shoulder) - (left_hip + right_hip)
+    return np.asarray(np.cross(across, up), dtype=np.float64)
+
+
+def wrong_sign(record: Record) -> float:
+    """Share of slanted limbs of the heaviest mode that lean the wrong way in depth.
+
+    Limbs are upper and lower arms and legs; one is slanted where its true angle to the image plane
+    is more than `SLANTED`. NaN: none is.
+    """
+    near, far = ([JOINTS.index(ends[i]) for ends in LIMBS] for i in (0, 1))
+    own, true = (x[:, far] - x[:, near] for x in (heaviest_joints(record), record.true))
+    lengths = np.linalg.norm(true, axis=2)
+    slanted = np.abs(true[..., 2]) > np.sin(SLANTED) * lengths  # false where there is no truth
+    if not slanted.any():
+        return float('nan')
+    return float((own[..., 2] * true[..., 2] < 0)[slanted].mean())
+
+
+def absent_share(record: Record) -> float:
+    """Share of the images of a run in which its track had ended; NaN: unknown.
+
+    From the first image that is tracked, those count in which the tracker says that nobody is in
+    view, or waits for somebody to begin a new track with.
+    """
+    without = np.isin(record.statuses, [Status.NOBODY.value, Status.WAITING.value])
+    if without.all():
+        return float('nan')
+    return float(without[np.argmin(without) :].sum() / len(without))
+
+
+def detector_scores(folder: Path, limit: int | None = None, rate: float = 0.0) -> dict[str, Any]:
     """The same of a detector's own 3D poses, where it has them: twelve joints, aligned at the hips.
 
     Args:
         folder: of the clip.
         limit: number of images; None: all.
+        rate: images a second at most; 0: all.
 
     Raises:
         ValueError: the clip has no keypoints of a detector.
@@ -101,6 +219,7 @@ def detector_scores(folder: Path, limit: int | None = None) -> dict[str, Any]:
     names = [x for x in EVALUATED_JOINTS if x in found.names and x in truth.joint_names]
     hips = [names.index(name) for name in HIPS]
     images = sorted(truth.joints)[:limit]
+    images = [images[i] for i in rows_at_rate(images, rate)]
     stamps = [stamp for stamp in images if stamp in found.joints]
     own = np.array([found.joints[stamp] for stamp in stamps])
     own = own.reshape(-1, len(found.names), 3)[:, [found.names.index(x) for x in names]]
@@ -179,7 +298,7 @@ def standing_speed(record: Record) -> float:
     placed = in_world(record, record.point[:, [JOINTS.index(name) for name in ANKLES]])
     speeds = np.linalg.norm(np.diff(placed, axis=0), axis=2)
     speeds /= 1e-9 * np.diff(record.stamps)[:, None]
-    standing = record.contact[1:] & record.contact[:-1] & _consecutive(record.stamps)[:, None]
+    standing = record.contact[1:] & _consecutive(record.stamps)[:, None]
     return float(speeds[standing].mean()) if standing.any() else float('nan')
 
 
@@ -211,6 +330,21 @@ def interval(
     means = values[drawn, rng.integers(seeds, size=(draws, clips, seeds))].mean((1, 2))
     low, high = np.quantile(means, [0.025, 0.975])
     return mean, float(low), float(high)
+
+
+def interval_over_seeds(differences: Array) -> tuple[float, float] | None:
+    """The 95 % interval of the mean of paired differences (seeds,) of one clip, by Student's t.
+
+    A few seeds are too few for a bootstrap, whose interval would be too narrow.
+
+    Returns:
+        Lower and upper end; None: fewer than two seeds, or one is unknown.
+    """
+    n = len(differences)
+    if n < 2 or not np.isfinite(differences).all():
+        return None
+    half = student.ppf(0.975, n - 1) * differences.std(ddof=1) / np.sqrt(n)
+    return float(differences.mean() - half), float(differences.mean() + half)
 
 
 def _distances(joints: Array, true: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from benchmarks.clips import table
@@ -40,8 +40,14 @@ KEPT = Column('kept, %', 'kept', factor=100.0)
 WEIGHTS = Column('weights', 'weights', '+.2f')
 JOINT_90 = Column('joint 90 %', 'joint_coverage_90', factor=100.0)
 EVALUATIONS = Column('evaluations', 'evaluations')
+EXPECTED, HIPS = Column('expected', 'expected_mm'), Column('hips', 'hips_mm')
+LOG_DENSITY = Column('-log p', 'negative_log_likelihood', '.1f')
+WRONG_WAY = Column('wrong way, %', 'wrong_way', '.1f', 100.0)
+WRONG_SIGN = Column('wrong sign, %', 'wrong_sign', '.1f', 100.0)
+NOBODY = Column('nobody, %', 'nobody', '.1f', 100.0)
+CPU = Column('CPU, ms', 'cpu_ms')
 ERRORS = (
-    HEAVIEST, Column('expected', 'expected_mm'), POINT, Column('PA', 'aligned_mm'), BEST, BLIND,
+    HEAVIEST, HIPS, EXPECTED, POINT, Column('PA', 'aligned_mm'), BEST, BLIND,
     KEPT, Column('root, %', 'root_percent', '.1f'), Column('depth, %', 'depth_percent', '+.1f'),
     Column('path, %', 'path_percent', '.1f'),
     Column('path length, %', 'path_length_percent', '+.1f'),
@@ -49,15 +55,30 @@ ERRORS = (
 CALIBRATION = (
     Column('50 %', 'coverage_50', factor=100.0), Column('90 %', 'coverage_90', factor=100.0),
     Column('joint 50 %', 'joint_coverage_50', factor=100.0), JOINT_90,
-    Column('-log p', 'negative_log_likelihood', '.1f'), WEIGHTS,
+    LOG_DENSITY, WEIGHTS,
     Column('acceleration', 'acceleration', '.1f'), Column('feet, m/s', 'feet', '.2f'),
     EVALUATIONS,
+)  # fmt: skip
+# Large mistakes, and what an image costs.
+MISTAKES = (
+    WRONG_WAY, Column('images', 'wrong_way_images', '.1f'), WRONG_SIGN, NOBODY,
+    EVALUATIONS, Column('99 %', 'evaluations_99'), Column('ms', 'ms'), CPU,
 )  # fmt: skip
 # Of two kinds of settings.
 COMPARED = tuple(
     column._replace(form=column.form.replace('.0f', '.1f'))
-    for column in (HEAVIEST, POINT, BEST, KEPT, WEIGHTS, JOINT_90)
-)
+    for column in (
+        HEAVIEST, HIPS, EXPECTED, POINT, BEST, KEPT, WEIGHTS, JOINT_90, WRONG_WAY, WRONG_SIGN,
+        NOBODY, EVALUATIONS, CPU,
+    )
+)  # fmt: skip
+# Of the tracker without a rule.
+OF_RULES = tuple(
+    column._replace(form=column.form.replace('.0f', '.1f'))
+    for column in (
+        HEAVIEST, EXPECTED, BEST, BLIND, LOG_DENSITY, WEIGHTS, WRONG_WAY, NOBODY, EVALUATIONS, CPU,
+    )
+)  # fmt: skip
 OF_ABLATIONS = (HEAVIEST, POINT, BEST, BLIND, KEPT, WEIGHTS, JOINT_90, EVALUATIONS)
 WORST_JOINT = 'worst joint 90 %'
 
@@ -75,15 +96,19 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         parts.append(_table(group, ERRORS, markdown))
         parts.append(f'{group["group"]}: calibration and motion.')
         parts.append(_table(group, CALIBRATION, markdown, worst_joint=True))
+        parts.append(f'{group["group"]}: large mistakes, and what an image costs.')
+        parts.append(_table(group, MISTAKES, markdown))
     if 'against' in result:
         found = result['against']
-        what = ', '.join(found['changes'])
-        for group in found['groups']:
-            parts.append(f'{group["group"]}: {what} minus the usual settings, mm.')
-            parts.append(_table(group, COMPARED, markdown, sign='+'))
-        if len(found['groups']) > 1:
-            parts.append(f'All clips: {what} minus the usual settings, mm.')
-            parts.append(_table({**found, 'clips': []}, COMPARED, markdown, sign='+'))
+        what = f'{", ".join(found["changes"])} minus the usual settings'
+        parts += _tables_of_comparison(found, what, markdown)
+    if 'baseline' in result:
+        found = result['baseline']
+        for clip, given, rate in found['lacking']:
+            parts.append(f'{clip}, {given}, rate {_rate(rate)}: not in {found["folder"]}.')
+        parts += _tables_of_comparison(found, f'this code minus {found["folder"]}', markdown)
+    if 'rules' in result:
+        parts += _tables_of_rules(result['rules'], markdown)
     if 'ablations' in result:
         found = result['ablations']
         parts.append(f'Images alone, seed 0; mean over {", ".join(found["clips"])}.')
@@ -116,21 +141,124 @@ def _table(
     sign: str = '',
     worst_joint: bool = False,
 ) -> str:
-    """Clips and inputs, then the means of each input with their intervals."""
+    """Clips and inputs, then means with their intervals and medians of each input."""
     extra = [WORST_JOINT] if worst_joint else []
-    rows = [['clip', 'inputs', *(column.head for column in columns), *extra]]
+    entries = [*group['clips'], *group['means']]
+    rated = ['rate'] if any(entry['rate'] > 0 for entry in entries) else []
+
+    def head(name: str, entry: dict[str, Any]) -> list[str]:
+        return [name, entry['inputs'], *(_rate(entry['rate']) for _ in rated)]
+
+    rows = [['clip', 'inputs', *rated, *(column.head for column in columns), *extra]]
     for entry in group['clips']:
         cells = [column.cell(entry.get(column.key), _sign(column, sign)) for column in columns]
         cells += [_worst_joint(entry)] if worst_joint else []
-        rows.append([entry['clip'], entry['inputs'], *cells])
-    for means in group['means']:
+        rows.append([*head(entry['clip'], entry), *cells])
+    for means, medians in zip(group['means'], group['medians'], strict=True):
         known = [(column, means.get(column.key, [None] * 3)) for column in columns]
         cells = [column.cell(values[0], _sign(column, sign)) for column, values in known]
         cells += [_worst_joint(means)] if worst_joint else []
-        rows.append(['mean', means['inputs'], *cells])
+        rows.append([*head('mean', means), *cells])
         ends = [_ends(column, values, sign) for column, values in known]
-        rows.append(['95 %', means['inputs'], *ends, *['' for _ in extra]])
+        rows.append([*head('95 %', means), *ends, *['' for _ in extra]])
+        cells = [column.cell(medians.get(column.key), _sign(column, sign)) for column in columns]
+        rows.append([*head('median', medians), *cells, *['' for _ in extra]])
+    return table(rows, left=2 + len(rated), markdown=markdown)
+
+
+def _rate(rate: float) -> str:
+    return f'{rate:g}' if rate > 0 else 'all'
+
+
+def _tables_of_comparison(found: dict[str, Any], what: str, markdown: bool) -> list[str]:
+    """Differences by group, of all clips together, and paired ones of the heaviest mode."""
+    parts = []
+    for group in found['groups']:
+        parts.append(f'{group["group"]}: {what}, mm.')
+        parts.append(_table(group, COMPARED, markdown, sign='+'))
+    if sum(bool(group['means']) for group in found['groups']) > 1:
+        parts.append(f'All clips: {what}, mm.')
+        parts.append(_table({**found, 'clips': []}, COMPARED, markdown, sign='+'))
+    parts.append(
+        f'Heaviest mode: {what}, mm, mean and 95 % interval over clips and seeds; clips whose own '
+        'interval over the seeds lies wholly above or below 0.'
+    )
+    rows = [['group', 'inputs', 'rate', 'clips', 'difference', '95 %', 'above', 'below']]
+    column = COMPARED[0]
+    rows += [
+        [
+            each['group'], each['inputs'], _rate(each['rate']), str(each['clips']),
+            column.cell(each['difference'][0], '+'), _ends(column, each['difference'], '+'),
+            _number_of(each['above']), _number_of(each['below']),
+        ]
+        for each in found['paired']
+    ]  # fmt: skip
+    parts.append(table(rows, left=3, markdown=markdown))
+    return parts
+
+
+def _number_of(clips: Sequence[str]) -> str:
+    return f'{len(clips)} ({", ".join(clips)})' if clips else '0'
+
+
+def _tables_of_rules(found: dict[str, Any], markdown: bool) -> list[str]:
+    """Differences without each rule: the heaviest mode in short, then all scores."""
+    what = f'clips {", ".join(found["clips"])}; seeds {", ".join(map(str, found["seeds"]))}'
+    parts = [f'The tracker without each rule minus the usual one: {what}.']
+    parts += [f'Skipped: {name}: {why}.' for name, why in found['skipped'].items()]
+    groups = [group for rule in found['rules'] for group in rule['groups']]
+    titles = [group['group'] for group in groups if group['means']]
+    for title in dict.fromkeys(titles):
+        parts.append(
+            f'{title}: heaviest mode without the rule, mm, more is worse; by input and rate. Last, '
+            'how often a clip has an interval over its seeds wholly above or below 0.'
+        )
+        parts.append(_summary_of_rules(found['rules'], title, markdown))
+        parts.append(f'{title}: differences of all scores.')
+        head = ['group', 'rule', 'inputs', 'rate', *(column.head for column in OF_RULES)]
+        rows = [head]
+        for rule, means in _means_of_rules(found['rules'], title):
+            cells = [_with_ends(column, means[column.key]) for column in OF_RULES]
+            rows.append(
+                [rule['rule_group'], rule['rule'], means['inputs'], _rate(means['rate']), *cells]
+            )
+        parts.append(table(rows, left=4, markdown=markdown))
+    return parts
+
+
+def _summary_of_rules(rules: Sequence[dict[str, Any]], title: str, markdown: bool) -> str:
+    """One row a rule, one column an input and rate."""
+    every = [(means['inputs'], means['rate']) for _, means in _means_of_rules(rules, title)]
+    columns = list(dict.fromkeys(every))
+    columns.sort(key=lambda column: -column[1] if column[1] > 0 else float('-inf'))
+    heads = [f'{given}, {_rate(rate)}' for given, rate in columns]
+    rows = [['group', 'rule', *heads, 'above', 'below']]
+    for rule in rules:
+        own = {
+            (x['inputs'], x['rate']): _with_ends(OF_RULES[0], x[OF_RULES[0].key])
+            for _, x in _means_of_rules([rule], title)
+        }
+        mine = [x for x in rule['paired'] if x['group'] == title]
+        counts = [str(sum(len(x[side]) for x in mine)) for side in ('above', 'below')]
+        cells = [own.get(column, '') for column in columns]
+        rows.append([rule['rule_group'], rule['rule'], *cells, *counts])
     return table(rows, left=2, markdown=markdown)
+
+
+def _means_of_rules(
+    rules: Sequence[dict[str, Any]], title: str
+) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """Rules with each of the means of a group of clips."""
+    for rule in rules:
+        for group in rule['groups']:
+            if group['group'] == title:
+                for means in group['means']:
+                    yield rule, means
+
+
+def _with_ends(column: Column, values: Sequence[float | None]) -> str:
+    mean = column.cell(values[0], _sign(column, '+'))
+    return mean if values[1] is None else f'{mean} ({_ends(column, values, "+")})'
 
 
 def _sign(column: Column, sign: str) -> str:

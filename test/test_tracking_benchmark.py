@@ -2,6 +2,7 @@
 
 import json
 import multiprocessing
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,11 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import tracking, tracking_oracle, tracking_speed
-from benchmarks.clips import LANDMARK_NAMES, read_clip, resized, rounded
+from benchmarks import runs, tracking, tracking_oracle, tracking_rules, tracking_speed
+from benchmarks.clips import LANDMARK_NAMES, at_rate, read_clip, resized, rounded, rows_at_rate
 from benchmarks.runs import (
     BOTH,
     IMAGES,
+    INPUTS,
     JOINTS,
     KEYPOINTS,
     Record,
@@ -24,15 +26,22 @@ from benchmarks.runs import (
     name_of,
     new_tracker,
     read_record,
+    recorded,
+    records_of,
     run_all,
     subject_of,
 )
 from benchmarks.runs import run as run_one
 from benchmarks.stages import STAGES
+from benchmarks.tracker_changes import changed
+from benchmarks.tracking_means import entry_of, grouped, paired
 from benchmarks.tracking_scores import (
+    SCORES,
     acceleration_ratio,
     detector_scores,
+    facing_scores,
     interval,
+    interval_over_seeds,
     procrustes_aligned,
     scores_of,
     standing_speed,
@@ -80,7 +89,8 @@ def quick_runs(monkeypatch, tmp_path):
             done.append(one)
         return records
 
-    monkeypatch.setattr(tracking, 'run_all', run_here)
+    for module in (tracking, tracking_rules):
+        monkeypatch.setattr(module, 'run_all', run_here)
     return done
 
 
@@ -130,6 +140,137 @@ def test_errors_of_a_record():
     assert found['root_percent'] == found['depth_percent'] == 0.0
     assert found['acceleration'] == pytest.approx(1.0)
     assert (found['evaluations'], found['ms']) == (200.0, pytest.approx(100.0))
+
+
+def standing_person(images=4):
+    """Positions (T, J, 3) of a person who faces the camera, arms out, forearms towards it."""
+    places = {
+        'pelvis': (0.0, 0.0, 4.0), 'neck': (0.0, -0.5, 4.0),
+        'left_shoulder': (0.2, -0.5, 4.0), 'right_shoulder': (-0.2, -0.5, 4.0),
+        'left_elbow': (0.5, -0.5, 4.0), 'right_elbow': (-0.5, -0.5, 4.0),
+        'left_wrist': (0.6, -0.5, 3.8), 'right_wrist': (-0.6, -0.5, 3.8),
+        'left_hip': (0.1, 0.0, 4.0), 'right_hip': (-0.1, 0.0, 4.0),
+        'left_knee': (0.1, 0.4, 3.9), 'right_knee': (-0.1, 0.4, 4.0),
+        'left_ankle': (0.1, 0.8, 4.0), 'right_ankle': (-0.1, 0.8, 4.0),
+    }  # fmt: skip
+    return np.tile(np.array([places[name] for name in JOINTS]), (images, 1, 1))
+
+
+def person_record(heaviest):
+    """A record of four images of `standing_person`, whose second mode is right."""
+    record, true = made_record(4), standing_person()
+    joints = np.stack([heaviest, true, true], axis=1)
+    return replace(record, true=true, joints=joints, point=heaviest)
+
+
+def turned(joints, degrees):
+    """The same about the vertical through the pelvis."""
+    turn = Rotation.from_euler('y', degrees, degrees=True).as_matrix()
+    return (joints - joints[:, :1]) @ turn.T + joints[:, :1]
+
+
+def test_a_person_who_faces_the_wrong_way_is_counted():
+    true = standing_person()
+    for degrees, wrong in ((0, 0), (80, 0), (100, 4), (180, 4), (-100, 4)):
+        found = scores_of(person_record(turned(true, degrees)))
+        assert (found['wrong_way'], found['wrong_way_images']) == (wrong / 4, wrong), degrees
+    heaviest = true.copy()
+    heaviest[1] = turned(true, 170)[1]
+    found = scores_of(person_record(heaviest))
+    assert (found['wrong_way'], found['wrong_way_images']) == (0.25, 1)
+    # Sides that are exchanged face the other way, too.
+    sides = [JOINTS.index(x.replace('left', 'R').replace('right', 'left').replace('R', 'right'))
+             for x in JOINTS]  # fmt: skip
+    assert scores_of(person_record(true[:, sides]))['wrong_way'] == 1.0
+    # One image lacks the truth of a hip: it does not count.
+    record = person_record(heaviest)
+    lacking = record.true.copy()
+    lacking[1, JOINTS.index('left_hip')] = np.nan
+    assert facing_scores(replace(record, true=lacking))['wrong_way'] == 0.0
+
+
+def test_signs_of_slanted_limbs():
+    true = standing_person()
+    # Slanted are both forearms; a thigh and a shin lean by 14 degrees.
+    assert scores_of(person_record(true))['wrong_sign'] == 0.0
+    heaviest = true.copy()
+    heaviest[:2, JOINTS.index('left_wrist'), 2] = 4.2
+    heaviest[:, JOINTS.index('left_knee'), 2] = 4.1
+    assert scores_of(person_record(heaviest))['wrong_sign'] == 0.25
+    flat = true.copy()
+    flat[:, :, 2] = 4.0
+    assert np.isnan(scores_of(replace(person_record(true), true=flat))['wrong_sign'])
+
+
+def test_errors_relative_to_the_hips():
+    true = standing_person()
+    heaviest = true + np.array([0.3, 0.0, 0.1])
+    heaviest[:, 0] = true[:, 0]
+    found = scores_of(person_record(heaviest))
+    assert found['hips_mm'] == pytest.approx(0.0, abs=1e-9)
+    assert found['heaviest_mm'] == pytest.approx(1e3 * np.hypot(0.3, 0.1))
+
+
+def test_tracks_that_end_too_early_are_counted():
+    record = made_record()
+    assert np.isnan(scores_of(record)['nobody'])
+    assert np.isnan(scores_of(record)['cpu_ms'])
+    statuses = np.array(
+        ['waiting', 'tracking', 'nobody', 'nobody', 'waiting', 'lost', 'tracking', 'tracking']
+    )
+    # An image before the track began is nobody's fault.
+    found = scores_of(replace(record, statuses=statuses, cpu_seconds=np.full(6, 0.2)))
+    assert found['nobody'] == pytest.approx(3 / 8)
+    assert found['cpu_ms'] == pytest.approx(200.0)
+    assert np.isnan(scores_of(replace(record, statuses=statuses[:1]))['nobody'])
+    costs = scores_of(replace(record, evaluations=np.array([1.0, 2.0, 3.0, 4.0, 5.0, 100.0])))
+    assert costs['evaluations_99'] == pytest.approx(95.25)
+
+
+def test_a_run_that_found_nobody_has_scores(clip):
+    record = recorded(clip, [], [], [], [], [], [], 0)
+    found = scores_of(record)
+    assert found.pop('kept') == 0.0
+    assert all(np.isnan(np.asarray(value)).all() for value in found.values())
+    assert {*scores_of(made_record())} == {*found, 'kept'} == {*SCORES, 'by_joint_90'}
+
+
+@pytest.mark.parametrize(
+    ('rate', 'every'), [(0.0, 1), (30.0, 1), (60.0, 1), (15.0, 2), (8.0, 4), (3.0, 10), (1e-9, 40)]
+)
+def test_images_are_left_out_by_their_stamps(rate, every):
+    stamps = [7 + round(i * 1e9 / 30) for i in range(40)]
+    assert rows_at_rate(stamps, rate) == list(range(0, 40, every))
+
+
+def test_rates_do_not_assume_thirty_images_a_second():
+    # 10 images a second; three are lost after the fifth.
+    stamps = [STEP * i for i in range(20) if i not in (5, 6, 7)]
+    kept = [stamps[i] // STEP for i in rows_at_rate(stamps, 3.0)]
+    assert kept == [0, 3, 8, 11, 14, 17]
+    assert rows_at_rate([], 3.0) == []
+    assert rows_at_rate([5], 3.0) == [0]
+
+
+def test_a_clip_at_a_lower_rate(clip):
+    step = clip.stamps[1] - clip.stamps[0]
+    half = at_rate(clip, 0.5e9 / step)
+    assert half.stamps == clip.stamps[::2]
+    assert [x is y for x, y in zip(half.images, clip.images[::2], strict=True)] == [True, True]
+    run = Run(REACH, IMAGES, 0, limit=2)
+    assert name_of(run) != name_of(replace(run, rate=3.0))
+
+
+def test_a_foot_stands_if_it_does_in_images_that_are_left_out(clip, tmp_path):
+    rows = np.arange(4)
+    contact = np.array([[True, True], [True, False], [True, True], [True, True]])
+    with np.load(REACH / 'truth.npz') as content:
+        np.savez(tmp_path / 'truth.npz', contact=contact, stamps=content['stamps'][rows])
+    here = replace(clip, folder=tmp_path)
+    assert runs._feet_and_views(here, clip.stamps)[0].tolist() == [
+        [True, True], [True, False], [True, False], [True, True],
+    ]  # fmt: skip
+    assert runs._feet_and_views(here, clip.stamps[::2])[0].tolist() == [[True, True], [True, False]]
 
 
 def test_modes_that_are_absent_do_not_count():
@@ -245,7 +386,7 @@ def test_standing_feet_are_followed_in_the_world():
     point[:, left, 0] += 0.02 * np.arange(6)  # 0.2 m/s
     point[:, right, 1] = 10.0 * np.arange(6)
     contact = np.array([[True, False]] * 6)
-    contact[3:, 1] = [True, False, True]  # never in two consecutive images
+    contact[0, 1] = True  # of the first image nothing is said of the one before
     standing = replace(record, point=point, contact=contact)
     assert standing_speed(standing) == pytest.approx(0.2)
     # A camera that moves and turns as the ankle does sees it at rest; in the world it moves.
@@ -371,6 +512,49 @@ def test_runs_go_on_where_they_were(tmp_path):
     assert np.array_equal(again[0].joints, first.joints, equal_nan=True)
     assert np.array_equal(again[0].levels, first.levels)
     assert name_of(runs[0]) != name_of(replace(runs[0], changes=(('rounds', 2),)))
+    assert (tmp_path / f'{name_of(runs[0])}.json').is_file()
+
+
+def keep(folder, name, one, record):
+    """A record as another checkout would have kept it, whose names are others."""
+    (folder / f'{name}.json').write_text(json.dumps(one.identity))
+    np.savez(folder / f'{name}.npz', **vars(record))
+
+
+def test_records_of_another_checkout_are_found(tmp_path):
+    changes = (('rounds', 2), ('likelihood.edges.weight', 0.0))
+    one = Run(Path('here') / 'walk', BOTH, 1, changes, 5, rate=8.0)
+    same = replace(one, folder=Path('elsewhere') / 'walk', changes=changes[::-1])
+    first, second = made_record(seed=1), made_record(seed=2)
+    keep(tmp_path, 'old', one, first)
+    os.utime(tmp_path / 'old.json', (1, 1))
+    assert np.array_equal(records_of([same], tmp_path)[0].true, first.true)
+    keep(tmp_path, 'new', one, second)
+    (found,) = records_of([same], tmp_path)
+    assert np.array_equal(found.true, second.true)
+    others = [
+        replace(one, folder=Path('here') / 'kick'), replace(one, inputs=IMAGES),
+        replace(one, seed=2), replace(one, changes=changes[:1]), replace(one, limit=None),
+        replace(one, rate=3.0), replace(one, start=KEYPOINTS), replace(one, size=0.5),
+    ]  # fmt: skip
+    assert records_of(others, tmp_path) == [None] * len(others)
+    # A damaged record leaves the one before it; a file of another kind is none.
+    (tmp_path / 'new.npz').write_bytes(b'half')
+    (tmp_path / 'other.json').write_text('[1]')
+    (tmp_path / 'broken.json').write_text('{')
+    assert np.array_equal(records_of([one], tmp_path)[0].true, first.true)
+    # What older records do not tell is unknown, or usual.
+    content = {
+        name: x for name, x in vars(first).items() if name not in ('statuses', 'cpu_seconds')
+    }
+    np.savez(tmp_path / 'old.npz', **content)
+    told = {name: x for name, x in replace(one, rate=0.0).identity.items() if name != 'rate'}
+    (tmp_path / 'old.json').write_text(json.dumps(told))
+    (found,) = records_of([replace(one, rate=0.0)], tmp_path)
+    assert np.isnan(scores_of(found)['nobody'])
+    (tmp_path / 'empty').mkdir()
+    with pytest.raises(ValueError, match='no records'):
+        records_of([one], tmp_path / 'empty')
 
 
 def test_the_first_error_ends_the_work():
@@ -399,7 +583,11 @@ def test_accuracy_over_the_bags(quick_runs, monkeypatch):
     assert 'Without keypoints of a detector, images alone: reach.' in text
     assert 'Other clips: errors in mm' in text
     assert 'settings were chosen on' not in text
-    assert len({line.count('|') for line in text.splitlines() if line.startswith('| reach')}) == 2
+    assert len({line.count('|') for line in text.splitlines() if line.startswith('| reach')}) == 3
+    assert (entry['nobody'], entry['rate']) == (0.0, 0.0)
+    assert 0 < entry['cpu_ms'] < 1e5
+    assert entry['evaluations'] <= entry['evaluations_99']
+    assert group['medians'][0]['point_mm'] == pytest.approx(entry['point_mm'])
     assert json.loads(json.dumps(rounded(result), allow_nan=False))['accuracy']
     with pytest.raises(ValueError, match='none of the clips'):
         tracking.measure(only=['nobody'])
@@ -407,13 +595,13 @@ def test_accuracy_over_the_bags(quick_runs, monkeypatch):
 
 def test_clips_that_settings_were_chosen_on_are_apart():
     entries = [
-        tracking._entry(clip, given, [{'kept': share, 'feet': np.nan}])
+        entry_of((clip, given, 0.0), [{'kept': share, 'feet': np.nan}])
         for clip, given, share in (
             ('turns', BOTH, 0.1), ('walk', KEYPOINTS, 0.2), ('walk', IMAGES, 0.3),
             ('kick', IMAGES, 0.5),
         )
     ]  # fmt: skip
-    chosen, others = tracking.grouped(entries)
+    chosen, others = grouped(entries)
     assert [(x['clip'], x['inputs']) for x in chosen['clips']] == [
         ('kick', IMAGES), ('walk', IMAGES), ('walk', KEYPOINTS),
     ]  # fmt: skip
@@ -422,6 +610,51 @@ def test_clips_that_settings_were_chosen_on_are_apart():
     ]  # fmt: skip
     assert chosen['means'][0]['feet'] == (None, None, None)
     assert [x['clip'] for x in others['clips']] == ['turns']
+
+
+def test_means_and_medians_leave_out_clips_that_are_apart():
+    entries = [
+        entry_of((clip, given, rate), [{'kept': share}])
+        for clip, given, rate, share in (
+            ('exercise', IMAGES, 0.0, 0.0), ('walk', IMAGES, 3.0, 0.2), ('walk', IMAGES, 0.0, 0.3),
+            ('kick', IMAGES, 0.0, 0.4), ('shoot', IMAGES, 0.0, 0.8),
+        )
+    ]  # fmt: skip
+    chosen, apart = grouped(entries)
+    assert [(x['inputs'], x['rate']) for x in chosen['means']] == [(IMAGES, 0.0), (IMAGES, 3.0)]
+    assert chosen['means'][0]['kept'][0] == pytest.approx(0.5)
+    assert [x['kept'] for x in chosen['medians']] == [0.4, 0.2]
+    assert [x['clip'] for x in apart['clips']] == ['exercise']
+    assert apart['means'] == apart['medians'] == []
+    text = tracking.as_text(
+        {'clips': 'here', 'seeds': [0], 'without_keypoints': [], 'accuracy': [chosen, apart]}
+    )
+    assert 'Clips that are in no mean: errors' in text
+    lines = [line.split()[:3] for line in text.splitlines() if line.startswith('walk')]
+    assert lines[:2] == [['walk', IMAGES, 'all'], ['walk', IMAGES, '3']]
+
+
+def test_paired_differences():
+    entries = [
+        entry_of((clip, IMAGES, 0.0), [{'heaviest_mm': value} for value in values])
+        for clip, values in (
+            ('walk', (4.0, 5.0, 6.0)), ('kick', (-5.0, 0.0, 6.0)), ('shoot', (-2.0, -2.1, -2.2)),
+            ('turns', (np.nan, 1.0, 1.0)), ('exercise', (1.0, 1.1, 1.2)),
+        )
+    ]  # fmt: skip
+    chosen, others, apart = paired(entries, 'heaviest_mm')
+    assert (chosen['clips'], chosen['above'], chosen['below']) == (3, ['walk'], ['shoot'])
+    assert chosen['difference'][0] == pytest.approx(np.mean([5.0, 1 / 3, -2.1]))
+    assert (others['above'], others['below'], others['difference'][0]) == ([], [], None)
+    assert (apart['above'], apart['difference'][0]) == (['exercise'], None)
+
+
+def test_intervals_over_few_seeds_hold_the_mean_as_often_as_they_say():
+    rng = np.random.default_rng(0)
+    ends = [interval_over_seeds(rng.normal(size=5)) for _ in range(2000)]
+    assert np.mean([low < 0.0 < high for low, high in ends]) == pytest.approx(0.95, abs=0.015)
+    assert interval_over_seeds(np.array([1.0])) is None
+    assert interval_over_seeds(np.array([1.0, np.nan])) is None
 
 
 def test_settings_are_compared_on_the_same_runs(quick_runs, monkeypatch):
@@ -433,6 +666,8 @@ def test_settings_are_compared_on_the_same_runs(quick_runs, monkeypatch):
     (entry,) = found['groups'][0]['clips']
     ours, theirs = (scores_of(record) for record in tracking.run_all(quick_runs[:2]))
     for column in tracking.COMPARED:
+        if column.key == 'cpu_ms':
+            continue
         difference = theirs[column.key] - ours[column.key]
         assert entry[column.key] == pytest.approx(difference)
         assert found['means'][0][column.key][0] == pytest.approx(difference)
@@ -442,6 +677,80 @@ def test_settings_are_compared_on_the_same_runs(quick_runs, monkeypatch):
     assert f'{entry["best_mm"]:+.1f}' in text
     same = tracking.measure(inputs=[IMAGES], seeds=(0,), parts=(), against=(('max_hypotheses', 4),))
     assert same['against']['means'][0]['heaviest_mm'][0] == 0.0
+
+
+def test_a_checkout_is_compared_with_the_one_before(quick_runs, monkeypatch, tmp_path):
+    monkeypatch.setenv('HMT_SHARED', 'nowhere')
+    given = {'only': ['reach'], 'inputs': [IMAGES], 'parts': (), 'rates': (30.0, 3.0)}
+    tracking.measure(**given, seeds=(0,), baseline=None)
+    seen = [Run(REACH, IMAGES, 0), Run(REACH, IMAGES, 0, rate=3.0)]
+    (mine,) = tracking.run_all(seen[:1])
+    keep(tmp_path, 'before', seen[0], replace(mine, joints=mine.joints + 0.0, point=mine.point))
+    found = tracking.measure(**given, seeds=(0,), baseline=tmp_path)['baseline']
+    assert found['lacking'] == [['reach', IMAGES, 3.0]]
+    (entry,) = found['groups'][0]['clips']
+    assert entry['heaviest_mm'] == entry['best_mm'] == 0.0
+    (pair,) = found['paired']
+    assert (pair['clips'], pair['difference'][0], pair['above']) == (1, 0.0, [])
+    text = tracking.as_text(
+        {'clips': 'here', 'seeds': [0], 'without_keypoints': [], 'baseline': found}, markdown=True
+    )
+    assert f'reach, images, rate 3: not in {tmp_path}.' in text
+    assert '| Other clips | images | all  |     1 |' in text
+    assert quick_runs[-1] == seen[0]
+    with pytest.raises(ValueError, match='lacks seeds'):
+        tracking.measure(**given, seeds=(1,), baseline=tmp_path)
+
+
+def test_rules_fit_the_settings(capsys):
+    names = [rule.name for rule in tracking_rules.RULES]
+    assert len({*names}) == len(names)
+    assert not {*names} & {*tracking_rules.GROUPS_OF_RULES}
+    for rule in tracking_rules.RULES:
+        assert rule.group in tracking_rules.GROUPS_OF_RULES
+        assert {*rule.inputs} <= {*INPUTS}
+        try:
+            settings = changed(rule.changes)
+        except ValueError as error:
+            assert 'no setting' in str(error), rule.name  # noqa: PT017 - it was removed
+        else:
+            assert settings != TrackerSettings(), rule.name
+    some = tracking_rules.rules_named(['rounds', tracking_rules.FACING])
+    assert {rule.group for rule in some} == {tracking_rules.FACING, tracking_rules.PROPOSALS}
+    assert tracking.main(['--rules', 'nothing']) == 1
+    assert 'no rule or group of rules nothing' in capsys.readouterr().err
+
+
+def test_the_tracker_without_rules(quick_runs, monkeypatch, capsys):
+    monkeypatch.setenv('HMT_SHARED', 'nowhere')
+    usual = TrackerSettings().rounds
+    rules = (
+        tracking_rules.Rule('combined', 'proposals', (('combinations', 8),)),
+        tracking_rules.Rule('removed', 'facing', (('no_such_setting', 0.0),)),
+        tracking_rules.Rule('off', 'facing', (('rounds', usual),)),
+        tracking_rules.Rule('detector', 'cues', (('rounds', 2),), (KEYPOINTS,)),
+    )
+    monkeypatch.setattr(tracking_rules, 'RULES', rules)
+    result = tracking.measure(
+        only=['reach'], inputs=[IMAGES], parts=('rules',),
+        plan=tracking_rules.Plan((0, 1), (30.0, 3.0)),
+    )  # fmt: skip
+    found = result['rules']
+    assert [*found['skipped']] == ['removed', 'off']
+    assert 'no_such_setting' in capsys.readouterr().err
+    assert [one.changes for one in quick_runs] == [()] * 4 + [rules[0].changes] * 4
+    assert [one.rate for one in quick_runs[:4]] == [0.0, 0.0, 3.0, 3.0]
+    (effect,) = found['rules']
+    ours, theirs = (scores_of(tracking.run_all([quick_runs[i]])[0]) for i in (0, 4))
+    means = effect['groups'][0]['means'][0]
+    assert means['best_mm'][0] == pytest.approx(theirs['best_mm'] - ours['best_mm'])
+    text = tracking.as_text(result, markdown=True)
+    assert 'Skipped: off: the tracker does without it.' in text
+    (line,) = [x for x in text.splitlines() if x.startswith('| proposals | combined | images |')][
+        :1
+    ]
+    assert f'{means["heaviest_mm"][0]:+.1f}' in line
+    assert json.loads(json.dumps(rounded(result), allow_nan=False))['rules']
 
 
 def test_settings_that_do_not_exist_are_told(capsys):

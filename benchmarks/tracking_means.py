@@ -1,0 +1,190 @@
+"""Scores of runs put together: by clip, means and medians over clips, and paired differences.
+
+An entry holds the scores of one clip, input and rate, by seed, and their means over the seeds. The
+clips fall into groups: those that settings of the tracker were chosen on, the others, and those
+that are in no mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.runs import INPUTS, Run
+from benchmarks.tracking_scores import interval, interval_over_seeds
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
+
+# Clips that settings of the tracker were chosen on.
+CHOSEN = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'follow')
+# Clips that are in no mean: this one plays four times too fast.
+APART = ('exercise',)
+OF_CHOSEN, OF_OTHERS, OF_APART = (
+    'Clips that settings were chosen on', 'Other clips', 'Clips that are in no mean',
+)  # fmt: skip
+GROUPS = (OF_CHOSEN, OF_OTHERS, OF_APART)
+DETECTOR = 'MediaPipe 3D'
+BY_JOINT = 'by_joint_90'
+# What tells entries apart.
+Key = tuple[str, str, float]
+
+
+def group_of(clip: str) -> str:
+    """The group of a clip, one of `GROUPS`."""
+    if clip in APART:
+        return OF_APART
+    return OF_CHOSEN if clip in CHOSEN else OF_OTHERS
+
+
+def by_clip(runs: Iterable[Run], scores: Iterable[Any]) -> dict[Key, list[tuple[Run, Any]]]:
+    """Runs with their scores, by clip, input and rate."""
+    result: dict[Key, list[tuple[Run, Any]]] = {}
+    for one, found in zip(runs, scores, strict=True):
+        result.setdefault((one.clip, one.inputs, one.rate), []).append((one, found))
+    return result
+
+
+def entry_of(key: Key, scores: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Scores of a clip by seed, and their means; None: unknown."""
+    clip, given, rate = key
+    numbers = {
+        name: [_known(one[name]) for one in scores] for name in scores[0] if name != BY_JOINT
+    }
+    result: dict[str, Any] = {'clip': clip, 'inputs': given, 'rate': rate, 'by_seed': numbers}
+    for name, values in numbers.items():
+        known = [value for value in values if value is not None]
+        result[name] = float(np.mean(known)) if len(known) == len(values) else None
+    if BY_JOINT in scores[0]:
+        shares = np.mean([one[BY_JOINT] for one in scores], axis=0)
+        result[BY_JOINT] = dict(zip(EVALUATED_JOINTS, map(_known, shares), strict=True))
+    return result
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def grouped(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Entries by `GROUPS`, with means and medians over the clips of those that have some."""
+    result = []
+    for title in GROUPS:
+        mine = [entry for entry in entries if group_of(entry['clip']) == title]
+        mine.sort(key=lambda entry: (entry['clip'], _rank(entry)))
+        if mine:
+            averaged = [] if title == OF_APART else mine
+            result.append(
+                {
+                    'group': title,
+                    'clips': mine,
+                    'means': means_of(averaged),
+                    'medians': medians_of(averaged),
+                }
+            )
+    return result
+
+
+def _rank(entry: dict[str, Any]) -> tuple[float, int]:
+    """All images come first, then falling rates; of a rate the inputs in their order."""
+    rate = entry['rate']
+    return -(rate if rate > 0 else np.inf), (*INPUTS, DETECTOR).index(entry['inputs'])
+
+
+def by_input(entries: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """Entries of the same rate and input together."""
+    ranks = sorted({_rank(entry) for entry in entries})
+    return [[entry for entry in entries if _rank(entry) == rank] for rank in ranks]
+
+
+def means_of(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Means over the clips by rate and input: mean, lower and upper end; see `interval`."""
+    result = []
+    for mine in by_input(entries):
+        means: dict[str, Any] = {'inputs': mine[0]['inputs'], 'rate': mine[0]['rate']}
+        for name in mine[0]['by_seed']:
+            means[name] = interval(_by_seed(mine, name))
+        if BY_JOINT in mine[0]:
+            shares = np.array([[*entry[BY_JOINT].values()] for entry in mine], dtype=float)
+            known = np.isfinite(shares)
+            sums = np.where(known, shares, 0.0).sum(0)
+            means[BY_JOINT] = {
+                name: float(total / count) if count else None
+                for name, total, count in zip(EVALUATED_JOINTS, sums, known.sum(0), strict=True)
+            }
+        result.append(means)
+    return result
+
+
+def medians_of(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Medians over the clips, by rate and input, of the means over their seeds."""
+    result = []
+    for mine in by_input(entries):
+        medians: dict[str, Any] = {'inputs': mine[0]['inputs'], 'rate': mine[0]['rate']}
+        for name in mine[0]['by_seed']:
+            known = [entry[name] for entry in mine if entry[name] is not None]
+            medians[name] = float(np.median(known)) if known else None
+        result.append(medians)
+    return result
+
+
+def _by_seed(entries: Sequence[dict[str, Any]], name: str) -> np.ndarray[Any, Any]:
+    return np.array([entry['by_seed'][name] for entry in entries], dtype=float)
+
+
+def difference_entries(
+    runs: Sequence[Run],
+    own: Sequence[dict[str, Any]],
+    usual: Sequence[dict[str, Any]],
+    names: Sequence[str],
+) -> list[dict[str, Any]]:
+    """Entries of paired differences.
+
+    Args:
+        runs: that are compared; of a clip, input and rate as many seeds as of any other.
+        own, usual: their scores, and those that are subtracted.
+        names: of the scores.
+    """
+    differences = [
+        {name: a[name] - b[name] for name in names} for a, b in zip(own, usual, strict=True)
+    ]
+    return [
+        entry_of(key, [scores for _, scores in found])
+        for key, found in by_clip(runs, differences).items()
+    ]
+
+
+def paired(entries: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
+    """Paired differences of one score, by group, rate and input.
+
+    Args:
+        entries: of differences.
+        name: of the score.
+
+    Returns:
+        By group, rate and input: `group`, `inputs`, `rate`, `clips` (their number), `difference`
+        (mean, lower and upper end over clips and seeds), and the clips whose own interval over the
+        seeds lies wholly `above` or `below` 0, see `interval_over_seeds`. Clips that are in no mean
+        have no difference.
+    """
+    result = []
+    for title in GROUPS:
+        ours = [entry for entry in entries if group_of(entry['clip']) == title]
+        for mine in by_input(ours):
+            values = _by_seed(mine, name)
+            ends = {
+                entry['clip']: found
+                for entry, own in zip(mine, values, strict=True)
+                if (found := interval_over_seeds(own)) is not None
+            }
+            result.append(
+                {
+                    'group': title,
+                    'inputs': mine[0]['inputs'],
+                    'rate': mine[0]['rate'],
+                    'clips': len(mine),
+                    'difference': (None,) * 3 if title == OF_APART else interval(values),
+                    'above': [clip for clip, (low, _) in ends.items() if low > 0],
+                    'below': [clip for clip, (_, high) in ends.items() if high < 0],
+                }
+            )
+    return result
