@@ -66,6 +66,8 @@ KEPT = ROOT / 'build' / 'benchmarks' / 'tracking'
 JOINTS = (ORIGIN, *EVALUATED_JOINTS)
 # Images a second of most clips.
 USUAL_RATE = 30.0
+# Images after which everything is compiled.
+WARMING = 2
 # Streams of random numbers of a seed.
 OF_BLIND_CONTROL = 5
 
@@ -414,6 +416,7 @@ def _own_a_core(turn: Any, cores: list[int]) -> None:
 
 def _run_and_keep(item: tuple[Run, Path]) -> None:
     one, path = item
+    _warm_up(one)
     record = run(one)
     partial = path.with_suffix(f'.{os.getpid()}.tmp.npz')
     np.savez_compressed(
@@ -421,6 +424,17 @@ def _run_and_keep(item: tuple[Run, Path]) -> None:
     )
     path.with_suffix('.json').write_text(json.dumps(one.identity), 'utf-8')
     partial.replace(path)
+
+
+# Filled once this process has run a tracker.
+_warm: list[bool] = []
+
+
+def _warm_up(one: Run) -> None:
+    """Runs a few images, once in a process: the first ones also compile, which is not counted."""
+    if not _warm:
+        run(replace(one, limit=WARMING, rate=0.0))
+        _warm.append(True)
 
 
 def read_record(path: Path) -> Record | None:

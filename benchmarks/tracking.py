@@ -200,13 +200,14 @@ def measure(
     lacking = [folder.name for folder in folders if not _has_keypoints(folder)]
 
     def runs_of(some: Sequence[Path], seeds: Sequence[int], rates: Sequence[float]) -> list[Run]:
+        slower = dict.fromkeys(rate if 0 < rate < USUAL_RATE else 0.0 for rate in rates)
         return [
             Run(
                 folder, given, seed, limit=limit, start=SUBJECT if given == IMAGES else start,
-                rate=0.0 if rate >= USUAL_RATE else rate,
+                rate=rate,
             )
             for folder in some
-            for rate in rates
+            for rate in slower
             for given in inputs
             if given == IMAGES or folder.name not in lacking
             for seed in seeds
@@ -242,7 +243,8 @@ def measure(
         sized = next((folder for folder in folders if folder.name == SIZED), folders[0])
         result['sizes'] = errors_by_size(sized, seeds, limit, processes)
     if 'oracle' in parts:
-        result['oracle'] = oracle(folders, limit, processes)
+        averaged = [folder for folder in folders if folder.name not in APART]
+        result['oracle'] = oracle(averaged or folders, limit, processes)
     still = [folder for folder in folders if (folder / 'background.png').is_file()]
     timed = next((folder for folder in still if folder.name == TIMED), still[-1] if still else None)
     if timed is not None and 'speed' in parts:

@@ -27,7 +27,6 @@ from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import minimise
 from hmt_ros.tracking import read_subject
-from hmt_ros.tracking.initialisation import start_from_keypoints
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -115,6 +114,9 @@ def of_clip(folder: Path, limit: int | None = None, every: int = EVERY) -> list[
     clip = read_clip(folder, limit)
     stamps, images = clip.stamps[::every], clip.images[::every]
     model = load_body('human37')
+    # Here, so that the other parts need no inner module of the tracker.
+    from hmt_ros.tracking.initialisation import start_from_keypoints
+
     begun = start_from_keypoints(model, clip.camera, read_subject(clip.subject, model))
     silhouettes = silhouettes_of(clip, every)
     shape, reference = _settings()

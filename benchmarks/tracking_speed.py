@@ -12,7 +12,6 @@ import numpy as np
 from benchmarks.clips import Clip, table
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
 from benchmarks.runs import new_tracker
-from benchmarks.stages import StageClock
 from hmt_ros.app.progress import with_progress
 from hmt_ros.body import load_body
 from hmt_ros.tracking import TrackerSettings
@@ -25,6 +24,9 @@ def speed(clip: Clip) -> dict[str, Any]:
 
     The camera of the clip does not move.
     """
+    # Here, so that the other parts need no inner modules of the tracker.
+    from benchmarks.stages import StageClock
+
     assert clip.background is not None
     forget_peak()
     tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)

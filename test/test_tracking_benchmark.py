@@ -261,6 +261,15 @@ def test_a_clip_at_a_lower_rate(clip):
     assert name_of(run) != name_of(replace(run, rate=3.0))
 
 
+def test_a_run_at_a_lower_rate(clip):
+    small = tuple((name, getattr(SMALL, name)) for name in ('max_hypotheses', 'candidates'))
+    rate = 0.5e9 / (clip.stamps[1] - clip.stamps[0])
+    record = run_one(Run(REACH, IMAGES, 0, small, limit=4, rate=rate))
+    assert record.stamps.tolist() == clip.stamps[:4:2]
+    assert (record.images.tolist(), record.statuses.tolist()) == ([2], ['tracking'] * 2)
+    assert (record.cpu_seconds > 0).all()
+
+
 def test_a_foot_stands_if_it_does_in_images_that_are_left_out(clip, tmp_path):
     rows = np.arange(4)
     contact = np.array([[True, True], [True, False], [True, True], [True, True]])
