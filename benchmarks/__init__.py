@@ -8,6 +8,7 @@ from types import ModuleType
 
 # Benchmark, which is the module of that name: what it measures.
 BENCHMARKS = {
+    'absence': 'whether a visible person is taken for nobody, an empty scene for somebody',
     'bags': 'reading, memory, and what replay adds to the estimate',
     'contour_noise': 'how far contours of people lie from those of the model',
     'depth': 'what depth images bring to the tracker',

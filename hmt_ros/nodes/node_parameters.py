@@ -12,7 +12,13 @@ from typing import Any
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
-from hmt_ros.sessions.declared_parameters import AT_LAUNCH, EFFECTS, DeclaredParameter, Value
+from hmt_ros.sessions.declared_parameters import (
+    AT_LAUNCH,
+    EFFECTS,
+    REMOVED,
+    DeclaredParameter,
+    Value,
+)
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 QOS_OVERRIDES = 'qos_overrides.'
@@ -56,6 +62,9 @@ def unknown_parameters(given: Iterable[str], known: Iterable[str]) -> list[str]:
     names = sorted(known)
     texts = []
     for name in sorted(set(given) - set(names)):
+        if name in REMOVED:
+            texts.append(f'parameter {name!r} was removed, it is ignored: {REMOVED[name]}')
+            continue
         near = difflib.get_close_matches(name, names, n=1, cutoff=_ALIKE)
         hint = f'; did you mean {near[0]!r}?' if near else ', it is ignored'
         texts.append(f'unknown parameter {name!r}{hint}')

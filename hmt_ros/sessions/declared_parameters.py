@@ -44,6 +44,11 @@ FRACTION = (0.0, 1.0)
 TRANSPORTS = ('raw', 'compressed')
 LONGEST_TIMEOUT = 60.0  # s
 
+# Parameters that nodes had before, and what is there instead.
+REMOVED = {
+    'absence_time': 'existence is a probability with rates per second: see existence_probability',
+}
+
 # Metadata of a field that is one parameter or holds several.
 _EFFECT, _LIMITS, _PREFIX = 'effect', 'limits', 'prefix'
 
@@ -229,6 +234,8 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
     known = {parameter.name: parameter for parameter in declared_parameters(settings)}
     for name in values:
         if name not in known:
+            if name in REMOVED:
+                raise ParameterError(f'parameter {name} was removed: {REMOVED[name]}')
             near = difflib.get_close_matches(name, known, n=1)
             hint = f'; is {near[0]} meant?' if near else ''
             raise ParameterError(f'there is no parameter {name}{hint}')

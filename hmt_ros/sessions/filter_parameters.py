@@ -47,7 +47,6 @@ _TRACKER = {
     'shape_interval': (0, 100_000),
     'lost_misfit': FRACTION,
     'lost_images': (1, 100_000),
-    'absence_time': (0.0, 60.0),
     **{f'likelihood.{term.name}.weight': NOT_NEGATIVE for term in TERMS},
     'likelihood.keypoints.weight': NOT_NEGATIVE,
     'likelihood.prior_weight': NOT_NEGATIVE,

@@ -363,6 +363,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             starts=starts,
             state=TrackState.LOST if tracker.status is Status.LOST else TrackState.TRACKING,
             track_id=tracker.track_id,
+            existence_probability=tracker.existence_probability,
             identities=tracker.modes.identities,
             velocities=tracker.velocities,
             up=known.up,
@@ -395,6 +396,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             self._messages,
             tracker.body,
             tracker.track_id,
+            tracker.existence_probability,
             tracker.settings.max_hypotheses,
             waiting.stamp_ns,
             f'{p.fixed_frame}_optical' if p.publish_in_fixed_frame else waiting.frame_id,
@@ -422,6 +424,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             doubted=silhouettes is not None and silhouettes.doubted,
             moved=silhouettes is not None and silhouettes.watch.moved,
             track_id=self._tracks if self._tracker is None else self._tracker.track_id,
+            existence=math.nan if self._tracker is None else self._tracker.existence_probability,
             started_from='' if source is None else source.value,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from hmt_ros.body import Body
@@ -26,6 +27,7 @@ class FilterState(SessionState):
         moved: whether the camera has moved since it was taken.
         track_id: number of the present track, or of the last one; 0 before the first.
         started_from: what that track began from; '' before the first.
+        existence: probability that a person is in view; NaN: no image yet.
     """
 
     body: Body | None = None
@@ -37,6 +39,7 @@ class FilterState(SessionState):
     moved: bool = False
     track_id: int = 0
     started_from: str = ''
+    existence: float = math.nan
 
     def summary(self) -> str:
         """The present estimate in a few words."""
@@ -47,7 +50,7 @@ class FilterState(SessionState):
         if self.status == Status.NOBODY.value:
             return 'nobody in view'
         if self.status == Status.LOST.value:
-            lost = f'lost: misfit {self.misfit:.2f}'
+            lost = f'lost: misfit {self.misfit:.2f}, existence {self.existence:.2f}'
             return f'{lost}; {CAMERA_MOVED}' if self.moved else lost
         if self.moved:
             return CAMERA_MOVED
@@ -58,6 +61,7 @@ class FilterState(SessionState):
         return [
             ('track', str(self.track_id)),
             ('started from', self.started_from),
+            ('probability that a person is in view', f'{self.existence:.3f}'),
             ('modes', str(self.modes)),
             ('entropy of the weights, nats', f'{self.entropy:.3f}'),
             ('misfit', f'{self.misfit:.3f}'),

@@ -7,7 +7,7 @@ The rules, besides those of `CameraSession`:
 - Somebody to whom the detector gives an identity keeps it. Others are told apart by where they were
   last and how they moved (`hmt_ros.tracking.association`).
 - A detection of nobody who is followed starts a filter, the largest first, up to `max_people`. Whom
-  no track has, or who is not seen for `absence_time`, is not followed any more.
+  no track has, or who is no longer in view (`Tracker.status`), is not followed any more.
 - The nearest person is tracked first. To everybody the pixels of those who are nearer are unknown,
   and the pixels that only somebody farther away covers (`Tracker.step`, others).
 - The background is learned while nobody is detected, or read from `background_file`.
@@ -71,6 +71,8 @@ def published_topic(topic: str) -> PublishedTopic:
 
 # Less of somebody in the image, px, is not worth a track.
 SMALLEST = 4
+# Somebody who is detected no more, and of whom no track has started, is forgotten after so long, s.
+UNSTARTED = 0.5
 
 
 @dataclass(eq=False)
@@ -403,12 +405,11 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         return grown(area)
 
     def _drop_those_who_left(self, stamp: int) -> None:
-        longest = self.parameters.tracker.absence_time * SECOND_NS
         self._people = [
             person
             for person in self._people
             if not person.session.ended
-            and (person.session.begun or stamp - person.place.stamp <= longest)
+            and (person.session.begun or stamp - person.place.stamp <= UNSTARTED * SECOND_NS)
         ]
 
     def _publish_people(self, waiting: WaitingImage, camera: Camera) -> None:

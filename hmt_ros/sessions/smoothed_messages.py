@@ -119,6 +119,7 @@ def final_messages(
     of: SmoothedBody,
     *,
     state: TrackState,
+    existence_probability: float,
     components: int,
     wanted: Callable[[str], bool],
     publish: Callable[[str, Any], None],
@@ -130,6 +131,7 @@ def final_messages(
         pose: its density.
         of: whose pose it is.
         state: of the track at that time.
+        existence_probability: that a person was in view, in the filter at that time; NaN: unknown.
         components: maximum number of components of the message.
         wanted: whether a topic is to be made.
         publish: takes the topic and the message, one after the other.
@@ -148,6 +150,7 @@ def final_messages(
         of.frame_id,
         state=state,
         track_id=of.track_id,
+        existence_probability=existence_probability,
         **_followed(pose, mixture),
     )
     if wanted('smoothed_pose_mixture'):
@@ -161,6 +164,7 @@ def nobody_messages(
     of: SmoothedBody,
     stamp_ns: int,
     *,
+    existence_probability: float,
     wanted: Callable[[str], bool],
     publish: Callable[[str, Any], None],
 ) -> None:
@@ -170,6 +174,7 @@ def nobody_messages(
         messages: factory.
         of: person of the poses before.
         stamp_ns: the time.
+        existence_probability: that a person is in view; NaN: unknown.
         wanted, publish: as for `window_messages`.
     """
     body, frame = of.body, of.frame_id
@@ -189,6 +194,7 @@ def nobody_messages(
             frame,
             state=TrackState.NOBODY,
             track_id=of.track_id,
+            existence_probability=existence_probability,
         )
         publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
 

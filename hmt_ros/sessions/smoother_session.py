@@ -140,7 +140,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._of: SmoothedBody | None = None
         self._resolved: tuple[Any, SmoothedBody] | None = None
         self._window: SlidingWindow | None = None
-        self._states: dict[int, TrackState] = {}
+        # State and probability of existence in the filter, by stamp.
+        self._states: dict[int, tuple[TrackState, float]] = {}
         self._newest: int | None = None
         self._nobody = False
         self._gaps, self._longest_gap = 0, 0.0
@@ -167,7 +168,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         try:
             content = pose_mixture_of(message)
             if content.kind is MixtureKind.LIKELIHOOD and not len(content.weights):
-                self._take_nobody(stamp)
+                self._take_nobody(stamp, content.existence_probability)
                 return
             mixture, of = content.mixture, self._whose(content)
         except MessageError as error:
@@ -208,7 +209,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._end_window()
             return
         self._newest, self._nobody = stamp, False
-        self._states[stamp] = content.state
+        self._states[stamp] = content.state, content.existence_probability
         self._log.counts['smoothed'] += 1
         self.kept = KeptMixtures(of, (*self.kept.items, (stamp, mixture))[-p.window_length :])
         self._weights = update.trajectories.weights
@@ -223,7 +224,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         for pose in update.final:
             self._publish_final(pose, of)
 
-    def _take_nobody(self, stamp: int) -> None:
+    def _take_nobody(self, stamp: int, existence: float) -> None:
         """Ends the window: the person is no longer in view."""
         if self._order(stamp, self._newest) is Order.SKIPPED:
             return
@@ -236,6 +237,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 self._messages,
                 of,
                 stamp,
+                existence_probability=existence,
                 wanted=self._wanted,
                 publish=lambda topic, made: self._publish(topic, stamp, made),
             )
@@ -310,11 +312,13 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     # Outputs.
 
     def _publish_final(self, pose: FinalPose, of: SmoothedBody) -> None:
+        state, existence = self._states.pop(pose.stamp_ns)
         final_messages(
             self._messages,
             pose,
             of,
-            state=self._states.pop(pose.stamp_ns),
+            state=state,
+            existence_probability=existence,
             components=self.parameters.max_hypotheses,
             wanted=self._wanted,
             publish=lambda topic, made: self._publish(topic, pose.stamp_ns, made),

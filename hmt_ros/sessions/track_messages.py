@@ -74,6 +74,7 @@ class TrackedImage:
         starts: whether the body is a new one, with other lengths than the image before.
         state: of the track.
         track_id: number of the track.
+        existence_probability: that a person is in view; NaN: unknown.
         identities: (K,) of the components of the posterior.
         velocities: (K, d) of the components of the posterior, per second; None: unknown.
         up: (3,) unit vector against gravity in the camera frame; None: it is not known, at most
@@ -97,6 +98,7 @@ class TrackedImage:
     starts: bool
     state: TrackState = TrackState.UNKNOWN
     track_id: int = 0
+    existence_probability: float = math.nan
     identities: Index | None = None
     velocities: Array | None = None
     up: Array | None = None
@@ -210,6 +212,7 @@ def nobody_messages(
     messages: MessageFactory,
     body: Body,
     track_id: int,
+    existence_probability: float,
     ranks: int,
     stamp_ns: int,
     frame_id: str,
@@ -224,6 +227,7 @@ def nobody_messages(
         messages: factory.
         body: of the track.
         track_id: its number.
+        existence_probability: that a person is in view.
         ranks: maximum number of modes of the track, whose markers are removed.
         stamp_ns, frame_id: of the image.
         image: (H, W, 3) BGR, shown without modes; None: no overlay.
@@ -234,8 +238,9 @@ def nobody_messages(
     for topic, kind in kinds.items():
         if wanted(topic):
             content = PoseMixture.of_body(
-                body, None, kind, stamp_ns, frame_id, state=TrackState.NOBODY, track_id=track_id
-            )
+                body, None, kind, stamp_ns, frame_id, state=TrackState.NOBODY, track_id=track_id,
+                existence_probability=existence_probability,
+            )  # fmt: skip
             publish(topic, pose_mixture_message(messages, content))
     if wanted('markers'):
         names = body.joint_names
@@ -269,6 +274,7 @@ def _mixtures(track: TrackedImage, joints: Array) -> tuple[PoseMixture, PoseMixt
             log_likelihoods=track.log_likelihoods,
             state=track.state,
             track_id=track.track_id,
+            existence_probability=track.existence_probability,
             identities=track.identities,
             velocities=velocities,
         ),
@@ -280,6 +286,7 @@ def _mixtures(track: TrackedImage, joints: Array) -> tuple[PoseMixture, PoseMixt
             frame,
             state=track.state,
             track_id=track.track_id,
+            existence_probability=track.existence_probability,
             log_likelihoods=track.likelihood_values,
         ),
     )

@@ -9,6 +9,7 @@ from hmt_ros.sessions.camera_session import camera_moved_fault
 from hmt_ros.sessions.filter_state import IN_BACKGROUND
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from hmt_ros.tracking import Status, Subject, Tracker
+from hmt_ros.tracking.existence import PRESENT
 from msg_tools.messages.headers import SECOND_NS
 
 # A person hardly moves meanwhile.
@@ -89,6 +90,12 @@ def _report_status(
             _report_age(log, stamp_ns - initial.stamp_ns)
     if now is Status.LOST:
         text = f'{track} is lost {at}: no mode explains {tracker.misfit:.0%} of what is seen'
+        if tracker.existence_probability < PRESENT:
+            probability = f'{tracker.existence_probability:.0%}'
+            text = (
+                f'{track} is lost {at}: no image says where the person is, who is in view with a '
+                f'probability of {probability}'
+            )
         log.note(Fault.LOST, f'{text}; it is searched for', warn=True)
 
 

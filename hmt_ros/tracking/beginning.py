@@ -3,14 +3,15 @@
     subject      at the image that its joints were seen in
     mixture      at the next image
     box          at the next image; keypoints or a prediction of that image come before it
-    nothing      at the first image, or once somebody has been seen for so long:
+    nothing      once somebody is in view with the probability `PRESENT` (`existence`), and is shown
+                 by one of these:
 
-        keypoints that suffice     0.1 s     most of the trunk, and 6 joints in all, with confidence
-        keypoints of a part        0.4 s     a person, with both shoulders or both hips
+        keypoints that suffice     most of the trunk, and 6 joints in all, with confidence
+        keypoints of a part        a person, with both shoulders or both hips; takes longer
+        mask                       takes longer where a side of the image may cut it
         prediction                 at once
-        mask                       0.2 s, 0.6 s where a side of the image may cut it
 
-After a track has ended the next one starts once somebody has been seen for 0.2 s, or 0.6 s.
+After a track has ended the next one starts in the same way; then a silhouette suffices.
 
 Keypoints give poses, depth and lengths (see `initialisation`); a mask or a box gives mean poses of
 several headings. A detector may take left for right, and silhouettes do not tell sides at all: with
@@ -41,28 +42,13 @@ from hmt_ros.tracking.initialisation import (
     poses_from_outline,
     start_from_keypoints,
 )
-from hmt_ros.tracking.presence import (
-    FEWEST_KEYPOINTS,
-    MOST_CHANGED,
-    ROUNDING,
-    View,
-    looks_like_person,
-    sees_person,
-)
+from hmt_ros.tracking.keypoint_evidence import FEWEST_KEYPOINTS, shows_a_part, suffices
+from hmt_ros.tracking.person_shape import looks_like_person
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.start_depth import depths_of, moved_to_depth
 from hmt_ros.tracking.subject import Subject
+from hmt_ros.tracking.view import View
 
-# A new track starts when somebody has been seen for so long, s; if a side of the image may cut the
-# silhouette, when it has been seen for the longer time.
-ARRIVAL, ARRIVAL_AT_BORDER = 0.2, 0.6
-# The first track starts from keypoints that have been seen for so long, s: one image alone may show
-# a detector somebody where nobody is. Of a part of a person more may be seen soon.
-SURE_KEYPOINTS, KEYPOINTS_OF_A_PART = 0.1, 0.4
-# A keypoint of this confidence is where it says, and this many of the joints of the trunk tell
-# where the person is and how the person is turned, as a fraction of all.
-CONFIDENT = 0.5
-MOST_OF_THE_TRUNK = 0.75
 # A person hardly moves in so long a time, ns.
 SAME_MOMENT_NS = 200_000_000
 # Number of the best poses from keypoints whose reversals in depth are searched, too.
@@ -107,93 +93,17 @@ class Beginning:
         return self.start[:1]
 
 
-class Arrival:
-    """How long somebody has been in view of whom no track knows."""
-
-    def __init__(self) -> None:
-        self._since: int | None = None
-
-    @property
-    def somebody(self) -> bool:
-        """Whether somebody was seen in the last image."""
-        return self._since is not None
-
-    def lasts(self, stamp: int, wanted: float | None) -> bool:
-        """Whether that has been long enough.
-
-        Args:
-            stamp: of the image, ns.
-            wanted: time, s; None: the image shows nobody.
-        """
-        if wanted is None:
-            self._since = None
-            return False
-        if self._since is None:
-            self._since = stamp
-        return (stamp - self._since) * 1e-9 + ROUNDING >= wanted
-
-
-def time_to_first(
-    view: View, body: Body, prediction: PosePrediction | None, *, masked: bool
-) -> float | None:
-    """Time for which somebody must have been seen for a first track that has no start, s.
+def shows_a_start(view: View, body: Body, *, masked: bool) -> bool:
+    """Whether an image shows somebody that a first track can start from, if somebody is there.
 
     Args:
         view: what the image shows.
         body: model of the person.
-        prediction: by the image, if any.
         masked: whether the silhouette is a segmenter's.
-
-    Returns:
-        None: the image shows nobody that a track could start from.
     """
-    waits = []
-    if suffices(view.keypoints, body):
-        return SURE_KEYPOINTS
-    if prediction is not None:
-        return 0.0
-    if _shows_a_part(view.keypoints, body):
-        waits.append(KEYPOINTS_OF_A_PART)
-    if masked and view.silhouette is not None and looks_like_person(view.silhouette):
-        waits.append(_time_of_silhouette(view))
-    return min(waits, default=None)
-
-
-def time_to_next(view: View, prediction: PosePrediction | None) -> float | None:
-    """Time for which somebody must have been seen after a track has ended, s; None: nobody is."""
-    if view.silhouette is None:
-        shown = prediction is not None
-    else:
-        shown = view.changed <= MOST_CHANGED and looks_like_person(view.silhouette)
-    return _time_of_silhouette(view) if shown or sees_person(view.keypoints) else None
-
-
-def _time_of_silhouette(view: View) -> float:
-    cut = view.silhouette is not None and view.silhouette[:, [0, -1]].any()
-    return ARRIVAL_AT_BORDER if cut else ARRIVAL
-
-
-def suffices(keypoints: Keypoints | None, body: Body) -> bool:
-    """Whether keypoints tell at once where a person is and which way the person faces."""
-    if keypoints is None:
-        return False
-    names = _confident(keypoints)
-    trunk = [name for pair in body.trunk_pairs for name in pair]
-    of_trunk = sum(name in names for name in trunk)
-    return len(names) >= FEWEST_KEYPOINTS and of_trunk >= MOST_OF_THE_TRUNK * len(trunk)
-
-
-def _shows_a_part(keypoints: Keypoints | None, body: Body) -> bool:
-    """Whether keypoints are a person, and tell which way the person faces."""
-    if keypoints is None or not sees_person(keypoints):
-        return False
-    names = _confident(keypoints)
-    return any(left in names and right in names for left, right in body.trunk_pairs)
-
-
-def _confident(keypoints: Keypoints) -> set[str]:
-    sure = keypoints.seen & (keypoints.confidences >= CONFIDENT)
-    return {keypoints.names[i] for i in np.flatnonzero(sure)}
+    if suffices(view.keypoints, body) or shows_a_part(view.keypoints, body):
+        return True
+    return masked and view.silhouette is not None and looks_like_person(view.silhouette)
 
 
 class Starts:
@@ -206,13 +116,11 @@ class Starts:
     Attributes:
         given: what the track starts from; None: what the images show.
         box: (left, top, right, bottom) of the person in the next image, px; None: unknown.
-        arrival: of somebody of whom no track knows.
     """
 
     def __init__(self, model: Body, camera: Camera) -> None:
         self.given: Subject | GaussianMixture | None = None
         self.box: Box | None = None
-        self.arrival = Arrival()
         self._model, self._camera = model, camera
 
     def first(
@@ -225,6 +133,7 @@ class Starts:
         observed: Callable[[], Observation],
         *,
         masked: bool,
+        somebody: bool,
     ) -> Beginning | None:
         """What a track begins from at an image; None: it does not start there.
 
@@ -236,6 +145,7 @@ class Starts:
             prediction: by the image, if any.
             observed: makes the observation of the image.
             masked: whether the silhouette is a segmenter's.
+            somebody: whether a person is in view.
         """
         given, model, camera = self.given, self._model, self._camera
         if given is not None and self.box is None:
@@ -245,10 +155,10 @@ class Starts:
             if isinstance(given, Subject) and stamp - given.stamp_ns <= SAME_MOMENT_NS:
                 depths = depths_of(view.depth)
             return beginning_given(given, model, body, camera, upright, depths)
-        if self.box is None:
-            wanted = time_to_first(view, model, prediction, masked=masked)
-            if not self.arrival.lasts(stamp, wanted):
-                return None
+        at_once = prediction is not None and not suffices(view.keypoints, model)
+        shown = somebody and shows_a_start(view, model, masked=masked)
+        if self.box is None and not at_once and not shown:
+            return None
         return beginning_seen(view, model, camera, upright, prediction, self.box, observed)
 
 
@@ -301,7 +211,7 @@ def beginning_seen(
     enough = suffices(keypoints, model)
     depths = depths_of(view.depth)
     if keypoints is not None and (
-        enough or (prediction is None and _shows_a_part(keypoints, model))
+        enough or (prediction is None and shows_a_part(keypoints, model))
     ):
         begun = start_from_keypoints(
             model, camera, Subject(0, keypoints, {}), upright=upright, depths=depths

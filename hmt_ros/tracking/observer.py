@@ -1,9 +1,9 @@
 """What a tracker takes from an image: a view of whoever is there, and what it says of the person.
 
-    view          silhouette near where the person can be, keypoints      before a pose is known
+    view          silhouettes near the person and anywhere, keypoints     before a pose is known
     observation   evidence of every term of the likelihood that counts    near a pose
 
-A view is what presence and starts are decided by. The observation is made of it when it is known
+A view is what existence and starts are decided by. The observation is made of it when it is known
 where the person is and whether the silhouettes of this track are believed.
 """
 
@@ -24,8 +24,9 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.tracking.depth_belief import DepthBelief
-from hmt_ros.tracking.presence import View
+from hmt_ros.tracking.person_shape import raster_step
 from hmt_ros.tracking.silhouettes import Silhouettes, region_of
+from hmt_ros.tracking.view import View
 
 
 class Observer:
@@ -73,8 +74,9 @@ class Observer:
         mask: Mask | None,
         body: Body,
         poses: Array | None,
+        dt: float,
         *,
-        nobody_predicted: bool,
+        predicted: bool | None,
         others: Mask | None = None,
         depth: NDArray[np.floating] | None = None,
     ) -> View:
@@ -85,20 +87,32 @@ class Observer:
             keypoints: of a detector, if any.
             mask: (H, W) of a segmenter, if any.
             body: of the person.
-            poses: (K, d) in the image before; None: the person may be anywhere.
-            nobody_predicted: whether a predictor saw nobody.
+            poses: (K, d) in an image before; None: the person may be anywhere.
+            dt: time since that image, s.
+            predicted: whether a predictor expects somebody; None: it does not say.
             others: (H, W) pixels that somebody else covers; None: none.
             depth: (H, W) of a depth camera, m, if any.
         """
         s = self._settings
-        found, changed = None, 0.0
+        silhouettes = self._silhouettes
+        found, anywhere, changed = None, None, 0.0
         if s.containment.weight > 0 or s.coverage.weight > 0:
-            region = None if poses is None else region_of(body, self._camera, poses)
-            found = self._silhouettes.silhouette(image, mask, region, others)
-            if found is not None and mask is None:
-                changed = self._silhouettes.background.changed
+            region = None if poses is None else region_of(body, self._camera, poses, dt=dt)
+            found = silhouettes.silhouette(image, mask, region, others)
+        if found is not None:
+            anywhere = silhouettes.anywhere(image, mask, others, raster_step(self._camera.height))
+            changed = silhouettes.background.changed if mask is None else 0.0
         foreground, unsure = (None, None) if found is None else found
-        return View(image, foreground, changed, keypoints, nobody_predicted, unsure, others, depth)
+        return View(
+            image, foreground, anywhere, changed, keypoints, predicted, unsure, others, depth
+        )
+
+    def seen_anywhere(self, view: View, mask: Mask | None) -> View:
+        """The same view, with the silhouette of somebody who may be anywhere in it."""
+        found = self._silhouettes.silhouette(view.image, mask, None, view.others)
+        if found is None:
+            return view
+        return view._replace(silhouette=found.foreground, unsure=found.unsure)
 
     def observation(self, view: View, pose: Array | None, *, believed: bool) -> Observation:
         """What an image says of a person.

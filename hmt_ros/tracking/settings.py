@@ -83,8 +83,6 @@ class TrackerSettings:
         lost_misfit: Fraction of the outline, or of the keypoints, left unexplained by every mode
             above which an image counts as lost.
         lost_images: Number of consecutive lost images after which the track restarts.
-        absence_time: Time after which the track of a person who is not in view ends, s; it is
-            measured by the stamps of the images.
         likelihood: settings of the likelihood.
         search: settings of the search of limbs.
         ground: settings of what is known of gravity and floor.
@@ -121,7 +119,6 @@ class TrackerSettings:
     shape_interval: int = 3
     lost_misfit: float = 0.35
     lost_images: int = 5
-    absence_time: float = 0.5
     likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
     search: LimbSearchSettings = field(default_factory=LimbSearchSettings)
     ground: GroundSettings = field(default_factory=GroundSettings)
@@ -142,7 +139,7 @@ class TrackerSettings:
             )
         least = {'samples': 1, 'rounds': 1, 'iterations': 1, 'base_iterations': 1, 'lost_images': 1}
         least |= {'combinations': 1, 'alternatives': 1, 'trust': 0, 'exploration': 0}
-        least |= {'facing_trial': 0, 'absence_time': 0}
+        least |= {'facing_trial': 0}
         for name, bound in least.items():
             if not getattr(self, name) >= bound:
                 raise ValueError(f'{name} must be at least {bound}, saw {getattr(self, name)}')

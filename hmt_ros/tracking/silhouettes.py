@@ -35,6 +35,8 @@ INSIDE, AROUND = 0.01, 0.06
 MOST_UNKNOWN = 0.02
 # Margin around all joints of all modes, as a fraction of their extent: where the silhouette may be.
 REGION_MARGIN = 0.3
+# Speed that a person hardly exceeds, a runner's, m/s: the margin is no less than the way.
+SPEED = 3.0
 
 
 class Silhouettes:
@@ -111,6 +113,21 @@ class Silhouettes:
             self.watch.look(image, self.background)
         return self.background.split(image, region, others)
 
+    def anywhere(self, image: Image, mask: Mask | None, others: Mask | None, step: int) -> Mask:
+        """All foreground of an image, at every step-th pixel (H / step, W / step).
+
+        Args:
+            image, mask, others: as for `silhouette`, which is not None.
+            step: px.
+        """
+        found = self.background.foreground(image) if mask is None else mask
+        coarse = found[::step, ::step]
+        if others is not None:
+            coarse = coarse & ~others[::step, ::step]
+        pixels = np.ascontiguousarray(coarse).view(np.uint8)
+        # Single pixels are noise.
+        return np.asarray(cv2.medianBlur(pixels, 3), dtype=np.uint8).view(np.bool_)
+
     def check(self, image: Image, body: Body, camera: Camera, poses: Array) -> None:
         """Doubts the background if too little of the person, in poses (K, d), is foreground.
 
@@ -141,20 +158,23 @@ class Silhouettes:
 
 
 def region_of(
-    body: Body, camera: Camera, poses: Array, margin: float = REGION_MARGIN
+    body: Body, camera: Camera, poses: Array, margin: float = REGION_MARGIN, dt: float = 0.0
 ) -> Box | None:
     """Where a person in poses (K, d) can be in the next image; None: anywhere.
 
     Args:
         body, camera, poses: of the person.
         margin: around all joints, as a fraction of their extent.
+        dt: time since the person was at the poses, s.
     """
     pixels = camera.project(body.joint_positions(poses)).reshape(-1, 2)
     pixels = pixels[np.isfinite(pixels).all(1)]
     if len(pixels) == 0:
         return None
     low, high = pixels.min(0), pixels.max(0)
-    margin = margin * max(float((high - low).max()), 1.0)
+    nearest = max(float(poses[:, 2].min()), 0.1)
+    reach = SPEED * dt * camera.magnification(nearest)
+    margin = max(margin * max(float((high - low).max()), 1.0), reach)
     size = (camera.width, camera.height)
     left, top = (int(x) for x in np.clip(np.floor(low - margin), 0, size))
     right, bottom = (int(x) for x in np.clip(np.ceil(high + margin), 0, size))

@@ -1,6 +1,9 @@
 """Follows one person through images: starts a track, moves it on, notices when it is lost.
 
-    WAITING -> (a start) -> TRACKING -> (unexplained images) -> LOST -> (started anew) -> TRACKING
+    WAITING or NOBODY  -> (a start)                        ->  TRACKING
+    TRACKING           -> (no image says where)            ->  LOST
+    LOST               -> (found again)                    ->  TRACKING
+    TRACKING or LOST   -> (an image says: nobody is there) ->  NOBODY
 
 The tracker knows images, background and starts; the `Track` knows the person, its filters carry the
 mixture.
@@ -22,16 +25,9 @@ from hmt_ros.image.observation import Box, Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.beginning import (
-    FROM_JOINTS,
-    Arrival,
-    Beginning,
-    Source,
-    Starts,
-    poses_to_search,
-    time_to_next,
-)
+from hmt_ros.tracking.beginning import FROM_JOINTS, Beginning, Source, Starts, poses_to_search
 from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
+from hmt_ros.tracking.existence import GIVEN, Existence
 from hmt_ros.tracking.facing import Track
 from hmt_ros.tracking.gravity import Gravity
 from hmt_ros.tracking.ground import Ground, GroundEstimator, KnownGround, unit_vector
@@ -40,13 +36,13 @@ from hmt_ros.tracking.initialisation import check_box
 from hmt_ros.tracking.observer import Observer
 from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.prediction import expected_poses
-from hmt_ros.tracking.presence import Presence, View
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.silhouettes import Silhouettes
 from hmt_ros.tracking.start_depth import depths_of
 from hmt_ros.tracking.status import Status
 from hmt_ros.tracking.subject import Subject
+from hmt_ros.tracking.view import View
 
 # The person may be where modes say that have at least this log weight, nats; the sign is changed.
 LIKELY = 4.0
@@ -108,7 +104,8 @@ class Tracker:
         self._ground = GroundEstimator(known_ground)
         self._track = self._new_track(body)
         self._point = PointEstimate()
-        self._presence = Presence(self.settings.absence_time)
+        self._existence = Existence()
+        self._nobody = False
         self._last_stamp: int | None = None
         self._followed: int | None = None
         self._camera_path = CameraPath()
@@ -141,7 +138,7 @@ class Tracker:
             self._starts.given = start
         self._starts.box = box
         self._drop_track()
-        self._presence = Presence(self.settings.absence_time)
+        self._existence, self._nobody = Existence(), False
         self._last_stamp = None
         self._camera_path = CameraPath()
 
@@ -194,12 +191,15 @@ class Tracker:
         self._move_camera(stamp)
         known = self.background.frames > 0 and not self.silhouettes.doubted
         self._ground.still = self._camera_path.known or (known and not self._ground.turning)
-        near = self.modes.poses if self._track.begun and not self._track.lost else None
+        near, dt = None, 0.0
+        if self._followed is not None and not self._track.lost:
+            near, dt = self.modes.poses, (stamp - self._followed) * 1e-9
         view = self._observer.view(
-            image, keypoints, mask, self.body, near,
-            nobody_predicted=nobody_predicted, others=others, depth=depth,
+            image, keypoints, mask, self.body, near, dt,
+            predicted=False if nobody_predicted else True if prediction is not None else None,
+            others=others, depth=depth,
         )  # fmt: skip
-        found = self._take(view, stamp, prediction, masked=mask is not None)
+        found = self._take(view, stamp, prediction, mask)
         self._last_stamp = stamp
         return found
 
@@ -211,11 +211,17 @@ class Tracker:
     @property
     def status(self) -> Status:
         """What the tracker is doing."""
-        if self._presence.absent:
+        if self._nobody:
             return Status.NOBODY
         if not self._track.begun:
             return Status.WAITING
-        return Status.LOST if self._track.lost else Status.TRACKING
+        found = self._existence.somebody and not self._track.lost
+        return Status.TRACKING if found else Status.LOST
+
+    @property
+    def existence_probability(self) -> float:
+        """Probability that a person is in view, given all images so far; see `Existence`."""
+        return self._existence.probability
 
     @property
     def body(self) -> Body:
@@ -333,22 +339,26 @@ class Tracker:
         self._track = self._new_track(self.body)
         self._point = PointEstimate()
         self._ground.reset()
-        self._starts.arrival = Arrival()
         self._observer.last_image, self._followed = None, None
+        self._existence.meet()
         self.depth.reset()
 
     def _take(
-        self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool
+        self, view: View, stamp: int, prediction: PosePrediction | None, mask: Mask | None
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """See `step`."""
+        masked, existence = mask is not None, self._existence
         if self._track.begun:
-            seen = self._is_seen(view, stamp)
-            if self._presence.absent:
+            existence.look(view, stamp, self.body)
+            if existence.nobody:
+                self._nobody = True
                 self._drop_track()
                 return None, None
-            if self._presence.hides(view) or (not seen and view.silhouette is not None):
+            if not existence.seen and (existence.hidden or view.silhouette is not None):
                 # Nothing is there to fit modes to.
                 return self._expected(stamp), self._likelihood(Observation())
+            if existence.elsewhere:
+                view = self._observer.seen_anywhere(view, mask)
             observation = self._observe(view, self.modes.poses[0])
             self._follow(observation, stamp, prediction)
         else:
@@ -367,6 +377,8 @@ class Tracker:
         self._point.update(self.body, self.modes.poses, np.exp(self.modes.log_weights), dt)
         self._observer.last_image, self._followed = view.image, stamp
         self.depth.update(self.body, self.modes.poses[0], self._observer.depths)
+        if self._existence.seen:
+            self._existence.learn(view, stamp, self.body, self.camera, self.modes.poses[0])
         self.evaluations = self._track.evaluations
         return self.posterior, self._likelihood(observation)
 
@@ -378,12 +390,17 @@ class Tracker:
         self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool
     ) -> Observation | None:
         """Starts a track, if it starts at this image; returns what it was started with."""
-        if self._presence.absent and self._starts.box is None:
-            if not self._starts.arrival.lasts(stamp, time_to_next(view, prediction)):
-                return None
+        # Before the first track a background may still be learned: its silhouettes are no start.
+        known = masked or self._nobody
+        self._existence.look(
+            view if known else view._replace(anywhere=None, silhouette=None), stamp, self.body
+        )
+        somebody = self._existence.somebody and self._existence.llr > 0.0
+        if self._nobody and self._starts.box is None:
             observation = self._observe(view, None)
-            poses = self._poses_to_search(observation, prediction)
-            assert poses is not None
+            poses = self._poses_to_search(observation, prediction) if somebody else None
+            if poses is None:
+                return None
             near = replace(
                 observation, magnification=self.camera.magnification(float(np.median(poses[:, 2])))
             )
@@ -392,16 +409,16 @@ class Tracker:
         else:
             beginning = self._starts.first(
                 view, stamp, self.body, self._gravity, prediction,
-                lambda: self._observe(view, None), masked=masked,
+                lambda: self._observe(view, None), masked=masked, somebody=somebody,
             )  # fmt: skip
             if beginning is None:
-                if not self._starts.arrival.somebody:
+                if self._starts.given is not None or self._existence.llr <= 0.0:
                     self.silhouettes.learn(view.image, view.silhouette if masked else None)
                 return None
             if not masked:
                 self.silhouettes.check(view.image, beginning.body, self.camera, beginning.best)
                 if self.silhouettes.doubted:
-                    view = view._replace(silhouette=None, unsure=None)
+                    view = view._replace(silhouette=None, anywhere=None, unsure=None)
             if beginning.source in FROM_JOINTS:
                 self.depth.update(beginning.body, beginning.best[0], depths_of(view.depth))
             observation = self._observe(view, beginning.best[0])
@@ -410,10 +427,14 @@ class Tracker:
                 # The start is where the person is; the silhouette is not.
                 observation = self._observe(view, beginning.best[0])
                 self._begin(observation, beginning, stamp)
+            if not somebody:
+                # The start itself says that somebody is there.
+                self._existence = Existence(GIVEN)
+                pose = self.modes.poses[0]
+                self._existence.learn(view, stamp, self.body, self.camera, pose)
+                self._existence.look(view, stamp, self.body)
         self.track_id += 1
-        self._starts.box = None
-        self._presence = Presence(self.settings.absence_time)
-        self._is_seen(view, stamp)
+        self._starts.box, self._nobody = None, False
         return observation
 
     def _expected(self, stamp: int) -> GaussianMixture:
@@ -422,9 +443,6 @@ class Tracker:
         dt = (stamp - self._followed) * 1e-9
         motion = self.settings.motion
         return expected_poses(self.modes, self.posterior.weights, self.body, motion, dt)
-
-    def _is_seen(self, view: View, stamp: int) -> bool:
-        return self._presence.sees(view, stamp, self.body, self.camera, self.modes.poses[0])
 
     def _begin(self, observation: Observation, beginning: Beginning, stamp: int) -> None:
         """Starts the track."""
@@ -439,7 +457,8 @@ class Tracker:
     ) -> None:
         """Takes the next image of a track."""
         assert self._followed is not None
-        poses = self._poses_to_search(observation, prediction) if self._track.lost else None
+        search = self._track.lost or self._existence.elsewhere
+        poses = self._poses_to_search(observation, prediction) if search else None
         if poses is None:
             dt = (stamp - self._followed) * 1e-9
             self._track.propagate(observation, stamp, dt, prediction)

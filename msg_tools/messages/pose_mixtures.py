@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -84,6 +85,8 @@ class PoseMixture:
             on; 0: no identity. None: all without.
         joint_covariances: (K, J, 3, 3) m^2, of the joint positions; None: unknown.
         joint_velocities: (K, J, 3) m/s, in the frame of the header; None: unknown.
+        existence_probability: that a person is in view, given all images so far; NaN: unknown, as
+            in messages of other publishers and in bags older than this field.
 
     Raises:
         MessageError: shapes or values that a message must not have.
@@ -107,6 +110,7 @@ class PoseMixture:
     identities: NDArray[np.uint32] | None = None
     joint_covariances: Array | None = None
     joint_velocities: Array | None = None
+    existence_probability: float = math.nan
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'mixture: dof_names'))
@@ -143,6 +147,11 @@ class PoseMixture:
                 check_finite(values, f'mixture: {name}')
         if components:
             check_weights(self.weights, 'mixture')
+        existence = self.existence_probability
+        if not (math.isnan(existence) or 0.0 <= existence <= 1.0):
+            raise MessageError(
+                f'mixture: existence_probability must lie in [0, 1] or be NaN, saw {existence}'
+            )
         if self.covariances is not None:
             check_covariances(self.covariances, 'mixture')
 
@@ -161,6 +170,7 @@ class PoseMixture:
         track_id: int = 0,
         identities: NDArray[Any] | None = None,
         velocities: Array | None = None,
+        existence_probability: float = math.nan,
     ) -> PoseMixture:
         """A mixture over the poses of a body at its present lengths.
 
@@ -172,8 +182,8 @@ class PoseMixture:
             body: the person.
             mixture: K Gaussians over its poses; None: nobody was seen.
             joint_positions: (K, J, 3) m, of the means; None: computed here.
-            kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities: see the
-                attributes.
+            kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities,
+                existence_probability: see the attributes.
             velocities: (K, d) of the poses, per second; None: unknown.
 
         Raises:
@@ -206,6 +216,7 @@ class PoseMixture:
             identities=identities,
             joint_covariances=_joint_covariances(jacobians, mixture.covariances),
             joint_velocities=joint_velocities,
+            existence_probability=existence_probability,
         )
 
     @cached_property
@@ -259,6 +270,7 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
         kind=int(content.kind),
         state=int(content.state),
         track_id=content.track_id,
+        existence_probability=content.existence_probability,
         components=components,
         segment_names=list(content.segment_lengths),
         segment_lengths=np.array(list(content.segment_lengths.values()), dtype=np.float64),
@@ -333,7 +345,15 @@ def pose_mixture_of(
         identities=np.array([c.id for c in components], dtype=np.uint32),
         joint_covariances=_optional(components, 'joint_covariances', (len(joints), 3, 3)),
         joint_velocities=_optional(components, 'joint_velocities', (len(joints), 3)),
+        existence_probability=_existence(message, state),
     )
+
+
+def _existence(message: Any, state: TrackState) -> float:
+    """The probability of existence; NaN where a publisher or an older definition lacks it."""
+    value = float(getattr(message, 'existence_probability', math.nan))
+    # ROS sets a field to 0 that a publisher leaves alone.
+    return math.nan if state is TrackState.UNKNOWN and value == 0.0 else value
 
 
 def _optional(components: Sequence[Any], name: str, shape: tuple[int, ...]) -> Array | None:

@@ -220,6 +220,7 @@ def test_defaults_lie_between_limits(settings):
         ({'max_hypotheses': 50}, 'max_hypotheses <= candidates'),
         ({'proposals': 'guess'}, "proposals must be one of .* saw 'guess'"),
         ({'likelihood.edges.wieght': 2.0}, 'is likelihood.edges.weight meant'),
+        ({'absence_time': 0.5}, 'absence_time was removed: existence is a probability with rates'),
         ({'surprise': 2.0}, 'there is no parameter surprise'),
         ({'background.method': 'guess'}, "saw 'guess'"),
         ({'image_transport': 'theora'}, "image_transport must be one of .* saw 'theora'"),

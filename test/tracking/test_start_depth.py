@@ -19,8 +19,8 @@ from hmt_ros.tracking import Subject, Tracker
 from hmt_ros.tracking.beginning import Starts
 from hmt_ros.tracking.depth_belief import DepthBelief
 from hmt_ros.tracking.initialisation import start_from_keypoints
-from hmt_ros.tracking.presence import View
 from hmt_ros.tracking.start_depth import depths_of, joint_depths, moved_to_depth
+from hmt_ros.tracking.view import View
 
 STATURE, AWAY = 1.9, 3.5
 MS = 1_000_000
@@ -129,7 +129,7 @@ def test_a_box_starts_at_the_depth_of_the_person(tall, camera):
     found = {}
     for name, depth in (('with', depths[0]), ('without', None)):
         view = View(images[0], depth=depth)
-        beginning = starts.first(view, 0, model, None, None, lambda: None, masked=False)
+        beginning = starts.first(view, 0, model, None, None, lambda: None, masked=False, somebody=True)
         assert isinstance(beginning.start, GaussianMixture)
         found[name] = np.abs(beginning.start.means[:, 2] - poses[0, 2]).max()
     assert found['with'] < 0.15 < found['without']
@@ -144,7 +144,7 @@ def test_the_joints_of_an_older_image_are_not_looked_up_in_this_depth(tall, came
     # A wall stands where the person was.
     view = View(images[0], depth=np.full_like(depths[0], 1.5))
     late, plain = (
-        starts.first(x, 900 * MS, model, None, None, lambda: None, masked=False)
+        starts.first(x, 900 * MS, model, None, None, lambda: None, masked=False, somebody=True)
         for x in (view, View(images[0]))
     )
     assert np.array_equal(late.best, plain.best)

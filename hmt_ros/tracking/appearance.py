@@ -1,0 +1,166 @@
+"""What is usual of one person in silhouettes and colours, and whether an image shows that.
+
+    place    share of the model that is foreground / usual share
+    area     area of the largest piece of the foreground that has the shape of one person / usual
+
+Where the clothes have the colours of the room only a part of the model is foreground: the share is
+asked against what this track has seen so far. A person who has not been seen for a time t may have
+gone SPEED t further away; the usual area shrinks accordingly.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.tracking.colours import MEMORY, Colours
+from hmt_ros.tracking.person_shape import (
+    Piece,
+    counted,
+    covered,
+    largest_person,
+    on_raster,
+    raster_step,
+)
+from hmt_ros.tracking.silhouettes import SPEED
+from hmt_ros.tracking.view import View
+
+# Fraction of the usual value at which a silhouette says nothing; at none of it somebody is absent,
+# at twice as much present.
+UNDECIDED = 0.25
+# More than this fraction of an image, or of a person, is most of it.
+MOST = 0.5
+
+
+class Silhouetted(NamedTuple):
+    """What a silhouette says of somebody's presence, from -1, nobody, to 1.
+
+    Attributes:
+        by_place: by what is foreground on the model.
+        by_area: by the largest piece that has the shape of a person, anywhere.
+        cut: whether a side of the image may cut that piece.
+    """
+
+    by_place: float
+    by_area: float
+    cut: bool
+
+    @property
+    def evidence(self) -> float:
+        """By both: a wrong pose is no absent person."""
+        return max(self.by_place, self.by_area)
+
+
+class Appearance:
+    """How one person usually looks.
+
+    Attributes:
+        colours: of the person.
+    """
+
+    def __init__(self) -> None:
+        self.colours = Colours()
+        self._model: Mask | None = None
+        self._depth = math.nan
+        self._share, self._area = MOST, math.nan
+        self._stamp = 0
+        # Of the last image: foreground on the raster, and the piece of it that is a person.
+        self._foreground: Mask | None = None
+        self._piece: Piece | None = None
+
+    def open_to_view(self, others: Mask | None) -> float:
+        """Share of the person, where the person was last seen, that others (H, W) do not cover."""
+        if self._model is None or others is None:
+            return 1.0
+        hidden = counted(self._model & on_raster(others, self._model))
+        return 1.0 - hidden / max(counted(self._model), 1)
+
+    def unseen(self, stamp: int) -> float:
+        """Time for which the person has not been seen at a stamp, ns, in s; never seen: 0."""
+        return 0.0 if self._model is None else 1e-9 * (stamp - self._stamp)
+
+    def silhouetted(self, view: View, stamp: int) -> Silhouetted | None:
+        """What the silhouette of an image says; None: it has none, or most of it has changed.
+
+        Args:
+            view: what the image shows.
+            stamp: of the image, ns.
+        """
+        self._foreground, self._piece = None, None
+        if view.anywhere is None:
+            return None
+        model = np.zeros_like(view.anywhere) if self._model is None else self._model
+        if view.changed > MOST + counted(model) / model.size:
+            return None
+        foreground, others = view.anywhere, view.others
+        if others is not None and view.silhouette is not None:
+            # It is open who else is in view: only what is near the person counts.
+            foreground = on_raster(view.silhouette, foreground)
+            model = model & ~on_raster(others, model)
+        self._foreground = foreground
+        self._piece = piece = largest_person(foreground, raster_step(len(view.image)))
+        place = counted(foreground & model) / max(counted(model), 1)
+        area = 0.0
+        if piece is not None:
+            shrunk = (self._depth / (self._depth + SPEED * self.unseen(stamp))) ** 2
+            least = self._area * shrunk * self.open_to_view(others)
+            area = 1.0 if math.isnan(least) else piece.area / least
+        return Silhouetted(
+            _evidence(place / self._share), _evidence(area), piece is not None and piece.cut
+        )
+
+    def colour_evidence(self, view: View) -> float | None:
+        """What the colours say, from -1, nobody, to 1; None: nothing."""
+        score = self.colours.score(_coarse(view))
+        return None if score is None else float(np.clip(2.0 * score - 1.0, -1.0, 1.0))
+
+    def is_apart(self, view: View) -> bool:
+        """Whether most keypoints of an image lie beside the box around the model."""
+        keypoints = view.keypoints
+        if keypoints is None or self._model is None or not keypoints.seen.any():
+            return False
+        x, y, width, height = cv2.boundingRect(self._model.view(np.uint8))
+        margin = max(width, height) // 4
+        pixels = keypoints.pixels[keypoints.seen] / raster_step(len(view.image))
+        low = np.array([x, y]) - margin
+        high = np.array([x + width, y + height]) + margin
+        within = (pixels >= low) & (pixels <= high)
+        return bool(within.all(axis=1).mean() < MOST)
+
+    def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
+        """Learns from an image in which the person is at a pose (d,); `silhouetted` came before."""
+        dt = 0.0 if self._model is None else 1e-9 * (stamp - self._stamp)
+        gain = -math.expm1(-dt / MEMORY)
+        self._model = model = covered(body, camera, pose, raster_step(camera.height))
+        self._depth, self._stamp = max(float(pose[2]), 0.1), stamp
+        free = self.open_to_view(view.others)
+        if free < MOST:
+            return
+        if view.others is not None:
+            model = model & ~on_raster(view.others, model)
+        if self._foreground is not None and model.any():
+            share = counted(self._foreground & model) / counted(model)
+            if share > UNDECIDED * self._share:
+                self._share += gain * (share - self._share)
+        if self._piece is not None:
+            area = self._piece.area / free
+            known = not math.isnan(self._area)
+            self._area = self._area + gain * (area - self._area) if known else area
+        self.colours.learn(_coarse(view), model, dt)
+
+
+def _coarse(view: View) -> Image:
+    """The image on the raster."""
+    step = raster_step(len(view.image))
+    return view.image[::step, ::step]
+
+
+def _evidence(value: float) -> float:
+    """From -1 to 1, of a value against the usual one."""
+    return min(max(value / UNDECIDED - 1.0, -1.0), 1.0)

@@ -1,0 +1,128 @@
+"""The colours of a person, and whether an image shows them anywhere.
+
+    p(M | colour) = h_M / (h_M + h_around)              ratio of two histograms
+    B(x) = mean of p(M | colour) over a box at x        as large as the model
+    score = (max B - elsewhere) / (here - elsewhere)
+
+M are the pixels that the model covers. `here` and `elsewhere` are the usual value of B where the
+person is, and its usual maximum over boxes beside the person: the score is about 1 where the image
+shows somebody in these colours, wherever that is, and about 0 in a room without the person. Where
+the two are alike the colours say nothing, and where the colours of the image are not those of the
+images before: a covered lens, another light.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.inference.arrays import Array, Image, Mask
+
+# Time constant of what is usual for a track, s.
+MEMORY = 2.0
+# Least difference between `here` and `elsewhere` that says something, a probability.
+LEAST_CONTRAST = 0.15
+# Least part of an image whose colours are those of the images before: most of it.
+FAMILIAR = 0.5
+# Bins of a colour channel.
+BINS = 8
+# Share of a colour below which it is rare, a probability.
+RARE = 1e-4
+
+
+class Colours:
+    """The colours of one person against those of the surroundings.
+
+    Attributes:
+        size: (width, height) of the model, px of the raster.
+        here, elsewhere: usual means of p(M | colour) over a box at the person and beside; NaN:
+            unknown.
+    """
+
+    def __init__(self) -> None:
+        self.size = (0, 0)
+        self.here = self.elsewhere = math.nan
+        self._inside: Array | None = None
+        self._around = self._scene = np.zeros(BINS**3)
+
+    def score(self, image: Image) -> float | None:
+        """How far an image (h, w, 3) BGR shows the person's colours; None: nothing can be told."""
+        contrast = self.here - self.elsewhere
+        if self._inside is None or not contrast >= LEAST_CONTRAST:
+            return None
+        bins = binned(image)
+        if np.minimum(shares(bins), self._scene).sum() < FAMILIAR:
+            return None
+        return float((self._means(bins).max() - self.elsewhere) / contrast)
+
+    def learn(self, image: Image, model: Mask, dt: float) -> None:
+        """Takes in an image (h, w, 3) with the person on the pixels (h, w) of the model.
+
+        Args:
+            image, model: on the raster.
+            dt: time since the last image that was learned, s.
+        """
+        around = surroundings(model)
+        if not model.any() or not around.any():
+            return
+        bins = binned(image)
+        on, off, scene = shares(bins, model), shares(bins, around), shares(bins)
+        first = self._inside is None
+        gain = 1.0 if first else -math.expm1(-dt / MEMORY)
+        self._inside = on if self._inside is None else self._inside + gain * (on - self._inside)
+        self._around = self._around + gain * (off - self._around)
+        self._scene = self._scene + gain * (scene - self._scene)
+        x, y, width, height = cv2.boundingRect(model.view(np.uint8))
+        self.size = width, height
+        means = self._means(bins)
+        row, column = y + height // 2, x + width // 2
+        here = float(means[row, column])
+        # Boxes that do not touch that of the person.
+        means[max(row - height, 0) : row + height, max(column - width, 0) : column + width] = -1.0
+        elsewhere = float(means.max())
+        self.here = _moved(self.here, here, gain)
+        if elsewhere >= 0.0:
+            self.elsewhere = _moved(self.elsewhere, elsewhere, gain)
+
+    def _means(self, bins: NDArray[np.uint16]) -> NDArray[np.float32]:
+        """Mean of p(M | colour) over a box at each pixel (h, w); beyond the image it is 0."""
+        assert self._inside is not None
+        ratio = (self._inside / (self._inside + self._around + RARE)).astype(np.float32)
+        size = (max(self.size[0], 1), max(self.size[1], 1))
+        means = cv2.boxFilter(ratio[bins], cv2.CV_32F, size, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(means, dtype=np.float32)
+
+
+def _moved(usual: float, value: float, gain: float) -> float:
+    return value if math.isnan(usual) else usual + gain * (value - usual)
+
+
+def binned(image: Image) -> NDArray[np.uint16]:
+    """The bin of the colour of each pixel (h, w) of an image (h, w, 3)."""
+    width = 256 // BINS
+    parts = (image // np.uint8(width)).astype(np.uint16)
+    result: NDArray[np.uint16] = (parts[..., 0] * BINS + parts[..., 1]) * BINS + parts[..., 2]
+    return result
+
+
+def shares(bins: NDArray[np.uint16], where: Mask | None = None) -> Array:
+    """Share (BINS^3,) of each colour among the pixels of a mask; all zero where it is empty."""
+    chosen = bins.ravel() if where is None else bins[where]
+    return np.bincount(chosen, minlength=BINS**3) / max(chosen.size, 1)
+
+
+def surroundings(model: Mask) -> Mask:
+    """Pixels (H, W) around those that the model covers, up to half its size away."""
+    x, y, width, height = cv2.boundingRect(model.view(np.uint8))
+    margin = max(width, height) // 2
+    near = max(margin // 5, 1)
+    size = (2 * near + 1, 2 * near + 1)
+    grown = cv2.dilate(model.view(np.uint8), np.ones(size, np.uint8))
+    result = np.zeros(model.shape, dtype=np.bool_)
+    rows = slice(max(y - margin, 0), y + height + margin)
+    columns = slice(max(x - margin, 0), x + width + margin)
+    result[rows, columns] = grown[rows, columns] == 0
+    return result

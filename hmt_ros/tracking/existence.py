@@ -1,0 +1,197 @@
+"""Whether a person is in view, as a probability: nobody is one more hypothesis of every image.
+
+    r = p(somebody is in view | images so far)
+
+    predict   r <- s(dt) r + b(dt) (1 - r)                     [exp(Q dt)], a two-state chain
+    update    logit r <- logit r + sum_g a_g(dt) llr_g         a_g(dt) = tanh(dt / (2 tau_g))
+
+This is the existence of integrated probabilistic data association (Musicki, Evans and Stankovic,
+"Integrated probabilistic data association", 1994) and of the Bernoulli filter (Ristic et al., "A
+tutorial on Bernoulli filters", 2013, equations 28 and 56), with rates per second in place of
+probabilities per scan. llr_g is the log likelihood ratio of the whole image for somebody against
+nobody by cue g, and a_g the share that is left to it because its errors last (`error_model`).
+
+    silhouette   m = max(share of the model on it / usual share, area of its largest piece that has
+                 the shape of a person / usual area), asked in the whole image
+    detector     sum of the confidences of the keypoints
+    predictor    whether it expects somebody; that it does, only where there is no silhouette
+    colours      whether the person's are anywhere; only where nothing else shows somebody
+
+An image most of which has changed says nothing: a covered lens, a flash, noise. Of a person whom
+others hide nothing speaks but the keypoints that are seen. So only an image that shows the place
+empty ends a track: without it r tends to b / (b + l), which is far above `ABSENT`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.error_model import share_of_time
+from hmt_ros.tracking.appearance import MOST, Appearance
+from hmt_ros.tracking.keypoint_evidence import keypoint_evidence, suffices
+from hmt_ros.tracking.view import View
+
+# Rates at which somebody comes into an empty view, and leaves it, per second.
+BIRTH, LEAVING = 0.1, 0.2
+# Above this probability somebody is there, and a new track may start; below it nobody is, if the
+# image says so. Between them nobody can say.
+PRESENT, ABSENT = 0.85, 0.03
+# Fraction of a cue that is left to a silhouette which a side of the image may cut, and to keypoints
+# of a part of a person.
+PART = 0.6
+
+
+class Cue(NamedTuple):
+    """How much a cue says.
+
+    Attributes:
+        nats: largest log likelihood ratio of somebody against nobody.
+        tau: how long its errors last, s.
+    """
+
+    nats: float
+    tau: float
+
+
+# A clear image is right unless something lasts that nobody has thought of: 1 in 3,000. A detector
+# misses a person whom it sees badly in about 1 of 100 images, for longer.
+CLEAR = Cue(8.0, 0.2)
+DOUBTFUL = Cue(5.0, 0.25)
+
+
+def moved_on(r: float, dt: float) -> float:
+    """The probability that somebody is in view after dt seconds without an image."""
+    total = BIRTH + LEAVING
+    return r - math.expm1(-total * dt) * (BIRTH / total - r)
+
+
+def updated(r: float, llr: float) -> float:
+    """The probability that somebody is in view, given a log likelihood ratio, nats."""
+    if r in (0.0, 1.0):
+        return r
+    return probability_of(math.log(r) - math.log1p(-r) + llr)
+
+
+def probability_of(log_odds: float) -> float:
+    """The probability that has these log odds, nats."""
+    return 0.5 * (1.0 + math.tanh(0.5 * log_odds))
+
+
+# Before the first image nobody is there, so far as one clear image leaves it open; a start that is
+# given is like one clear image of somebody.
+NOBODY_YET, GIVEN = probability_of(-CLEAR.nats), probability_of(CLEAR.nats)
+
+
+class Existence:
+    """The probability that a person is in view, image by image.
+
+    Args:
+        probability: before the first image.
+
+    Attributes:
+        probability: r, given all images so far.
+        llr: sum of the cues of the last image, nats; positive: it shows somebody.
+        seen: whether the last image shows a filter something to follow: a cue shows somebody, or
+            none shows nobody and the image can be used.
+        hidden: whether others hid most of the person in the last image.
+        elsewhere: whether it shows somebody where no mode is, or after so long that the modes tell
+            nothing: the track has to search.
+    """
+
+    def __init__(self, probability: float = NOBODY_YET) -> None:
+        self.probability = probability
+        self.llr = 0.0
+        self.seen = self.hidden = self.elsewhere = False
+        self._stamps: tuple[int, int] | None = None  # of the first and of the last image
+        self._asked: dict[str, int] = {}  # when each cue spoke last
+        self._appearance = Appearance()
+
+    @property
+    def somebody(self) -> bool:
+        """Whether a person is there."""
+        return self.probability >= PRESENT
+
+    @property
+    def nobody(self) -> bool:
+        """Whether nobody is there, and the last image has said so."""
+        return self.probability < ABSENT and self.llr < 0.0
+
+    def meet(self) -> None:
+        """Forgets what is usual of the person: another one may come."""
+        self._appearance = Appearance()
+
+    def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
+        """Learns what is usual from the last image, in which the person is at a pose (d,)."""
+        self._appearance.learn(view, stamp, body, camera, pose)
+
+    def look(self, view: View, stamp: int, body: Body) -> None:
+        """Takes the next image.
+
+        Args:
+            view: what it shows.
+            stamp: of the image, ns; later than the one before.
+            body: of the person.
+        """
+        if self._stamps is not None:
+            self.probability = moved_on(self.probability, 1e-9 * (stamp - self._stamps[1]))
+        # After so long whoever was seen last may as well have gone.
+        forgotten = moved_on(1.0, self._appearance.unseen(stamp)) < MOST
+        self.hidden = self._appearance.open_to_view(view.others) < 1.0 - MOST
+        cues, usable, apart = self._cues(view, stamp, body)
+        if self.hidden:
+            cues = {name: cue for name, cue in cues.items() if cue[0] > 0.0}
+        self.llr = sum(
+            value * cue.nats * share_of_time(self._time_since(name, stamp), cue.tau)
+            for name, (value, cue) in cues.items()
+        )
+        self.probability = updated(self.probability, self.llr)
+        values = [value for value, _ in cues.values()]
+        shown = any(value > 0.0 for value in values)
+        self.seen = shown or (usable and not any(value < 0.0 for value in values))
+        self.elsewhere = shown and (forgotten or apart)
+        self._asked |= dict.fromkeys(cues, stamp)
+        self._stamps = stamp if self._stamps is None else self._stamps[0], stamp
+
+    def _cues(
+        self, view: View, stamp: int, body: Body
+    ) -> tuple[dict[str, tuple[float, Cue]], bool, bool]:
+        """What cues say by name, from -1, nobody, to 1; also of the image.
+
+        Returns:
+            The cues that say something; whether the silhouette can be used, as far as there is
+            one; whether somebody is shown where the model is not.
+        """
+        cues, apart = {}, False
+        usable = view.anywhere is None
+        found = self._appearance.silhouetted(view, stamp)
+        if found is not None:
+            usable = True
+            part = PART if found.cut and found.by_place <= 0.0 < found.by_area else 1.0
+            cues['silhouette'] = part * found.evidence, CLEAR
+            apart = found.by_place < 0.0 < found.by_area
+        if view.keypoints is not None:
+            value = keypoint_evidence(view.keypoints)
+            if value > 0.0:
+                part = 1.0 if suffices(view.keypoints, body) else PART
+                cues['detector'] = part * value, CLEAR
+                apart = apart or self._appearance.is_apart(view)
+            else:
+                cues['detector'] = value, DOUBTFUL
+        if view.predicted is not None and (not view.predicted or view.anywhere is None):
+            cues['predictor'] = (1.0, CLEAR) if view.predicted else (-1.0, DOUBTFUL)
+        if found is None and not any(value > 0.0 for value, _ in cues.values()):
+            colours = self._appearance.colour_evidence(view)
+            # Where most of the image has changed, the colours may have, too.
+            if colours is not None and (usable or colours > 0.0):
+                cues['colours'] = colours, DOUBTFUL
+        return cues, usable, apart
+
+    def _time_since(self, cue: str, stamp: int) -> float:
+        """Time since a cue spoke, s; infinite in the first image."""
+        if self._stamps is None:
+            return math.inf
+        return 1e-9 * (stamp - self._asked.get(cue, self._stamps[0]))

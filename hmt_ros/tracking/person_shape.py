@@ -1,0 +1,120 @@
+"""What a person covers in an image, and which pieces of a silhouette may be a person."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.flesh import Mesh
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image.background import BackgroundSettings, one_person
+from hmt_ros.image.texture import coarse_mesh
+from hmt_ros.inference.arrays import Array, Mask
+
+# Height of the raster that areas and colours are taken at, px.
+RASTER = 240
+# A person's silhouette is this long at least, px, and neither a line nor a rectangle: bounds of its
+# area as a fraction of the square of its length, and of its bounding box.
+LEAST_LENGTH = 40
+LEAST_FILLED, MOST_FILLED = 0.04, 0.9
+
+
+class Piece(NamedTuple):
+    """A piece of a silhouette that has the shape of one person.
+
+    Attributes:
+        area: px of the image.
+        cut: whether the left or the right side of the image may cut it.
+    """
+
+    area: float
+    cut: bool
+
+
+def raster_step(height: int) -> int:
+    """How many pixels of an image of this height lie between two of the raster."""
+    return max(round(height / RASTER), 1)
+
+
+def on_raster(image: NDArray[Any], raster: Mask) -> NDArray[Any]:
+    """An image (H, W, ...) at the pixels of a coarser raster (h, w)."""
+    size = raster.shape[::-1]
+    seen = image.view(np.uint8) if image.dtype == np.bool_ else image
+    return np.asarray(cv2.resize(seen, size, interpolation=cv2.INTER_NEAREST)).view(image.dtype)
+
+
+def largest_person(foreground: Mask, step: int = 1) -> Piece | None:
+    """The largest piece of a foreground that has the shape of one person; None: there is none.
+
+    A piece is connected, or it is the largest one with what is near it: clothes in the colours of
+    the room leave holes.
+
+    Args:
+        foreground: (h, w).
+        step: px of the image between two of its pixels.
+    """
+    pixels = foreground.view(np.uint8)
+    count, _, stats, _ = cv2.connectedComponentsWithStats(pixels, connectivity=8)
+    if count < 2:
+        return None
+    whole = one_person(foreground, BackgroundSettings())
+    boxes = [*stats[1:].tolist(), [*cv2.boundingRect(whole.view(np.uint8)), counted(whole)]]
+    alike = [
+        Piece(float(step**2 * area), left == 0 or left + width == foreground.shape[1])
+        for left, _, width, height, area in boxes
+        if _is_person(width, height, area, step)
+    ]
+    return max(alike, default=None)
+
+
+def _is_person(width: int, height: int, area: int, step: int) -> bool:
+    length = max(width, height)
+    return (
+        step * length >= LEAST_LENGTH
+        and area >= LEAST_FILLED * length**2
+        and area <= MOST_FILLED * width * height
+    )
+
+
+def looks_like_person(silhouette: Mask) -> bool:
+    """Whether a silhouette (H, W) has the size and shape of one person."""
+    _, _, width, height = cv2.boundingRect(silhouette.view(np.uint8))
+    return _is_person(width, height, counted(silhouette), 1)
+
+
+def covered(body: Body, camera: Camera, pose: Array, step: int = 1) -> Mask:
+    """Every step-th pixel (H / step, W / step) that a body covers at a pose (d,).
+
+    Each part of the flesh counts as the convex hull of its projected points.
+    """
+    mesh = _mesh(body)
+    points = forward(body.skeleton, pose[None]).points(mesh.segments, mesh.vertices)[:, :, 0]
+    shape = -(-camera.height // step), -(-camera.width // step)
+    limit = 4.0 * max(shape)
+    pixels = camera.project(points) / step
+    usable: Mask = np.all(np.isfinite(pixels), axis=1)
+    pixels = np.clip(np.nan_to_num(pixels), -limit, limit).round().astype(np.int32)
+    mask = np.zeros(shape, dtype=np.uint8)
+    for part in range(len(body.flesh.parts)):
+        here = mesh.parts == part
+        # A part that is partly behind the camera has no hull.
+        if usable[here].all():
+            hull = cv2.convexHull(pixels[here])
+            cv2.fillConvexPoly(mask, hull, 1)
+    return mask.view(np.bool_)
+
+
+def counted(mask: Mask) -> int:
+    """Number of the pixels of a mask."""
+    return cv2.countNonZero(mask.view(np.uint8))
+
+
+@lru_cache(maxsize=8)
+def _mesh(body: Body) -> Mesh:
+    return coarse_mesh(body)

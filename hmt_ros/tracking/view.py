@@ -1,0 +1,41 @@
+"""What an image may show of a person, before a pose is known."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Image, Mask
+
+
+class View(NamedTuple):
+    """What an image may show of a person.
+
+    Attributes:
+        image: (H, W, 3) BGR.
+        silhouette: (H, W) foreground near the person, all false where there is none; None: there is
+            no background.
+        anywhere: (h, w) all of the foreground of the image, on a coarser raster; None: there is no
+            background.
+        changed: share of the pixels that differ from the background.
+        keypoints: of a detector; without any that was seen: it saw nobody. None: it has not
+            answered, or there is none.
+        predicted: whether a predictor expects somebody by this image; None: it has not answered, or
+            there is none.
+        unsure: (H, W) what may be the person or a shadow; None: nothing.
+        others: (H, W) what somebody else covers; None: nothing.
+        depth: (H, W) depth along the axis of the camera, m; None: unknown.
+    """
+
+    image: Image
+    silhouette: Mask | None = None
+    anywhere: Mask | None = None
+    changed: float = 0.0
+    keypoints: Keypoints | None = None
+    predicted: bool | None = None
+    unsure: Mask | None = None
+    others: Mask | None = None
+    depth: NDArray[np.floating] | None = None

@@ -1,0 +1,401 @@
+"""Existence as a probability: the chain, the cues one by one at known poses, and an oracle."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from datetime import datetime, timedelta, timezone
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.error_model import share_of_time
+from hmt_ros.rendering.renderer import render_silhouettes
+from hmt_ros.tracking.existence import (
+    ABSENT,
+    BIRTH,
+    CLEAR,
+    GIVEN,
+    LEAVING,
+    PRESENT,
+    Existence,
+    moved_on,
+    updated,
+)
+from hmt_ros.tracking.view import View
+
+SECOND = 1_000_000_000
+NO_KEYPOINTS = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
+PROBABILITIES = st.floats(0.0, 1.0)
+TIMES = st.floats(0.0, 1e4)
+
+
+# The recursion.
+
+
+@given(PROBABILITIES, TIMES, TIMES)
+def test_where_nothing_is_said_time_can_be_divided_at_will(r, first, second):
+    """Chapman-Kolmogorov."""
+    assert moved_on(moved_on(r, first), second) == pytest.approx(
+        moved_on(r, first + second), abs=1e-12
+    )
+
+
+@pytest.mark.parametrize('dt', [0.03, 1.0, 20.0])
+def test_the_chain_is_the_exponential_of_its_rates(dt):
+    rates = np.array([[-LEAVING, LEAVING], [BIRTH, -BIRTH]])  # somebody, nobody
+    for r in (0.0, 0.3, 1.0):
+        assert moved_on(r, dt) == pytest.approx(([r, 1 - r] @ expm(rates * dt))[0], abs=1e-13)
+
+
+@given(PROBABILITIES, st.lists(st.tuples(TIMES, st.floats(-1e3, 1e3)), max_size=8))
+def test_it_is_always_a_probability(r, steps):
+    for dt, llr in steps:
+        r = updated(moved_on(r, dt), llr)
+        assert 0.0 <= r <= 1.0
+
+
+def test_without_an_image_nobody_is_not_said():
+    """However long it lasts: r stays far above the limit."""
+    for dt in (1.0, 1e3, 1e9):
+        assert moved_on(GIVEN, dt) > 5 * ABSENT
+
+
+def test_against_all_sequences_of_states():
+    """p(somebody | y_1:T) by enumerating 2^T sequences of the hidden Markov chain."""
+    rng = np.random.default_rng(0)
+    steps, start = 8, 0.2
+    times, llrs = rng.uniform(0.05, 3.0, steps), rng.normal(0.0, 2.0, steps)
+    r = start
+    for dt, llr in zip(times, llrs, strict=True):
+        r = updated(moved_on(r, dt), llr)
+    total = dict.fromkeys((False, True), 0.0)
+    for states in itertools.product((False, True), repeat=steps + 1):
+        p = start if states[0] else 1 - start
+        for before, after, dt, llr in zip(states, states[1:], times, llrs, strict=False):
+            there = moved_on(float(before), dt)
+            p *= (there if after else 1 - there) * (math.exp(llr) if after else 1.0)
+        total[states[-1]] += p
+    assert r == pytest.approx(total[True] / (total[True] + total[False]), rel=1e-12)
+
+
+def test_against_the_bernoulli_filter_of_stone_soup():
+    """At a constant rate, with a measurement at the person in some scans only."""
+    pytest.importorskip('stonesoup')
+    from stonesoup.models.measurement.linear import LinearGaussian
+    from stonesoup.predictor.particle import BernoulliParticlePredictor
+    from stonesoup.types.array import StateVectors
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.multihypothesis import MultipleHypothesis
+    from stonesoup.types.prediction import BernoulliParticleStatePrediction
+    from stonesoup.updater.particle import BernoulliParticleUpdater
+
+    dt, detected, clutter = 0.2, 0.9, 0.05
+    predictor = BernoulliParticlePredictor(
+        transition_model=None,
+        birth_probability=moved_on(0.0, dt),
+        survival_probability=moved_on(1.0, dt),
+    )
+    model = LinearGaussian(1, [0], np.array([[1.0]]))
+    updater = BernoulliParticleUpdater(
+        model, clutter_rate=1, clutter_distribution=clutter, detection_probability=detected
+    )
+    ours = theirs = 0.3
+    for step, at in enumerate([0.1, 0.0, 5.0, 50.0, 50.0, -0.3, 1.0, 50.0]):
+        ours = moved_on(ours, dt)
+        theirs = predictor.estimate_existence(theirs)
+        time = datetime(2020, 1, 1, tzinfo=timezone.utc) + timedelta(seconds=step * dt)
+        # The particles lie where the person is.
+        state = BernoulliParticleStatePrediction(
+            StateVectors(np.zeros((1, 4))), log_weight=np.full(4, math.log(0.25)),
+            existence_probability=theirs, timestamp=time,
+        )  # fmt: skip
+        detection = Detection([at], measurement_model=model, timestamp=time)
+        found = updater.update(MultipleHypothesis([SingleHypothesis(state, detection)]))
+        theirs = float(found.existence_probability)
+        density = math.exp(-0.5 * at**2) / math.sqrt(2 * math.pi)
+        ours = updated(ours, math.log(1 - detected + detected * density / clutter))
+        assert ours == pytest.approx(theirs, rel=1e-9)
+        assert 0.01 < ours < 0.999
+
+
+# The cues.
+
+
+@pytest.fixture(scope='module')
+def film(filmed, camera, human32):
+    """Poses, images and silhouettes of a second, and the empty scene."""
+    poses, images, empty = filmed('reach', 1.0, camera)
+    return poses, images, render_silhouettes(human32, poses, camera), empty
+
+
+@pytest.fixture(scope='module')
+def watched(film, human32, camera):
+    """Function (views, rate) -> probabilities, what was seen, the existence that has watched."""
+
+    def watch(views, rate=10.0, pose_of=lambda pose, _: pose, watching=None, first=0):
+        if watching is None:
+            watching = Existence(GIVEN)
+            watching.learn(views[0], round(first * SECOND / rate), human32, camera, film[0][first])
+        found = []
+        for i, view in enumerate(views, first):
+            stamp = round(i * SECOND / rate)
+            watching.look(view, stamp, human32)
+            if watching.seen:
+                pose = pose_of(film[0][i % len(film[0])], i)
+                watching.learn(view, stamp, human32, camera, pose)
+            found.append((watching.probability, watching.seen))
+        return np.array([x for x, _ in found]), [x for _, x in found], watching
+
+    return watch
+
+
+def view_of(image, mask, **fields):
+    return View(image, mask, mask, fields.pop('changed', mask.mean()), **fields)
+
+
+def full_views(film, count=6, **fields):
+    _, images, masks, _ = film
+    return [view_of(images[i % 10], masks[i % 10], **fields) for i in range(count)]
+
+
+def empty_views(film, count, **fields):
+    nothing = np.zeros(film[3].shape[:2], dtype=np.bool_)
+    return [view_of(film[3], nothing, **fields) for _ in range(count)]
+
+
+@pytest.mark.parametrize('rate', [30.0, 10.0, 7.0, 5.0])
+def test_an_empty_scene_ends_it_within_half_a_second(film, watched, rate):
+    found, seen, watching = watched(full_views(film), rate)
+    assert all(seen)
+    assert found.min() > 0.99
+    found, seen, watching = watched(empty_views(film, 20), rate, watching=watching, first=6)
+    assert not any(seen)
+    assert watching.nobody
+    # After the last image of the person, which is one before the first.
+    assert 0.3 <= (1 + np.argmax(found < ABSENT)) / rate <= 0.5
+    # Who comes is there within 0.3 s.
+    found, seen, _ = watched(full_views(film, 10), rate, watching=watching, first=26)
+    assert 0.1 <= np.argmax(found > PRESENT) / rate <= 0.34
+
+
+@pytest.mark.parametrize('rate', [2.7, 1.0])
+def test_at_low_rates_one_image_or_two_suffice(film, watched, rate):
+    _, _, watching = watched(full_views(film), rate)
+    found, *_ = watched(empty_views(film, 2), rate, watching=watching, first=6)
+    assert found[-1] < ABSENT
+    found, *_ = watched(full_views(film, 2), rate, watching=watching, first=8)
+    assert found[-1] > PRESENT
+
+
+@pytest.mark.parametrize('share', [0.36, 0.2])
+def test_clothes_in_the_colours_of_the_room(film, watched, share):
+    """Most of the person is missing in the silhouette, as usual for this one."""
+    rng = np.random.default_rng(0)
+    views = [
+        view_of(view.image, view.silhouette & (rng.random(view.silhouette.shape) < share))
+        for view in full_views(film, 10)
+    ]
+    found, seen, watching = watched(views)
+    assert all(seen)
+    assert found.min() > PRESENT
+    _, seen, _ = watched(empty_views(film, 3), watching=watching, first=10)
+    assert not any(seen)
+
+
+def test_a_wrong_pose_is_not_an_absent_person(film, watched):
+    """The silhouette is as large as usual, beside the model: the track has to search."""
+
+    def aside(pose, i):
+        return pose if i < 6 else pose + 0.9 * (np.arange(len(pose)) == 0)
+
+    found, seen, watching = watched(full_views(film, 7), pose_of=aside)
+    assert not watching.elsewhere
+    found, seen, watching = watched(full_views(film, 4), pose_of=aside, watching=watching, first=7)
+    assert all(seen)
+    assert found.min() > PRESENT
+    assert watching.elsewhere
+    remnant = [
+        view_of(view.image, view.silhouette & (np.arange(240) > 205)[:, None])
+        for view in full_views(film, 3)
+    ]
+    found, *_ = watched(remnant, watching=watching, first=11)
+    assert watching.llr < 0
+
+
+def test_a_part_of_the_person_is_a_person(film, watched):
+    """A table hides the person from the hips down."""
+    _, _, watching = watched(full_views(film, 10))
+    upper = [
+        view_of(view.image, view.silhouette & (np.arange(240) < 130)[:, None])
+        for view in full_views(film, 10)
+    ]
+    found, seen, _ = watched(upper, watching=watching, first=10)
+    assert all(seen)
+    assert found.min() > 0.99
+
+
+@pytest.mark.parametrize('kind', ['black', 'noise', 'white'])
+@pytest.mark.parametrize('background', [True, False])
+def test_images_that_show_nothing_say_nothing(film, watched, kind, background):
+    shape = film[3].shape
+    image = {
+        'black': np.zeros(shape, np.uint8),
+        'white': np.full(shape, 255, np.uint8),
+        'noise': np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8),
+    }[kind]
+    everything = np.ones(shape[:2], dtype=np.bool_)
+    before = full_views(film)
+    view = view_of(image, everything, changed=1.0)
+    if not background:
+        before, view = [View(x.image) for x in before], View(image)
+    _, _, watching = watched(before)
+    r = watching.probability
+    found, *_ = watched([view] * 3, watching=watching, first=6)
+    assert watching.llr == 0.0
+    assert found[-1] == pytest.approx(moved_on(r, 0.3), abs=1e-9)
+
+
+def test_colours_are_asked_where_the_background_is_of_no_use(film, watched):
+    """The camera was pushed: everything is foreground, the person is still there."""
+    _, images, _, empty = film
+    everything = np.ones(empty.shape[:2], dtype=np.bool_)
+    _, _, watching = watched(full_views(film))
+    pushed = [view_of(images[i], everything, changed=1.0) for i in (6, 7)]
+    _, seen, _ = watched(pushed, watching=watching, first=6)
+    assert seen == [True] * 2
+    # There they say nothing against the person.
+    watched([view_of(empty, everything, changed=1.0)] * 3, watching=watching, first=8)
+    assert watching.llr == 0.0
+
+
+def test_colours_decide_where_there_is_no_background(film, watched):
+    """Also for somebody who has moved through the image in a gap."""
+    _, images, _, empty = film
+    found, seen, watching = watched([View(image) for image in images[:8]])
+    assert seen == [True] * 8
+    assert found.min() > PRESENT
+    aside = [View(np.roll(image, 90, axis=1)) for image in images[:5]]
+    found, *_ = watched(
+        aside, watching=watching, first=60,
+        pose_of=lambda pose, _: pose + 90 / 330 * pose[2] * (np.arange(len(pose)) == 0),
+    )  # fmt: skip
+    assert found[-1] > PRESENT
+    found, seen, _ = watched([View(empty)] * 12, watching=watching, first=65)
+    assert not any(seen)
+    assert watching.nobody
+    assert 0.4 < 0.1 * (1 + np.argmax(found < ABSENT)) < 1.5
+
+
+def test_colours_that_are_the_same_everywhere_say_nothing(film, watched):
+    grey = np.full(film[3].shape, 90, np.uint8)
+    _, seen, watching = watched([View(grey)] * 20)
+    assert all(seen)
+    assert watching.llr == 0.0
+
+
+def keypoints(count, confidence, at=(100.0, 100.0)):
+    return Keypoints(
+        tuple(f'joint_{i}' for i in range(count)),
+        np.tile(at, (count, 1)),
+        np.tile(np.eye(2), (count, 1, 1)),
+        np.full(count, confidence),
+    )
+
+
+def test_a_failed_detector_does_not_end_a_track_with_a_silhouette(film, watched):
+    for rate in (30.0, 10.0, 2.7, 1.0):
+        views = full_views(film, 10, keypoints=NO_KEYPOINTS)
+        found, seen, _ = watched(views, rate)
+        assert all(seen)
+        assert found.min() > PRESENT
+
+
+@pytest.mark.parametrize('fields', [{'keypoints': NO_KEYPOINTS}, {'predicted': False}])
+def test_a_detector_alone_can_end_a_track(film, watched, fields):
+    grey = np.full(film[3].shape, 90, np.uint8)
+    for rate in (30.0, 10.0, 5.0):
+        found, seen, watching = watched([View(grey)] * 2, rate)
+        views = [View(grey, **fields)] * 40
+        found, seen, _ = watched(views, rate, watching=watching, first=2)
+        assert not any(seen)
+        assert 0.5 <= (1 + np.argmax(found < ABSENT)) / rate <= 1.1
+
+
+def test_a_detector_that_does_not_answer_says_nothing(film, watched):
+    grey = np.full(film[3].shape, 90, np.uint8)
+    _, _, watching = watched([View(grey), *[View(grey)] * 20])
+    assert watching.llr == 0.0
+
+
+def test_keypoints_far_from_the_model_are_somebody_elsewhere(film, watched):
+    grey = np.full(film[3].shape, 90, np.uint8)
+    _, _, watching = watched([View(grey)] * 2)
+    watched([View(grey, keypoints=keypoints(12, 0.9, (160.0, 120.0)))], watching=watching, first=2)
+    assert not watching.elsewhere
+    watched([View(grey, keypoints=keypoints(12, 0.9, (10.0, 120.0)))], watching=watching, first=3)
+    assert watching.elsewhere
+
+
+@pytest.mark.parametrize('hidden', [0.6, 1.0])
+def test_who_is_hidden_has_not_left(film, watched, hidden):
+    """Somebody else stands before the person; no cue counts, for as long as that lasts."""
+    others = np.zeros(film[3].shape[:2], dtype=np.bool_)
+    _, _, watching = watched(full_views(film))
+    rows = np.flatnonzero(film[2][5].any(1))
+    others[: round(rows[0] + hidden * (rows[-1] - rows[0])) + 1] = True
+    views = empty_views(film, 50, keypoints=NO_KEYPOINTS, others=others)
+    found, *_ = watched(views, watching=watching, first=6)
+    assert watching.hidden
+    assert watching.llr == 0.0
+    assert not watching.nobody
+    assert np.all(np.diff(found) < 0)
+    assert found[-1] > 0.3
+
+
+def test_a_part_that_others_hide_is_not_missed(film, watched):
+    """Some of the model is hidden: the share of the rest counts."""
+    views, others = full_views(film, 10), np.zeros(film[3].shape[:2], dtype=np.bool_)
+    others[:100] = True
+    part = [view_of(view.image, view.silhouette & ~others, others=others) for view in views]
+    found, seen, watching = watched(part)
+    assert all(seen)
+    assert not watching.hidden
+    assert found.min() > 0.99
+
+
+def test_the_first_image_of_somebody_leaves_it_open(film, watched):
+    """A second one shortly after does not."""
+    found, *_ = watched(full_views(film, 3), watching=Existence())
+    assert found[0] == pytest.approx(0.5)
+    assert found[1] > PRESENT
+
+
+def test_a_silhouette_at_the_side_of_the_image_takes_longer(film, watched):
+    times = []
+    for shift in (0, -155):
+        views = []
+        for i in range(12):
+            mask = np.roll(film[2][i % 10], shift, axis=1)
+            mask[:, 250:] = False
+            views.append(view_of(film[1][0], mask))
+        watching = Existence()
+        watched(empty_views(film, 5), watching=watching)
+        stamps = range(5, 17)
+        found = []
+        for i, view in zip(stamps, views, strict=True):
+            watching.look(view, i * SECOND // 10, None)
+            found.append(watching.somebody)
+        times.append(0.1 * np.argmax(found))
+    assert times[0] == pytest.approx(0.3)
+    assert 0.4 <= times[1] <= 0.7
+
+
+def test_llr_has_the_share_of_the_time(film, watched):
+    _, _, watching = watched(full_views(film, 3), 10.0)
+    assert watching.llr == pytest.approx(CLEAR.nats * share_of_time(0.1, CLEAR.tau))

@@ -1,0 +1,85 @@
+"""What a person covers, and which pieces of a silhouette have the shape of one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hmt_ros.rendering.renderer import render_silhouettes
+from hmt_ros.tracking.person_shape import (
+    covered,
+    largest_person,
+    looks_like_person,
+    on_raster,
+    raster_step,
+)
+
+
+@pytest.fixture(scope='module')
+def film(filmed, camera, human32):
+    """Poses and silhouettes of a second."""
+    poses, _, _ = filmed('reach', 1.0, camera)
+    return poses, render_silhouettes(human32, poses, camera)
+
+
+def test_the_model_covers_what_it_shows(film, human32, camera):
+    for pose, mask in zip(film[0][:3], film[1][:3], strict=True):
+        found = covered(human32, camera, pose)
+        assert (found & mask).sum() / (found | mask).sum() > 0.93
+        coarse = covered(human32, camera, pose, 3)
+        assert coarse.shape == (80, 107)
+        assert coarse.mean() == pytest.approx(mask.mean(), rel=0.2)
+
+
+def test_a_body_out_of_the_image_covers_nothing(film, human32, camera):
+    for axis, shift in ((0, 30.0), (2, -30.0)):
+        moved = film[0][0].copy()
+        moved[axis] += shift
+        assert not covered(human32, camera, moved).any()
+
+
+def test_shapes_of_persons(film):
+    masks = film[1]
+    assert all(looks_like_person(mask) for mask in masks)
+    box = np.zeros((240, 320), dtype=np.bool_)
+    assert not looks_like_person(box)
+    box[40:200, 100:200] = True
+    assert not looks_like_person(box)
+    line = np.zeros((240, 320), dtype=np.bool_)
+    line[40:200, 100:103] = True
+    assert not looks_like_person(line)
+    small = np.zeros((240, 320), dtype=np.bool_)
+    small[40:80, 100:140] = masks[0][60:100, 140:180]
+    assert not looks_like_person(small & (np.arange(240) < 70)[:, None])
+
+
+def test_the_largest_piece_is_that_of_a_person(film):
+    """A larger box beside the person is none, whatever is near it."""
+    mask = film[1][0].copy()
+    piece = largest_person(mask)
+    assert piece.area == pytest.approx(mask.sum(), rel=0.02)
+    assert not piece.cut
+    mask[20:230, 0:80] = True
+    assert largest_person(mask).area == pytest.approx(piece.area, rel=0.02)
+    assert largest_person(np.zeros_like(mask)) is None
+    half = mask.copy()
+    half[:, :160] = False
+    cut = largest_person(np.roll(half, -160, axis=1))
+    assert cut is not None
+    assert cut.cut
+
+
+def test_a_person_in_pieces_is_one(film):
+    mask = film[1][0].copy()
+    rows = np.flatnonzero(mask.any(1))
+    mask[rows[len(rows) // 2] - 2 : rows[len(rows) // 2] + 3] = False
+    assert largest_person(mask).area == pytest.approx(mask.sum(), rel=0.02)
+
+
+def test_rasters():
+    assert [raster_step(height) for height in (120, 240, 480, 720)] == [1, 1, 2, 3]
+    mask = np.zeros((480, 640), dtype=np.bool_)
+    mask[:, 320:] = True
+    coarse = on_raster(mask, np.zeros((240, 320), dtype=np.bool_))
+    assert coarse.dtype == np.bool_
+    assert coarse.mean() == 0.5
