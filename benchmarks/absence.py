@@ -165,7 +165,8 @@ def noise_of(clip: Clip) -> float:
 
 def _counted(clip: Clip, settings: TrackerSettings, film: Film) -> dict[str, Any]:
     """Counts of states: of the images of the person, and of the late ones of the empty scene."""
-    body, subject = load_body('human37'), read_subject(clip.subject)
+    body = load_body('human37')
+    subject = read_subject(clip.subject, body)
     assert clip.background is not None
     tracker = Tracker(body, clip.camera, settings, BackgroundModel.from_image(clip.background))
     tracker.reset(subject)

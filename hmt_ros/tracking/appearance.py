@@ -67,7 +67,7 @@ class Appearance:
     def __init__(self) -> None:
         self.colours = Colours()
         self._model: Mask | None = None
-        self._depth = math.nan
+        self._depth = self._magnification = math.nan
         self._share, self._area = MOST, math.nan
         self._stamp = 0
         # Of the last image: foreground on the raster, and the piece of it that is a person.
@@ -120,18 +120,20 @@ class Appearance:
         score = self.colours.score(_coarse(view))
         return None if score is None else float(np.clip(2.0 * score - 1.0, -1.0, 1.0))
 
-    def is_apart(self, view: View) -> bool:
-        """Whether most keypoints of an image lie beside the box around the model."""
+    def is_apart(self, view: View, stamp: int) -> bool:
+        """Whether most keypoints lie beside the box around the model, where a person may have gone.
+
+        What is too far away in so short a time is a mistake of the detector, or somebody else.
+        """
         keypoints = view.keypoints
         if keypoints is None or self._model is None or not keypoints.seen.any():
             return False
         x, y, width, height = cv2.boundingRect(self._model.view(np.uint8))
-        margin = max(width, height) // 4
         pixels = keypoints.pixels[keypoints.seen] / raster_step(len(view.image))
-        low = np.array([x, y]) - margin
-        high = np.array([x + width, y + height]) + margin
-        within = (pixels >= low) & (pixels <= high)
-        return bool(within.all(axis=1).mean() < MOST)
+        low, high = np.array([x, y]), np.array([x + width, y + height])
+        away = np.maximum(low - pixels, pixels - high).max(axis=1)
+        way = SPEED * self.unseen(stamp) * self._magnification
+        return bool(0.25 * max(width, height) < np.median(away) < way)
 
     def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
         """Learns from an image in which the person is at a pose (d,); `silhouetted` came before."""
@@ -139,6 +141,7 @@ class Appearance:
         gain = -math.expm1(-dt / MEMORY)
         self._model = model = covered(body, camera, pose, raster_step(camera.height))
         self._depth, self._stamp = max(float(pose[2]), 0.1), stamp
+        self._magnification = camera.magnification(self._depth) / raster_step(camera.height)
         free = self.open_to_view(view.others)
         if free < MOST:
             return

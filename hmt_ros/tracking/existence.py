@@ -178,7 +178,7 @@ class Existence:
             if value > 0.0:
                 part = 1.0 if suffices(view.keypoints, body) else PART
                 cues['detector'] = part * value, CLEAR
-                apart = apart or self._appearance.is_apart(view)
+                apart = apart or self._appearance.is_apart(view, stamp)
             else:
                 cues['detector'] = value, DOUBTFUL
         if view.predicted is not None and (not view.predicted or view.anywhere is None):

@@ -52,6 +52,7 @@ class StubTracker:
         self.depth = SimpleNamespace(believed=True)
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.track_id, self.started_from = 0, None
+        self.existence_probability = 0.875
         self.log_likelihoods = np.array([-1.5, -2.5])
         self.known_ground = known_ground
         up = np.array([0.0, -1.0, 0.0]) if known_ground.up is None else known_ground.up

@@ -116,6 +116,7 @@ def test_a_lost_track_is_told(session, outputs, small_camera, stub_tracker, monk
     monkeypatch.setattr(stub_tracker, 'step', step)
     one.take(IMAGE, small_camera.image(0))
     assert [content.state for content in mixtures_of(outputs)] == [TrackState.LOST]
+    assert [content.existence_probability for content in mixtures_of(outputs)] == [0.875]
 
 
 def test_a_reset_starts_a_new_track(session, outputs, small_camera):
@@ -337,12 +338,14 @@ def test_nobody_in_view_is_told_once(session, outputs, small_camera, stub_tracke
     for topic, kind in zip(MIXTURES, (MixtureKind.POSTERIOR, MixtureKind.LIKELIHOOD), strict=True):
         content = pose_mixture_of(messages[topic])
         assert (len(content.weights), content.kind, content.frame_id) == (0, kind, 'lens')
+        assert content.existence_probability == 0.875
     removed = {(marker.ns, marker.id): marker.action for marker in messages['markers'].markers}
     modes = {(f'mode_{rank}', key): 2 for rank in range(3) for key in (0, 1)}
     assert removed == {**modes, ('floor', 0): 2, ('contacts', 0): 2}
     state = one.state
     assert (state.status, state.trouble(), state.wants) == ('nobody', 'nobody in view', '')
     assert (state.modes, state.track_id, state.counts['tracked']) == (0, 1, 1)
+    assert dict(state.values())['probability that a person is in view'] == '0.875'
     # The next person is another track of the same body.
     handled = one.take(IMAGE, small_camera.image(3))
     assert [topic for topic, _ in handled.published] == ONE_IMAGE

@@ -129,7 +129,9 @@ def test_a_box_starts_at_the_depth_of_the_person(tall, camera):
     found = {}
     for name, depth in (('with', depths[0]), ('without', None)):
         view = View(images[0], depth=depth)
-        beginning = starts.first(view, 0, model, None, None, lambda: None, masked=False, somebody=True)
+        beginning = starts.first(
+            view, 0, model, None, None, lambda: None, masked=False, somebody=True
+        )
         assert isinstance(beginning.start, GaussianMixture)
         found[name] = np.abs(beginning.start.means[:, 2] - poses[0, 2]).max()
     assert found['with'] < 0.15 < found['without']

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -104,6 +106,27 @@ def test_messages_older_than_the_lengths(
     np.testing.assert_array_equal(back.weights, [0.5, 0.3, 0.2])
     # Written again it is of the present definition.
     assert serialise(deserialise(data[:-8], POSE_MIXTURE, old)) == data
+
+
+def test_probability_of_existence(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
+    """NaN where it is unknown: in older bags, and of publishers that leave the field alone."""
+    content = replace(pose_mixture, state=TrackState.LOST, existence_probability=0.25)
+    message = pose_mixture_message(messages, content)
+    assert pose_mixture_of(message).existence_probability == 0.25
+    assert math.isnan(pose_mixture.existence_probability)
+    unknown = pose_mixture_message(messages, pose_mixture)
+    assert math.isnan(pose_mixture_of(unknown).existence_probability)
+    untouched = replace(pose_mixture, state=TrackState.UNKNOWN, existence_probability=0.0)
+    alone = pose_mixture_message(messages, untouched)
+    assert math.isnan(pose_mixture_of(alone).existence_probability)
+    nobody = replace(pose_mixture, state=TrackState.NOBODY, existence_probability=0.0)
+    assert pose_mixture_of(pose_mixture_message(messages, nobody)).existence_probability == 0.0
+    # Bags carry their own definition: a message of an older one has no such field.
+    kept = {x: getattr(message, x) for x in vars(message) if x != 'existence_probability'}
+    assert math.isnan(pose_mixture_of(SimpleNamespace(**kept)).existence_probability)
+    for wrong in (-0.1, 1.1, math.inf):
+        with pytest.raises(MessageError, match=r'existence_probability must lie in \[0, 1\]'):
+            replace(pose_mixture, existence_probability=wrong)
 
 
 def test_whose_poses_they_are() -> None:
