@@ -30,6 +30,7 @@ EMPTY = 2.0  # s of the empty scene each time
 LATE = 1.0  # s after which it has to be noticed
 GAP, EVERY = 1.0, 4.0  # s
 STAGES = ('film', 'empty')
+Case = dict[str, Any]
 Film = Iterator[tuple[float, NDArray[np.uint8], bool]]
 
 
@@ -195,44 +196,48 @@ def _counted(clip: Clip, settings: TrackerSettings, film: Film) -> dict[str, Any
 
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
-    """Tables of what `measure` has counted."""
+    """Tables of what `measure` has counted, summed over clips and offsets."""
     parts = []
     if 'film' in result:
-        head = [
-            'clip',
-            'rate, Hz',
-            'gaps',
-            'offset',
-            'images',
-            'NOBODY',
-            'LOST',
-            'tracks',
-            'least r',
-        ]
-        rows = [
-            [x['clip'], f'{x["rate"]:g}', 'yes' if x['gaps'] else 'no', f'{x["offset"]:g}']
-            + [str(x[key]) for key in ('images', 'nobody', 'lost', 'tracks')]
-            + [f'{x["least_probability"]:.3f}']
-            for x in result['film']
-        ]
-        parts.append(table([head, *rows], markdown=markdown))
+        head = ['images/s', 'lost seconds', 'images', 'NOBODY', 'LOST', 'new tracks', 'of clips']
+        rows = []
+        for (rate, gaps), cases in _grouped(result['film'], 'rate', 'gaps').items():
+            total = _summed(cases)
+            wrong = sorted({x['clip'] for x in cases if x['nobody']})
+            numbers = [
+                total['images'],
+                total['nobody'],
+                total['lost'],
+                total['tracks'] - len(cases),
+            ]
+            lost = 'every fourth' if gaps else 'none'
+            rows.append([f'{rate:g}', lost, *map(str, numbers), ', '.join(wrong) or '-'])
+        parts.append(table([head, *rows], left=2, markdown=markdown))
     if 'empty' in result:
-        head = [
-            'clip',
-            'rate, Hz',
-            'images',
-            'NOBODY',
-            'LOST',
-            'empty',
-            'not noticed',
-            'tracks',
-        ]
-        keys = ('images', 'nobody', 'lost', 'empty', 'unnoticed', 'tracks')
-        rows = [
-            [x['clip'], f'{x["rate"]:g}', *(str(x[key]) for key in keys)] for x in result['empty']
-        ]
+        head = ['images/s', 'images', 'NOBODY', 'empty images', 'not NOBODY', 'of clips']
+        rows = []
+        for (rate,), cases in _grouped(result['empty'], 'rate').items():
+            total = _summed(cases)
+            wrong = sorted({x['clip'] for x in cases if x['nobody'] or x['unnoticed']})
+            numbers = [total[key] for key in ('images', 'nobody', 'empty', 'unnoticed')]
+            rows.append([f'{rate:g}', *map(str, numbers), ', '.join(wrong) or '-'])
         parts.append(table([head, *rows], markdown=markdown))
     return '\n\n'.join(parts)
+
+
+def _grouped(cases: list[Case], *keys: str) -> dict[tuple[Any, ...], list[Case]]:
+    """Cases by the values of some keys, in their order."""
+    result: dict[tuple[Any, ...], list[Case]] = {}
+    for case in cases:
+        result.setdefault(tuple(case[key] for key in keys), []).append(case)
+    return result
+
+
+def _summed(cases: list[Case]) -> Counter[str]:
+    result = Counter[str]()
+    for case in cases:
+        result.update({key: value for key, value in case.items() if type(value) is int})
+    return result
 
 
 if __name__ == '__main__':

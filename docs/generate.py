@@ -40,6 +40,7 @@ PAGES = {
     'kjs': 'sampling.md',
     'smoothing': 'smoothing.md',
     'experts': 'experts.md',
+    'absence': 'tracking.md',
     'tracking': 'tracking.md',
     'votes': 'tracking.md',
 }

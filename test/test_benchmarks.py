@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import (
+    absence,
     bags,
     contour_noise,
     depth,
@@ -284,8 +285,8 @@ def test_command_line(capsys, tmp_path):
     assert 'tracking' in capsys.readouterr().out
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
-        "benchmarks: no 'flops', wanted one of bags, contour_noise, depth, experts, flips, "
-        'keypoint_noise, kernels, kjs, live, motion_prior, nodes, people, smoothing, soak, '
+        "benchmarks: no 'flops', wanted one of absence, bags, contour_noise, depth, experts, "
+        'flips, keypoint_noise, kernels, kjs, live, motion_prior, nodes, people, smoothing, soak, '
         'tracking, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
@@ -385,3 +386,20 @@ def test_depth_brings_tracks_nearer():
     text = depth.as_text(result, markdown=True)
     assert f'| walk 0 | {entry["without"]["heaviest_mm"]:.0f} -> ' in ' '.join(text.split())
     assert result['speed']['with_ms'] > 0
+
+
+def test_absence_counts_wrong_states():
+    """The person of the clip is seen at every rate, and the empty scene is noticed."""
+    result = absence.measure(ROOT / 'bags', rates=(2.0,), hypotheses=2, quick=True)
+    assert [(x['gaps'], x['offset']) for x in result['film']] == [
+        (False, 0.0), (False, 0.5), (True, 0.0), (True, 0.5),
+    ]  # fmt: skip
+    for case in result['film']:
+        assert case['images'] == (12 if not case['gaps'] else 10)
+        assert (case['nobody'], case['tracks']) == (0, 1)
+    (empty,) = result['empty']
+    assert empty['empty'] == 3 * 2
+    assert (empty['nobody'], empty['unnoticed']) == (0, 0)
+    assert 'not NOBODY' in absence.as_text(result)
+    with pytest.raises(ValueError, match='no clip is called moon'):
+        absence.measure(ROOT / 'bags', ['moon'])

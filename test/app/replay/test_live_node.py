@@ -113,7 +113,7 @@ def test_same_of_a_person_who_leaves_and_returns(tmp_path, capsys):
     entries, period = recorded(3), 10**9 // 15
     images = [(x[1], decode_image(x[2])) for x in entries if x[0] == 'image/compressed']
     empty = cv2.imread(str(REACH / 'background.png'))
-    shown = [*(image for _, image in images), *[empty] * 5, *[images[0][1]] * 5]
+    shown = [*(image for _, image in images), *[empty] * 8, *[images[0][1]] * 8]
     camera = next(x for x in entries if x[0] == 'camera_info')
     stamps = [images[0][0] + i * period for i in range(len(shown))]
     pictures = [
@@ -126,19 +126,19 @@ def test_same_of_a_person_who_leaves_and_returns(tmp_path, capsys):
     (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
     assert one == other
     assert one[0] == 0
-    assert '7 of 13 images tracked' in one[1]
+    assert '12 of 19 images tracked' in one[1]
     for topic in ('pose_mixture', 'likelihood_mixture', 'smoothed_pose_mixture'):
         with BagReader(offline) as bag_out:
             found = [
                 (stamps.index(stored.log_time_ns), len(stored.message.components))
                 for stored in bag_out.messages([topic])
             ]
-        # The person is there in 0 to 2 and from 8 on; who comes is watched for 0.2 s.
-        assert [index for index, _ in found] == [0, 1, 2, 3, 4, 5, 11, 12]
-        assert [index for index, count in found if count == 0] == [5]
+        # The person is there in 0 to 2 and from 11 on; who leaves or comes is watched for a while.
+        assert [index for index, _ in found] == [*range(9), 15, 16, 17, 18]
+        assert [index for index, count in found if count == 0] == [8]
     for topic in ('human_joint_states', '/tf'):
-        assert len(messages(offline, topic)) == 7
-    assert [stamps.index(stamp) for stamp, _ in messages(offline, 'markers')][5] == 5
+        assert len(messages(offline, topic)) == 12
+    assert [stamps.index(stamp) for stamp, _ in messages(offline, 'markers')][8] == 8
     assert content(offline) == content(live)
 
 
