@@ -10,7 +10,6 @@ from typing import Any
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.tracking import filter as filter_module
 from hmt_ros.tracking import observer as observer_module
-from hmt_ros.tracking.facing import Track
 from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals.kinematic_jumps import KinematicJumps
@@ -22,14 +21,15 @@ Stages = Sequence[tuple[Any, str, str]]
 STAGES: Stages = (
     (BackgroundModel, 'split', 'background'),
     (observer_module, 'observe', 'observation'),
-    (Track, 'begin', 'start of the track'),
+    (MixtureFilter, 'begin', 'start of the track'),
     (filter_module, 'follow_flow', 'motion'),
     (KinematicJumps, 'propose', 'combinations'),
     (CovarianceScaledSamples, 'propose', 'samples'),
     (LimbSearch, 'find', 'chain search'),
     (KinematicJumps, '_rate', 'rating'),
     (Posterior, 'minimise', 'candidates'),
-    (MixtureFilter, '_weigh_and_select', 'keeping'),
+    (MixtureFilter, '_weigh', 'keeping'),
+    (MixtureFilter, '_select', 'keeping'),
     (MixtureFilter, '_fit_shape', 'shape'),
     (MixtureFilter, 'likelihood_mixture', 'likelihood modes'),
 )

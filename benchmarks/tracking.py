@@ -66,11 +66,7 @@ USUAL_PARTS = ('accuracy', 'ablations', 'sizes', 'oracle', 'speed')
 PARTS = (*USUAL_PARTS, 'rules')
 SEEDS = (0, 1, 2)
 RATES = (USUAL_RATE,)
-ABLATIONS: tuple[tuple[str, Any], ...] = (
-    *(('max_hypotheses', k) for k in (1, 2, 4, 8, 16)),
-    ('reweighting', 'ancestry'),
-    ('reweighting', 'bhattacharyya'),
-)
+ABLATIONS: tuple[tuple[str, Any], ...] = (*(('max_hypotheses', k) for k in (1, 2, 4, 8, 16)),)
 TIMED = 'walk'  # if it is there
 SIZED = 'signals'  # if it is there
 SIZES = (0.25, 0.5, 1.0)  # of the images

@@ -22,16 +22,16 @@ from benchmarks.tracking_means import difference_entries, grouped, paired
 from benchmarks.tracking_scores import scores_of
 from hmt_ros.tracking import TrackerSettings
 
-FACING, WEIGHTS, CUES, ABSENCE, PROPOSALS = 'facing', 'weights', 'cues', 'absence', 'proposals'
-GROUPS_OF_RULES = (FACING, WEIGHTS, CUES, ABSENCE, PROPOSALS)
+WEIGHTS, CUES, ABSENCE, PROPOSALS = 'weights', 'cues', 'absence', 'proposals'
+GROUPS_OF_RULES = (WEIGHTS, CUES, ABSENCE, PROPOSALS)
 WITH_IMAGES = (IMAGES, BOTH)
 # Scores whose differences are told.
 COMPARED_SCORES = (
     'heaviest_mm', 'expected_mm', 'best_mm', 'blind_mm', 'negative_log_likelihood', 'weights',
     'wrong_way', 'nobody', 'evaluations', 'cpu_ms',
 )  # fmt: skip
-# A time and a number of images that no track reaches.
-NEVER, NO_IMAGE = 1e6, 1_000_000
+# A number of images that no track reaches.
+NO_IMAGE = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,6 @@ SCREEN = Plan((0, 1), (30.0, 3.0))
 DECIDE = Plan((0, 1, 2, 3, 4), (30.0, 8.0, 3.0))
 
 RULES = (
-    Rule('reversals', FACING, (('reversal_probability', 0.0),)),
-    Rule('facing_trial', FACING, (('facing_trial', 0.0),)),
-    Rule('facing_odds', FACING, (('facing_gain', 0.0),)),
-    Rule('kept_ambiguities', FACING, (('reach', 0.0),)),
-    Rule('error_correlation', WEIGHTS, (('error_correlation', 0.0),)),
-    Rule('trust', WEIGHTS, (('trust', 1.0),)),
-    Rule('exploration', WEIGHTS, (('exploration', 1.0),)),
-    Rule('ancestry', WEIGHTS, (('reweighting', 'bhattacharyya'),)),
     Rule('least_weight', WEIGHTS, (('least_log_weight', -1000.0),)),
     Rule('merging', WEIGHTS, (('hypothesis_merge_distance', 0.0),)),
     Rule('heavy_tails', WEIGHTS, (('tails', 1000.0),)),
@@ -89,11 +81,8 @@ RULES = (
     Rule('contact', CUES, (('ground.contact_weight', 0.0),)),
     Rule('shape', CUES, (('shape_images', 0),)),
     Rule('later_shape', CUES, (('shape_interval', 0),)),
-    Rule('end_of_track', ABSENCE, (('absence_time', NEVER),)),
     Rule('restarts', ABSENCE, (('lost_images', NO_IMAGE),)),
     Rule('limb_search', PROPOSALS, (('searched_chains', 0),)),
-    Rule('rounds', PROPOSALS, (('rounds', 1),)),
-    Rule('flips', PROPOSALS, (('jump_probability', 1e-9),)),
     Rule('alternatives', PROPOSALS, (('alternatives', 1),)),
     Rule('kinematic_jumps', PROPOSALS, (('proposals', 'css'),)),
 )

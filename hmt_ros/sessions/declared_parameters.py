@@ -47,6 +47,12 @@ LONGEST_TIMEOUT = 60.0  # s
 # Parameters that nodes had before, and what is there instead.
 REMOVED = {
     'absence_time': 'existence is a probability with rates per second: see existence_probability',
+    'reweighting': 'the weight of a mode follows from all pairs of modes (docs/tracking.md)',
+    'jump_probability': 'a jump costs what its distance does in the time between two images',
+    'prediction_probability': 'predictions are proposals, and weigh as any other hypothesis',
+    'facing_trial': 'one filter follows both ways to face for as long as they are open',
+    'trust': 'how far images are believed is a table: hmt_ros/inference/error_model.py',
+    'error_correlation': 'errors last for a time in s: hmt_ros/inference/error_model.py',
 }
 
 # Metadata of a field that is one parameter or holds several.

@@ -15,7 +15,7 @@ After a track has ended the next one starts in the same way; then a silhouette s
 
 Keypoints give poses, depth and lengths (see `initialisation`); a mask or a box gives mean poses of
 several headings. A detector may take left for right, and silhouettes do not tell sides at all: with
-every pose comes its reversal in depth, and both ways to face are followed (see `facing`).
+every pose comes its reversal in depth, and both ways to face are followed (see `classes`).
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ FROM_JOINTS = (Source.SUBJECT, Source.KEYPOINTS)
 
 @dataclass(frozen=True, eq=False)
 class Beginning:
-    """What `Track.begin` is given of a start; see there.
+    """What `MixtureFilter.begin` is given of a start; see there.
 
     Attributes:
         source: what it comes from.
@@ -82,7 +82,6 @@ class Beginning:
     source: Source
     body: Body
     start: GaussianMixture | Array
-    both_ways: bool
     clicked: Keypoints | None = None
 
     @property
@@ -177,11 +176,9 @@ def beginning_given(
         depths: of the image that a subject's joints were seen in; None: unknown.
     """
     if isinstance(start, GaussianMixture):
-        return Beginning(Source.MIXTURE, body, start, both_ways=False)
+        return Beginning(Source.MIXTURE, body, start)
     begun = start_from_keypoints(model, camera, start, upright=upright, depths=depths)
-    return Beginning(
-        Source.SUBJECT, begun.body, begun.poses, both_ways=False, clicked=start.keypoints
-    )
+    return Beginning(Source.SUBJECT, begun.body, begun.poses, clicked=start.keypoints)
 
 
 def beginning_seen(
@@ -220,18 +217,18 @@ def beginning_seen(
         if prediction is not None:
             predicted = prediction.seen_as(begun.body).means
             poses.append(moved_to_depth(begun.body, camera, predicted, depths))
-        return Beginning(Source.KEYPOINTS, begun.body, np.concatenate(poses), both_ways=True)
+        return Beginning(Source.KEYPOINTS, begun.body, np.concatenate(poses))
     if prediction is not None:
         both = _mixture_at(prediction.both_ways(prediction.body), prediction.body, camera, depths)
-        return Beginning(Source.PREDICTION, prediction.body, both, both_ways=view.keypoints is None)
+        return Beginning(Source.PREDICTION, prediction.body, both)
     if box is not None:
         start = _mixture_at(mixture_from_box(model, camera, box), model, camera, depths)
-        return Beginning(Source.BOX, model, start, both_ways=True)
+        return Beginning(Source.BOX, model, start)
     outline = observed().outline
     if outline is None:
         return None
     outlined = moved_to_depth(model, camera, poses_from_outline(model, camera, outline), depths)
-    return Beginning(Source.MASK, model, outlined, both_ways=True)
+    return Beginning(Source.MASK, model, outlined)
 
 
 def _mixture_at(

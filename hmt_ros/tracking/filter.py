@@ -3,29 +3,29 @@
 predict     x_k | ancestor       motion prior, optical flow                       prediction
 propose     x_k^0                jumps, samples, predictions of others            proposals
 optimise    x_k = argmin E(x)    bounded Newton from x_k^0                        optimisation
-weigh       log w_k = log p(ancestor) + log p(jumps) - beta E(x_k)                weighting
+weigh       log w_k = log sum_j w_j p(x_k | x_j) - sum_g a_g E_g(x_k)             weighting
 select      K of N hypotheses    the least expected distance to one that is kept  selection
 """
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
+from hmt_ros.body.mirror import faces_back
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.bounded_newton import Minimum
+from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.ambiguities import ambiguity_classes
 from hmt_ros.tracking.camera_motion import CameraMotion
+from hmt_ros.tracking.classes import Facing
 from hmt_ros.tracking.contact import FootContacts
-from hmt_ros.tracking.facing_odds import FacingOdds
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import (
     Hypotheses,
@@ -38,26 +38,17 @@ from hmt_ros.tracking.hypotheses import (
 from hmt_ros.tracking.laplace_approximation import likelihood_modes, posterior_modes
 from hmt_ros.tracking.loss import unexplained_share
 from hmt_ros.tracking.motion_states import PredictedStates
-from hmt_ros.tracking.optimisation import Search, UsualEnergy
-from hmt_ros.tracking.posterior import Posterior, free_covariances
+from hmt_ros.tracking.optimisation import Search
+from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.prediction import dynamics_of, follow_flow, predict
-from hmt_ros.tracking.proposals import PROPOSALS, PredictedPoses, Proposal
-from hmt_ros.tracking.proposals.headings import Headings
+from hmt_ros.tracking.proposals import PROPOSALS, PosePrediction, PredictedPoses, Proposal
 from hmt_ros.tracking.proposals.reversals import Reversals
 from hmt_ros.tracking.reliability import SilhouetteRecall
-from hmt_ros.tracking.selection import choose_hypotheses, heads_of_classes
+from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
-from hmt_ros.tracking.weighting import (
-    at_least,
-    inherited_log_weights,
-    lasting_errors,
-    normalised,
-    weigh,
-)
+from hmt_ros.tracking.weighting import Continuity, at_least, normalised
 
-# Number of images from one reversal that is proposed to the next.
-REVERSED_EVERY = 3
 # How often the shape is fitted to the first image.
 FIRST_FITS = 3
 # Number of the heaviest modes that the shape is estimated from.
@@ -81,8 +72,6 @@ class MixtureFilter:
         shape: the estimate of them.
         misfit: share of the last image that no mode explains.
         recall: how far silhouettes are believed.
-        log_evidence: sum over images of -beta times the least energy, for comparison with another
-            filter of the same images.
     """
 
     def __init__(
@@ -98,22 +87,20 @@ class MixtureFilter:
         self.camera = camera
         self.settings = settings
         self.misfit = 0.0
-        self.log_evidence = 0.0
-        self._seed = seed
         self._rng = np.random.default_rng(seed)
         self._modes: Modes | None = None
         self._identities = Identities()
         self.shape = ShapeEstimate(body)
         self.recall = SilhouetteRecall(len(body.skeleton.parents))
         self._observed: tuple[Observation, Observation] | None = None
-        self._usual = UsualEnergy(settings.energy_rise)
         self._outline_costs = np.empty((0, 0))
         self._bad_images = 0
         self._images = 0
+        self._dt = np.inf
         self._shape_age = 0.0
-        self._facing = FacingOdds()
         self._posterior = Posterior(body, camera, settings, extra, ground)
         self.contacts = FootContacts()
+        self._facing = Facing()
         self._proposal = PROPOSALS[settings.proposals](self._posterior)
 
     @property
@@ -137,11 +124,6 @@ class MixtureFilter:
         return self._modes
 
     @property
-    def beta(self) -> float:
-        """Factor on the energies in the weights; see `trust`."""
-        return self._posterior.trust.inverse_temperature
-
-    @property
     def dynamics(self) -> LinearGaussianDynamics:
         """How modes move by themselves."""
         return dynamics_of(self.body, self.settings.motion)
@@ -161,68 +143,68 @@ class MixtureFilter:
     def begin(
         self,
         body: Body,
-        poses: Array,
-        log_weights: Array,
-        precisions: Array,
+        start: GaussianMixture | Array,
         observation: Observation,
-    ) -> Minimum:
-        """Starts from expected poses (N, d); returns the minimum that each of them led to.
+        clicked: Keypoints | None = None,
+    ) -> None:
+        """Starts a track.
 
         Args:
             body: of the person; its shape is estimated.
-            poses: (N, d).
-            log_weights: (N,).
-            precisions: (N, d, d) of the poses.
+            start: expected poses, or poses (N, d) that all count the same.
             observation: of the first image.
+            clicked: keypoints that the start is fitted to, in place of those of the image.
         """
+        self.evaluations = 0
+        if isinstance(start, GaussianMixture):
+            poses = start.means
+            with np.errstate(divide='ignore'):
+                log_weights = np.log(start.normalised().weights)
+            precisions = np.asarray(np.linalg.inv(start.covariances), dtype=np.float64)
+        else:
+            poses, log_weights = start, np.zeros(len(start))
+            precisions = np.zeros((len(poses), body.dimension, body.dimension))
+        seen = observation if clicked is None else replace(observation, keypoints=clicked)
         self._use_body(body)
         self.shape = ShapeEstimate(body)
 
-        def settle(starts: Array, iterations: int) -> Minimum:
+        def settle(starts: Array, iterations: int) -> Array:
             self._identities.restart()
-            term = self._posterior.around(observation, poses, precisions)
+            term = self._posterior.around(seen, poses, precisions)
             solved = self._posterior.minimise(term, starts, iterations)
-            self.hold(solved, log_weights, observation)
-            return solved
+            self._hold(Optimised(new_hypotheses(solved.x, log_weights), solved), seen)
+            return solved.x
 
-        solved = settle(poses, 3 * self.settings.iterations)
+        found = settle(poses, 3 * self.settings.iterations)
         for _ in range(FIRST_FITS):
-            if not self._fit_shape(observation, self.settings.trust / FIRST_FITS):
+            if not self._fit_shape(seen, ERRORS['image'].independent / FIRST_FITS):
                 break
-            solved = settle(solved.x, self.settings.iterations)
-        self._learn_recall(observation)
-        return solved
+            found = settle(found, self.settings.iterations)
+        self._learn_recall(seen)
+        self.assess(observation)
 
-    def begin_anew(self, poses: Array, observation: Observation) -> Minimum:
-        """Starts from an image and poses (N, d) to search from; returns the minima."""
+    def begin_anew(self, poses: Array, observation: Observation) -> None:
+        """Starts from an image, the present modes and poses (N, d) to search from."""
+        self.evaluations = 0
+        poses = np.concatenate([self.modes.poses, poses])
         term = self._posterior.of_image(observation)
         solved = self._posterior.minimise(term, poses, 3 * self.settings.iterations)
-        self.hold(solved, np.zeros(len(poses)), observation)
+        self._hold(Optimised(new_hypotheses(solved.x, np.zeros(len(poses))), solved), observation)
         self._bad_images = 0
-        return solved
+        self.assess(observation)
 
-    def hold(self, solved: Minimum, log_weights: Array, observation: Observation) -> None:
-        """Makes modes at rest from minima and their log prior weights (N,)."""
-        optimised = Optimised(new_hypotheses(solved.x, log_weights), solved)
+    def _hold(self, optimised: Optimised, observation: Observation) -> None:
+        """Makes modes at rest."""
         self._posterior.stance = None
         self._posterior.exchanges.forget()
-        least = self._weigh_and_select(optimised, None, observation)
-        self._stand(None)
-        self.log_evidence = -self.beta * least
-
-    def twin(self) -> MixtureFilter:
-        """Another filter of the same person, without modes, with random numbers of its own."""
-        extra, ground = self._posterior.extra, self._posterior.ground
-        other = MixtureFilter(self.body, self.camera, self.settings, self._seed + 1, extra, ground)
-        other.shape = deepcopy(self.shape)
-        other._identities = self._identities
-        return other
-
-    def absorb(self, modes: Modes, observation: Observation) -> None:
-        """Takes over modes; their textures are taken from the image anew."""
-        textures = self._posterior.textures(modes.poses, observation)
-        self._modes = replace(modes, textures=textures, texture_rows=np.arange(len(modes)))
-        self._posterior.exchanges.forget()
+        self._dt = np.inf
+        optimised = _finite(optimised)
+        log_weights = optimised.hypotheses.log_weights
+        log_weights = log_weights - ERRORS['image'].independent * optimised.minima.value
+        rows = self._distinct(optimised, log_weights)
+        optimised, log_weights = optimised[rows], log_weights[rows]
+        self._facing.start(self.body, optimised.minima.x, log_weights)
+        self._select(optimised, log_weights, None, observation)
         self._stand(None)
 
     # One image after another.
@@ -230,12 +212,12 @@ class MixtureFilter:
     def carry(self, motion: CameraMotion) -> None:
         """Takes everything that has a place into the camera frame of the next image."""
         self._modes = motion.modes(self.body, self.modes)
-        self._facing.carry(self.body, motion)
+        self._facing.carry(self.body, self._modes.poses)
         self.contacts.carry(motion)
         self._posterior.stance = self.contacts.stance
 
     def propagate(
-        self, observation: Observation, dt: float, expected: GaussianMixture | None
+        self, observation: Observation, dt: float, expected: PosePrediction | None
     ) -> None:
         """Moves the mixture on to the next image.
 
@@ -245,55 +227,37 @@ class MixtureFilter:
             expected: pose hypotheses from an external predictor, if any.
         """
         s, modes, posterior = self.settings, self.modes, self._posterior
-        observation = self._believed(observation)
+        self.evaluations = 0
+        self._dt = dt
+        seen = self._believed(observation)
         posterior.exchanges.predict(dt)
         predicted, states = predict(modes, self.body, self.dynamics, dt)
-        covariances, searched = states.pose_covariances, states.searched
-        precisions = np.asarray(np.linalg.inv(covariances), dtype=np.float64)
-        beta = self.beta
-        predicted = follow_flow(predicted, precisions, observation, posterior)
+        precisions = np.asarray(np.linalg.inv(states.pose_covariances), dtype=np.float64)
+        continuity = Continuity(self.body, predicted.poses, modes.log_weights, dt)
+        predicted = follow_flow(predicted, precisions, seen, posterior)
         base = posterior.minimise(
-            posterior.given(observation, predicted, precisions), predicted.poses, s.base_iterations
+            posterior.given(seen, predicted, precisions), predicted.poses, s.base_iterations
         )
+        search = Search(posterior, seen, states, precisions, continuity)
         proposals: list[Proposal] = [self._proposal]
-        self._images += 1
-        if s.reversal_probability > 0:
-            if self._images % REVERSED_EVERY == 0:
-                proposals.insert(0, Reversals(posterior, s.reversal_probability))
-            if base.value.min() > self._usual.value + 2.0 * s.energy_rise:
-                proposals.insert(0, Headings(posterior, 1e-3))
+        if not self._facing.back.any():
+            proposals.insert(0, Reversals())
         if expected is not None:
-            elsewhere = PredictedPoses(self.body, expected, s.prediction_probability)
-            proposals.insert(0, elsewhere)
-        candidates, *others = (
-            x.propose(base, predicted, searched, observation, self._rng) for x in proposals
-        )
+            proposals.insert(0, PredictedPoses(self.body, expected.seen_as(self.body)))
+        candidates, *others = (x.propose(search, base, predicted, self._rng) for x in proposals)
         for more in others:
             candidates = candidates.joined(more)
-        search = Search(posterior, observation, states, precisions)
-        optimised = search.optimise(candidates)
-        if self._proposal.iterated:
-            optimised = search.search_again(optimised, self._proposal, self._usual.value, self._rng)
-        self._usual.update(float(optimised.minima.value.min()))
-        hypotheses, solved = optimised.hypotheses, optimised.minima
-        before = None
-        if s.reweighting == 'bhattacharyya':
-            hypotheses = replace(hypotheses, log_weights=np.zeros(len(hypotheses)))
-            before = GaussianMixture(np.exp(modes.log_weights), predicted.poses, covariances)
-        least = self._weigh_and_select(
-            Optimised(hypotheses, solved), states, observation, before,
-            modes.energies - modes.energies.min(),
-        )  # fmt: skip
-        # Of the error of an energy only what is new counts.
-        self.log_evidence -= beta * (least - s.error_correlation * float(modes.energies.min()))
-        posterior.trust.update(least)
+        optimised, log_weights = self._weigh(search, search.optimise(candidates))
+        self._select(optimised, log_weights, states, seen)
         self._stand(dt)
+        self._images += 1
         self._shape_age += dt
         if self._images < s.shape_images or (
             s.shape_interval > 0 and self._images % s.shape_interval == 0
         ):
-            self._fit_shape(observation, s.trust)
-        self._learn_recall(observation)
+            self._fit_shape(seen, ERRORS['image'].independent)
+        self._learn_recall(seen)
+        self.assess(observation)
 
     def assess(self, observation: Observation) -> None:
         """Takes in how much of an image no mode explains, and whether the track is lost."""
@@ -303,75 +267,91 @@ class MixtureFilter:
         )  # fmt: skip
         self._bad_images = self._bad_images + 1 if self.misfit > self.settings.lost_misfit else 0
 
-    def likelihood_mixture(
-        self, modes: Modes, observation: Observation
-    ) -> tuple[GaussianMixture, Array]:
+    def likelihood_mixture(self, observation: Observation) -> tuple[GaussianMixture, Array]:
         """See `likelihood_modes`."""
-        return likelihood_modes(modes, self._posterior, self._believed(observation))
+        seen = self._believed(observation)
+        return likelihood_modes(self.modes, self._posterior, seen, self._dt)
 
     # The steps.
 
-    def _weigh_and_select(
+    def _distinct(self, optimised: Optimised, log_weights: Array) -> Index:
+        """Hypotheses that have come to optima of their own; see `distinct_hypotheses`."""
+        joints = relative_joints(self.body, optimised.minima.x)
+        return distinct_hypotheses(joints, log_weights, self.settings.hypothesis_merge_distance)
+
+    def _weigh(self, search: Search, optimised: Optimised) -> tuple[Optimised, Array]:
+        """Hypotheses that are distinct, and their log weights."""
+        optimised = _finite(optimised)
+        evidence = search.evidence(optimised)
+        # Of those that meet, one that has moved there is kept before one that has jumped.
+        followed = np.asarray(~optimised.hypotheses.jumped.any(1))
+        order = np.lexsort((evidence, ~followed))
+        optimised, evidence = optimised[order], evidence[order]
+        rows = self._distinct(optimised, -np.arange(len(order), dtype=np.float64))
+        optimised, evidence = optimised[rows], evidence[rows]
+        poses = optimised.minima.x
+        log_weights = self._facing.weigh(
+            self.body,
+            poses,
+            search.continuity.log_transitions(poses),
+            search.continuity.log_priors(poses) - evidence,
+            evidence,
+            np.asarray(~optimised.hypotheses.jumped.all(1)),
+            search.dt,
+        )
+        return optimised, log_weights
+
+    def _select(
         self,
         optimised: Optimised,
+        log_weights: Array,
         states: PredictedStates | None,
         observation: Observation,
-        before: GaussianMixture | None = None,
-        excess: Array | None = None,
-    ) -> float:
-        """Makes the modes of this image; returns the least energy.
+    ) -> None:
+        """Makes the modes of this image.
 
         Args:
             optimised: hypotheses at their optima.
+            log_weights: (N,) of the hypotheses.
             states: of the ancestors, predicted; None: the modes begin.
             observation: of the image.
-            before: the prediction that modes inherit their weights from; None: from ancestors.
-            excess: (K,) of the ancestors' energies over the least in the image before.
         """
         s = self.settings
-        optimised = optimised[np.flatnonzero(np.isfinite(optimised.minima.value))]
-        h, solved = optimised.hypotheses, optimised.minima
-        if len(h) == 0:
-            raise ValueError('no hypothesis has a finite energy')
-        log_weights = weigh(h.log_weights, solved.value, self.beta)
-        if excess is not None:
-            log_weights += lasting_errors(
-                solved.value, excess[h.ancestors], self.beta, s.error_correlation
-            )
-        if before is None and self.body.trunk_pairs:
-            followed = np.asarray(~h.jumped.all(1), dtype=np.bool_)
-            gamma = s.facing_gain * self.beta
-            log_weights = self._facing.weigh(
-                self.body, solved.x, solved.value, log_weights, followed, gamma
-            )
-        classes = ambiguity_classes(self.body, solved.x, solved.x[np.argmax(log_weights)])
+        poses = optimised.minima.x
+        joints = relative_joints(self.body, poses)
         kept = choose_hypotheses(
-            relative_joints(self.body, solved.x),
+            joints,
             log_weights,
             s.max_hypotheses,
             same=s.hypothesis_merge_distance,
-            first=heads_of_classes(classes, log_weights, s.reach, s.max_hypotheses // 2),
+            first=self._best_of_the_other_way(poses, log_weights),
         )
-        rows, weights = kept.chosen, normalised(kept.log_weights)
-        if before is not None:
-            covariances = free_covariances(solved.hessian[rows], solved.free[rows])
-            order = np.argsort(-weights, kind='stable')
-            weights = normalised(
-                weights + inherited_log_weights(solved.x[rows], covariances, order, before)
-            )
-        weights = at_least(weights, s.least_log_weight)
+        weights = at_least(normalised(kept.log_weights), s.least_log_weight)
         order = np.argsort(-weights, kind='stable')
-        selected, posterior = optimised[rows[order]], self._posterior
+        selected, posterior = optimised[kept.chosen[order]], self._posterior
         self._modes = modes = posterior_modes(
             selected, weights[order], posterior, observation, self.shape, self.dynamics, states,
-            self._identities_of(selected.hypotheses, anew=states is None),
+            self._identities_of(selected.hypotheses, anew=states is None), self._dt,
         )  # fmt: skip
         posterior.exchanges.update(
             posterior.likelihood, observation, modes.poses,
             posterior.exchanges_of(selected.hypotheses),
         )  # fmt: skip
         self._outline_costs = posterior.fit(modes.poses, observation).outline_costs
-        return float(solved.value.min())
+        self._facing.lead(self.body, modes.poses)
+
+    def _best_of_the_other_way(self, poses: Array, log_weights: Array) -> list[int]:
+        """The heaviest of poses (N, d) that faces the other way than the heaviest of all, if any.
+
+        It is kept as long as its way has any mass: small steps do not lead back to it.
+        """
+        if not self.body.trunk_pairs:
+            return []
+        best = int(np.argmax(log_weights))
+        back = np.flatnonzero(faces_back(self.body, poses, poses[best]))
+        least = log_weights[best] + self.settings.least_log_weight
+        back = back[log_weights[back] >= least]
+        return [int(back[np.argmax(log_weights[back])])] if len(back) else []
 
     def _identities_of(self, selected: Hypotheses, *, anew: bool) -> Index:
         """Identities of hypotheses that become modes, heaviest first."""
@@ -433,7 +413,18 @@ class MixtureFilter:
         before = self._posterior
         self._posterior = Posterior(body, self.camera, self.settings, before.extra, before.ground)
         self._posterior.evaluations = before.evaluations
-        self._posterior.trust = before.trust
         self._posterior.stance = before.stance
         self._posterior.exchanges = before.exchanges
         self._proposal = PROPOSALS[self.settings.proposals](self._posterior)
+
+
+def _finite(optimised: Optimised) -> Optimised:
+    """Hypotheses of finite energy.
+
+    Raises:
+        ValueError: there is none.
+    """
+    usable = np.flatnonzero(np.isfinite(optimised.minima.value))
+    if len(usable) == 0:
+        raise ValueError('no hypothesis has a finite energy')
+    return optimised[usable]

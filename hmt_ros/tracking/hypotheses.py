@@ -2,8 +2,8 @@
 
     predict -> propose -> optimise -> weigh -> select
 
-A hypothesis is born with a prior: its ancestor, its jumps, and where it is expected. It gets a pose
-that is locally optimal and a weight; if it is selected it is a mode, with covariances and texture.
+A hypothesis is born with an ancestor, jumps, and a pose where it is expected. It gets a pose that
+is locally optimal and a weight; if it is selected it is a mode, with covariances and texture.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Hypotheses:
 
     Attributes:
         poses: (N, d).
-        log_weights: (N,) log prior probabilities; of modes log posterior probabilities.
+        log_weights: (N,) of the ancestors; of modes log posterior probabilities.
         ancestors: (N,) mode of the image before that each comes from.
         expected: (N, d) pose that the motion prior is centred at.
         jumped: (N, d) degrees of freedom that did not move there, but jumped.
@@ -111,15 +111,10 @@ class Modes(Hypotheses):
     state_covariances: Array
     identities: Index
 
-    def mixture(self, share: float) -> GaussianMixture:
-        """The modes as a mixture over poses.
-
-        Args:
-            share: of the evidence that is believed; see `trust`. The log weights of an image are
-                nearly those of the next, and so are their errors.
-        """
-        log_weights = share * self.log_weights
-        weights = np.exp(log_weights - np.logaddexp.reduce(log_weights))
+    @property
+    def mixture(self) -> GaussianMixture:
+        """The modes as a mixture over poses."""
+        weights = np.exp(self.log_weights - np.logaddexp.reduce(self.log_weights))
         return GaussianMixture(weights, self.poses, self.covariances)
 
 

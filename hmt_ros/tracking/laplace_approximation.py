@@ -1,12 +1,13 @@
 """Gaussians around optima: the modes of the posterior, and those of the likelihood alone.
 
     filtered     H^-1                                      as if errors did not last
-    covariance   (H_other + information H_image)^-1 + J P J'
+    covariance   (H_prior + sum_g a_g(dt) H_g)^-1 + J P J'                 g: image, keypoints
     state        N(pose, velocity) conditioned on where the pose was found; see `motion_states`
 
-H is the Gauss-Newton Hessian of the energy at an optimum. Errors of images last, so of H_image only
-the share `information` is believed (`trust`), and what is not known of the shape is not known of
-the pose: J P J' (`shape_estimation`). A variable that rests on its limit hardly varies.
+H is the Gauss-Newton Hessian of the energy at an optimum, H_prior that of body and ground, without
+the motion prior. Errors last, so only the share a_g of a cue is believed (`inference.error_model`),
+and what is not known of the shape is not known of the pose: J P J' (`shape_estimation`). A variable
+that rests on its limit hardly varies.
 """
 
 from __future__ import annotations
@@ -16,13 +17,14 @@ import numpy as np
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import resting
+from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.hypotheses import Modes, Optimised
 from hmt_ros.tracking.motion_states import PredictedStates, fused
 from hmt_ros.tracking.posterior import Posterior, free_covariances
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
-from hmt_ros.tracking.weighting import normalised, weigh
+from hmt_ros.tracking.weighting import normalised
 
 
 def posterior_modes(
@@ -34,6 +36,7 @@ def posterior_modes(
     dynamics: LinearGaussianDynamics,
     states: PredictedStates | None,
     identities: Index,
+    dt: float,
 ) -> Modes:
     """The modes of the posterior.
 
@@ -46,18 +49,16 @@ def posterior_modes(
         dynamics: how modes move by themselves.
         states: of the ancestors, predicted; None: the modes begin, at rest.
         identities: (K,) of the modes.
+        dt: time since the image before, s; infinite: there is none.
     """
     h, solved = selected.hypotheses, selected.minima
     poses = solved.x
     filtered = free_covariances(solved.hessian, solved.free)
     fit = posterior.fit(poses, observation)
     covariances = alone = filtered
-    images = bool(observation.evidence)
-    measured = images or observation.keypoints is not None
+    measured = bool(observation.evidence) or observation.keypoints is not None
     if measured:
-        # In the first image no error of keypoints has lasted yet: their noise holds all of it.
-        if images or states is not None:
-            alone = posterior.covariances(fit, solved.free, keypoints_alone=not images)
+        alone = posterior.covariances(fit, solved.free, dt)
         covariances = alone + shape.considered(
             posterior.likelihood, observation, poses, posterior.given_way(poses, observation)[1]
         )
@@ -89,7 +90,7 @@ def posterior_modes(
 
 
 def likelihood_modes(
-    modes: Modes, posterior: Posterior, observation: Observation
+    modes: Modes, posterior: Posterior, observation: Observation, dt: float
 ) -> tuple[GaussianMixture, Array]:
     """The modes of the likelihood alone, without what was known from the images before.
 
@@ -100,6 +101,7 @@ def likelihood_modes(
         modes: of the posterior, K.
         posterior: of the image.
         observation: of the image.
+        dt: time since the image before, s; infinite: there is none.
 
     Returns:
         The mixture, heaviest component first, and the log likelihoods (K,) of the image at its
@@ -114,10 +116,8 @@ def likelihood_modes(
     limit = 3.0 * np.sqrt(np.einsum('kii->ki', modes.covariances))
     step = np.clip(step, -limit, limit)
     means = np.clip(poses + step, body.lower, body.upper)
-    if observation.evidence:
-        covariances = posterior.covariances(fit, free, keypoints_alone=False)
-    nothing = np.zeros(len(poses))
-    beta = posterior.trust.inverse_temperature
-    weights = np.exp(normalised(weigh(nothing, fit.energy.value, beta)))
+    if observation.evidence or observation.keypoints is not None:
+        covariances = posterior.covariances(fit, free, dt)
+    weights = np.exp(normalised(-ERRORS['image'].share(dt) * fit.energy.value))
     mixture = GaussianMixture(weights, means, covariances).sorted()
     return mixture, posterior.log_likelihoods(mixture.means, observation)

@@ -10,6 +10,7 @@ the user of a tracker adds.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -35,19 +36,15 @@ from hmt_ros.inference.energy import (
     Sum,
     add_energies,
 )
+from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking.exchanges import SideExchanges
 from hmt_ros.tracking.hypotheses import Hypotheses
-from hmt_ros.tracking.trust import Trust
 
 if TYPE_CHECKING:
     from hmt_ros.tracking.ground import GroundEstimator
     from hmt_ros.tracking.settings import TrackerSettings
 
 
-# Share of the curvature of keypoints that is believed where there is nothing else: errors of the
-# same landmark correlate by 0.86 from image to image, and n such images hold the information of
-# n (1 - 0.86) / (1 + 0.86) independent ones (see `trust`).
-KEYPOINT_SHARE = 0.075
 # Largest standard deviation of a mode: where an image shows nothing, rad or m.
 WIDEST = 2.0
 # Standard deviation of a variable that rests on its limit, rad or m: 3 degrees.
@@ -85,7 +82,6 @@ class Posterior:
     Attributes:
         stance: how the modes of the image before stood; None: unknown.
         evaluations: of the likelihood, so far.
-        trust: how far images are believed.
     """
 
     def __init__(
@@ -104,7 +100,6 @@ class Posterior:
         self.stance: Stance | None = None
         self.exchanges = SideExchanges()
         self._ground_term: GroundTerm | None = None
-        self.trust = Trust(settings.trust, settings.error_correlation)
         self.evaluations = 0
         self._step_scale = np.where(body.skeleton.dof_is_rotation, 0.3, 0.2)
         self._last_fit: tuple[Array, Observation, ImageFit] | None = None
@@ -260,24 +255,44 @@ class Posterior:
         both = free[:, :, None] & free[:, None, :]
         return gradient * free, np.where(both, free_covariances(hessian, free), 0.0)
 
-    def covariances(self, fit: ImageFit, free: Mask, *, keypoints_alone: bool) -> Array:
+    def covariances(self, fit: ImageFit, free: Mask, dt: float) -> Array:
         """Covariances (K, d, d) that an image alone leaves, on the free variables (K, d).
-
-        Of the image only a share is believed: shapes, shadows and clothes differ from the model's
-        in much the same way in image after image, and such errors do not average out, over pixels
-        or over time. Nor do those of keypoints, but beside an image, which errs in other ways, they
-        count.
 
         Args:
             fit: of the poses.
             free: (K, d) variables that do not rest on a limit.
-            keypoints_alone: whether there is nothing but keypoints.
+            dt: time since the image before, s.
         """
         _, hessian = fit.energy.derivatives()
-        disbelieved = (1.0 - self.trust.information) * fit.image_hessian
-        if keypoints_alone:
-            disbelieved = (1.0 - KEYPOINT_SHARE) * fit.keypoint_hessian
-        return free_covariances(hessian - disbelieved, free)
+        lasting = (1.0 - ERRORS['image'].share(dt)) * fit.image_hessian
+        lasting = lasting + (1.0 - ERRORS['keypoints'].share(dt)) * fit.keypoint_hessian
+        return free_covariances(hessian - lasting, free)
+
+    def evidence(
+        self, poses: Array, observation: Observation, exchanges: Array, dt: float
+    ) -> Array:
+        """What an image adds to minus the log weights of poses (N, d), (N,) nats.
+
+        Textures are left out: each hypothesis carries its own.
+
+        Args:
+            poses: (N, d).
+            observation: of the image.
+            exchanges: (N, E) log probabilities of exchanges of sides.
+            dt: time since the image before, s.
+        """
+        frames, rows = forward(self.body.skeleton, poses), np.arange(len(poses))
+        self.evaluations += len(poses)
+
+        def of(name: str, terms: Sequence[FrameTerm]) -> Array:
+            value = np.zeros(len(poses))
+            for term in terms:
+                value += term.energy(frames, rows, derivatives=Derivatives.NONE).value
+            return ERRORS[name].share(dt) * value
+
+        image, *keypoints = self.likelihood.seen(observation, exchanges=exchanges)
+        priors = (*self.likelihood.priors, *self.known)
+        return of('image', [image]) + of('keypoints', keypoints) + of('prior', priors)
 
     def textures(self, poses: Array, observation: Observation) -> Textures | None:
         """What an image shows on the surfaces of poses (K, d)."""

@@ -62,25 +62,21 @@ def choose_hypotheses(
     return Kept(chosen, owner, groups)
 
 
-def heads_of_classes(classes: Index, log_weights: Array, reach: float, most: int) -> list[int]:
-    """The heaviest hypothesis of each class but that of the heaviest of all, heaviest first.
+def distinct_hypotheses(joints: Array, log_weights: Array, same: float) -> Index:
+    """Indices of hypotheses without those that have come to the same optimum, heaviest first.
 
     Args:
-        classes: (N,).
+        joints: (N, J, 3) positions that distances are taken of, m.
         log_weights: (N,).
-        reach: how much lighter than the heaviest of all they may be, nats.
-        most: how many.
+        same: mean distance below which two hypotheses are one, m.
     """
     order = np.argsort(-log_weights, kind='stable')
-    seen = {int(classes[order[0]])}
-    result: list[int] = []
-    for i in order[1:]:
-        if log_weights[i] < log_weights[order[0]] - reach or len(result) == most:
-            break
-        if int(classes[i]) not in seen:
-            seen.add(int(classes[i]))
-            result.append(int(i))
-    return result
+    kept: list[int] = []
+    for i in order:
+        apart = np.linalg.norm(joints[kept] - joints[i], axis=2).mean(1)
+        if not (apart < same).any():
+            kept.append(int(i))
+    return np.array(kept, dtype=np.intp)
 
 
 @njit(cache=True, nogil=True)

@@ -6,9 +6,10 @@
 
 theta is the shape (see `body.shape`), x_k the pose of mode k, h and H are gradient and Gauss-Newton
 Hessian of the energy of one image over both. A pose gives way to a wrong shape: what is left of the
-information when it does is the Schur complement S. Of every image only the share tau is believed,
-as its errors are those of its neighbours. What is not known of the shape is not known of the pose
-either: J P J' is added to the covariances of modes (a consider covariance, [Schmidt 1966]).
+information when it does is the Schur complement S. Of every image only the share tau is believed
+(`inference.error_model`), as its errors are those of its neighbours. What is not known of the shape
+is not known of the pose either: J P J' is added to the covariances of modes (a consider covariance,
+[Schmidt 1966]).
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@
     LOST               -> (found again)                    ->  TRACKING
     TRACKING or LOST   -> (an image says: nobody is there) ->  NOBODY
 
-The tracker knows images, background and starts; the `Track` knows the person, its filters carry the
-mixture.
+The tracker knows images, background, starts and existence; a `MixtureFilter` knows the person and
+carries the mixture.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.beginning import FROM_JOINTS, Beginning, Source, Starts, poses_to_search
 from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
 from hmt_ros.tracking.existence import GIVEN, Existence
-from hmt_ros.tracking.facing import Track
+from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.gravity import Gravity
 from hmt_ros.tracking.ground import Ground, GroundEstimator, KnownGround, unit_vector
 from hmt_ros.tracking.hypotheses import Modes
@@ -269,7 +269,7 @@ class Tracker:
         are off, or the motion of the camera is unknown. The camera stands still where there is a
         background image, and moves as `set_camera` says.
         """
-        return self._track.contacts if self._ground.still else {}
+        return self._track.contacts.by_foot() if self._ground.still else {}
 
     @property
     def misfit(self) -> float:
@@ -308,7 +308,7 @@ class Tracker:
     @property
     def posterior(self) -> GaussianMixture:
         """The present posterior."""
-        return self.modes.mixture(1.0 - self.settings.error_correlation)
+        return self.modes.mixture
 
     def _move_camera(self, stamp: int) -> None:
         """Carries what is known into the camera frame of the next image; takes newer gravity."""
@@ -331,8 +331,10 @@ class Tracker:
         weight, known = self.settings.ground.upright_weight, self._ground.known.up is not None
         return Gravity(self._ground.plane, weight) if known and weight > 0 else None
 
-    def _new_track(self, body: Body) -> Track:
-        return Track(body, self.camera, self.settings, self._seed, self._extra, self._ground)
+    def _new_track(self, body: Body) -> MixtureFilter:
+        return MixtureFilter(
+            body, self.camera, self.settings, self._seed, self._extra, self._ground
+        )
 
     def _drop_track(self) -> None:
         """Keeps nothing but the body."""
@@ -404,7 +406,7 @@ class Tracker:
             near = replace(
                 observation, magnification=self.camera.magnification(float(np.median(poses[:, 2])))
             )
-            arrived = Beginning(Source.ARRIVAL, self.body, poses, both_ways=True)
+            arrived = Beginning(Source.ARRIVAL, self.body, poses)
             self._begin(near, arrived, stamp)
         else:
             beginning = self._starts.first(
@@ -423,7 +425,7 @@ class Tracker:
                 self.depth.update(beginning.body, beginning.best[0], depths_of(view.depth))
             observation = self._observe(view, beginning.best[0])
             self._begin(observation, beginning, stamp)
-            if not self._track.believes_silhouettes:
+            if not self._track.recall.believed:
                 # The start is where the person is; the silhouette is not.
                 observation = self._observe(view, beginning.best[0])
                 self._begin(observation, beginning, stamp)
@@ -447,10 +449,7 @@ class Tracker:
     def _begin(self, observation: Observation, beginning: Beginning, stamp: int) -> None:
         """Starts the track."""
         self.started_from = beginning.source
-        self._track.begin(
-            beginning.body, beginning.start, observation, stamp,
-            both_ways=beginning.both_ways, clicked=beginning.clicked,
-        )  # fmt: skip
+        self._track.begin(beginning.body, beginning.start, observation, beginning.clicked)
 
     def _follow(
         self, observation: Observation, stamp: int, prediction: PosePrediction | None
@@ -461,9 +460,9 @@ class Tracker:
         poses = self._poses_to_search(observation, prediction) if search else None
         if poses is None:
             dt = (stamp - self._followed) * 1e-9
-            self._track.propagate(observation, stamp, dt, prediction)
+            self._track.propagate(observation, dt, prediction)
         else:
-            self._track.begin_anew(poses, observation, stamp, both_ways=True)
+            self._track.begin_anew(poses, observation)
 
     def _poses_to_search(
         self, observation: Observation, prediction: PosePrediction | None
@@ -473,4 +472,4 @@ class Tracker:
 
     def _observe(self, view: View, pose: Array | None) -> Observation:
         """What an image says of a person who is about at a pose (d,), if it is known."""
-        return self._observer.observation(view, pose, believed=self._track.believes_silhouettes)
+        return self._observer.observation(view, pose, believed=self._track.recall.believed)

@@ -1,81 +1,80 @@
-"""The weight of a hypothesis (KJS figure 4, steps 4 and 5).
+"""The weight of a hypothesis: the forward recursion over all pairs of modes.
 
-    log w_k = log p(ancestor) + log p(jumps) - beta (E(x_k) - rho min(e_k, e_ancestor))        (1)
+    log w_k = log sum_j w_j p(x_k | x_j) - sum_g a_g(dt) E_g(x_k)                               (1)
+    p(x_k | x_j) = t(x_k, x_j) / (sum_l t(x_l, x_j) + e^-c)                                     (2)
+    log t(x, x_j) = -nu/2 log(1 + D(x, f(x_j)) / (nu q dt))                                     (3)
 
-E is the energy of the posterior at the optimum x_k, motion prior included. The inverse temperature
-beta is below 1, because neighbouring measurements of an image err together; errors also last from
-image to image, so that of the excess e over the least energy only what is new counts (`trust`). The
-two ways to face have odds of their own (`facing_odds`). The normaliser
-|S_k|^(1/2) of a mode is left out, as in the paper: the Hessian shows how well the image fixes a
-pose, and what it fixes badly (depth, a limb behind the trunk) would gain weight by being unseen.
+x_j are the modes of the image before and f(x_j) where the dynamics move them; D is the mean squared
+distance of the joints, seen from the pelvis, and q the mean squared distance by which people leave
+their prediction in a second. Every hypothesis is a continuation of every mode, as far as a body can
+move in dt: which proposal it came from does not enter. A mode goes on as one of the hypotheses of
+the image (2), or ends, if all of them are less likely than e^-c. E_g is the energy of cue g, of
+which an image adds the share a_g (`inference.error_model`).
 
-Instead of its ancestor's weight a mode can take over that of the nearest component of the
-prediction by the Bhattacharyya distance D (KJS figure 4, step 5):
-
-    log w_k = log p(argmin_j D(k, j)) - beta E(x_k)                                            (2)
-
-Ways to face, each followed by a filter of its own, are weighed by the evidence of their filters,
-the sum over images of -beta min_k E(x_k).                                                     (3)
+The normaliser |S_k|^(1/2) of a mode is left out, as in the paper: the Hessian shows how well the
+image fixes a pose, and what it fixes badly (depth, a limb behind the trunk) would gain weight by
+being unseen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from hmt_ros.inference.arrays import Array, Index, Mask
-from hmt_ros.inference.mixture import GaussianMixture, bhattacharyya_distances
+from hmt_ros.body.body import Body
+from hmt_ros.inference.arrays import Array
+from hmt_ros.tracking.hypotheses import relative_joints
 
-REWEIGHTINGS = ('ancestry', 'bhattacharyya')
+# Mean squared distance q by which joints leave their prediction, m^2/s, and the degrees of freedom
+# nu of its tails: modes tremble, and limbs are found where they were not looked for.
+SPREAD, TAILS = 0.01, 2.0
+# A mode of which no hypothesis is likelier than this goes on ends: c, nats.
+ENDS = 5.0
 
 
-def weigh(log_priors: Array, energies: Array, beta: float) -> Array:
-    """Log weights (N,), equation (1), not normalised, as if errors did not last.
+@dataclass(frozen=True, eq=False)
+class Continuity:
+    """The motion prior on every transition from the modes of an image to the next one.
 
-    Args:
-        log_priors: (N,) log p(ancestor) + log p(jumps).
-        energies: (N,) nats.
-        beta: inverse temperature.
+    Attributes:
+        body: of the poses.
+        predicted: (K, d) poses that the modes are moved to.
+        log_weights: (K,) of the modes.
+        dt: time between the images, s.
     """
-    return log_priors - beta * energies
 
+    body: Body
+    predicted: Array
+    log_weights: Array
+    dt: float
 
-def lasting_errors(energies: Array, excess: Array, beta: float, correlation: float) -> Array:
-    """What errors that last give back to log weights (N,): beta rho min(e, e_ancestor).
+    @cached_property
+    def _joints(self) -> Array:
+        return relative_joints(self.body, self.predicted)
 
-    What a pose cost more than the best in the image before, it costs for the same reason again.
+    def log_transitions(self, poses: Array) -> Array:
+        """log t(x_n, x_k), (K, N), of poses (N, d), equation (3)."""
+        joints = relative_joints(self.body, poses)
+        a, b = (x.reshape(len(x), -1) for x in (self._joints, joints))
+        squares = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * a @ b.T
+        ratio = np.maximum(squares, 0.0) / (joints.shape[1] * SPREAD * self.dt)
+        return np.asarray(-0.5 * TAILS * np.log1p(ratio / TAILS))
 
-    Args:
-        energies: (N,) nats.
-        excess: (N,) e_ancestor, of the ancestors' energies over the least in the image before.
-        beta: inverse temperature.
-        correlation: rho of the errors of two images in a row.
-    """
-    over = energies - energies.min()
-    return np.asarray(beta * correlation * np.minimum(over, excess), dtype=np.float64)
+    def rated(self, poses: Array) -> Array:
+        """log sum_k w_k t(x_n, x_k), (N,), of poses (N, d): how well each alone goes on."""
+        result: Array = np.logaddexp.reduce(
+            self.log_weights[:, None] + self.log_transitions(poses), axis=0
+        )
+        return result
 
-
-def cost_of_room(hessians: Array, own: Array, usual: Array, jumped: Mask) -> Array:
-    """What the wider motion prior of jumps costs (N,), nats: Occam's factor.
-
-        1/2 log |I + H S_own| - 1/2 log |I + H S_usual|
-
-    H is the curvature of all but the motion prior. What the image does not fix costs nothing.
-
-    Args:
-        hessians: (N, d, d) at the optimum, motion prior included.
-        own: (N, d, d) precisions S_own^-1 of the motion prior of each hypothesis.
-        usual: (N, d, d) of those that have not jumped.
-        jumped: (N, d) what has jumped.
-    """
-    result = np.zeros(len(hessians))
-    rows = np.flatnonzero(jumped.any(1))
-    if len(rows):
-        h, a, b = hessians[rows], own[rows], usual[rows]
-        logs = [np.linalg.slogdet(x)[1] for x in (h, a, h - a + b, b)]
-        result[rows] = np.maximum(0.5 * (logs[0] - logs[1] - logs[2] + logs[3]), 0.0)
-    return result
+    def log_priors(self, poses: Array) -> Array:
+        """log sum_k w_k p(x_n | x_k), (N,), of all poses (N, d) of an image, equation (2)."""
+        logs = self.log_transitions(poses)
+        total = np.logaddexp(np.logaddexp.reduce(logs, axis=1), -ENDS)
+        result: Array = np.logaddexp.reduce((self.log_weights - total)[:, None] + logs, axis=0)
+        return result
 
 
 def normalised(log_weights: Array) -> Array:
@@ -86,31 +85,3 @@ def normalised(log_weights: Array) -> Array:
 def at_least(log_weights: Array, least: float) -> Array:
     """Normalised log weights (N,), those below `least` raised to it: a mode that may come back."""
     return normalised(np.maximum(log_weights, least))
-
-
-def inherited_log_weights(
-    means: Array, covariances: Array, order: Index, before: GaussianMixture
-) -> Array:
-    """Log weights (K,) that new modes take over from a mixture before, equation (2).
-
-    A component whose weight was taken over is out of the matching; modes that none is left for get
-    the smallest weight. So a track keeps the modes that it had, while new ones may emerge.
-
-    Args:
-        means, covariances: (K, d), (K, d, d).
-        order: (K,) in which they choose.
-        before: the prediction.
-    """
-    distances = bhattacharyya_distances(means, covariances, before.means, before.covariances)
-    log_weights = np.log(np.maximum(before.normalised().weights, np.finfo(np.float64).tiny))
-    result = np.full(len(means), log_weights.min())
-    for k in order[: len(before)]:
-        nearest = int(np.argmin(distances[k]))
-        result[k] = log_weights[nearest]
-        distances[:, nearest] = np.inf
-    return result
-
-
-def log_shares(evidence: Sequence[float]) -> Array:
-    """Log probabilities of ways to face from the evidence of their filters, equation (3)."""
-    return normalised(np.asarray(evidence, dtype=np.float64))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import toeplitz
 
-from hmt_ros.inference.error_model import share_of_time
+from hmt_ros.inference.error_model import ERRORS, CueErrors, share_of_time
 
 
 @pytest.mark.parametrize('dt', [0.01, 0.1, 0.4, 2.0])
@@ -40,3 +40,30 @@ def test_limits():
     for dt, tau in ((-0.1, 0.2), (0.1, -0.2), (math.nan, 0.2)):
         with pytest.raises(ValueError, match='not negative, saw'):
             share_of_time(dt, tau)
+
+
+@pytest.mark.parametrize('name', list(ERRORS))
+def test_an_image_says_no_more_than_its_share_of_space(name):
+    errors = ERRORS[name]
+    assert 0.0 < errors.independent <= 1.0
+    shares = [errors.share(dt) for dt in (0.0, 0.001, 1 / 30, 0.1, 1 / 3, 10.0)]
+    assert shares[0] == 0.0
+    assert (np.diff(shares) >= 0.0).all()
+    assert max(shares) <= errors.independent
+    assert errors.share(math.inf) == errors.independent
+
+
+@pytest.mark.parametrize('name', list(ERRORS))
+def test_a_second_of_more_images_says_no_less(name):
+    found = [rate * ERRORS[name].share(1.0 / rate) for rate in (1.0, 3.0, 8.0, 30.0, 1000.0)]
+    assert (np.diff(found) > 0.0).all()
+    # There is an end to it, however many there are.
+    assert found[-1] <= ERRORS[name].independent / (2.0 * ERRORS[name].time)
+
+
+@pytest.mark.parametrize('time', [0.3, 1.0, 10.0])
+def test_the_rate_hardly_matters_where_errors_last_longer_than_the_interval(time):
+    errors = CueErrors(0.4, time)
+    fast, slow = (rate * errors.share(1.0 / rate) for rate in (30.0, 8.0))
+    assert fast == pytest.approx(0.4 / (2.0 * time), rel=0.02)
+    assert slow == pytest.approx(fast, rel=0.02)

@@ -224,7 +224,7 @@ def test_what_diagnostics_tell_is_what_the_page_says(running, small_camera):
         for key in explained
     }
     # What this node alone tells.
-    own = {'misfit', 'evaluations of the likelihood'}
+    own = {'misfit', 'evaluations of the likelihood', 'probability that a person is in view'}
     running.spin_until(lambda: 'nothing on /image' in running.diagnosis()[2], 'all of it')
     keys = running.diagnosis()[2].keys() - own
     assert [key for key in keys if not any(p.fullmatch(key) for p in patterns.values())] == []

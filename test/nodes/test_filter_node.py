@@ -151,7 +151,7 @@ def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
         ({'max_hypotheses': 0}, 'out of range. Min: 1, Max: 64, value: 0'),
         ({'max_hypotheses': 20}, 'max_hypotheses <= candidates, saw 20 and 16'),
         ({'proposals': 'guess'}, "saw 'guess'"),
-        ({'jump_probability': 0.0}, 'jump_probability must lie in (0, 1)'),
+        ({'background.method': 'guess'}, "saw 'guess'"),
         ({'subject_file': str(tmp_path / 'none.yaml')}, 'none.yaml: can not be read'),
         ({'background_file': str(tmp_path / 'two\nlines')}, 'two lines: can not be read'),
         ({'body_model': 'nobody'}, "no body 'nobody'"),

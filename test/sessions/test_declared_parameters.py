@@ -226,7 +226,7 @@ def test_defaults_lie_between_limits(settings):
         ({'image_transport': 'theora'}, "image_transport must be one of .* saw 'theora'"),
         ({'body_model': ''}, 'body_model must be a name or a file'),
         ({'sample_scale': -1.0}, 'sample_scale must lie between 0 and inf'),
-        ({'jump_probability': 0.0}, 'jump_probability must lie in'),
+        ({'jump_probability': 0.1}, 'jump_probability was removed: a jump costs'),
     ],
 )
 def test_wrong_parameters_of_the_node(values, message):

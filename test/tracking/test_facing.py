@@ -1,35 +1,33 @@
-"""Both ways to face are followed until the images have decided."""
+"""Both ways to face are modes of one mixture until the images have decided."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hmt_ros.body.mirror import reverse_depth
+from hmt_ros.body.mirror import faces_back, left_directions, reverse_depth
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings
-from hmt_ros.tracking.facing import faces_like, left_directions
 
 FRAME = 100_000_000  # ns
 SMALL = TrackerSettings(
-    candidates=8, max_hypotheses=4, shape_images=0, rounds=1, searched_chains=1, combinations=32
+    candidates=8, max_hypotheses=4, shape_images=0, searched_chains=1, combinations=32
 )
 
 
 @pytest.fixture(scope='module')
 def film(filmed, camera):
     """Poses, images and the empty scene of a person who stands before the camera and reaches."""
-    return filmed('reach', 0.8, camera)
+    return filmed('reach', 2.0, camera)
 
 
 @pytest.fixture(scope='module')
-def followed(film, human32, camera):
-    """Function (seconds of trial) -> tracker and posteriors, of a track that is told the wrong way.
+def followed(film, human32, camera, keypoints_of):
+    """Function (with keypoints, sure) -> tracker and posteriors of a track that is told wrongly.
 
-    The last two images see predictions, too.
+    The prediction of the first image faces the other way than the person; if the start is sure,
+    it is all that the track starts from, else its reversal is among its modes.
     """
     poses, images, empty = film
     wrong = PosePrediction(
@@ -39,14 +37,17 @@ def followed(film, human32, camera):
         human32,
     )
 
-    def run(seconds):
-        tracker = Tracker(
-            human32, camera, replace(SMALL, facing_trial=seconds), BackgroundModel.from_image(empty)
-        )
+    def run(keypoints=False, sure=False):
+        tracker = Tracker(human32, camera, SMALL, BackgroundModel.from_image(empty))
+        if sure:
+            tracker.reset(wrong.mixture)
         posteriors = []
         for i, image in enumerate(images):
-            prediction = None if 0 < i < len(images) - 2 else wrong
-            posteriors.append(tracker.step(image, i * FRAME, prediction=prediction)[0])
+            seen = keypoints_of(human32, poses[i], 1.0, i) if keypoints and i else None
+            prediction = wrong if i == 0 and not sure else None
+            posteriors.append(
+                tracker.step(image, i * FRAME, keypoints=seen, prediction=prediction)[0]
+            )
         return tracker, posteriors
 
     return run
@@ -64,60 +65,64 @@ def test_directions_to_the_left(human32, motion):
 
 def test_the_reversal_in_depth_faces_the_other_way(human32, motion):
     both = np.concatenate([motion, reverse_depth(human32, motion)])
-    alike = faces_like(human32, both, motion[0])
-    assert alike[: len(motion)].all()
-    assert not alike[len(motion) :].any()
+    back = faces_back(human32, both, motion[0])
+    assert not back[: len(motion)].any()
+    assert back[len(motion) :].all()
 
 
-def ways(body, posteriors, pose):
-    """Of each posterior the weight of the modes that face as a pose does."""
-    return [float(p.weights[faces_like(body, p.means, pose)].sum()) for p in posteriors]
+def ways(body, posteriors, poses):
+    """Of each posterior the weight of the modes that face as the person does."""
+    return [
+        float(p.weights[~faces_back(body, p.means, pose)].sum())
+        for p, pose in zip(posteriors, poses)
+    ]
 
 
-def test_both_ways_are_followed_and_become_one_mixture(film, followed, human32):
-    poses, _, _ = film
-    tracker, posteriors = followed(0.5)
-    right = ways(human32, posteriors, poses[0])
-    # A person who stands can hardly be told from one who stands back to front.
-    assert all(0.05 < share < 0.95 for share in right[:5])
-    assert right[-1] > 0.5
+def check(posteriors):
     for posterior in posteriors:
         assert posterior.weights.sum() == pytest.approx(1.0)
         assert len(posterior) <= SMALL.max_hypotheses
         assert (np.diff(posterior.weights) <= 0).all()
+
+
+def test_both_ways_are_modes_of_one_mixture(film, followed, human32):
+    """A person who stands can hardly be told from one who stands back to front."""
+    tracker, posteriors = followed()
+    right = ways(human32, posteriors, film[0])
+    assert all(0.05 < share < 0.95 for share in right[:8])
+    check(posteriors)
     assert tracker.modes.textures is not None
     assert len(tracker.modes.textures.counts) == len(posteriors[-1])
 
 
-def test_the_images_decide(film, followed, human32, monkeypatch):
-    poses, _, _ = film
-    monkeypatch.setattr('hmt_ros.tracking.facing.DECIDED', 0.1)
-    _, posteriors = followed(0.5)
-    right = ways(human32, posteriors, poses[0])
-    decided = next(i for i, share in enumerate(right) if share in (0.0, 1.0))
-    assert decided < 5
-    # As far as one can see until then; what was given up was the less probable.
-    before = right[decided - 1] if decided else 1.0
-    assert (right[decided] == 1.0) == (before > 0.5)
+@pytest.mark.xfail(strict=True, reason='images alone take the wrong way here, after a second')
+def test_images_alone_find_the_way(film, followed, human32):
+    right = ways(human32, followed()[1], film[0])
+    assert right[-1] > 0.5
 
 
-def test_without_a_trial_one_way_is_taken_at_once(followed):
-    tracker, _ = followed(0.0)
-    assert tracker.modes.textures is not None
+def test_keypoints_decide(film, followed, human32):
+    _, posteriors = followed(keypoints=True)
+    right = ways(human32, posteriors, film[0])
+    assert min(right) > 0.5
+    assert min(right[7:]) > 0.9
+    assert min(right[9:]) > 0.95
+    check(posteriors)
+
+
+def test_a_track_that_was_sure_of_the_wrong_way_turns_about(film, followed, human32):
+    """Not at once: detectors exchange sides, too."""
+    _, posteriors = followed(keypoints=True, sure=True)
+    right = ways(human32, posteriors, film[0])
+    assert right[0] == 0.0
+    assert max(right[:6]) < 0.1
+    # A mode of the right way is kept for when it is needed.
+    assert sum(share > 0.0 for share in right[1:]) >= len(right) - 3
+    assert min(right[-5:]) > 0.95
+    check(posteriors)
 
 
 def test_the_same_bytes_twice(followed):
-    a, b = (followed(0.5)[1] for _ in range(2))
-    assert [x.means.tobytes() for x in a] == [x.means.tobytes() for x in b]
-
-
-def test_a_trial_is_not_shorter_than_nothing():
-    with pytest.raises(ValueError, match='facing_trial must be at least 0, saw -1'):
-        TrackerSettings(facing_trial=-1.0)
-
-
-def test_a_start_that_is_repeated_without_silhouettes_follows_two_ways(followed, monkeypatch):
-    monkeypatch.setattr('hmt_ros.tracking.facing.Track.believes_silhouettes', False)
-    tracker, posteriors = followed(0.5)
-    assert all(posterior is not None for posterior in posteriors)
-    assert len(tracker.modes.poses) <= SMALL.max_hypotheses
+    a, b = (followed(keypoints=True, sure=True)[1] for _ in range(2))
+    for name in ('weights', 'means', 'covariances'):
+        assert [getattr(x, name).tobytes() for x in a] == [getattr(x, name).tobytes() for x in b]

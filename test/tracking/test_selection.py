@@ -1,4 +1,4 @@
-"""Choice of hypotheses and inheritance of weights against plain loops and full enumeration."""
+"""Choice of hypotheses against plain loops and full enumeration."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking.selection import choose_hypotheses
-from hmt_ros.tracking.weighting import inherited_log_weights
+from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
 
 SAME, CAP = 0.02, 0.3
 
@@ -137,58 +135,25 @@ def test_an_unlikely_hypothesis_far_away_beats_a_likely_one_nearby():
     assert np.allclose(np.exp(kept.log_weights), [0.9, 0.1])
 
 
-def gaussians(n, d, seed):
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(n, d, d))
-    return rng.normal(0, 2.0, (n, d)), root @ root.transpose(0, 2, 1) + 0.3 * np.eye(d)
-
-
-def bhattacharyya(m1, s1, m2, s2):
-    middle = (s1 + s2) / 2
-    gap = m1 - m2
-    dets = [np.linalg.det(s) for s in (middle, s1, s2)]
-    value = gap @ np.linalg.inv(middle) @ gap / 8
-    return value + 0.5 * np.log(dets[0] / np.sqrt(dets[1] * dets[2]))
+def test_what_is_chosen_first_is_kept_after_the_heaviest():
+    joints, log_weights = hypotheses(12, 6)
+    heaviest, *_, lightest = np.argsort(-log_weights)
+    kept = choose_hypotheses(joints, log_weights, 4, first=[lightest])
+    assert list(kept.chosen[:2]) == [heaviest, lightest]
+    alone = choose_hypotheses(joints, log_weights, 1, first=[lightest])
+    assert list(alone.chosen) == [heaviest]
 
 
 @pytest.mark.parametrize('seed', range(4))
-@pytest.mark.parametrize(('modes', 'before'), [(5, 5), (3, 6), (7, 3), (1, 1)])
-def test_inherited_weights(seed, modes, before):
-    means, covariances = gaussians(modes, 3, seed)
-    rng = np.random.default_rng(seed)
-    components = gaussians(before, 3, 50 + seed)
-    mixture = GaussianMixture(3.0 * rng.dirichlet(np.ones(before)), *components)
-    order = rng.permutation(modes)
-    found = inherited_log_weights(means, covariances, order, mixture)
-    weights = mixture.weights / mixture.weights.sum()
-    free = set(range(before))
-    wanted = np.full(modes, weights.min())
-    for k in order:
-        if free:
-            nearest = min(
-                free,
-                key=lambda j, k=k: bhattacharyya(
-                    means[k], covariances[k], mixture.means[j], mixture.covariances[j]
-                ),
-            )
-            free.remove(nearest)
-            wanted[k] = weights[nearest]
-    assert np.allclose(np.exp(found), wanted, rtol=1e-12)
-
-
-def test_modes_that_did_not_move_keep_their_weights():
-    means, covariances = gaussians(6, 4, 9)
-    weights = np.array([0.3, 0.25, 0.2, 0.15, 0.07, 0.03])
-    mixture = GaussianMixture(weights, means, covariances)
-    shuffled = np.array([4, 2, 0, 5, 1, 3])
-    found = inherited_log_weights(means[shuffled], covariances[shuffled], np.arange(6), mixture)
-    assert np.allclose(np.exp(found), weights[shuffled], rtol=1e-12)
-
-
-def test_components_without_weight_stay_finite():
-    means, covariances = gaussians(2, 2, 10)
-    mixture = GaussianMixture(np.array([1.0, 0.0]), means, covariances)
-    found = inherited_log_weights(means, covariances, np.arange(2), mixture)
-    assert found[0] == 0.0
-    assert np.isfinite(found[1])
-    assert found[1] < -600
+def test_distinct_hypotheses_are_the_heaviest_of_their_neighbours(seed):
+    joints, log_weights = hypotheses(30, seed, spread=0.1)
+    same = 0.14
+    kept = distinct_hypotheses(joints, log_weights, same)
+    assert 1 < len(kept) < 30
+    gaps = np.linalg.norm(joints[:, None] - joints[None], axis=3).mean(2)
+    among = gaps[np.ix_(kept, kept)] + np.where(np.eye(len(kept)) > 0, np.inf, 0.0)
+    assert among.min() >= same
+    assert (np.diff(log_weights[kept]) <= 0).all()
+    for i in set(range(30)) - set(kept):
+        near = [k for k in kept if gaps[i, k] < same]
+        assert max(log_weights[near]) >= log_weights[i]

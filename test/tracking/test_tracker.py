@@ -16,6 +16,7 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy
+from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking import (
     GroundSettings,
     PosePrediction,
@@ -112,9 +113,8 @@ def in_bytes(mixtures):
 
 
 @pytest.mark.parametrize('proposals', ['kjs', 'css', 'ss'])
-@pytest.mark.parametrize('reweighting', ['ancestry', 'bhattacharyya'])
-def test_the_truth_is_among_the_modes(follow, proposals, reweighting):
-    tracker, mixtures, errors = follow(proposals=proposals, reweighting=reweighting, samples=64)
+def test_the_truth_is_among_the_modes(follow, proposals):
+    tracker, mixtures, errors = follow(proposals=proposals, samples=64)
     assert tracker.status is Status.TRACKING
     assert errors.mean() < 0.045
     assert errors.max() < 0.07
@@ -154,15 +154,13 @@ def test_heaviest_modes_explain_the_joints(follow, camera, human32, motion, keyp
 def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     follow, camera, human32, motion, keypoints_of
 ):
-    """exp(-beta * energy) at the modes of the posterior, normalised, with the ground off."""
-    tracker, mixtures, _ = follow(frames=4, trust=0.4, ground=OFF)
+    """exp(-share * energy) at the modes of the posterior, normalised, with the ground off."""
+    tracker, mixtures, _ = follow(frames=4, ground=OFF)
     posterior, likelihood = mixtures[-1]
     seen = Observation(keypoints=keypoints_of(human32, motion[3], 1.0, 3))
     likelihood_of = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).given(seen)
     energies = likelihood_of.energy(posterior.means).value
-    beta = tracker._track._filters[0].beta
-    assert 0.1 < beta < 0.4
-    weights = np.exp(-beta * (energies - energies.min()))
+    weights = np.exp(-ERRORS['image'].share(0.1) * (energies - energies.min()))
     assert np.allclose(likelihood.weights, np.sort(weights / weights.sum())[::-1], atol=1e-12)
     # Its log at the means is that of the image, without the prior of the body.
     frames = forward(tracker.body.skeleton, likelihood.means)
@@ -312,7 +310,7 @@ def jumped(motion):
 
 
 def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion, keypoints_of):
-    tracker = started(energy_rise=1e9, lost_images=2, reversal_probability=0.0)
+    tracker = started(lost_images=2)
     other = jumped(motion)
     seen, misfits, errors = [], [], []
     for i in range(8):
@@ -326,10 +324,10 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     assert max(misfits[:3]) < 0.1
     assert min(misfits[3:5]) > tracker.settings.lost_misfit
     assert max(misfits[5:]) < 0.1
-    assert min(errors[3:5]) > 0.2
+    assert min(errors[3:5]) > 0.15
     assert max(errors[5:]) < 0.06
     # The place too, not only the posture.
-    assert np.abs(posterior.means[0, :3] - other[:3]).max() < 0.2
+    assert np.abs(posterior.means[:, :3] - other[:3]).max(1).min() < 0.2
 
 
 def predicted(body, pose) -> PosePrediction:
@@ -356,9 +354,9 @@ def test_a_prediction_starts_a_track(human32, camera, black, motion, keypoints_o
 def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, motion, keypoints_of):
     few = ('left_hip', 'right_knee', 'left_wrist', 'right_elbow', 'left_toe')
     other = jumped(motion)
-    errors = {}
+    errors, first = {}, np.zeros(1, dtype=np.intp)
     for given in (False, True):
-        tracker = started(energy_rise=1e9, lost_images=2, reversal_probability=0.0)
+        tracker = started(lost_images=2)
         statuses = []
         for i in range(6):
             seen = keypoints_of(human32, motion[i] if i < 3 else other, 1.0, i)
@@ -370,22 +368,22 @@ def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, mot
             statuses.append(tracker.status)
         assert statuses[4] is Status.LOST
         assert (statuses[5] is Status.TRACKING) == given
-        errors[given] = best_error(tracker.body, posterior, human32, other)
+        errors[given] = best_error(tracker.body, posterior[first], human32, other)
     assert errors[True] < 0.6 * errors[False]
 
 
 def test_predictions_are_among_the_hypotheses(human32, started, black, motion, keypoints_of):
-    """Search is off: nothing else finds the jump in its image."""
+    """Nothing else finds the jump in its image."""
     errors = {}
     for given in (False, True):
-        tracker = started(energy_rise=1e9, reversal_probability=0.0)
+        tracker = started()
         for i in range(4):
             pose = motion[i] if i < 3 else jumped(motion)
             prediction = predicted(human32, pose) if given else None
             seen = keypoints_of(human32, pose, 1.0, i)
             posterior, _ = tracker.step(black, i * FRAME, seen, prediction)
         errors[given] = best_error(tracker.body, posterior, human32, pose)
-    assert errors[False] > 0.2
+    assert errors[False] > 0.15
     assert errors[True] < 0.06
 
 
@@ -416,22 +414,6 @@ def test_predictions_are_as_far_away_as_the_person_is_large(human32, motion):
     assert np.abs(depths[2] - depths[0]).max() > 0.1
 
 
-def test_surprising_images_are_searched_again(human32, started, black, motion, keypoints_of):
-    """With rounds of search; nothing changes where nothing surprises."""
-    evaluations, quiet = {}, {}
-    for rounds in (1, 3):
-        tracker = started(rounds=rounds, reversal_probability=0.0)
-        for i in range(4):
-            pose = motion[i] if i < 3 else jumped(motion)
-            posterior, _ = tracker.step(black, i * FRAME, keypoints_of(human32, pose, 1.0, i))
-            evaluations[rounds, i] = tracker.evaluations
-            if i == 2:  # nothing surprises until here
-                quiet[rounds] = in_bytes([(posterior,)])
-    assert quiet[1] == quiet[3]
-    assert evaluations[3, 2] == evaluations[1, 2] > 0
-    assert evaluations[3, 3] > 1.5 * evaluations[1, 3]
-
-
 def test_keypoints_alone_leave_more_open_than_their_sum_says(follow):
     """Their errors last from image to image: images are no independent witnesses."""
     tracker, mixtures, _ = follow(6)
@@ -443,12 +425,15 @@ def test_keypoints_alone_leave_more_open_than_their_sum_says(follow):
 
 
 def test_who_jumps_is_found_where_the_keypoints_are(human32, started, black, motion, keypoints_of):
+    """As soon as so many images went by that the track is lost, and not before."""
     tracker, errors = started(), []
-    for i in range(6):
+    found = 3 + tracker.settings.lost_images
+    for i in range(found + 3):
         pose = motion[i] if i < 3 else jumped(motion)
         posterior, _ = tracker.step(black, i * FRAME, keypoints_of(human32, pose, 1.0, i))
         errors.append(best_error(tracker.body, posterior, human32, pose))
-    assert max(errors[3:]) < 0.06
+    assert min(errors[3:found]) > 0.15
+    assert max(errors[found:]) < 0.06
 
 
 def test_one_bad_image_is_forgiven(human32, started, black, motion, keypoints_of):
@@ -501,13 +486,10 @@ def test_starts_of_another_dimension_are_refused(human32, camera):
     ('values', 'said'),
     [
         ({'proposals': 'magic'}, r"proposals must be one of .*kjs.* saw 'magic'"),
-        ({'reweighting': 'none'}, r"reweighting must be one of .*ancestry.* saw 'none'"),
         ({'motion': 'still'}, r"motion must be one of .*learned.* saw 'still'"),
         ({'vote': 'loud'}, r"vote must be one of .*trace.* saw 'loud'"),
         ({'max_hypotheses': 0}, '1 <= max_hypotheses <= candidates, saw 0 and 16'),
         ({'candidates': 4}, '1 <= max_hypotheses <= candidates, saw 8 and 4'),
-        ({'jump_probability': 0.0}, r'jump_probability must lie in \(0, 1\), saw 0.0'),
-        ({'jump_probability': 1.0}, r'jump_probability must lie in \(0, 1\), saw 1.0'),
     ],
 )
 def test_settings_that_are_refused(values, said):

@@ -1,24 +1,146 @@
-"""Weights against their equations."""
+"""Weights against their equations: plain loops, and all paths through all images."""
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 
-from hmt_ros.tracking.weighting import at_least, cost_of_room, log_shares, normalised, weigh
+from hmt_ros.body.mirror import reverse_depth
+from hmt_ros.tracking.weighting import ENDS, SPREAD, TAILS, Continuity, at_least, normalised
 
-
-def test_weights_are_prior_times_tempered_posterior():
-    priors, energies = np.array([0.7, 0.3]), np.array([10.0, 8.0])
-    weights = np.exp(normalised(weigh(np.log(priors), energies, 0.3)))
-    wanted = priors * np.exp(-0.3 * energies)
-    assert weights == pytest.approx(wanted / wanted.sum(), rel=1e-14)
+DT = 0.1
 
 
-def test_without_temperature_only_the_prior_counts():
-    priors = np.log([0.7, 0.2, 0.1])
-    assert np.array_equal(weigh(priors, np.array([1e9, 0.0, -1e9]), 0.0), priors)
+@pytest.fixture(scope='module')
+def poses_near(human32, motion):
+    """Function (n, seed, spread in rad) -> poses (n, d) about one of the motion."""
+
+    def draw(n: int, seed: int = 0, spread: float = 0.1) -> np.ndarray:
+        rng = np.random.default_rng(seed)
+        poses = motion[0] + spread * rng.normal(size=(n, human32.dimension))
+        return np.clip(poses, human32.lower, human32.upper)
+
+    return draw
+
+
+def log_transition(body, pose, expected, dt):
+    """Equation (3), joint by joint."""
+    a, b = (body.joint_positions(x[None])[0] for x in (pose, expected))
+    total = 0.0
+    for p, q in zip(a, b):
+        total += sum(((p[i] - a[0][i]) - (q[i] - b[0][i])) ** 2 for i in range(3))
+    distance = total / len(a)
+    return -TAILS / 2 * np.log(1 + distance / (TAILS * SPREAD * dt))
+
+
+def transition(body, pose, expected, all_poses, dt):
+    """p(x_k | x_j), equation (2)."""
+    every = [np.exp(log_transition(body, x, expected, dt)) for x in all_poses]
+    return np.exp(log_transition(body, pose, expected, dt)) / (sum(every) + np.exp(-ENDS))
+
+
+@pytest.mark.parametrize('dt', [0.01, 0.1, 3.0])
+def test_transitions_are_a_student_density_of_the_joints(human32, poses_near, dt):
+    before, poses = poses_near(3, 1), poses_near(5, 2, 0.3)
+    found = Continuity(human32, before, np.zeros(3), dt).log_transitions(poses)
+    wanted = [[log_transition(human32, x, b, dt) for x in poses] for b in before]
+    assert found == pytest.approx(np.array(wanted), abs=1e-9)
+
+
+def test_where_the_person_stands_is_no_part_of_a_transition(human32, poses_near):
+    before = poses_near(1)
+    aside = before.copy()
+    aside[:, :3] += 1.0
+    found = Continuity(human32, before, np.zeros(1), DT).log_transitions(aside)
+    assert found == pytest.approx(0.0, abs=1e-9)
+
+
+def test_weights_are_the_sum_over_all_paths(human32, poses_near):
+    """Three modes in each of four images: the recursion against all 3^4 ways through them."""
+    images, count = 4, 3
+    rng = np.random.default_rng(0)
+    poses = [poses_near(count, 10 + t, 0.15) for t in range(images)]
+    moved = [x + 0.02 * rng.normal(size=x.shape) for x in poses]
+    evidence = rng.uniform(0.0, 4.0, (images, count))
+    first = normalised(rng.normal(size=count))
+    gaps = (0.1, 0.03, 0.4)
+    log_weights = normalised(first - evidence[0])
+    for t in range(1, images):
+        continuity = Continuity(human32, moved[t - 1], log_weights, gaps[t - 1])
+        log_weights = normalised(continuity.log_priors(poses[t]) - evidence[t])
+    wanted = np.zeros(count)
+    for path in itertools.product(range(count), repeat=images):
+        share = np.exp(first[path[0]] - evidence[0, path[0]])
+        for t in range(1, images):
+            j, k = path[t - 1], path[t]
+            share *= transition(human32, poses[t][k], moved[t - 1][j], poses[t], gaps[t - 1])
+            share *= np.exp(-evidence[t, k])
+        wanted[path[-1]] += share
+    assert np.exp(log_weights) == pytest.approx(wanted / wanted.sum(), rel=1e-10)
+    assert np.ptp(log_weights) > 0.5
+
+
+def test_what_a_pose_alone_goes_on_from(human32, poses_near):
+    before, poses = poses_near(3, 1), poses_near(4, 2)
+    log_weights = normalised(np.array([0.0, -1.0, -3.0]))
+    found = Continuity(human32, before, log_weights, DT).rated(poses)
+    for n, pose in enumerate(poses):
+        logs = [w + log_transition(human32, pose, b, DT) for w, b in zip(log_weights, before)]
+        assert found[n] == pytest.approx(np.log(np.exp(logs).sum()), abs=1e-9)
+
+
+def test_a_mode_without_continuation_ends(human32, poses_near):
+    """What is likelier than e^-c takes the mass of a mode; what is less likely, a share of it."""
+    near = poses_near(1)
+    far = reverse_depth(human32, near)
+    both = np.concatenate([near, far])
+    dt = 1e-4
+    apart = log_transition(human32, near[0], far[0], dt)
+    assert apart < -ENDS - 1.0
+    continuity = Continuity(human32, both, np.log([0.5, 0.5]), dt)
+    left = np.exp(continuity.log_priors(near))
+    stayed = 1.0 / (1.0 + np.exp(-ENDS))
+    crossed = np.exp(apart) / (np.exp(apart) + np.exp(-ENDS))
+    assert left == pytest.approx(0.5 * (stayed + crossed), rel=1e-6)
+    # Of the mode that has no continuation, most is lost.
+    assert crossed < np.exp(apart + ENDS) < 0.3
+    # With one for each, nearly nothing is.
+    assert np.exp(continuity.log_priors(both)).sum() > 0.98
+
+
+@pytest.mark.parametrize('copies', [2, 10, 100])
+def test_copies_of_a_continuation_do_not_multiply_the_mass_of_a_mode(human32, poses_near, copies):
+    """Two modes that both go on: one as one hypothesis, the other as many that are nearly one."""
+    a = poses_near(1, 1)
+    b = reverse_depth(human32, a)
+    near = np.repeat(b, copies, axis=0)
+    near[:, 7:] += 1e-4 * np.random.default_rng(0).normal(size=near[:, 7:].shape)
+    near = np.clip(near, human32.lower, human32.upper)
+    dt = 1e-5
+    continuity = Continuity(human32, np.concatenate([a, b]), np.log([0.7, 0.3]), dt)
+    weights = np.exp(continuity.log_priors(np.concatenate([a, near])))
+    assert weights[0] == pytest.approx(0.7, rel=0.02)
+    assert weights[1:].sum() == pytest.approx(0.3, rel=0.1)
+    # Each alone would have as much as the mode itself.
+    assert np.exp(continuity.rated(near)) == pytest.approx(0.3, rel=0.1)
+
+
+@pytest.mark.parametrize('dt', [1e-9, 1000.0])
+def test_gaps_of_any_length_give_finite_numbers(human32, poses_near, dt):
+    before, poses = poses_near(3, 1), poses_near(4, 2, 1.0)
+    continuity = Continuity(human32, before, np.log([0.9, 0.1, 1e-6]), dt)
+    for found in (continuity.log_priors(poses), continuity.rated(poses)):
+        assert np.isfinite(found).all()
+    if dt > 1.0:
+        # After so long every pose goes on from every mode alike.
+        assert np.exp(continuity.log_priors(poses)) == pytest.approx(0.25, rel=0.02)
+
+
+def test_weights_are_normalised():
+    found = normalised(np.array([-1000.0, -1001.0]))
+    assert np.exp(found) == pytest.approx([np.e / (1 + np.e), 1 / (1 + np.e)], rel=1e-12)
 
 
 def test_no_mode_falls_below_the_least_weight():
@@ -26,41 +148,3 @@ def test_no_mode_falls_below_the_least_weight():
     assert np.exp(raised).sum() == pytest.approx(1.0, abs=1e-15)
     assert raised[2] == pytest.approx(-10.0, abs=1e-3)
     assert raised[0] - raised[1] == pytest.approx(5.0, abs=1e-12)
-
-
-def test_shares_are_probabilities():
-    assert np.exp(log_shares([-3.0, -3.0])) == pytest.approx([0.5, 0.5])
-    assert log_shares([-1000.0, -1010.0]) == pytest.approx([0.0, -10.0], abs=1e-4)
-
-
-def precisions_of(seed, count, d=5):
-    root = np.random.default_rng(seed).normal(size=(count, d, d))
-    return root @ root.transpose(0, 2, 1) + 0.1 * np.eye(d)
-
-
-def test_room_costs_what_the_evidence_loses():
-    """Of a measurement y at its mean: log N(y; m, S_usual + R) - log N(y; m, S_own + R)."""
-    measured, usual = precisions_of(0, 4), precisions_of(1, 4)
-    own = usual.copy()
-    own[:, :2] *= 0.01
-    own[:, :, :2] *= 0.01
-    found = cost_of_room(measured + own, own, usual, np.ones((4, 5), dtype=bool))
-    for cost, r, a, b in zip(found, measured, own, usual):
-        logs = [
-            multivariate_normal.logpdf(np.zeros(5), cov=np.linalg.inv(p) + np.linalg.inv(r))
-            for p in (a, b)
-        ]
-        assert cost == pytest.approx(logs[1] - logs[0])
-    assert found.min() > 1.0
-
-
-def test_room_that_is_not_used_costs_nothing():
-    usual = precisions_of(2, 3)
-    own = 0.01 * usual
-    jumped = np.zeros((3, 5), dtype=bool)
-    jumped[1, 2] = True
-    blind = cost_of_room(own, own, usual, jumped)
-    assert blind == pytest.approx(0.0, abs=1e-9)
-    seen = cost_of_room(own + 5.0 * usual, own, usual, jumped)
-    assert (seen[[0, 2]] == 0).all()
-    assert seen[1] > 1.0

@@ -7,10 +7,9 @@ from typing import Protocol
 
 import numpy as np
 
-from hmt_ros.image.observation import Observation
-from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.tracking.hypotheses import Hypotheses
+from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals.kinematic_jumps import KinematicJumps
 from hmt_ros.tracking.proposals.predicted_poses import PosePrediction, PredictedPoses
@@ -26,33 +25,17 @@ __all__ = [
 
 
 class Proposal(Protocol):
-    """Something that proposes hypotheses for an image.
-
-    Attributes:
-        iterated: whether it proposes again, around the optima, when their energies are unusually
-            high.
-    """
-
-    @property
-    def iterated(self) -> bool:
-        """See the class."""
-        ...
+    """Something that proposes hypotheses for an image."""
 
     def propose(
-        self,
-        base: Minimum,
-        sources: Hypotheses,
-        covariances: Array,
-        observation: Observation,
-        rng: np.random.Generator,
+        self, search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
     ) -> Hypotheses:
-        """Hypotheses that are to be optimised.
+        """Hypotheses that are to be optimised; what they weigh is not for a proposal to say.
 
         Args:
+            search: of the image.
             base: optima of the image, one for each of
             sources: the hypotheses that they were optimised from.
-            covariances: (K, d, d) of the predictions, which the ancestors of the sources index.
-            observation: of the image.
             rng: source of randomness.
         """
         ...

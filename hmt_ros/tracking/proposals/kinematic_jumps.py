@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import ClassVar
 
 import numpy as np
 
@@ -23,12 +22,13 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.texture import Textures, with_swapped_sides
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
+from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking.hypotheses import Hypotheses, relative_joints
+from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals.chain_votes import chain_votes
 from hmt_ros.tracking.proposals.limb_search import LimbSearch
 from hmt_ros.tracking.selection import choose_hypotheses
-from hmt_ros.tracking.weighting import weigh
 
 # Groups of modes with a trunk of their own whose products are rated.
 MOST_GROUPS = 3
@@ -38,6 +38,8 @@ SAME_TRUNK = 0.06
 LIKELY = 4.0
 # Configurations of a limb are distinct when some joint is further apart, m.
 DISTINCT = 0.08
+# What a configuration that no mode has costs where combinations are ranked, nats.
+JUMP = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,21 +91,16 @@ class KinematicJumps:
     """
 
     posterior: Posterior
-    iterated: ClassVar[bool] = True
 
     def propose(
-        self,
-        base: Minimum,
-        sources: Hypotheses,
-        covariances: Array,
-        observation: Observation,
-        rng: np.random.Generator,
+        self, search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
     ) -> Hypotheses:
         """See `Proposal`."""
-        s, textures = self.posterior.settings, sources.textures
-        beta = self.posterior.trust.inverse_temperature
-        everything: list[tuple[Array, Index, Array, Array, Index]] = []
-        prior = weigh(sources.log_weights, base.value, beta)
+        s, textures, observation = self.posterior.settings, sources.textures, search.observation
+        covariances = search.states.searched
+        share = ERRORS['image'].share(search.dt)
+        everything: list[tuple[Array, Index, Array, Index]] = []
+        prior = search.rated(base.x, base.value)
         for group in self._groups(base)[:MOST_GROUPS]:
             likely = prior[group].max() > prior.max() - LIKELY
             lead = _Lead(
@@ -121,21 +118,19 @@ class KinematicJumps:
             for product in products:
                 combined = best_combinations(
                     self.posterior.body, product.modes, product.log_weights, product.energy,
-                    product.alternatives, product.changes, beta, s.combinations,
+                    product.alternatives, product.changes, share, s.combinations,
                 )  # fmt: skip
                 members = product.members[combined.parents]
                 rows = np.full(len(members), product.row)
                 if product.row == lead.row:
                     rows = sources.texture_rows[members]
-                everything.append(
-                    (combined.poses, members, combined.log_priors, combined.energies, rows)
-                )
-        poses, members, log_priors, energies, rows = (
-            np.concatenate([part[i] for part in everything]) for i in range(5)
+                everything.append((combined.poses, members, combined.energies, rows))
+        poses, members, energies, rows = (
+            np.concatenate([part[i] for part in everything]) for i in range(4)
         )
         kept = choose_hypotheses(
             relative_joints(self.posterior.body, poses),
-            s.exploration * weigh(log_priors, energies, beta),
+            search.rated(poses, energies),
             s.candidates,
             same=s.hypothesis_merge_distance,
         ).chosen
@@ -144,7 +139,7 @@ class KinematicJumps:
         changed = np.abs(poses - base.x[members]) > 1e-9
         return Hypotheses(
             poses,
-            log_priors[kept],
+            sources.log_weights[members],
             sources.ancestors[members],
             np.where(changed, poses, sources.expected[members]),
             changed | sources.jumped[members],
@@ -190,9 +185,7 @@ class KinematicJumps:
         """
         changes, energy = self._rate(lead, alternatives)
         products = [_Product(modes, members, log_weights, alternatives, changes, energy, lead.row)]
-        weight = np.array(
-            [np.logaddexp.reduce(log_weights) + np.log(self.posterior.settings.jump_probability)]
-        )
+        weight = np.array([np.logaddexp.reduce(log_weights) - JUMP])
         for pair in self.posterior.body.chain_pairs:
             swapped = self._swap(lead, pair)
             if swapped is None:
@@ -242,8 +235,7 @@ class KinematicJumps:
         """Configurations of a chain in a group: the modes' own, what was found, and all flips."""
         s, body = self.posterior.settings, self.posterior.body
         own = body.skeleton.chain_dofs[chain]
-        jump = -np.log(s.jump_probability)
-        angles, penalties = [modes[:, own]], [np.where(np.eye(len(modes)) > 0, 0.0, jump)]
+        angles, penalties = [modes[:, own]], [np.where(np.eye(len(modes)) > 0, 0.0, JUMP)]
         if found is not None:
             angles.append(found)
         if chain in self._searches:
@@ -257,7 +249,7 @@ class KinematicJumps:
         flips, parents = enumerate_flips(body, poses, chain)
         first = np.concatenate([[True], parents[1:] != parents[:-1]])
         every = np.concatenate([sources, flips[~first][:, own]])
-        penalties.append(np.full((len(modes), len(every) - len(modes)), jump))
+        penalties.append(np.full((len(modes), len(every) - len(modes)), JUMP))
         return distinct_alternatives(
             body, modes[0], chain, every, np.concatenate(penalties, axis=1),
             apart=DISTINCT, most=s.alternatives,
@@ -284,7 +276,7 @@ class KinematicJumps:
         return result
 
     def _swap(self, lead: _Lead, pair: tuple[str, str]) -> tuple[_Lead, list[Alternatives]] | None:
-        """The pose with two limbs each on the other's image, in all ways; None if they reach not.
+        """The pose with two limbs each on the other's image, in all ways; None if unreachable.
 
         Limbs that cross in the image are easily taken for each other, and one alone that changes
         sides leaves its own place empty.

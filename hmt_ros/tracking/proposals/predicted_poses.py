@@ -1,24 +1,20 @@
 """Pose hypotheses from an external single-image predictor, such as a mixture of experts.
 
-    log p(jump) = log epsilon + log w_m        of component m of the prediction
-
 They are proposals, no evidence, which would count the image twice.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import reverse_depth
-from hmt_ros.image.observation import Observation
-from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.hypotheses import Hypotheses, relative_joints
+from hmt_ros.tracking.hypotheses import Hypotheses
+from hmt_ros.tracking.optimisation import Search
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,31 +75,21 @@ class PredictedPoses:
 
     Attributes:
         body: of the person.
-        prediction: over poses of the body, weights that sum to 1.
-        probability: epsilon, prior probability of a pose that comes from the image alone.
+        prediction: over poses of the body.
     """
 
     body: Body
     prediction: GaussianMixture
-    probability: float
-    iterated: ClassVar[bool] = False
 
     def propose(
-        self,
-        _base: Minimum,
-        sources: Hypotheses,
-        _covariances: Array,
-        _observation: Observation,
-        _rng: np.random.Generator,
+        self, search: Search, _base: Minimum, sources: Hypotheses, _rng: np.random.Generator
     ) -> Hypotheses:
         """See `Proposal`."""
         poses = self.prediction.means
-        joints = (relative_joints(self.body, x) for x in (poses, sources.expected))
-        apart = next(joints)[:, None] - next(joints)[None]
-        nearest = np.linalg.norm(apart, axis=3).mean(2).argmin(1)
+        nearest = search.continuity.log_transitions(poses).argmax(0)
         return Hypotheses(
             poses,
-            sources.log_weights[nearest] + np.log(self.probability * self.prediction.weights),
+            sources.log_weights[nearest],
             sources.ancestors[nearest],
             poses,
             np.ones(poses.shape, dtype=np.bool_),

@@ -12,13 +12,12 @@ from typing import ClassVar
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.tracking.hypotheses import Hypotheses, relative_joints
+from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.selection import choose_hypotheses
-from hmt_ros.tracking.weighting import weigh
 
 
 def spherical_samples(
@@ -73,19 +72,14 @@ class CovarianceScaledSamples:
     """
 
     posterior: Posterior
-    iterated: ClassVar[bool] = False
     draw: ClassVar = staticmethod(covariance_scaled_samples)
 
     def propose(
-        self,
-        base: Minimum,
-        sources: Hypotheses,
-        covariances: Array,
-        observation: Observation,
-        rng: np.random.Generator,
+        self, search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
     ) -> Hypotheses:
         """See `Proposal`."""
         s, body, k = self.posterior.settings, self.posterior.body, len(sources)
+        observation, covariances = search.observation, search.states.searched
         each = max(s.samples // k, 1)
         drawn = self.draw(body, sources.expected, covariances, each, s.sample_scale, rng)
         poses = np.concatenate([base.x, drawn.reshape(-1, body.dimension)])
@@ -95,7 +89,7 @@ class CovarianceScaledSamples:
         )
         kept = choose_hypotheses(
             relative_joints(body, poses),
-            weigh(sources.log_weights[rows], energies, self.posterior.trust.inverse_temperature),
+            search.rated(poses, energies),
             s.candidates,
             same=s.hypothesis_merge_distance,
         ).chosen

@@ -83,6 +83,7 @@ class StandingStill:
     def __init__(self, body, camera, settings, background, seed, **others):
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
+        self.existence_probability = 1.0
         self.track_id, self.started_from = 1, None
         self.keypoints, self.positions, self.predictions, self.masks = [], [], [], []
         self.depths = []

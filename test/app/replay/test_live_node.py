@@ -122,7 +122,7 @@ def test_same_of_a_person_who_leaves_and_returns(tmp_path, capsys):
     ]
     bag = write(tmp_path / 'bag', [camera, *pictures])
     options = ['--set', 'max_hypotheses=2', '--set', 'candidates=3']
-    options += ['--set', 'facing_trial=0.0', '--set', 'smoother.fixed_lag=1']
+    options += ['--set', 'smoother.fixed_lag=1']
     (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
     assert one == other
     assert one[0] == 0

@@ -1,0 +1,122 @@
+"""Which way the person faces: a two-state chain, whose evidence lasts as long as the track.
+
+    S_t- = max(logit [exp(Q dt)] p_(t-1), max log t(x_k, x_j)),    j as the track faces, k not  (1)
+    S_t  = S_t- + b(min e_k (as the track faces) - min e_k (the other way))                     (2)
+    b(d) = log (v e^d + 1 - v) - log (v + (1 - v) e^d)                                          (3)
+
+A camera hardly tells a pose from its reversal in depth (`body.mirror`), and a wrong one does not
+come right by small steps. S = logit p are the log odds that the person faces the other way than the
+heaviest mode, Q the rate at which tracks turn out to be wrong, e_k what an image says against mode
+k. Nobody turns about from one image to the next: a hypothesis that faces the other way is another
+history of the track, and weighs what all images so far say of that history, whether a mode was kept
+of it or not. Seen from the side the two histories meet (1). The best motion of either way stands
+for it (2), as the number of its modes says nothing; one that was not followed is no evidence, as
+nothing held it. An image speaks of the way to face with the probability v, or of something else, as
+a flash does or a covered lens (3): no single one turns a track about.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.mirror import faces_back
+from hmt_ros.inference.arrays import Array, Mask
+
+# How often a track turns out to have taken the wrong way to face, 1/s.
+REVERSALS = 0.02
+# Probability v that what an image says of the way to face is about the person.
+VALID = 0.9
+# Log odds of a way to face that a start does not contain, and the largest that are counted, nats.
+ABSENT, MOST = -10.0, 10.0
+
+
+class Facing:
+    """Which way the person of one track faces.
+
+    Attributes:
+        log_odds: S, that the person faces the other way than the mode that leads, the heaviest.
+        back: (K,) modes that face the other way than that one.
+    """
+
+    def __init__(self) -> None:
+        self.log_odds = ABSENT
+        self.back: Mask = np.zeros(0, dtype=np.bool_)
+        self._lead: Array | None = None
+
+    def start(self, body: Body, poses: Array, log_weights: Array) -> None:
+        """Takes in poses (N, d) at the start of a track, with their log weights (N,)."""
+        self.log_odds = ABSENT
+        self._lead = poses[np.argmax(log_weights)]
+        if not body.trunk_pairs:
+            return
+        back = faces_back(body, poses, self._lead)
+        if back.any():
+            self.log_odds = max(float(log_weights[back].max() - log_weights[~back].max()), ABSENT)
+
+    def lead(self, body: Body, poses: Array) -> None:
+        """The first of the modes, poses (K, d), says from now on how the track faces."""
+        before = self._lead
+        if before is not None and body.trunk_pairs and faces_back(body, poses[:1], before)[0]:
+            self.log_odds = -self.log_odds
+        self.carry(body, poses)
+
+    def carry(self, body: Body, poses: Array) -> None:
+        """The same modes, (K, d), are seen by a camera that has moved."""
+        self._lead = poses[0]
+        if body.trunk_pairs:
+            self.back = faces_back(body, poses, self._lead)
+
+    def weigh(
+        self,
+        body: Body,
+        poses: Array,
+        transitions: Array,
+        log_weights: Array,
+        evidence: Array,
+        followed: Mask,
+        dt: float,
+    ) -> Array:
+        """Log weights (N,) of poses (N, d), in which either way has the weight of its history.
+
+        Args:
+            body: of the poses.
+            poses: (N, d).
+            transitions: (K, N) log t(x_n, x_k) from the modes.
+            log_weights: (N,) that only the ratios within a way are taken of.
+            evidence: (N,) what the image says against each, nats.
+            followed: (N,) which have moved on from a mode.
+            dt: time since the image before, s.
+        """
+        if self._lead is None or not body.trunk_pairs:
+            return log_weights
+        back = faces_back(body, poses, self._lead)
+        across = transitions[np.ix_(~self.back, back)]
+        log_odds = max(after(self.log_odds, dt), float(across.max(initial=-np.inf)))
+        on, off = followed & ~back, followed & back
+        if on.any() and off.any():
+            log_odds += believed(float(evidence[on].min() - evidence[off].min()))
+        self.log_odds = log_odds = float(np.clip(log_odds, -MOST, MOST))
+        if back.all():
+            # All modes went over: the track is as sure of this way as it was of the other one.
+            self.log_odds = abs(log_odds)
+        if back.all() or not back.any():
+            return log_weights
+        result = log_weights.copy()
+        for which, odds in ((back, log_odds), (~back, -log_odds)):
+            share = -np.logaddexp(0.0, -odds)
+            result[which] += share - np.logaddexp.reduce(log_weights[which])
+        return result
+
+
+def after(log_odds: float, dt: float) -> float:
+    """Log odds dt seconds later, of a chain that changes its state `REVERSALS` times a second."""
+    p = 1.0 / (1.0 + np.exp(-log_odds))
+    p += 0.5 * -np.expm1(-2.0 * REVERSALS * dt) * (1.0 - 2.0 * p)
+    return float(np.log(p) - np.log1p(-p))
+
+
+def believed(evidence: float) -> float:
+    """What evidence for a way to face counts where an image may speak of something else, (3)."""
+    valid, other = np.log(VALID), np.log1p(-VALID)
+    return float(np.logaddexp(valid + evidence, other) - np.logaddexp(valid, other + evidence))
