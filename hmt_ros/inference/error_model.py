@@ -50,8 +50,8 @@ class CueErrors:
         return self.independent * share_of_time(dt, self.time)
 
 
-# Chosen on eight clips, at 30 and 3 images a second. The prior of the pose is counted like a cue,
-# because the same pose is judged again in every image.
+# Chosen, not learned, at 30 and 3 images a second: one pair for all cues. The prior of the pose is
+# counted like a cue, because the same pose is judged again in every image.
 ERRORS: Mapping[str, CueErrors] = MappingProxyType(
     {
         'image': CueErrors(0.35, 0.053),

@@ -96,7 +96,6 @@ class Modes(Hypotheses):
         covariances: (N, d, d) of the posterior.
         filtered: (N, d, d) covariances as if errors were independent from image to image.
         log_likelihoods: (N,) of the image.
-        energies: (N,) of the posterior at the optimum, nats.
         state_covariances: (N, n, n) that are propagated, of poses and velocities. Of a random walk
             they are `filtered`; with velocities only a share of the images is believed, because
             their errors last.
@@ -107,7 +106,6 @@ class Modes(Hypotheses):
     covariances: Array
     filtered: Array
     log_likelihoods: Array
-    energies: Array
     state_covariances: Array
     identities: Index
 

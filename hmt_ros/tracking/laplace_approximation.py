@@ -83,7 +83,6 @@ def posterior_modes(
         covariances=covariances,
         filtered=filtered,
         log_likelihoods=-fit.image_energy,
-        energies=solved.value,
         state_covariances=state_covariances,
         identities=identities,
     )

@@ -64,7 +64,7 @@ def modes_of(body: Body, poses: np.ndarray, seed: int = 0) -> Modes:
     own = np.ascontiguousarray(states[:, :d, :d])
     return Modes(
         **vars(new_hypotheses(poses, np.zeros(k))), velocities=velocities, covariances=own,
-        filtered=own, log_likelihoods=np.zeros(k), energies=np.zeros(k), state_covariances=states,
+        filtered=own, log_likelihoods=np.zeros(k), state_covariances=states,
         identities=np.arange(1, k + 1),
     )  # fmt: skip
 

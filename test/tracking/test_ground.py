@@ -53,7 +53,7 @@ def single(pose: np.ndarray, velocity: np.ndarray | None = None) -> Modes:
     one = np.eye(d)[None]
     return Modes(
         **vars(start), velocities=velocities, covariances=one, filtered=one,
-        log_likelihoods=np.zeros(1), energies=np.zeros(1), state_covariances=one,
+        log_likelihoods=np.zeros(1), state_covariances=one,
         identities=np.ones(1, dtype=np.intp),
     )  # fmt: skip
 

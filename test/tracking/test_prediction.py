@@ -35,7 +35,6 @@ def modes_of(body: Body) -> Modes:
         covariances=np.tile(np.eye(d), (K, 1, 1)),
         filtered=states[:, :d, :d],
         log_likelihoods=np.zeros(K),
-        energies=np.zeros(K),
         state_covariances=states,
         identities=np.arange(1, K + 1),
     )
