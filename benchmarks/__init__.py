@@ -12,6 +12,7 @@ BENCHMARKS = {
     'bags': 'reading, memory, and what replay adds to the estimate',
     'contour_noise': 'how far contours of people lie from those of the model',
     'depth': 'what depth images bring to the tracker',
+    'error_model': 'how far the errors of each cue are independent, in an image and in time',
     'experts': 'conditional densities: a toy, motions of people apart, clips, speed',
     'flips': 'time per leaf of the interpretation trees',
     'keypoint_noise': 'where landmarks of a detector lie on the body, and how they err',

@@ -33,7 +33,7 @@ from hmt_ros.tracking.initialisation import start_from_keypoints
 
 Array = NDArray[np.float64]
 
-CLIPS = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'exercise')
+CLIPS = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'follow')
 QUICK = 2
 # Scale of the robust kernel of offsets, m, and number of its iterations.
 KERNEL, ITERATIONS = 0.06, 30

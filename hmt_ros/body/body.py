@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from hmt_ros.body import kinematics
 from hmt_ros.body.flesh import Flesh, Superquadric
 from hmt_ros.body.skeleton import Skeleton, sided_pairs
+from hmt_ros.body.symmetries import Symmetry
 from hmt_ros.inference.arrays import Array
 
 # How a part of the flesh differs from that of the model, column by column: logarithms of factors on
@@ -92,6 +93,7 @@ class Body:
         stature_lengths, stature_extra: the stature is the sum of these lengths plus the extra (m,
             at the default lengths; it scales with them).
         default_lengths: (L,) lengths of the model file, m.
+        symmetries: poses that a camera takes for each other, by map; see `body.symmetries`.
         growth: (B, 5) how each part differs from the model's; see `GROWTH`.
     """
 
@@ -104,6 +106,7 @@ class Body:
     stature_lengths: tuple[str, ...]
     stature_extra: float
     default_lengths: Array
+    symmetries: Mapping[str, Symmetry]
     growth: Array = field(default_factory=lambda: np.zeros((0, len(GROWTH))))
 
     def __post_init__(self) -> None:

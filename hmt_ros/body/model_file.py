@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from copy import deepcopy
 from functools import cache
 from importlib import resources
@@ -13,6 +14,7 @@ import numpy as np
 from hmt_ros.body.body import Body, PartShape
 from hmt_ros.body.length_prior import STATURE_SPREAD, length_covariance
 from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.body.symmetries import symmetries_of
 from hmt_ros.inference.arrays import Array
 from msg_tools.files.plain_yaml import load_plain_yaml, read_plain_yaml
 
@@ -74,6 +76,12 @@ def _shipped(name: str) -> dict[str, Any]:
     return _whole(load_plain_yaml(file.read_text('utf-8')))
 
 
+def usual_symmetries() -> Mapping[str, float]:
+    """The table of human37, which bodies without one of their own have."""
+    result: Mapping[str, float] = _shipped('human37')['symmetries']
+    return result
+
+
 def _whole(content: Any) -> dict[str, Any]:
     """The content of a model with that of the one it extends."""
     if not isinstance(content, dict):
@@ -121,7 +129,7 @@ def _mount(entry: dict[str, Any]) -> Array:
 
 KEYS = {
     'name', 'lengths', 'stature_spread', 'stature', 'stature_extra', 'segments', 'joints',
-    'chains', 'fixed',
+    'chains', 'fixed', 'symmetries',
 }  # fmt: skip
 SEGMENT_KEYS = {
     'name', 'parent', 'offset', 'points', 'x_axis', 'length', 'diffusion', 'dofs', 'flesh',
@@ -246,6 +254,7 @@ def _build(content: dict[str, Any]) -> Body:
         stature_lengths=tuple(content['stature']),
         stature_extra=float(content['stature_extra']),
         default_lengths=lengths,
+        symmetries=symmetries_of(content.get('symmetries', usual_symmetries())),
     )
 
 

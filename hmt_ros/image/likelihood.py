@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, make_dataclass
+from dataclasses import dataclass, field, make_dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import Any
@@ -159,17 +159,21 @@ class ImageLikelihood:
             return (image,)
         return (image, self.keypoint_term(observation, exchanges))
 
-    def keypoint_term(self, observation: Observation, exchanges: Array | None) -> KeypointTerm:
+    def keypoint_term(
+        self, observation: Observation, exchanges: Array | None, share: float = 1.0
+    ) -> KeypointTerm:
         """The term of the keypoints of an observation that has some.
 
         Args:
             observation: of the image.
             exchanges: of sides, see `KeypointTerm`; None: as usual for detectors.
+            share: of the energy that counts, beside what is known of the exchanges.
         """
         assert observation.keypoints is not None
         exchanges = usual_exchanges() if exchanges is None else exchanges
         return KeypointTerm(
-            self.body.skeleton, self.camera, observation.keypoints, self.settings.keypoints,
+            self.body.skeleton, self.camera, observation.keypoints,
+            replace(self.settings.keypoints, weight=share * self.settings.keypoints.weight),
             observation.magnification, exchanges,
         )  # fmt: skip
 

@@ -54,8 +54,8 @@ class CueErrors:
 # counted like a cue, because the same pose is judged again in every image.
 ERRORS: Mapping[str, CueErrors] = MappingProxyType(
     {
-        'image': CueErrors(0.35, 0.053),
+        'image': CueErrors(0.15, 0.019),
         'keypoints': CueErrors(0.35, 0.053),
-        'prior': CueErrors(0.35, 0.053),
+        'prior': CueErrors(0.15, 0.019),
     }
 )

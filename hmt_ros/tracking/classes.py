@@ -6,13 +6,13 @@
 
 A camera hardly tells a pose from its reversal in depth (`body.mirror`), and a wrong one does not
 come right by small steps. S = logit p are the log odds that the person faces the other way than the
-heaviest mode, Q the rate at which tracks turn out to be wrong, e_k what an image says against mode
-k. Nobody turns about from one image to the next: a hypothesis that faces the other way is another
-history of the track, and weighs what all images so far say of that history, whether a mode was kept
-of it or not. Seen from the side the two histories meet (1). The best motion of either way stands
-for it (2), as the number of its modes says nothing; one that was not followed is no evidence, as
-nothing held it. An image speaks of the way to face with the probability v, or of something else, as
-a flash does or a covered lens (3): no single one turns a track about.
+heaviest mode, Q the rate of the symmetry `reversal` (`body.symmetries`), e_k what an image says
+against mode k. Nobody turns about from one image to the next: a hypothesis that faces the other way
+is another history of the track, and weighs what all images so far say of that history, whether a
+mode was kept of it or not. Seen from the side the two histories meet (1). The best motion of either
+way stands for it (2), as the number of its modes says nothing; one that was not followed is no
+evidence, as nothing held it. An image speaks of the way to face with the probability v, or of
+something else, as a flash does or a covered lens (3): no single one turns a track about.
 """
 
 from __future__ import annotations
@@ -23,8 +23,6 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import faces_back
 from hmt_ros.inference.arrays import Array, Mask
 
-# How often a track turns out to have taken the wrong way to face, 1/s.
-REVERSALS = 0.02
 # Probability v that what an image says of the way to face is about the person.
 VALID = 0.9
 # Log odds of a way to face that a start does not contain, and the largest that are counted, nats.
@@ -92,7 +90,8 @@ class Facing:
             return log_weights
         back = faces_back(body, poses, self._lead)
         across = transitions[np.ix_(~self.back, back)]
-        log_odds = max(after(self.log_odds, dt), float(across.max(initial=-np.inf)))
+        stayed = body.symmetries['reversal'].after(self.log_odds, dt)
+        log_odds = max(stayed, float(across.max(initial=-np.inf)))
         on, off = followed & ~back, followed & back
         if on.any() and off.any():
             log_odds += believed(float(evidence[on].min() - evidence[off].min()))
@@ -107,13 +106,6 @@ class Facing:
             share = -np.logaddexp(0.0, -odds)
             result[which] += share - np.logaddexp.reduce(log_weights[which])
         return result
-
-
-def after(log_odds: float, dt: float) -> float:
-    """Log odds dt seconds later, of a chain that changes its state `REVERSALS` times a second."""
-    p = 1.0 / (1.0 + np.exp(-log_odds))
-    p += 0.5 * -np.expm1(-2.0 * REVERSALS * dt) * (1.0 - 2.0 * p)
-    return float(np.log(p) - np.log1p(-p))
 
 
 def believed(evidence: float) -> float:

@@ -21,8 +21,6 @@ from hmt_ros.inference.arrays import Array, Index, Mask
 
 # Least probability of an exchange.
 LEAST = 1e-6
-# What else is exchanged when all that was is not: all for none, legs for arms.
-COMPLEMENT = [1, 0, 3, 2]
 
 
 class SideExchanges:
@@ -49,14 +47,13 @@ class SideExchanges:
 
         Args:
             ancestors: modes of the image before.
-            anew: (N,) hypotheses that say that the track was wrong: if it was about the way to
-                face, it was about the sides as well.
+            anew: (N,) hypotheses that say that the track was wrong: what it took the detector for
+                was wrong as well.
         """
+        usual = np.repeat(usual_exchanges(), len(ancestors), axis=0)
         if self.prior is None:
-            return np.repeat(usual_exchanges(), len(ancestors), axis=0)
-        own = self.prior[ancestors]
-        either = np.logaddexp(own, own[:, COMPLEMENT]) - np.log(2.0)
-        return np.where(anew[:, None], either, own)
+            return usual
+        return np.where(anew[:, None], usual, self.prior[ancestors])
 
     def update(
         self, likelihood: ImageLikelihood, observation: Observation, poses: Array, prior: Array

@@ -273,7 +273,8 @@ class Posterior:
     ) -> Array:
         """What an image adds to minus the log weights of poses (N, d), (N,) nats.
 
-        Textures are left out: each hypothesis carries its own.
+        Textures are left out: each hypothesis carries its own. What a detector takes for what is a
+        chain (`exchanges`): its prior counts whole, the energies by their share.
 
         Args:
             poses: (N, d).
@@ -283,16 +284,20 @@ class Posterior:
         """
         frames, rows = forward(self.body.skeleton, poses), np.arange(len(poses))
         self.evaluations += len(poses)
+        share = {name: errors.share(dt) for name, errors in ERRORS.items()}
 
-        def of(name: str, terms: Sequence[FrameTerm]) -> Array:
+        def of(terms: Sequence[FrameTerm]) -> Array:
             value = np.zeros(len(poses))
             for term in terms:
                 value += term.energy(frames, rows, derivatives=Derivatives.NONE).value
-            return ERRORS[name].share(dt) * value
+            return value
 
-        image, *keypoints = self.likelihood.seen(observation, exchanges=exchanges)
-        priors = (*self.likelihood.priors, *self.known)
-        return of('image', [image]) + of('keypoints', keypoints) + of('prior', priors)
+        image, *keypoints = self.likelihood.seen(observation)
+        total = share['image'] * of([image])
+        total += share['prior'] * of([*self.likelihood.priors, *self.known])
+        if keypoints:
+            total += of([self.likelihood.keypoint_term(observation, exchanges, share['keypoints'])])
+        return total
 
     def textures(self, poses: Array, observation: Observation) -> Textures | None:
         """What an image shows on the surfaces of poses (K, d)."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
 from scipy.special import expit, logit
 
+from hmt_ros.body import load_body
 from hmt_ros.body.mirror import (
     faces_back,
     reverse_depth,
@@ -14,10 +14,11 @@ from hmt_ros.body.mirror import (
     root_rotation_dofs,
     root_rotations,
 )
-from hmt_ros.tracking.classes import ABSENT, MOST, REVERSALS, VALID, Facing, after, believed
+from hmt_ros.tracking.classes import ABSENT, MOST, VALID, Facing, believed
 from hmt_ros.tracking.weighting import Continuity
 
 DT = 0.1
+REVERSALS = load_body('human37').symmetries['reversal']
 KNOWN = np.ones(2, dtype=bool)
 
 
@@ -65,30 +66,6 @@ def begun(body, poses, log_odds=ABSENT):
     return facing
 
 
-@pytest.mark.parametrize('log_odds', [-10.0, -1.0, 0.0, 4.0])
-@pytest.mark.parametrize('dt', [0.03, 1.0, 40.0])
-def test_odds_follow_a_chain_of_two_states(log_odds, dt):
-    rates = REVERSALS * np.array([[-1.0, 1.0], [1.0, -1.0]])
-    p = expit(log_odds)
-    moved = np.array([1.0 - p, p]) @ expm(rates * dt)
-    assert after(log_odds, dt) == pytest.approx(logit(moved[1]), abs=1e-9)
-
-
-@pytest.mark.parametrize('log_odds', [-10.0, -3.0, 0.0, 7.0])
-def test_odds_of_two_gaps_are_those_of_one(log_odds):
-    for a, b in ((0.0, 0.1), (0.03, 0.3), (2.0, 50.0)):
-        assert after(after(log_odds, a), b) == pytest.approx(after(log_odds, a + b), abs=1e-9)
-
-
-def test_nothing_is_known_after_long():
-    assert after(-8.0, 1000.0) == pytest.approx(0.0, abs=1e-12)
-    assert after(-MOST, np.inf) == 0.0
-    gaps = [after(-8.0, dt) for dt in (0.0, 0.1, 1.0, 10.0, 100.0)]
-    assert gaps[0] == pytest.approx(-8.0)
-    assert (np.diff(gaps) > 0).all()
-    assert max(gaps) < 0.0
-
-
 def test_evidence_that_lasts_turns_the_track_about(human32, both, weigh):
     facing = begun(human32, both, log_odds=-4.0)
     images = 0
@@ -111,13 +88,13 @@ def test_one_image_does_not_turn_the_track_about(human32, both, weigh):
     facing = begun(human32, both, log_odds=-4.0)
     log_weights = weigh(facing, [22.0, 20.0])
     assert log_weights[0] > log_weights[1] + 1.0
-    assert facing.log_odds == pytest.approx(after(-4.0, DT) + believed(2.0))
+    assert facing.log_odds == pytest.approx(REVERSALS.after(-4.0, DT) + believed(2.0))
 
 
 def test_hypotheses_that_were_not_followed_are_no_evidence(human32, both, weigh):
     facing = begun(human32, both, log_odds=-4.0)
     weigh(facing, [99.0, 0.0], followed=[True, False])
-    assert facing.log_odds == pytest.approx(after(-4.0, DT))
+    assert facing.log_odds == pytest.approx(REVERSALS.after(-4.0, DT))
 
 
 def test_the_best_motion_stands_for_its_way(human32, both, weigh):
@@ -125,9 +102,9 @@ def test_the_best_motion_stands_for_its_way(human32, both, weigh):
     many = np.concatenate([both[:1], np.repeat(both[1:], 3, axis=0)])
     facing = begun(human32, both, log_odds=-2.0)
     log_weights = weigh(facing, [20.0, 20.0, 30.0, 40.0], np.ones(4, dtype=bool), poses=many)
-    wanted = expit(after(-2.0, DT))
+    wanted = expit(REVERSALS.after(-2.0, DT))
     assert np.exp(log_weights[1:]).sum() == pytest.approx(wanted)
-    assert facing.log_odds == pytest.approx(after(-2.0, DT))
+    assert facing.log_odds == pytest.approx(REVERSALS.after(-2.0, DT))
 
 
 def test_within_a_way_weights_keep_their_ratios(human32, both, weigh):
@@ -137,7 +114,7 @@ def test_within_a_way_weights_keep_their_ratios(human32, both, weigh):
     found = weigh(facing, np.zeros(3), np.ones(3, dtype=bool), before, poses)
     assert found[0] - found[1] == pytest.approx(np.log(3.0))
     assert np.exp(found).sum() == pytest.approx(1.0)
-    assert np.exp(found[2]) == pytest.approx(expit(after(-3.0, DT)))
+    assert np.exp(found[2]) == pytest.approx(expit(REVERSALS.after(-3.0, DT)))
     # Where all face one way, there is nothing to share.
     one_way = weigh(facing, np.zeros(2), KNOWN, before[:2], poses[:2])
     assert np.array_equal(one_way, before[:2])
@@ -167,7 +144,9 @@ def test_odds_are_bounded(human32, both, weigh):
         assert -MOST <= facing.log_odds <= MOST
         facing.lead(human32, both)
     # The chain forgets as fast as images tell, where they are certain.
-    assert facing.log_odds == pytest.approx(after(facing.log_odds, DT) - logit(VALID), abs=0.1)
+    assert facing.log_odds == pytest.approx(
+        REVERSALS.after(facing.log_odds, DT) - logit(VALID), abs=0.1
+    )
     assert np.isfinite(log_weights).all()
 
 
@@ -230,7 +209,7 @@ def test_the_only_way_that_is_left_leads(human32, both, weigh):
     found = weigh(facing, [5.0], [True], before, both[1:])
     assert np.array_equal(found, before)
     facing.lead(human32, both[1:])
-    assert facing.log_odds == pytest.approx(after(-3.0, DT))
+    assert facing.log_odds == pytest.approx(REVERSALS.after(-3.0, DT))
 
 
 def test_a_body_without_a_trunk_is_left_alone(human32, both):

@@ -8,6 +8,7 @@ that stand for all become candidates.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -38,8 +39,6 @@ SAME_TRUNK = 0.06
 LIKELY = 4.0
 # Configurations of a limb are distinct when some joint is further apart, m.
 DISTINCT = 0.08
-# What a configuration that no mode has costs where combinations are ranked, nats.
-JUMP = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +98,8 @@ class KinematicJumps:
         s, textures, observation = self.posterior.settings, sources.textures, search.observation
         covariances = search.states.searched
         share = ERRORS['image'].share(search.dt)
+        symmetries = self.posterior.body.symmetries
+        prices = {name: symmetry.price(search.dt) for name, symmetry in symmetries.items()}
         everything: list[tuple[Array, Index, Array, Index]] = []
         prior = search.rated(base.x, base.value)
         for group in self._groups(base)[:MOST_GROUPS]:
@@ -109,11 +110,11 @@ class KinematicJumps:
             )  # fmt: skip
             found = self._search(lead, base.x, rng) if likely else {}
             alternatives = [
-                self._alternatives(base.x[group], chain, found.get(chain))
+                self._alternatives(base.x[group], chain, found.get(chain), prices['limb_flip'])
                 for chain in self.posterior.body.chains
             ]
             products, textures = self._products(
-                lead, base.x[group], group, sources.log_weights[group], alternatives
+                lead, base.x[group], group, sources.log_weights[group], alternatives, prices
             )
             for product in products:
                 combined = best_combinations(
@@ -172,6 +173,7 @@ class KinematicJumps:
         members: Index,
         log_weights: Array,
         alternatives: list[Alternatives],
+        prices: Mapping[str, float],
     ) -> tuple[list[_Product], Textures | None]:
         """The product of a group, those with limbs exchanged, and those with the torso flipped.
 
@@ -179,13 +181,15 @@ class KinematicJumps:
             lead: first mode of the group.
             modes, members, log_weights: (G, d), (G,), (G,) of the group.
             alternatives: one entry a chain.
+            prices: of the symmetries of the body, nats.
 
         Returns:
             The products, and the textures of which they have rows.
         """
         changes, energy = self._rate(lead, alternatives)
         products = [_Product(modes, members, log_weights, alternatives, changes, energy, lead.row)]
-        weight = np.array([np.logaddexp.reduce(log_weights) - JUMP])
+        weight = np.array([np.logaddexp.reduce(log_weights)])
+        exchanged, flipped_over = (weight - prices[name] for name in ('exchange', 'trunk_flip'))
         for pair in self.posterior.body.chain_pairs:
             swapped = self._swap(lead, pair)
             if swapped is None:
@@ -203,12 +207,14 @@ class KinematicJumps:
                     choices.append(Alternatives(chain.chain, chain.angles, chain.penalties[:1]))
                     joined.append(change)
             products.append(
-                _Product(other.pose[None], members[:1], weight, choices, joined, energy, other.row)
+                _Product(
+                    other.pose[None], members[:1], exchanged, choices, joined, energy, other.row
+                )
             )
         for flipped, hung in self._torso_flips(lead.pose, [a.chain for a in alternatives]):
             rated, energy = self._rate(replace(lead, pose=flipped), hung)
             products.append(
-                _Product(flipped[None], members[:1], weight, hung, rated, energy, lead.row)
+                _Product(flipped[None], members[:1], flipped_over, hung, rated, energy, lead.row)
             )
         return products, lead.textures
 
@@ -231,11 +237,16 @@ class KinematicJumps:
             for i in sorted(chosen)
         }
 
-    def _alternatives(self, modes: Array, chain: str, found: Array | None) -> Alternatives:
-        """Configurations of a chain in a group: the modes' own, what was found, and all flips."""
+    def _alternatives(
+        self, modes: Array, chain: str, found: Array | None, price: float
+    ) -> Alternatives:
+        """Configurations of a chain in a group: the modes' own, what was found, and all flips.
+
+        Each has a price, nats, for the modes that do not have it.
+        """
         s, body = self.posterior.settings, self.posterior.body
         own = body.skeleton.chain_dofs[chain]
-        angles, penalties = [modes[:, own]], [np.where(np.eye(len(modes)) > 0, 0.0, JUMP)]
+        angles, penalties = [modes[:, own]], [np.where(np.eye(len(modes)) > 0, 0.0, price)]
         if found is not None:
             angles.append(found)
         if chain in self._searches:
@@ -249,7 +260,7 @@ class KinematicJumps:
         flips, parents = enumerate_flips(body, poses, chain)
         first = np.concatenate([[True], parents[1:] != parents[:-1]])
         every = np.concatenate([sources, flips[~first][:, own]])
-        penalties.append(np.full((len(modes), len(every) - len(modes)), JUMP))
+        penalties.append(np.full((len(modes), len(every) - len(modes)), price))
         return distinct_alternatives(
             body, modes[0], chain, every, np.concatenate(penalties, axis=1),
             apart=DISTINCT, most=s.alternatives,
