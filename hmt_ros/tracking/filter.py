@@ -239,9 +239,7 @@ class MixtureFilter:
             posterior.given(seen, predicted, precisions), predicted.poses, s.base_iterations
         )
         search = Search(posterior, seen, states, precisions, continuity)
-        proposals: list[Proposal] = [self._proposal]
-        if not self._facing.back.any():
-            proposals.insert(0, Reversals())
+        proposals: list[Proposal] = [Reversals(), self._proposal]
         if expected is not None:
             proposals.insert(0, PredictedPoses(self.body, expected.seen_as(self.body)))
         candidates, *others = (x.propose(search, base, predicted, self._rng) for x in proposals)
