@@ -239,7 +239,10 @@ class MixtureFilter:
             posterior.given(seen, predicted, precisions), predicted.poses, s.base_iterations
         )
         search = Search(posterior, seen, states, precisions, continuity)
-        proposals: list[Proposal] = [Reversals(), self._proposal]
+        proposals: list[Proposal] = [self._proposal]
+        back = self._facing.back
+        if not back.any() or back[np.argmax(search.rated(base.x, base.value))]:
+            proposals.insert(0, Reversals())
         if expected is not None:
             proposals.insert(0, PredictedPoses(self.body, expected.seen_as(self.body)))
         candidates, *others = (x.propose(search, base, predicted, self._rng) for x in proposals)
