@@ -22,7 +22,7 @@ from scipy.special import logsumexp
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.mirror import mirror_order
-from hmt_ros.body.model_file import model_names, read_body
+from hmt_ros.body.model_file import load_body, model_names
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.mixture import GaussianMixture
@@ -170,7 +170,7 @@ def _shipped(name: str) -> AngleMixture | None:
     if name not in model_names() or not file.is_file():
         return None
     with resources.as_file(file) as path:
-        return read_pose_prior(path, read_body(name))
+        return read_pose_prior(path, load_body(name))
 
 
 def _same_angles(first: Skeleton, second: Skeleton) -> bool:

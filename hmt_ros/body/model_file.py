@@ -35,8 +35,10 @@ def model_names() -> list[str]:
     )
 
 
-def read_body(source: str | Path) -> Body:
-    """Body of a YAML file, or of a name that ships with the package.
+def load_body(source: str | Path) -> Body:
+    """The body of a YAML file, or of a name that ships: 'human37', 'human34' or 'human32'.
+
+    That of a motion file is read by `hmt_ros.motion.motion_file.read_skeleton`.
 
     Raises:
         FileNotFoundError: neither a file nor a known name.
@@ -56,6 +58,18 @@ def read_body(source: str | Path) -> Body:
         ) from fault
 
 
+def named_body(name: str) -> Body:
+    """The body that ships under a name; for names in messages, which must not lead to files.
+
+    Raises:
+        FileNotFoundError: none ships under this name.
+    """
+    known = model_names()
+    if name not in known:
+        raise FileNotFoundError(f'no body {name!r}: wanted one of {known}')
+    return load_body(name)
+
+
 def _read(source: str | Path) -> dict[str, Any]:
     """The content of a model file, with what it extends."""
     if str(source) in model_names():
@@ -63,8 +77,7 @@ def _read(source: str | Path) -> dict[str, Any]:
     path = Path(source)
     if not path.is_file():
         raise FileNotFoundError(
-            f'no body {str(source)!r}: wanted one of {model_names()}, a YAML file, or a motion '
-            f'file (.bvh, .asf, .amc)'
+            f'no body {str(source)!r}: wanted one of {model_names()}, or a YAML file'
         )
     return _whole(read_plain_yaml(path, LARGEST_FILE))
 

@@ -150,34 +150,6 @@ class GaussianMixture:
         i = np.atleast_1d(np.arange(len(self))[index])
         return GaussianMixture(self.weights[i], self.means[i], self.covariances[i])
 
-    def reduce(self, k: int) -> GaussianMixture:
-        """At most k components with the same mean and covariance (`reduction.merged_pairwise`).
-
-        Raises:
-            ValueError: k < 1.
-        """
-        from hmt_ros.inference.reduction import merged_pairwise
-
-        return merged_pairwise(self, k)
-
-
-def bhattacharyya_distances(
-    means_a: Array, covariances_a: Array, means_b: Array, covariances_b: Array
-) -> Array:
-    """Bhattacharyya distances (A, B) between two sets of Gaussians (KJS fig. 4, step 5).
-
-    1/8 (mi-mj)' [(Si+Sj)/2]^-1 (mi-mj) + 1/2 log(|(Si+Sj)/2| / sqrt(|Si||Sj|))
-    """
-    middle = 0.5 * (covariances_a[:, None] + covariances_b[None])
-    offset = means_a[:, None] - means_b[None]
-    factor = np.linalg.cholesky(middle)
-    z = np.linalg.solve(factor, offset[..., None])[..., 0]
-    log_det = 2.0 * np.log(np.diagonal(factor, axis1=-2, axis2=-1)).sum(-1)
-    log_a = np.linalg.slogdet(covariances_a)[1]
-    log_b = np.linalg.slogdet(covariances_b)[1]
-    result: Array = 0.125 * (z * z).sum(-1) + 0.5 * (log_det - 0.5 * (log_a[:, None] + log_b[None]))
-    return result
-
 
 def _points(x: ArrayLike, dimension: int) -> Array:
     points = np.asarray(x, dtype=np.float64)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.length_prior import length_covariance
-from hmt_ros.body.model_file import read_body
+from hmt_ros.body.model_file import load_body
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference.arrays import Array
 from msg_tools.files.bounded_file import read_bytes
@@ -224,7 +224,7 @@ def rig_body(rig: Rig, name: str, unit_to_m: float) -> Body:
 
 def _rates(rig: Rig, names: Sequence[str]) -> Array:
     """Variances (d,) per second, as of human37; a segment that it lacks has those of its parent."""
-    person = read_body('human37')
+    person = load_body('human37')
     known = person.skeleton
     turns = {
         int(s): float(rate)

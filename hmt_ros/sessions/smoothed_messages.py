@@ -11,6 +11,7 @@ import numpy as np
 from hmt_ros.body import Body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.reduction import merged_pairwise
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
 from msg_tools import MessageFactory
@@ -141,7 +142,7 @@ def final_messages(
     """
     if not wanted('smoothed_pose_mixture') and not wanted('smoothed_joint_states'):
         return
-    mixture = pose.mixture.reduce(components).normalised()
+    mixture = merged_pairwise(pose.mixture, components).normalised()
     content = PoseMixture.of_body(
         of.body,
         GaussianMixture(mixture.weights, mixture.means, _symmetric(np.array(mixture.covariances))),

@@ -9,7 +9,6 @@ import pytest
 import yaml
 
 from hmt_ros.body import load_body
-from hmt_ros.body.model_file import read_body
 
 TEXT = (resources.files('hmt_ros.body') / 'models' / 'human37.yaml').read_text('utf-8')
 
@@ -112,7 +111,7 @@ def test_a_segment_without_a_diffusion_has_that_of_its_parent(tmp_path):
             if segment['name'] in ('pelvis', '{side}_forearm', 'trunk', 'head'):
                 del segment['diffusion']
 
-    body = read_body(write(tmp_path / 'own.yaml', drop))
+    body = load_body(write(tmp_path / 'own.yaml', drop))
     rates = dict(zip(body.dof_names, np.sqrt(body.rates)))
     wanted = {'root_tz': 0.25, 'root_z': 1.4, 'trunk_x': 1.4, 'neck_y': 1.4, 'left_elbow': 2.2}
     assert {name: rates[name] for name in wanted} == pytest.approx(wanted)

@@ -10,7 +10,7 @@ from scipy import integrate
 from scipy.stats import multivariate_normal
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.mixture import bhattacharyya_distances
+from hmt_ros.inference.reduction import merged_pairwise
 
 
 def random_mixture(k: int, d: int, seed: int, total: float = 1.0) -> GaussianMixture:
@@ -111,7 +111,7 @@ def test_samples_have_the_density():
 )
 def test_reduction_keeps_mean_covariance_and_total_weight(k, keep, d, seed, total):
     mixture = random_mixture(k, d, seed, total)
-    reduced = mixture.reduce(keep)
+    reduced = merged_pairwise(mixture, keep)
     assert len(reduced) == min(k, keep)
     assert reduced.weights.sum() == pytest.approx(total)
     scale = np.abs(mixture.covariance()).max()
@@ -124,19 +124,19 @@ def test_reduction_merges_twins_first():
     mixture = GaussianMixture(
         [0.2, 0.5, 0.3], [[0.0], [10.0], [0.01]], np.array([[[1.0]], [[1.0]], [[1.0]]])
     )
-    reduced = mixture.reduce(2)
+    reduced = merged_pairwise(mixture, 2)
     np.testing.assert_allclose(np.sort(reduced.means[:, 0]), [0.006, 10.0])
-    assert len(mixture.reduce(3)) == len(mixture.reduce(7)) == 3
+    assert len(merged_pairwise(mixture, 3)) == len(merged_pairwise(mixture, 7)) == 3
 
 
 def test_reduction_drops_components_of_weight_zero():
     mixture = GaussianMixture([0.5, 0.0, 0.5], [[0.0], [5.0], [9.0]], np.ones((3, 1, 1)))
-    np.testing.assert_array_equal(mixture.reduce(2).means, [[0.0], [9.0]])
+    np.testing.assert_array_equal(merged_pairwise(mixture, 2).means, [[0.0], [9.0]])
 
 
 def test_reduction_to_one_is_the_moment_match():
     mixture = random_mixture(6, 3, 10, total=2.0)
-    one = mixture.reduce(1)
+    one = merged_pairwise(mixture, 1)
     np.testing.assert_allclose(one.means[0], mixture.mean())
     np.testing.assert_allclose(one.covariances[0], mixture.covariance())
     assert one.weights[0] == pytest.approx(2.0)
@@ -147,7 +147,7 @@ def test_reduction_of_many_components_costs_little_divergence():
     centres = np.array([[-6.0, 0], [6, 0], [0, 7]])
     means = centres[rng.integers(0, 3, 60)] + rng.normal(0, 0.1, (60, 2))
     mixture = GaussianMixture(np.full(60, 1 / 60), means, np.tile(np.eye(2), (60, 1, 1)))
-    reduced = mixture.reduce(3)
+    reduced = merged_pairwise(mixture, 3)
     x = mixture.sample(2000, rng)
     assert np.mean(mixture.log_density(x) - reduced.log_density(x)) < 0.01
 
@@ -201,46 +201,10 @@ def test_use_that_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match=r'points have shape \(4, 3\), wanted \(N, 2\)'):
         mixture.log_density(np.zeros((4, 3)))
     with pytest.raises(ValueError, match='k must be at least 1, saw 0'):
-        mixture.reduce(0)
+        merged_pairwise(mixture, 0)
     indefinite = GaussianMixture([1.0, 1.0], np.zeros((2, 2)), [np.eye(2), np.diag([1.0, -1.0])])
     with pytest.raises(ValueError, match='component 1 is not positive definite'):
         indefinite.log_density(np.zeros((1, 2)))
     nothing = GaussianMixture([0.0], [[0.0]], [[[1.0]]])
     with pytest.raises(ValueError, match='total weight 0'):
         nothing.normalised()
-
-
-def test_bhattacharyya_distance_equals_the_direct_formula():
-    a, b = random_mixture(3, 4, 13), random_mixture(2, 4, 14)
-    distances = bhattacharyya_distances(a.means, a.covariances, b.means, b.covariances)
-    assert distances.shape == (3, 2)
-    for i in range(3):
-        for j in range(2):
-            middle = (a.covariances[i] + b.covariances[j]) / 2
-            offset = a.means[i] - b.means[j]
-            expected = offset @ np.linalg.inv(middle) @ offset / 8 + 0.5 * np.log(
-                np.linalg.det(middle)
-                / np.sqrt(np.linalg.det(a.covariances[i]) * np.linalg.det(b.covariances[j]))
-            )
-            assert distances[i, j] == pytest.approx(expected, rel=1e-9)
-
-
-def test_bhattacharyya_distance_is_minus_the_log_of_the_overlap():
-    """In one dimension: the integral of sqrt(p q), summed over a grid."""
-    a, b = random_mixture(2, 1, 15), random_mixture(2, 1, 16)
-    distances = bhattacharyya_distances(a.means, a.covariances, b.means, b.covariances)
-    for i in range(2):
-        for j in range(2):
-            p, q = (multivariate_normal(m.means[k], m.covariances[k]) for m, k in ((a, i), (b, j)))
-            x = np.linspace(-60, 60, 24001)
-            overlap = np.sqrt(p.pdf(x) * q.pdf(x)).sum() * (x[1] - x[0])
-            assert distances[i, j] == pytest.approx(-np.log(overlap), abs=1e-6)
-
-
-@given(seed=st.integers(0, 2**32 - 1), d=st.integers(1, 5))
-def test_bhattacharyya_distance_is_symmetric_and_zero_to_itself(seed, d):
-    a = random_mixture(4, d, seed)
-    distances = bhattacharyya_distances(a.means, a.covariances, a.means, a.covariances)
-    np.testing.assert_allclose(distances, distances.T, atol=1e-9)
-    np.testing.assert_allclose(np.diagonal(distances), 0.0, atol=1e-9)
-    assert (distances > -1e-9).all()

@@ -68,7 +68,7 @@ def test_reduction_keeps_moments_and_little_is_lost(seed):
     np.testing.assert_allclose(small.covariance(), large.covariance(), atol=1e-6)
     points = large.sample(20_000, rng)
     lost = [(large.log_density(points) - q.log_density(points)).mean()
-            for q in (small, clustered(large, 5), large.reduce(1))]  # fmt: skip
+            for q in (small, clustered(large, 5), merged_pairwise(large, 1))]  # fmt: skip
     assert lost[0] < lost[1] + 0.01
     assert lost[0] < 0.6 * lost[2]
 

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hmt_ros.body import load_body
 from hmt_ros.motion.bvh import read_bvh
 from hmt_ros.motion.motion_file import (
     WORLD_FROM_FILE,
@@ -210,11 +209,10 @@ def test_an_amc_finds_its_skeleton_elsewhere(rod, tmp_path):
     assert len(read_motion(folder / 'rod.amc', skeleton=tmp_path / 'rod.asf')) == 2
 
 
-def test_motion_files_are_bodies_to_load(rod):
-    by_name = load_body(rod)
-    assert by_name.joint_names == read_skeleton(rod).joint_names
-    assert load_body(rod.with_suffix('.asf')).dof_names == by_name.dof_names
-    assert not by_name.flesh.parts
+def test_a_skeleton_of_motion_and_of_its_skeleton_file_are_one_body_without_flesh(rod):
+    body = read_skeleton(rod)
+    assert read_skeleton(rod.with_suffix('.asf')).dof_names == body.dof_names
+    assert not body.flesh.parts
 
 
 def test_equal_limits_hold_a_joint_almost_still(rod):
