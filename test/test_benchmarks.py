@@ -185,7 +185,7 @@ def test_votes():
         assert 0 <= one['plausible_per_sample'] <= one['minima_per_sample'] < 1
         assert one == votes.new_minima('human34', vote, 0, 3, 6)
     film = votes.filmed('walk', 0, 2)
-    tracked = [votes.tracked(film, vote, 0) for vote in ('minima', votes.ALL)]
+    tracked = [votes.tracked(film, count, 0) for count in votes.SEARCHED.values()]
     assert all(one['best_mm'] < 150 for one in tracked)
     assert tracked[0]['evaluations'] < tracked[1]['evaluations']
     summary = votes._summary([{'best_mm': 1.0}, {'best_mm': 3.0}])

@@ -101,7 +101,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._own = OwnMessages()
         self._failure = ''
         self._inner_faults = InnerFaults()
-        self._ticks, self._told_at = 0, 0
+        self._told_at = 0
         self._events = MiddlewareEvents(self.get_logger().warn)
         self._silent = SilentTopics(self, self.get_logger().warn)
         self._counted = f'{self.SESSION.UNIT}s'
@@ -372,12 +372,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._log_status(counts)
 
     def _log_status(self, counts: Counter[str]) -> None:
-        """One line a period, or a few periods, while messages arrive."""
-        self._ticks += 1
-        interval = self._settings.status_interval
-        if not interval or self._ticks < interval or counts['received'] == self._told_at:
+        """One line a period while messages arrive."""
+        if counts['received'] == self._told_at:
             return
-        self._ticks, self._told_at = 0, counts['received']
+        self._told_at = counts['received']
         if self._session is not None:
             label = self._state_machine.current_state[1]
             _, text = self._judgement(label, self._session.state)

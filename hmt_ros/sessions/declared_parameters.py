@@ -45,6 +45,9 @@ TRANSPORTS = ('raw', 'compressed')
 LONGEST_TIMEOUT = 60.0  # s
 
 # Parameters that nodes had before, and what is there instead.
+_TRACKER = 'programs set it in TrackerSettings'
+_LIKELIHOOD = 'programs set it in LikelihoodSettings'
+_BACKGROUND = 'programs set it in BackgroundSettings'
 REMOVED = {
     'absence_time': 'existence is a probability with rates per second: see existence_probability',
     'reweighting': 'the weight of a mode follows from all pairs of modes (docs/tracking.md)',
@@ -52,6 +55,17 @@ REMOVED = {
     'prediction_probability': 'predictions are proposals, and weigh as any other hypothesis',
     'facing_trial': 'one filter follows both ways to face for as long as they are open',
     'trust': 'how far images are believed is a table: hmt_ros/inference/error_model.py',
+    'proposals': f'kinematic jumps; {_TRACKER}',
+    'samples': f'kinematic jumps draw none; {_TRACKER}',
+    'sample_scale': f'kinematic jumps draw none; {_TRACKER}',
+    'hypothesis_merge_distance': f'modes are merged below 20 mm; {_TRACKER}',
+    'likelihood.prior_weight': f'the factor 0.5; {_LIKELIHOOD}',
+    'likelihood.pose_prior': f'the learned prior, where the body has one; {_LIKELIHOOD}',
+    'likelihood.self_intersection_sigma': f'the deviation 30 mm; {_LIKELIHOOD}',
+    'background.threshold': f'the squared distance 20; {_BACKGROUND}',
+    'background.shadow_threshold': f'the brightness 0.3; {_BACKGROUND}',
+    'overlay_quality': 'the JPEG quality is 90',
+    'status_interval': 'a line a second while messages arrive; none with --log-level warn',
     'error_correlation': 'errors last for a time in s: hmt_ros/inference/error_model.py',
 }
 
@@ -93,15 +107,12 @@ class NodeParameters:
             estimate; if false, it is skipped.
         queue_size: Maximum number of messages that wait to be estimated from; when the node is late
             the oldest are dropped.
-        status_interval: Interval between two status lines on the console while messages arrive, s;
-            0 switches them off.
         autostart: If true, the node configures and activates itself; if false, it waits for its
             lifecycle services.
     """
 
     reset_on_time_jump: bool = parameter_field(False, AT_ONCE)
     queue_size: int = parameter_field(5, AT_ONCE, (1, 1000))
-    status_interval: int = parameter_field(1, AT_ONCE, (0, 3600))
     autostart: bool = parameter_field(True, AT_LAUNCH)
 
 

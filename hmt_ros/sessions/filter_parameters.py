@@ -31,11 +31,7 @@ from hmt_ros.tracking.ground import KnownGround
 # Settings that are parameters, with their limits.
 _TRACKER = {
     'max_hypotheses': (1, 64),
-    'hypothesis_merge_distance': (0.0, 1.0),
-    'proposals': None,
     'candidates': (1, 1024),
-    'samples': (1, 65536),
-    'sample_scale': NOT_NEGATIVE,
     'searched_chains': (0, 64),
     'shape_images': (0, 100_000),
     'shape_interval': (0, 100_000),
@@ -43,11 +39,8 @@ _TRACKER = {
     'lost_images': (1, 100_000),
     **{f'likelihood.{term.name}.weight': NOT_NEGATIVE for term in TERMS},
     'likelihood.keypoints.weight': NOT_NEGATIVE,
-    'likelihood.prior_weight': NOT_NEGATIVE,
-    'likelihood.pose_prior': None,
-    'likelihood.self_intersection_sigma': NOT_NEGATIVE,
 }
-BACKGROUND = {'method': None, 'threshold': NOT_NEGATIVE, 'shadow_threshold': FRACTION}
+BACKGROUND = {'method': None}
 
 
 @dataclass(frozen=True)
@@ -92,7 +85,6 @@ class FilterParameters(CameraNodeParameters):
             same origin and the axes of a camera; if false, in the frame of the camera.
         overlay_modes: Maximum number of modes drawn on the image, the heaviest; 0 switches the
             overlay off.
-        overlay_quality: JPEG quality of the overlay.
         publish_tf: If true, the links of the point estimate are published on /tf, and
             camera_upright where gravity is known.
         frame_prefix: Prefix of the names of the links on /tf and in human_description, which tells
@@ -118,7 +110,6 @@ class FilterParameters(CameraNodeParameters):
     fixed_frame: str = parameter_field('', NEXT_CONFIGURE)
     publish_in_fixed_frame: bool = parameter_field(False, NEXT_CONFIGURE)
     overlay_modes: int = parameter_field(3, AT_ONCE, (0, 64))
-    overlay_quality: int = parameter_field(85, AT_ONCE, (1, 100))
     publish_tf: bool = parameter_field(True, AT_ONCE)
     frame_prefix: str = parameter_field('human/', AT_ONCE)
     tracker: TrackerSettings = field(

@@ -372,7 +372,6 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         presentation = Presentation(
             tracker.settings.max_hypotheses,
             p.overlay_modes,
-            p.overlay_quality,
             p.publish_tf,
             p.frame_prefix,
             describe=starts or self._shown_frames != (frame, p.frame_prefix),
@@ -401,7 +400,6 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             waiting.stamp_ns,
             f'{p.fixed_frame}_optical' if p.publish_in_fixed_frame else waiting.frame_id,
             waiting.image if p.overlay_modes else None,
-            p.overlay_quality,
             self._wanted,
             lambda topic, message: self._publish(topic, waiting.stamp_ns, message),
         )

@@ -112,7 +112,6 @@ class Presentation:
     Attributes:
         max_hypotheses: maximum number of modes of a track.
         overlay_modes: heaviest modes that are drawn on the image; 0: no overlay.
-        overlay_quality: of the JPEG, 1 to 100.
         publish_tf: whether there are transforms.
         frame_prefix: of the names of the frames of the links.
         describe: whether the URDF is due: a new body, or other names of its frames.
@@ -120,7 +119,6 @@ class Presentation:
 
     max_hypotheses: int
     overlay_modes: int
-    overlay_quality: int
     publish_tf: bool
     frame_prefix: str
     describe: bool
@@ -202,10 +200,7 @@ def track_messages(
             track.posterior.weights,
             presentation.overlay_modes,
         )
-        quality = presentation.overlay_quality
-        publish(
-            'overlay/compressed', compressed_image_message(messages, drawn, stamp, frame, quality)
-        )
+        publish('overlay/compressed', compressed_image_message(messages, drawn, stamp, frame))
 
 
 def nobody_messages(
@@ -217,7 +212,6 @@ def nobody_messages(
     stamp_ns: int,
     frame_id: str,
     image: NDArray[np.uint8] | None,
-    quality: int,
     wanted: Callable[[str], bool],
     publish: Callable[[str, Any], None],
 ) -> None:
@@ -231,7 +225,6 @@ def nobody_messages(
         ranks: maximum number of modes of the track, whose markers are removed.
         stamp_ns, frame_id: of the image.
         image: (H, W, 3) BGR, shown without modes; None: no overlay.
-        quality: of its JPEG, 1 to 100.
         wanted, publish: as for `track_messages`.
     """
     kinds = {'pose_mixture': MixtureKind.POSTERIOR, 'likelihood_mixture': MixtureKind.LIKELIHOOD}
@@ -251,7 +244,7 @@ def nobody_messages(
         markers.markers += removed_ground(messages, stamp_ns, frame_id)
         publish('markers', markers)
     if image is not None and wanted('overlay/compressed'):
-        picture = compressed_image_message(messages, image, stamp_ns, frame_id, quality)
+        picture = compressed_image_message(messages, image, stamp_ns, frame_id)
         publish('overlay/compressed', picture)
 
 

@@ -236,7 +236,7 @@ class MixtureFilter:
         continuity = Continuity(self.body, predicted.poses, modes.log_weights, dt)
         predicted = follow_flow(predicted, precisions, seen, posterior)
         base = posterior.minimise(
-            posterior.given(seen, predicted, precisions), predicted.poses, s.base_iterations
+            posterior.given(seen, predicted, precisions), predicted.poses, s.iterations
         )
         search = Search(posterior, seen, states, precisions, continuity)
         proposals: list[Proposal] = [self._proposal]

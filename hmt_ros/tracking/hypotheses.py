@@ -23,6 +23,10 @@ from hmt_ros.inference.mixture import GaussianMixture
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+# Where modes may be that have at most so much less log weight than the heaviest, nats: the person
+# may be there.
+LIKELY = 4.0
+
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from hmt_ros.tracking.settings import TrackerSettings
 
 
+# Gain by a step below which a minimum is found, nats.
+TOLERANCE = 0.02
 # Largest standard deviation of a mode: where an image shows nothing, rad or m.
 WIDEST = 2.0
 # Standard deviation of a variable that rests on its limit, rad or m: 3 degrees.
@@ -101,7 +103,7 @@ class Posterior:
         self.exchanges = SideExchanges()
         self._ground_term: GroundTerm | None = None
         self.evaluations = 0
-        self._step_scale = np.where(body.skeleton.dof_is_rotation, 0.3, 0.2)
+        self._step_scale = step_scale(body)
         self._last_fit: tuple[Array, Observation, ImageFit] | None = None
 
     @cached_property
@@ -197,7 +199,7 @@ class Posterior:
         """Minima from poses (N, d) within the limits of the body."""
         return minimise(
             term, poses, self.body.lower, self.body.upper, step_scale=self._step_scale,
-            damping=1.0, max_iterations=iterations, tolerance=0.02,
+            damping=1.0, max_iterations=iterations, tolerance=TOLERANCE,
         )  # fmt: skip
 
     def gaussian_hessians(
@@ -322,6 +324,11 @@ class _Counted:
     ) -> Energy:
         self.counter.evaluations += len(x)
         return self.term.energy(x, rows, derivatives=derivatives)
+
+
+def step_scale(body: Body) -> Array:
+    """Length (d,) of a moderate step of each variable, rad or m."""
+    return np.where(body.skeleton.dof_is_rotation, 0.3, 0.2)
 
 
 def free_covariances(hessians: Array, free: Mask) -> Array:

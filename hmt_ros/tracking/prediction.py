@@ -25,9 +25,6 @@ from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses
 from hmt_ros.tracking.motion_states import PredictedStates
 from hmt_ros.tracking.posterior import Posterior
 
-# Newton steps that follow the optical flow.
-FLOW_ITERATIONS = 5
-
 
 def dynamics_of(body: Body, motion: str) -> LinearGaussianDynamics:
     """The dynamics of the poses of a body, by the setting `motion`."""
@@ -101,8 +98,8 @@ def follow_flow(
         observation: of the image.
         posterior: of the body.
     """
-    s, body = posterior.settings.likelihood, posterior.body
-    if 'motion' not in observation.evidence or s.motion.weight == 0:
+    s, body = posterior.settings, posterior.body
+    if 'motion' not in observation.evidence or s.likelihood.motion.weight == 0:
         return predicted
     seen = ObservedImage(
         posterior.flow_likelihood, observation, predicted.textures, predicted.texture_rows
@@ -113,5 +110,5 @@ def follow_flow(
             Quadratic(predicted.poses, precisions),
         )
     )
-    moved = posterior.minimise(term, predicted.poses, FLOW_ITERATIONS).x
+    moved = posterior.minimise(term, predicted.poses, s.iterations).x
     return replace(predicted, poses=moved, expected=moved)

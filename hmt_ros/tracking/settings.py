@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.tracking.ground import GroundSettings
 from hmt_ros.tracking.proposals import PROPOSALS
-from hmt_ros.tracking.proposals.chain_votes import VOTES
 
 MOTIONS = ('learned', 'random_walk')
 
@@ -44,10 +43,8 @@ class TrackerSettings:
         alternatives: Maximum number of configurations of a limb that are rated.
         samples: Number of samples drawn in an image by the proposals 'css' and 'ss'.
         sample_scale: Scale of the proposal covariance; 0 selects Cauchy tails.
-        vote: Rule that chooses limbs for search: 'trace', 'minima' or 'uniform'.
-        searched_chains: Number of chains searched in an image.
-        base_iterations: Number of Newton steps on the predictions.
-        iterations: Number of Newton steps on the candidates.
+        searched_chains: Number of limbs searched in an image, chosen at random.
+        iterations: Number of Newton steps on the predictions, and on the candidates.
         motion: Motion prior: 'learned', where the body ships with one, or 'random_walk' at the
             rates of the body.
         tails: Degrees of freedom of the Student motion prior; small numbers give heavy tails.
@@ -71,9 +68,7 @@ class TrackerSettings:
     alternatives: int = 10
     samples: int = 256
     sample_scale: float = 2.0
-    vote: str = 'trace'
     searched_chains: int = 4
-    base_iterations: int = 6
     iterations: int = 6
     motion: str = 'learned'
     tails: float = 10.0
@@ -91,14 +86,12 @@ class TrackerSettings:
             raise ValueError(f'proposals must be one of {tuple(PROPOSALS)}, saw {self.proposals!r}')
         if self.motion not in MOTIONS:
             raise ValueError(f'motion must be one of {MOTIONS}, saw {self.motion!r}')
-        if self.vote not in VOTES:
-            raise ValueError(f'vote must be one of {VOTES}, saw {self.vote!r}')
         if self.max_hypotheses < 1 or self.candidates < self.max_hypotheses:
             raise ValueError(
                 f'wanted 1 <= max_hypotheses <= candidates, saw {self.max_hypotheses} and '
                 f'{self.candidates}'
             )
-        least = {'samples': 1, 'iterations': 1, 'base_iterations': 1, 'lost_images': 1}
+        least = {'samples': 1, 'iterations': 1, 'lost_images': 1}
         least |= {'combinations': 1, 'alternatives': 1}
         for name, bound in least.items():
             if not getattr(self, name) >= bound:

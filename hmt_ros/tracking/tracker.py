@@ -31,7 +31,7 @@ from hmt_ros.tracking.existence import GIVEN, Existence
 from hmt_ros.tracking.filter import MixtureFilter
 from hmt_ros.tracking.gravity import Gravity
 from hmt_ros.tracking.ground import Ground, GroundEstimator, KnownGround, unit_vector
-from hmt_ros.tracking.hypotheses import Modes
+from hmt_ros.tracking.hypotheses import LIKELY, Modes
 from hmt_ros.tracking.initialisation import check_box
 from hmt_ros.tracking.observer import Observer
 from hmt_ros.tracking.point_estimate import PointEstimate
@@ -44,8 +44,6 @@ from hmt_ros.tracking.status import Status
 from hmt_ros.tracking.subject import Subject
 from hmt_ros.tracking.view import View
 
-# The person may be where modes say that have at least this log weight, nats; the sign is changed.
-LIKELY = 4.0
 # Share of the time for which somebody stands on both feet, where contact is unknown.
 RESTING = 0.3
 

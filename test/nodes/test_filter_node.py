@@ -150,7 +150,6 @@ def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
     running.assert_refused(
         ({'max_hypotheses': 0}, 'out of range. Min: 1, Max: 64, value: 0'),
         ({'max_hypotheses': 20}, 'max_hypotheses <= candidates, saw 20 and 16'),
-        ({'proposals': 'guess'}, "saw 'guess'"),
         ({'background.method': 'guess'}, "saw 'guess'"),
         ({'subject_file': str(tmp_path / 'none.yaml')}, 'none.yaml: can not be read'),
         ({'background_file': str(tmp_path / 'two\nlines')}, 'two lines: can not be read'),
@@ -508,7 +507,7 @@ def test_ends_cleanly(number, subject_file, executable):
     ('arguments', 'message'),
     [
         (('-p', 'max_hypotheses:=99'), 'out of range'),
-        (('-p', 'proposals:=guess'), "saw 'guess'"),
+        (('-p', 'background.method:=guess'), "saw 'guess'"),
     ],
 )
 def test_wrong_arguments_are_one_line(arguments, message, executable):

@@ -104,7 +104,7 @@ def test_parameters_of_the_ground(world, stub_tracker, small_camera):
 
 
 def test_missing_frames_are_told_once(world, small_camera):
-    one = world(gravity_frame='map', input_timeout=0.0, status_interval=0).start()
+    one = world(gravity_frame='map', input_timeout=0.0).start()
     one.send('camera_info', small_camera.info())
     one.send('tf_static', camera_place(0, 'world'))
     for index in range(3):

@@ -178,10 +178,10 @@ def test_docstrings_without_attributes_describe_nothing():
 
 def test_nodes_have_few_parameters():
     counts = [len(declared_parameters(settings)) for settings in ALL]
-    assert counts[0] <= 58
-    assert sum(counts) <= 93
+    assert counts[0] <= 40
+    assert sum(counts) <= 72
     names = {p.name for p in declared_parameters(FilterParameters())}
-    assert {'max_hypotheses', 'hypothesis_merge_distance', 'random_seed', 'proposals'} < names
+    assert {'max_hypotheses', 'candidates', 'random_seed', 'gravity'} < names
     parameters = with_values(FilterParameters(), {'likelihood.edges.weight': 7, 'candidates': 20})
     assert parameters.tracker.likelihood.edges.weight == 7.0
     assert parameters.tracker.candidates == 20
@@ -218,14 +218,14 @@ def test_defaults_lie_between_limits(settings):
     [
         ({'max_hypotheses': 0}, 'max_hypotheses must lie between 1 and 64, saw 0'),
         ({'max_hypotheses': 50}, 'max_hypotheses <= candidates'),
-        ({'proposals': 'guess'}, "proposals must be one of .* saw 'guess'"),
+        ({'proposals': 'css'}, 'proposals was removed: kinematic jumps; programs set it'),
         ({'likelihood.edges.wieght': 2.0}, 'is likelihood.edges.weight meant'),
         ({'absence_time': 0.5}, 'absence_time was removed: existence is a probability with rates'),
         ({'surprise': 2.0}, 'there is no parameter surprise'),
         ({'background.method': 'guess'}, "saw 'guess'"),
         ({'image_transport': 'theora'}, "image_transport must be one of .* saw 'theora'"),
         ({'body_model': ''}, 'body_model must be a name or a file'),
-        ({'sample_scale': -1.0}, 'sample_scale must lie between 0 and inf'),
+        ({'camera_height': -1.0}, 'camera_height must lie between 0 and 100'),
         ({'jump_probability': 0.1}, 'jump_probability was removed: a jump costs'),
     ],
 )

@@ -23,8 +23,8 @@ def test_file_of_the_node_is_what_it_declares():
 def test_other_values_survive(tmp_path):
     changed = with_values(
         FilterParameters(),
-        {'subject_file': "it's: #1", 'sample_scale': 1e-5, 'publish_tf': False,
-         'likelihood.self_intersection_sigma': float('inf')},
+        {'subject_file': "it's: #1", 'lost_misfit': 1e-5, 'publish_tf': False,
+         'likelihood.edges.weight': float('inf')},
     )  # fmt: skip
     path = tmp_path / 'changed.yaml'
     path.write_text(parameter_file_text('filter_node', changed))
@@ -43,13 +43,13 @@ def test_sections_are_chosen_by_the_name_of_the_node(tmp_path):
     path.write_text(
         '/camera:\n  ros__parameters: {rate: 30}\n'
         'filter_node:\n  ros__parameters:\n    max_hypotheses: 4\n'
-        '    background: {threshold: 0.5}\n'
+        '    background: {method: knn}\n'
         '/**:\n  ros__parameters: {max_hypotheses: 6, likelihood.edges.weight: 3.0}\n'
     )
     assert read_parameter_file(path, 'filter_node') == {
         'max_hypotheses': 4,
         'likelihood.edges.weight': 3.0,
-        'background.threshold': 0.5,
+        'background.method': 'knn',
     }
     assert read_parameter_file(path, 'other') == {
         'max_hypotheses': 6,
@@ -59,10 +59,10 @@ def test_sections_are_chosen_by_the_name_of_the_node(tmp_path):
 
 def test_files_without_sections(tmp_path):
     path = tmp_path / 'plain.yaml'
-    path.write_text('max_hypotheses: 4\nbackground:\n  threshold: 0.5\n')
+    path.write_text('max_hypotheses: 4\nbackground:\n  method: knn\n')
     assert read_parameter_file(path, 'filter_node') == {
         'max_hypotheses': 4,
-        'background.threshold': 0.5,
+        'background.method': 'knn',
     }
     path.write_text('')
     assert read_parameter_file(path, 'filter_node') == {}

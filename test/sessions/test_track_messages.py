@@ -58,7 +58,7 @@ def draw(body, poses, weights, count, image):
     return draw_modes(image, CAMERA, joints, body.skeleton.bones, weights, count)
 
 
-SHOWN = Presentation(8, 3, 90, True, 'anna/', True)
+SHOWN = Presentation(8, 3, True, 'anna/', True)
 
 
 def made(track, presentation=SHOWN):

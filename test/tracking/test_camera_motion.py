@@ -252,7 +252,7 @@ def track(body, camera, walking):
         black = np.zeros((camera.height, camera.width, 3), np.uint8)
         settings = TrackerSettings(
             max_hypotheses=1, candidates=2, likelihood=NO_IMAGE, shape_images=0,
-            ground=GroundSettings(0.0, 0.0, 0.0, 0.0), iterations=12, base_iterations=12,
+            ground=GroundSettings(0.0, 0.0, 0.0, 0.0), iterations=12,
         )  # fmt: skip
         term = Places(body, np.zeros((1, 3)))
         tracker = Tracker(body, camera, settings, background, extra=[term])

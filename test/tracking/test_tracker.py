@@ -487,7 +487,6 @@ def test_starts_of_another_dimension_are_refused(human32, camera):
     [
         ({'proposals': 'magic'}, r"proposals must be one of .*kjs.* saw 'magic'"),
         ({'motion': 'still'}, r"motion must be one of .*learned.* saw 'still'"),
-        ({'vote': 'loud'}, r"vote must be one of .*trace.* saw 'loud'"),
         ({'max_hypotheses': 0}, '1 <= max_hypotheses <= candidates, saw 0 and 16'),
         ({'candidates': 4}, '1 <= max_hypotheses <= candidates, saw 8 and 4'),
     ],

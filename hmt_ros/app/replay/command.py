@@ -48,7 +48,7 @@ files under the same names; the new bags are the same, byte for byte.
 
 examples:
   replay bags/reach -o out --subject bags/reach/subject.yaml --background bags/reach/background.png
-  replay walk.mcap -o out --subject walk.yaml --set max_hypotheses=16 --set proposals=css --seed 1
+  replay walk.mcap -o out --subject walk.yaml --set max_hypotheses=16 --seed 1
   replay walk.mcap -o out --subject walk.yaml --config filter.yaml --live
   replay walk.mcap -o out --background empty.png --set bme.stature=1.75
   replay recording -o out --namespace /humans/bodies/anna --image-topic /camera/image_raw

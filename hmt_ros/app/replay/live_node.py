@@ -239,8 +239,6 @@ class LiveNode:
 
     def _start(self, parameters: Any, sensors: tuple[str, ...]) -> subprocess.Popen[bytes]:
         values = {name: yaml_scalar(value) for name, value in values_of(parameters).items()}
-        # Without status lines the last line of its output is the one that matters.
-        values['status_interval'] = '0'
         for topic in sensors:
             values[f'qos_overrides.{topic}.subscription.reliability'] = 'reliable'
         lines = [f'    {name}: {text}' for name, text in values.items()]
@@ -248,6 +246,8 @@ class LiveNode:
         file.write_text('\n'.join(['/**:', '  ros__parameters:', *lines, '']), encoding='utf-8')
         sources = str(Path(hmt_ros.__file__).resolve().parents[1])
         command = [sys.executable, '-m', self._module, '--ros-args', '--params-file', str(file)]
+        # Without status lines the last line of its output is the one that matters.
+        command += ['--log-level', 'warn']
         if self._namespace:
             command += ['-r', f'__ns:={self._namespace}']
         with self._output.open('wb') as output:

@@ -24,20 +24,15 @@ from hmt_ros.image.texture import Textures, with_swapped_sides
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.error_model import ERRORS
-from hmt_ros.tracking.hypotheses import Hypotheses, relative_joints
+from hmt_ros.tracking.hypotheses import LIKELY, Hypotheses, relative_joints
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
-from hmt_ros.tracking.proposals.chain_votes import chain_votes
 from hmt_ros.tracking.proposals.limb_search import LimbSearch
 from hmt_ros.tracking.selection import choose_hypotheses
 
 # Groups of modes with a trunk of their own whose products are rated.
 MOST_GROUPS = 3
-# Modes have the same trunk when its joints are nowhere further apart, m.
-SAME_TRUNK = 0.06
-# Limbs are searched on trunks whose best mode is at most so much less probable than the best, nats.
-LIKELY = 4.0
-# Configurations of a limb are distinct when some joint is further apart, m.
+# Trunks, and configurations of a limb, are distinct when some joint is further apart, m.
 DISTINCT = 0.08
 
 
@@ -108,7 +103,7 @@ class KinematicJumps:
                 base.x[group[0]], covariances[sources.ancestors[group[0]]], observation, textures,
                 int(sources.texture_rows[group[0]]),
             )  # fmt: skip
-            found = self._search(lead, base.x, rng) if likely else {}
+            found = self._search(lead, rng) if likely else {}
             alternatives = [
                 self._alternatives(base.x[group], chain, found.get(chain), prices['limb_flip'])
                 for chain in self.posterior.body.chains
@@ -161,7 +156,7 @@ class KinematicJumps:
         groups = []
         while left:
             gaps = np.linalg.norm(trunk[left] - trunk[left[0]], axis=2).max(1)
-            near = gaps < SAME_TRUNK
+            near = gaps < DISTINCT
             groups.append(np.array([i for i, ok in zip(left, near) if ok], dtype=np.intp))
             left = [i for i, ok in zip(left, near) if not ok]
         return groups
@@ -218,18 +213,15 @@ class KinematicJumps:
             )
         return products, lead.textures
 
-    def _search(self, lead: _Lead, known: Array, rng: np.random.Generator) -> dict[str, Array]:
-        """Configurations of some limbs, chosen by vote, that fit the image."""
+    def _search(self, lead: _Lead, rng: np.random.Generator) -> dict[str, Array]:
+        """Configurations of some limbs that fit the image."""
         s, evidence = self.posterior.settings, lead.observation.evidence
         shape = 'containment' in evidence or 'edges' in evidence
         names = list(self._searches) if shape else []
         count = min(s.searched_chains, len(names))
         if count == 0:
             return {}
-        votes = chain_votes(
-            self.posterior.body, lead.covariance[None], names, s.vote, lead.pose[None], known
-        )[0]
-        chosen = rng.choice(len(names), size=count, replace=False, p=votes)
+        chosen = rng.choice(len(names), size=count, replace=False)
         return {
             names[i]: self._searches[names[i]].find(
                 lead.pose, lead.covariance, lead.observation, lead.textures, lead.row, rng

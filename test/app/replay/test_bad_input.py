@@ -298,7 +298,7 @@ def test_start_that_nothing_explains(good, tmp_path, capsys):
         (['--set', 'max_hypotheses=99'], 'max_hypotheses must lie between 1 and 64, saw 99'),
         (['--set', 'max_hypotheses=20'], 'max_hypotheses <= candidates'),
         (['--set', 'image_transport=raw'], 'image_transport is decided by replay'),
-        (['--set', 'proposals=['], '--set proposals=['),
+        (['--set', 'body_model=['], '--set body_model=['),
         (['--image-topic', 'imag'], 'has no topic imag; it has /camera_info, /image'),
         (['--image-topic', 'camera_info'], 'CameraInfo, wanted CompressedImage or Image'),
         (['--camera-info-topic', 'image'], 'wanted CameraInfo'),

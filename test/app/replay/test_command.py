@@ -349,12 +349,12 @@ def test_options_reach_the_tracker(still, short, tmp_path):
         '    image_transport: raw\n    autostart: false\n    use_sim_time: true\n'
         '    qos_overrides: {/image: {subscription: {depth: 3}}}\n    random_seed: 3\n'
     )
-    options = ['--config', str(config), '--set', 'candidates=12', '--set', 'proposals=css']
+    options = ['--config', str(config), '--set', 'candidates=12']
     options += ['--set', 'likelihood.edges.weight=3', '--seed', '7', '--body', 'human34', '--quiet']
     assert main([str(short), '-o', str(tmp_path / 'out'), *SUBJECT, *options]) == 0
     (tracker,) = still
     settings = tracker.settings
-    assert (settings.max_hypotheses, settings.candidates, settings.proposals) == (5, 12, 'css')
+    assert (settings.max_hypotheses, settings.candidates) == (5, 12)
     assert settings.likelihood.edges.weight == 3.0
     assert (tracker.seed, tracker.body.name) == (7, 'human34')
 

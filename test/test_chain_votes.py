@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.chain_votes import VOTES, chain_votes, shares_of_new_minima
 from hmt_ros.flips.interpretation_tree import enumerate_flips, flip_counts
-from hmt_ros.tracking.proposals.chain_votes import VOTES, chain_votes, shares_of_new_minima
 
 CHAINS = ('left_arm', 'right_arm', 'left_leg', 'right_leg', 'neck')
 
