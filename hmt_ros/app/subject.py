@@ -24,7 +24,6 @@ from msg_tools import BagReader
 from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.keypoints import keypoints_of
 
-KEYPOINTS_TYPE = 'hmt_msgs/msg/Keypoints2D'
 # Joints that an image to start from shows, and how many of them.
 WANTED = tuple(
     f'{side}_{joint}'

@@ -3,14 +3,13 @@
     node  p(r_t | m_i)  = int p(r_t | x) m_i(x) dx           = sum_j w_j N(mu_i; mu_j, S_i + S_j)
     link  p(m_j | m_i)  = int int m_j(y) p(y | x) m_i(x)     = N(mu_j; A mu_i, S_j + A S_i A' + Q)
 
-in closed form for Gaussian modes and linear dynamics, by sampling for Student modes and dynamics of
-any other form. Where the state has velocities, the link integrates over what is known of them at
+in closed form. Where the state has velocities, the link integrates over what is known of them at
 first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -18,8 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
-from scipy.special import gammaln, logsumexp
+from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
@@ -167,97 +165,6 @@ def _with_first(
     )
 
 
-def sampled_network(
-    mixtures: Sequence[GaussianMixture],
-    move: Callable[[Array, float], Array],
-    noise: Callable[[float], Array],
-    intervals: Array,
-    *,
-    degrees_of_freedom: Sequence[Array] | None = None,
-    samples: int = 256,
-    seed: int = 0,
-) -> EmbeddedNetwork:
-    """The network of Gaussian or Student modes under p(y | x) = N(y; move(x, dt), noise(dt)).
-
-    Samples are drawn from the mode that a value starts from and, for Student modes, from the scales
-    of the mode that it leads to; what is left is Gaussian and integrated exactly.
-
-    Args:
-        mixtures: T mixtures; of Student modes the covariances are the scale matrices.
-        move: maps poses (N, d) and an interval to poses (N, d).
-        noise: maps an interval to a covariance (d, d).
-        intervals: (T-1,) s.
-        degrees_of_freedom: T arrays (K_t,) of the modes; 0: Gaussian. None: all Gaussian.
-        samples: per mode.
-        seed: of the samples.
-
-    Raises:
-        ValueError: mixtures that can not be smoothed.
-    """
-    check_mixtures(mixtures)
-    rng = np.random.default_rng(seed)
-    freedom = degrees_of_freedom or [np.zeros(len(mixture)) for mixture in mixtures]
-    drawn, scales = [], []
-    for mixture, nu in zip(mixtures, freedom):
-        d = mixture.dimension
-        u = np.ones((len(mixture), samples))
-        for k in np.flatnonzero(nu > 0):
-            u[k] = rng.chisquare(nu[k], samples) / nu[k]
-        z = rng.standard_normal((len(mixture), samples, d))
-        x = mixture.means[:, None] + z @ mixture.cholesky().swapaxes(1, 2) / np.sqrt(u)[..., None]
-        drawn.append(x)
-        # Scales of their own for the mode at the other end.
-        v = np.ones((len(mixture), samples))
-        for k in np.flatnonzero(nu > 0):
-            v[k] = rng.chisquare(nu[k], samples) / nu[k]
-        scales.append(v)
-    nodes, links = [], []
-    zero = np.zeros((mixtures[0].dimension,) * 2)
-    for mixture, nu, x in zip(mixtures, freedom, drawn):
-        k, d = mixture.means.shape
-        each = np.empty((k, k, samples))
-        for j in range(k):
-            flat = x.reshape(-1, d)
-            each[:, j] = _log_mode(mixture, j, float(nu[j]), flat).reshape(k, samples)
-        with np.errstate(divide='ignore'):
-            total = logsumexp(each + np.log(mixture.weights)[None, :, None], axis=1)
-        nodes.append(logsumexp(total, axis=1) - np.log(samples))
-    for t, interval in enumerate(intervals):
-        a, b = mixtures[t], mixtures[t + 1]
-        q = np.asarray(noise(float(interval)), dtype=np.float64)
-        moved = move(drawn[t].reshape(-1, a.dimension), float(interval))
-        log = np.empty((len(a), len(b)))
-        for j in range(len(b)):
-            v = np.tile(scales[t + 1][j], len(a))
-            if freedom[t + 1][j] > 0:
-                covariances = b.covariances[j] / v[:, None, None] + q
-                which = np.arange(len(moved))
-            else:
-                covariances = (b.covariances[j] + q)[None]
-                which = np.zeros(len(moved), dtype=np.int64)
-            pairs = np.stack([which, np.arange(len(moved))], axis=1)
-            centre = np.broadcast_to(b.means[j], (len(covariances), b.dimension))
-            each = pair_log_densities(
-                centre, covariances, moved, np.broadcast_to(zero, (len(moved), *zero.shape)), pairs
-            )
-            log[:, j] = logsumexp(each.reshape(len(a), samples), axis=1) - np.log(samples)
-        links.append(log)
-    return EmbeddedNetwork(tuple(nodes), tuple(links))
-
-
 def _velocity_covariance(dynamics: LinearGaussianDynamics) -> Array:
     d = dynamics.dimension
     return np.asarray(np.linalg.inv(dynamics.initial_precision[d:, d:]), dtype=np.float64)
-
-
-def _log_mode(mixture: GaussianMixture, k: int, freedom: float, x: Array) -> Array:
-    """log density (N,) of one Gaussian (freedom 0) or Student mode."""
-    if freedom == 0:
-        return mixture[k].component_log_densities(x)[:, 0]
-    d = mixture.dimension
-    (factor,) = mixture[k].cholesky()
-    z = solve_triangular(factor, (x - mixture.means[k]).T, lower=True)
-    log_scale = gammaln(0.5 * (freedom + d)) - gammaln(0.5 * freedom)
-    log_scale -= 0.5 * d * np.log(freedom * np.pi) + np.log(np.diagonal(factor)).sum()
-    result: Array = log_scale - 0.5 * (freedom + d) * np.log1p((z * z).sum(0) / freedom)
-    return result

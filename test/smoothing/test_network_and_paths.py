@@ -1,4 +1,4 @@
-"""The embedded network against quadrature and sampling, its paths against enumeration."""
+"""The embedded network against closed forms, its paths against enumeration."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import itertools
 import numpy as np
 import pytest
 from scipy.special import logsumexp
-from scipy.stats import multivariate_normal, multivariate_t
+from scipy.stats import multivariate_normal
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.smoothing import LinearGaussianDynamics
-from hmt_ros.smoothing.embedded_network import _log_mode, embedded_network, sampled_network
+from hmt_ros.smoothing.embedded_network import embedded_network
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.paths import (
     diverse_subset,
@@ -54,42 +54,6 @@ def test_values_in_closed_form(modes, d):
         spread = after.covariances[j] + a @ before.covariances[i] @ a.T + q
         expected = multivariate_normal(a @ before.means[i], spread).logpdf(after.means[j])
         assert network.links[0][i, j] == pytest.approx(expected)
-
-
-def test_sampled_values_meet_those_in_closed_form(modes, walk):
-    mixtures = modes(1.0)
-    exact = embedded_network(mixtures, walk, INTERVALS)
-    found = sampled_network(
-        mixtures, lambda x, dt: x, lambda dt: walk.transition(dt)[1], INTERVALS, samples=4000
-    )
-    for a, b in zip((*found.nodes, *found.links), (*exact.nodes, *exact.links)):
-        np.testing.assert_allclose(a, b, atol=0.08)
-
-
-def test_student_modes_have_the_density_of_scipy():
-    rng = np.random.default_rng(3)
-    root = rng.normal(size=(3, 3))
-    mixture = GaussianMixture([1.0], [[0.3, -1.0, 2.0]], [root @ root.T + np.eye(3)])
-    x = rng.normal(size=(50, 3), scale=4.0)
-    for freedom in (1.0, 4.0, 30.0):
-        wanted = multivariate_t.logpdf(x, mixture.means[0], mixture.covariances[0], df=freedom)
-        np.testing.assert_allclose(_log_mode(mixture, 0, freedom, x), wanted, rtol=1e-12)
-
-
-def test_student_modes_against_quadrature():
-    one = GaussianMixture([2.0], [[0.3]], [[[0.5]]])
-    two = GaussianMixture([1.0], [[1.5]], [[[0.7]]])
-    found = sampled_network(
-        [one, two], lambda x, dt: np.sin(x), lambda dt: np.array([[0.2]]), np.ones(1),
-        degrees_of_freedom=[np.array([3.0]), np.array([4.0])], samples=40_000,
-    )  # fmt: skip
-    x = np.linspace(-60, 60, 6001)
-    step = x[1] - x[0]
-    p = multivariate_t.pdf(x, [0.3], [[0.5]], df=3)
-    r = multivariate_t.pdf(x, [1.5], [[0.7]], df=4)
-    assert found.nodes[0][0] == pytest.approx(np.log(2 * (p * p).sum() * step), abs=0.02)
-    move = np.exp(-0.5 * (x[None] - np.sin(x)[:, None]) ** 2 / 0.2) / np.sqrt(2 * np.pi * 0.2)
-    assert found.links[0][0, 0] == pytest.approx(np.log(p @ move @ r * step**2), abs=0.02)
 
 
 def test_most_probable_paths_are_those_of_enumeration(network, every_path):
