@@ -18,6 +18,11 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 
+def seconds(nanoseconds: int) -> float:
+    """A difference of stamps, in s."""
+    return 1e-9 * nanoseconds
+
+
 def share_of_time(dt: float, tau: float) -> float:
     """The share a(dt) of an independent measurement that a measurement counts for.
 

@@ -19,6 +19,7 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.inference.error_model import seconds
 from hmt_ros.tracking.colours import MEMORY, Colours
 from hmt_ros.tracking.person_shape import (
     Piece,
@@ -83,7 +84,7 @@ class Appearance:
 
     def unseen(self, stamp: int) -> float:
         """Time for which the person has not been seen at a stamp, ns, in s; never seen: 0."""
-        return 0.0 if self._model is None else 1e-9 * (stamp - self._stamp)
+        return 0.0 if self._model is None else seconds(stamp - self._stamp)
 
     def silhouetted(self, view: View, stamp: int) -> Silhouetted | None:
         """What the silhouette of an image says; None: it has none, or most of it has changed.
@@ -137,7 +138,7 @@ class Appearance:
 
     def learn(self, view: View, stamp: int, body: Body, camera: Camera, pose: Array) -> None:
         """Learns from an image in which the person is at a pose (d,); `silhouetted` came before."""
-        dt = 0.0 if self._model is None else 1e-9 * (stamp - self._stamp)
+        dt = 0.0 if self._model is None else seconds(stamp - self._stamp)
         gain = -math.expm1(-dt / MEMORY)
         self._model = model = covered(body, camera, pose, raster_step(camera.height))
         self._depth, self._stamp = max(float(pose[2]), 0.1), stamp

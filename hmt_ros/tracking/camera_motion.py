@@ -26,6 +26,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mirror import root_angles, root_rotation_dofs, root_rotations
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.error_model import seconds
 from hmt_ros.tracking.hypotheses import Modes
 
 # Time for which the last known motion of the camera is taken to go on, s.
@@ -210,7 +211,7 @@ class CameraPath:
         return CameraMotion.between(_pose_at(first, second, last), _pose_at(first, second, stamp))
 
     def _is_near(self, stamp: int) -> bool:
-        return (stamp - self._given[-1][0]) * 1e-9 <= LONGEST_GUESS
+        return seconds(stamp - self._given[-1][0]) <= LONGEST_GUESS
 
 
 def _pose_at(

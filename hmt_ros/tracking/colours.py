@@ -25,12 +25,8 @@ from hmt_ros.inference.arrays import Array, Image, Mask
 MEMORY = 2.0
 # Least difference between `here` and `elsewhere` that says something, a probability.
 LEAST_CONTRAST = 0.15
-# Least part of an image whose colours are those of the images before: most of it.
-FAMILIAR = 0.5
 # Bins of a colour channel.
 BINS = 8
-# Share of a colour below which it is rare, a probability.
-RARE = 1e-4
 
 
 class Colours:
@@ -54,7 +50,7 @@ class Colours:
         if self._inside is None or not contrast >= LEAST_CONTRAST:
             return None
         bins = binned(image)
-        if np.minimum(shares(bins), self._scene).sum() < FAMILIAR:
+        if np.minimum(shares(bins), self._scene).sum() < 0.5:  # most of it has other colours
             return None
         return float((self._means(bins).max() - self.elsewhere) / contrast)
 
@@ -90,7 +86,9 @@ class Colours:
     def _means(self, bins: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Mean of p(M | colour) over a box at each pixel (h, w); beyond the image it is 0."""
         assert self._inside is not None
-        ratio = (self._inside / (self._inside + self._around + RARE)).astype(np.float32)
+        # A colour of less than a pixel is nobody's.
+        whole = self._inside + self._around + 1.0 / bins.size
+        ratio = (self._inside / whole).astype(np.float32)
         size = (max(self.size[0], 1), max(self.size[1], 1))
         means = cv2.boxFilter(ratio[bins], cv2.CV_32F, size, borderType=cv2.BORDER_CONSTANT)
         return np.asarray(means, dtype=np.float32)

@@ -30,7 +30,7 @@ from typing import NamedTuple
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.error_model import share_of_time
+from hmt_ros.inference.error_model import seconds, share_of_time
 from hmt_ros.tracking.appearance import MOST, Appearance
 from hmt_ros.tracking.keypoint_evidence import keypoint_evidence, suffices
 from hmt_ros.tracking.view import View
@@ -137,7 +137,7 @@ class Existence:
             body: of the person.
         """
         if self._stamps is not None:
-            self.probability = moved_on(self.probability, 1e-9 * (stamp - self._stamps[1]))
+            self.probability = moved_on(self.probability, seconds(stamp - self._stamps[1]))
         # After so long whoever was seen last may as well have gone.
         forgotten = moved_on(1.0, self._appearance.unseen(stamp)) < MOST
         self.hidden = self._appearance.open_to_view(view.others) < 1.0 - MOST
@@ -194,4 +194,4 @@ class Existence:
         """Time since a cue spoke, s; infinite in the first image."""
         if self._stamps is None:
             return math.inf
-        return 1e-9 * (stamp - self._asked.get(cue, self._stamps[0]))
+        return seconds(stamp - self._asked.get(cue, self._stamps[0]))

@@ -9,10 +9,8 @@ from hmt_ros.image.terms.keypoints import Keypoints
 
 # Fewest keypoints that are a person, as a number of joints.
 FEWEST_KEYPOINTS = 6
-# A keypoint of this confidence is where it says, and this many of the joints of the trunk tell
-# where the person is and how the person is turned, as a fraction of all.
+# A keypoint of this confidence is where it says.
 CONFIDENT = 0.5
-MOST_OF_THE_TRUNK = 0.75
 
 
 def keypoint_evidence(keypoints: Keypoints) -> float:
@@ -28,13 +26,16 @@ def keypoint_evidence(keypoints: Keypoints) -> float:
 
 
 def suffices(keypoints: Keypoints | None, body: Body) -> bool:
-    """Whether keypoints tell at once where a person is and which way the person faces."""
+    """Whether keypoints tell at once where a person is and which way the person faces.
+
+    They do with all joints of the trunk but one.
+    """
     if keypoints is None:
         return False
     names = _confident(keypoints)
     trunk = [name for pair in body.trunk_pairs for name in pair]
     of_trunk = sum(name in names for name in trunk)
-    return len(names) >= FEWEST_KEYPOINTS and of_trunk >= MOST_OF_THE_TRUNK * len(trunk)
+    return len(names) >= FEWEST_KEYPOINTS and of_trunk >= len(trunk) - 1
 
 
 def shows_a_part(keypoints: Keypoints | None, body: Body) -> bool:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.model_file import LARGEST_FILE
 from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools.files.plain_yaml import read_plain_yaml
 
-LARGEST_FILE = 1_000_000  # bytes
 LARGEST_PIXEL = 1e5
 KEYS = ('stamp_ns', 'sigma_px', 'keypoints', 'segment_lengths_m', 'stature_m')
 
@@ -98,7 +98,7 @@ def _check_names(given: dict[Any, Any], known: tuple[str, ...], kind: str, body:
         raise SubjectError(f'{body} has no {kind} {wrong}; it has {sorted(known)}')
 
 
-def _positive(value: Any, name: str, largest: float = 1e4) -> float:
+def _positive(value: Any, name: str, largest: float = LARGEST_PIXEL) -> float:
     if isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value <= largest:
         return float(value)
     raise SubjectError(f'{name} must be a number above 0 and at most {largest:g}, saw {value!r}')

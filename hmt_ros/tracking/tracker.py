@@ -24,6 +24,7 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.observation import Box, Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.inference.error_model import seconds
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.beginning import FROM_JOINTS, Beginning, Source, Starts, poses_to_search
 from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
@@ -46,7 +47,6 @@ from hmt_ros.tracking.view import View
 
 # Share of the time for which somebody stands on both feet, where contact is unknown.
 RESTING = 0.3
-
 
 class Tracker:
     """Follows one person through images; the posterior over poses is a mixture.
@@ -191,7 +191,7 @@ class Tracker:
         self._ground.still = self._camera_path.known or (known and not self._ground.turning)
         near, dt = None, 0.0
         if self._followed is not None and not self._track.lost:
-            near, dt = self.modes.poses, (stamp - self._followed) * 1e-9
+            near, dt = self.modes.poses, seconds(stamp - self._followed)
         view = self._observer.view(
             image, keypoints, mask, self.body, near, dt,
             predicted=False if nobody_predicted else True if prediction is not None else None,
@@ -370,7 +370,7 @@ class Tracker:
             likely = self.modes.log_weights > -LIKELY
             poses = self.modes.poses[likely]
             self.silhouettes.complete(view.image, self.body, self.camera, poses)
-        dt = 0.0 if self._followed is None else (stamp - self._followed) * 1e-9
+        dt = 0.0 if self._followed is None else seconds(stamp - self._followed)
         if self.settings.ground.on:
             resting = min(self.contacts.values(), default=RESTING)
             self._ground.update(self.body, self.modes, resting, dt)
@@ -440,7 +440,7 @@ class Tracker:
     def _expected(self, stamp: int) -> GaussianMixture:
         """The posterior of a time at which nothing is seen."""
         assert self._followed is not None
-        dt = (stamp - self._followed) * 1e-9
+        dt = seconds(stamp - self._followed)
         motion = self.settings.motion
         return expected_poses(self.modes, self.posterior.weights, self.body, motion, dt)
 
@@ -457,7 +457,7 @@ class Tracker:
         search = self._track.lost or self._existence.elsewhere
         poses = self._poses_to_search(observation, prediction) if search else None
         if poses is None:
-            dt = (stamp - self._followed) * 1e-9
+            dt = seconds(stamp - self._followed)
             self._track.propagate(observation, dt, prediction)
         else:
             self._track.begin_anew(poses, observation)
