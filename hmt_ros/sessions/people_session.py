@@ -46,7 +46,7 @@ from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
 from hmt_ros.tracking.areas import grown, hull, unknown_area
-from hmt_ros.tracking.association import SAME, ImageTrack, Sighting, assigned
+from hmt_ros.tracking.association import GATE, ImageTrack, Sighting, assigned
 from hmt_ros.tracking.camera_motion import CameraPose
 from hmt_ros.tracking.silhouettes import Silhouettes, region_of
 from msg_tools.messages.detections import (
@@ -323,7 +323,8 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
             corners = np.clip(np.rint(one.sighting.corners), 0, size).astype(int)
             if not one.suffices or (corners[1] - corners[0]).min() < SMALLEST:
                 continue
-            if any(x.place.cost(one.sighting, stamp) < SAME for x in own if own[x] is not one):
+            costs = [x.place.cost(one.sighting, stamp) for x in own if own[x] is not one]
+            if min(costs, default=GATE) < 0.5 * GATE:
                 continue  # a second detection of the same person
             if len(self._people) >= p.max_people:
                 self._log.note(

@@ -14,10 +14,9 @@ import numpy as np
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.tracking.association import Sighting
 
-# Margin around what a person covers that is unknown to others, as a fraction of the height.
-MARGIN = 0.03
-# The same around the hull of the keypoints of somebody of whom no pose is known.
-WIDE_MARGIN = 0.1
+# Margin around what a person covers, or around the hull of keypoints, that is unknown to others, as
+# a fraction of the height: the radius of a limb.
+MARGIN = 0.05
 
 
 def unknown_area(mine: Mask, nearer: Sequence[Mask], farther: Sequence[Mask]) -> Mask | None:
@@ -45,13 +44,13 @@ def hull(sighting: Sighting, shape: tuple[int, ...]) -> Mask:
     points = np.clip(joints, -limit, limit).round().astype(np.int32)
     mask = np.zeros(shape[:2], dtype=np.uint8)
     cv2.fillConvexPoly(mask, cv2.convexHull(points), 1)
-    return grown(mask.view(np.bool_), WIDE_MARGIN)
+    return grown(mask.view(np.bool_))
 
 
-def grown(area: Mask, margin: float = MARGIN) -> Mask:
-    """An area (H, W) with a margin, as a fraction of its height."""
+def grown(area: Mask) -> Mask:
+    """An area (H, W) with a margin."""
     pixels = area.view(np.uint8)
-    size = max(round(margin * cv2.boundingRect(pixels)[3]), 1)
+    size = max(round(MARGIN * cv2.boundingRect(pixels)[3]), 1)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * size + 1, 2 * size + 1))
     return np.asarray(cv2.dilate(pixels, kernel), dtype=np.uint8) > 0
 

@@ -11,6 +11,7 @@ without a detection costs as much as the worst possible pair.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,18 +20,15 @@ from scipy.optimize import linear_sum_assignment
 
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.error_model import seconds
 
-# Costs below which a pair is possible: from one image to the next, and after a second or more.
-GATE, WIDEST_GATE = 0.4, 0.8
-# A second detection of somebody who has one lies nearer than this.
-SAME = 0.15
-# Time for which a person is taken to go on as before, s, and the time constant of the velocity.
+# Cost below which a pair is possible from one image to the next, in sizes of the person; it grows
+# by as much in `GOES_ON`.
+GATE = 0.4
+# Time for which a person is taken to go on as before, and to keep the size though less is seen now,
+# s, and the time constant of the velocity.
 GOES_ON = 1.0
 MEMORY = 0.25
-# What remains a second of the size of a person of whom less is seen now.
-SIZE_KEPT = 0.6
-# Fewer joints in common do not tell how far a person has moved.
-FEWEST_IN_COMMON = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +62,7 @@ class Sighting:
     def shifts_to(self, other: Sighting) -> Array:
         """Ways (n, 2) of the joints in common to where another has them; of the middle, else."""
         common = [name for name in self.joints if name in other.joints]
-        if len(common) < FEWEST_IN_COMMON:
+        if not common:
             return np.asarray((other.middle - self.middle)[None])
         return np.array([other.joints[name] - self.joints[name] for name in common])
 
@@ -91,18 +89,18 @@ class ImageTrack:
 
     def update(self, sighting: Sighting, stamp: int) -> None:
         """Takes the next sighting, of a later image."""
-        dt = 1e-9 * (stamp - self.stamp)
+        dt = seconds(stamp - self.stamp)
         moved = np.median(self.sighting.shifts_to(sighting), axis=0)
         self._known_for += dt
         # At first the mean of what was seen, later that of the last moments.
         gain = min(dt / min(self._known_for, MEMORY), 1.0)
         self.velocity += gain * (moved / dt - self.velocity)
-        self.size = max(sighting.size, self.size * SIZE_KEPT**dt)
+        self.size = max(sighting.size, self.size * math.exp(-dt / GOES_ON))
         self.sighting, self.stamp = sighting, stamp
 
     def shift(self, stamp: int) -> Array:
         """Way (2,) that the person is expected to have moved since then, px."""
-        dt = min(1e-9 * (stamp - self.stamp), GOES_ON)
+        dt = min(seconds(stamp - self.stamp), GOES_ON)
         return np.asarray(dt * self.velocity)
 
     def cost(self, sighting: Sighting, stamp: int) -> float:
@@ -112,8 +110,7 @@ class ImageTrack:
 
     def gate(self, stamp: int) -> float:
         """Cost from which a sighting is of somebody else."""
-        unseen = min(1e-9 * (stamp - self.stamp), 1.0)
-        return GATE + (WIDEST_GATE - GATE) * unseen
+        return GATE * (1.0 + min(seconds(stamp - self.stamp) / GOES_ON, 1.0))
 
 
 def assigned(

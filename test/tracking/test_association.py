@@ -5,7 +5,7 @@ import pytest
 
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.tracking.areas import hull, moved, unknown_area
-from hmt_ros.tracking.association import GATE, WIDEST_GATE, ImageTrack, Sighting, assigned
+from hmt_ros.tracking.association import GATE, ImageTrack, Sighting, assigned
 
 NAMES = ('left_hip', 'right_hip', 'left_shoulder', 'right_shoulder')
 SHAPE = np.array([[-10.0, 20.0], [10.0, 20.0], [-15.0, -30.0], [15.0, -30.0]])
@@ -53,14 +53,14 @@ def test_the_cost_is_the_median_way_in_sizes():
     track = walked(0.0, 0.0)
     size = np.hypot(30.0, 50.0)
     assert track.cost(sighting(6.0), 5 * FRAME) == pytest.approx(6.0 / size)
-    # Where two joints are in common the middles of the boxes tell.
-    assert track.cost(sighting(6.0, seen=2), 5 * FRAME) == pytest.approx(6.0 / size)
+    # Where no joint is in common the middles of the boxes tell.
+    assert track.cost(sighting(6.0, seen=0), 5 * FRAME) == pytest.approx(6.0 / size)
 
 
 def test_the_gate_opens_while_somebody_is_not_seen():
     track = walked(0.0, 0.0, images=1)
     assert track.gate(0) == GATE
-    assert track.gate(30 * FRAME) == WIDEST_GATE
+    assert track.gate(30 * FRAME) == 2.0 * GATE
     far = sighting(0.6 * track.size)
     assert assigned([track], [far], FRAME) == {}
     assert assigned([track], [far], 10 * FRAME) == {0: 0}
