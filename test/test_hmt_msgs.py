@@ -39,6 +39,8 @@ def pose_mixture() -> Any:
     mixture.kind = PoseMixture.SMOOTHED
     mixture.state = PoseMixture.STATE_LOST
     mixture.track_id = 12
+    mixture.existence_probability = 0.75
+    mixture.error_share, mixture.error_time = 0.5, 0.125
     for weight, log_likelihood in ((0.75, -12.5), (0.25, math.nan)):
         component = PoseComponent(weight=weight, log_likelihood=log_likelihood)
         component.mean = rng.normal(size=DOF).tolist()
@@ -46,6 +48,7 @@ def pose_mixture() -> Any:
         component.id = 3
         component.degrees_of_freedom = 4.0
         component.joint_covariances = rng.normal(size=2 * 9).tolist()
+        component.joint_covariances_relative = rng.normal(size=2 * 9).tolist()
         component.joint_velocities = rng.normal(size=2 * 3).tolist()
         component.joint_positions = [Point(x=x, y=y, z=z) for x, y, z in rng.normal(size=(2, 3))]
         mixture.components.append(component)

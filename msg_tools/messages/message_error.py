@@ -27,6 +27,8 @@ class MessageFault(Enum):
     NOT_FINITE = 'not finite'
     WEIGHTS = 'weights'
     COVARIANCES = 'covariances'
+    KIND = 'kind'
+    ERRORS = 'error_share and error_time'
     OTHER = 'contents'
 
 
@@ -84,6 +86,19 @@ def check_finite(values: Array, what: str) -> None:
     """Raises MessageError where a value is NaN or infinite."""
     if not np.isfinite(values).all():
         raise MessageError(f'{what} has values that are not finite', MessageFault.NOT_FINITE)
+
+
+def identities_of(values: NDArray[Any], count: int, what: str) -> NDArray[np.uint32]:
+    """Identities (count,) of components, read-only.
+
+    Raises:
+        MessageError: another number of them.
+    """
+    result = np.array(values, dtype=np.uint32)
+    if result.shape != (count,):
+        raise MessageError(f'{what}: identities has shape {result.shape}, wanted {(count,)}')
+    result.setflags(write=False)
+    return result
 
 
 def check_weights(weights: Array, what: str) -> None:

@@ -27,6 +27,7 @@ from msg_tools.messages.message_error import (
     check_names,
     check_weights,
     freeze_arrays,
+    identities_of,
     lengths_of,
     names_of,
     numbers,
@@ -38,6 +39,8 @@ Array = NDArray[np.float64]
 POSE_MIXTURE = 'hmt_msgs/msg/PoseMixture'
 # No node publishes more components; a message with millions would block its reader.
 MAX_COMPONENTS = 1024
+# Arrays of the joints of each component that may be unknown.
+OF_JOINTS = ('joint_covariances', 'joint_covariances_relative', 'joint_velocities')
 
 
 class MixtureKind(IntEnum):
@@ -48,6 +51,7 @@ class MixtureKind(IntEnum):
     PREDICTION = 2
     SMOOTHED = 3
     GROUND_TRUTH = 4
+    FORECAST = 5
 
 
 class TrackState(IntEnum):
@@ -84,9 +88,14 @@ class PoseMixture:
         identities: (K,) of the components, which last from image to image within a track, from 1
             on; 0: no identity. None: all without.
         joint_covariances: (K, J, 3, 3) m^2, of the joint positions; None: unknown.
+        joint_covariances_relative: (K, J, 3, 3) m^2, of the joint positions relative to the first
+            joint, whose own are 0; None: unknown, as in bags older than this field.
         joint_velocities: (K, J, 3) m/s, in the frame of the header; None: unknown.
         existence_probability: that a person is in view, given all images so far; NaN: unknown, as
             in messages of other publishers and in bags older than this field.
+        error_share: share of the evidence of one image that is independent, in (0, 1], beside a
+            likelihood; NaN: unknown, as in bags older than this field.
+        error_time: time for which errors last, s; NaN: unknown.
 
     Raises:
         MessageError: shapes or values that a message must not have.
@@ -111,6 +120,9 @@ class PoseMixture:
     joint_covariances: Array | None = None
     joint_velocities: Array | None = None
     existence_probability: float = math.nan
+    joint_covariances_relative: Array | None = None
+    error_share: float = math.nan
+    error_time: float = math.nan
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'mixture: dof_names'))
@@ -123,6 +135,7 @@ class PoseMixture:
             'covariances': (components, d, d),
             'joint_positions': (components, joints, 3),
             'joint_covariances': (components, joints, 3, 3),
+            'joint_covariances_relative': (components, joints, 3, 3),
             'joint_velocities': (components, joints, 3),
             'log_likelihoods': (components,),
             'degrees_of_freedom': (components,),
@@ -132,17 +145,10 @@ class PoseMixture:
         if self.degrees_of_freedom is None:
             object.__setattr__(self, 'degrees_of_freedom', np.zeros(components))
         identities = np.zeros(components) if self.identities is None else self.identities
-        identities = np.array(identities, dtype=np.uint32)
-        if identities.shape != (components,):
-            raise MessageError(
-                f'mixture: identities has shape {identities.shape}, wanted {(components,)}'
-            )
-        identities.setflags(write=False)
-        object.__setattr__(self, 'identities', identities)
-        optional = ('covariances', 'joint_covariances', 'joint_velocities')
-        freeze_arrays(self, shapes, 'mixture', optional=optional)
+        object.__setattr__(self, 'identities', identities_of(identities, components, 'mixture'))
+        freeze_arrays(self, shapes, 'mixture', optional=('covariances', *OF_JOINTS))
         check_finite(self.means, 'mixture: mean')
-        for name in ('joint_positions', 'joint_covariances', 'joint_velocities'):
+        for name in ('joint_positions', *OF_JOINTS):
             if (values := getattr(self, name)) is not None:
                 check_finite(values, f'mixture: {name}')
         if components:
@@ -151,6 +157,14 @@ class PoseMixture:
         if not (math.isnan(existence) or 0.0 <= existence <= 1.0):
             raise MessageError(
                 f'mixture: existence_probability must lie in [0, 1] or be NaN, saw {existence}'
+            )
+        if not (math.isnan(self.error_share) or 0.0 < self.error_share <= 1.0):
+            raise MessageError(
+                f'mixture: error_share must lie in (0, 1] or be NaN, saw {self.error_share}'
+            )
+        if not (math.isnan(self.error_time) or 0.0 <= self.error_time < math.inf):
+            raise MessageError(
+                f'mixture: error_time must be 0 s or more, or NaN, saw {self.error_time}'
             )
         if self.covariances is not None:
             check_covariances(self.covariances, 'mixture')
@@ -171,6 +185,8 @@ class PoseMixture:
         identities: NDArray[Any] | None = None,
         velocities: Array | None = None,
         existence_probability: float = math.nan,
+        error_share: float = math.nan,
+        error_time: float = math.nan,
     ) -> PoseMixture:
         """A mixture over the poses of a body at its present lengths.
 
@@ -178,12 +194,14 @@ class PoseMixture:
 
             S_joint = J S J',    v_joint = J v,    J = d joint / d pose at the mean
 
+        and those relative to the pelvis, which is the first joint, have J - J_pelvis for J.
+
         Args:
             body: the person.
             mixture: K Gaussians over its poses; None: nobody was seen.
             joint_positions: (K, J, 3) m, of the means; None: computed here.
             kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities,
-                existence_probability: see the attributes.
+                existence_probability, error_share, error_time: see the attributes.
             velocities: (K, d) of the poses, per second; None: unknown.
 
         Raises:
@@ -215,8 +233,13 @@ class PoseMixture:
             track_id=track_id,
             identities=identities,
             joint_covariances=_joint_covariances(jacobians, mixture.covariances),
+            joint_covariances_relative=_joint_covariances(
+                jacobians - jacobians[:, :1], mixture.covariances
+            ),
             joint_velocities=joint_velocities,
             existence_probability=existence_probability,
+            error_share=error_share,
+            error_time=error_time,
         )
 
     @cached_property
@@ -257,6 +280,7 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
             degrees_of_freedom=float(content.degrees_of_freedom[k]),
             joint_positions=messages.points(content.joint_positions[k]),
             joint_covariances=_flat(content.joint_covariances, k),
+            joint_covariances_relative=_flat(content.joint_covariances_relative, k),
             joint_velocities=_flat(content.joint_velocities, k),
         )
         for k in np.argsort(-content.weights, kind='stable')
@@ -271,6 +295,8 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
         state=int(content.state),
         track_id=content.track_id,
         existence_probability=content.existence_probability,
+        error_share=content.error_share,
+        error_time=content.error_time,
         components=components,
         segment_names=list(content.segment_lengths),
         segment_lengths=np.array(list(content.segment_lengths.values()), dtype=np.float64),
@@ -346,6 +372,10 @@ def pose_mixture_of(
         joint_covariances=_optional(components, 'joint_covariances', (len(joints), 3, 3)),
         joint_velocities=_optional(components, 'joint_velocities', (len(joints), 3)),
         existence_probability=_existence(message, state),
+        joint_covariances_relative=_optional(
+            components, 'joint_covariances_relative', (len(joints), 3, 3)
+        ),
+        **_errors(message),
     )
 
 
@@ -356,9 +386,21 @@ def _existence(message: Any, state: TrackState) -> float:
     return math.nan if state is TrackState.UNKNOWN and value == 0.0 else value
 
 
+def _errors(message: Any) -> dict[str, float]:
+    """How errors last; NaN where a publisher or an older definition does not tell."""
+    share = float(getattr(message, 'error_share', math.nan))
+    if share == 0.0:
+        # ROS sets fields to 0 that a publisher leaves alone.
+        return {}
+    return {'error_share': share, 'error_time': float(getattr(message, 'error_time', math.nan))}
+
+
 def _optional(components: Sequence[Any], name: str, shape: tuple[int, ...]) -> Array | None:
-    """A field (K, *shape) that all components have or none has; None: none."""
-    values = [getattr(component, name) for component in components]
+    """A field (K, *shape) that all components have or none has; None: none.
+
+    An older definition may lack it.
+    """
+    values = [getattr(component, name, ()) for component in components]
     if not any(len(value) for value in values):
         return None
     for k, value in enumerate(values):

@@ -18,6 +18,7 @@ from msg_tools.messages.message_error import (
     check_names,
     check_weights,
     freeze_arrays,
+    identities_of,
     lengths_of,
     names_of,
     numbers,
@@ -48,6 +49,8 @@ class TrajectoryMixture:
         segment_lengths: m, by name, as in `PoseMixture`; empty: unknown.
         joint_names: (J,) order of the joints.
         joint_positions: (M, T, J, 3) m, at the means; None: not computed.
+        identities: (M,) of the motions, which last within a track, from 1 on; 0: no identity. None:
+            all without, as in bags older than this field.
 
     Raises:
         MessageError: shapes or values that a message must not have.
@@ -67,6 +70,7 @@ class TrajectoryMixture:
     segment_lengths: Mapping[str, float] = field(default_factory=dict)
     joint_names: tuple[str, ...] = ()
     joint_positions: Array | None = None
+    identities: NDArray[np.uint32] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'stamps_ns', tuple(int(stamp) for stamp in self.stamps_ns))
@@ -77,6 +81,8 @@ class TrajectoryMixture:
         m, t, d = len(self.weights), len(self.stamps_ns), len(self.dof_names)
         if m == 0 or t == 0:
             raise MessageError(f'trajectories: {m} components of {t} poses, wanted one at least')
+        identities = np.zeros(m) if self.identities is None else self.identities
+        object.__setattr__(self, 'identities', identities_of(identities, m, 'trajectories'))
         shapes: dict[str, tuple[int, ...]] = {
             'weights': (m,),
             'means': (m, t, d),
@@ -101,9 +107,11 @@ class TrajectoryMixture:
 def trajectory_mixture_message(messages: MessageFactory, content: TrajectoryMixture) -> Any:
     """hmt_msgs/TrajectoryMixture; components heaviest first, of equal weights in their order."""
     covariances, joints = content.marginal_covariances, content.joint_positions
+    assert content.identities is not None
     components = [
         messages.create(
             'hmt_msgs/msg/TrajectoryComponent',
+            id=int(content.identities[m]),
             weight=float(content.weights[m]),
             log_joint=float(content.log_joint[m]),
             inflation=float(content.inflation[m]),
@@ -170,6 +178,7 @@ def trajectory_mixture_of(
         segment_lengths=lengths_of(message, 'trajectories'),
         joint_names=joints,
         joint_positions=_optional(components, 'joint_positions', (t, len(joints), 3)),
+        identities=np.array([getattr(component, 'id', 0) for component in components]),
     )
 
 

@@ -32,6 +32,7 @@ def test_constants_of_the_definition() -> None:
         'PREDICTION': 2,
         'SMOOTHED': 3,
         'GROUND_TRUTH': 4,
+        'FORECAST': 5,
         'STATE_UNKNOWN': 0,
         'STATE_TRACKING': 1,
         'STATE_LOST': 2,

@@ -108,6 +108,70 @@ def test_messages_older_than_the_lengths(
     assert serialise(deserialise(data[:-8], POSE_MIXTURE, old)) == data
 
 
+def test_bags_from_before_error_model_and_relative_covariances(
+    pose_mixture: PoseMixture, messages: RosbagsMessages
+) -> None:
+    """Messages whose definition lacks the fields are read as if nothing was known of them."""
+    told = replace(pose_mixture, error_share=0.5, error_time=0.125)
+    message = pose_mixture_message(messages, told)
+    store = typestore()
+    definition, _ = store.generate_msgdef(POSE_MIXTURE, ros_version=2)
+    fields = (
+        'float64 error_share\n', 'float64 error_time\n', 'float64[] joint_covariances_relative\n',
+    )  # fmt: skip
+    assert all(definition.count(field) == 1 for field in fields)
+    for field in fields:
+        definition = definition.replace(field, '')
+    old = typestore_of_definition(POSE_MIXTURE, 'ros2msg', definition)
+    data = bytes(old.serialize_cdr(message, POSE_MIXTURE))
+    assert len(data) < len(serialise(message))
+    back = pose_mixture_of(deserialise(data, POSE_MIXTURE, old))
+    assert math.isnan(back.error_share)
+    assert math.isnan(back.error_time)
+    assert back.joint_covariances_relative is None
+    now = pose_mixture_of(message)
+    for name in ('weights', 'means', 'joint_covariances', 'joint_velocities', 'identities'):
+        np.testing.assert_array_equal(getattr(back, name), getattr(now, name))
+
+
+def test_error_model(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
+    """Both are unknown where a publisher leaves them alone."""
+    told = replace(pose_mixture, error_share=0.5, error_time=0.0)
+    back = pose_mixture_of(pose_mixture_message(messages, told))
+    assert (back.error_share, back.error_time) == (0.5, 0.0)
+    message = pose_mixture_message(messages, pose_mixture)
+    assert math.isnan(message.error_share)
+    message.error_share = message.error_time = 0.0
+    back = pose_mixture_of(message)
+    assert math.isnan(back.error_share)
+    assert math.isnan(back.error_time)
+    for wrong in (-0.1, 1.1, math.inf):
+        with pytest.raises(MessageError, match=r'error_share must lie in \(0, 1\]'):
+            replace(pose_mixture, error_share=wrong)
+    for wrong in (-0.1, math.inf):
+        with pytest.raises(MessageError, match='error_time must be 0 s or more'):
+            replace(pose_mixture, error_time=wrong)
+
+
+def test_relative_covariances_are_those_of_samples() -> None:
+    """Of joints as seen from the pelvis, whose own place is the least certain."""
+    body = load_body('human37')
+    sigma = np.where(body.skeleton.dof_is_rotation, 1e-3, 0.3)
+    mixture = GaussianMixture([1.0], body.prior_mean[None], np.diag(sigma**2)[None])
+    content = PoseMixture.of_body(body, mixture, MixtureKind.POSTERIOR, 10**18, 'lens')
+    rng = np.random.default_rng(0)
+    joints = body.joint_positions(mixture.sample(4000, rng))
+    seen = joints - joints[:, :1]
+    assert content.joint_covariances_relative is not None
+    assert content.joint_covariances is not None
+    assert not content.joint_covariances_relative[0, 0].any()
+    wrist = body.joint_names.index('left_wrist')
+    wanted = np.cov(seen[:, wrist].T)
+    found = content.joint_covariances_relative[0, wrist]
+    assert np.abs(found - wanted).max() < 0.1 * wanted.max()
+    assert content.joint_covariances[0, wrist].trace() > 1e3 * found.trace()
+
+
 def test_probability_of_existence(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
     """NaN where it is unknown: in older bags, and of publishers that leave the field alone."""
     content = replace(pose_mixture, state=TrackState.LOST, existence_probability=0.25)

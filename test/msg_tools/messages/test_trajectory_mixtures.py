@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ CONTENT = TrajectoryMixture(
     frame_id='camera',
     joint_names=('pelvis', 'head'),
     joint_positions=RNG.normal(size=(2, 5, 2, 3)),
+    identities=np.array([7, 2]),
 )
 
 
@@ -43,6 +45,7 @@ def test_round_trip_sorts_by_weight(messages: RosbagsMessages) -> None:
     back = trajectory_mixture_of(message, CONTENT.dof_names)
     for name in (
         'weights', 'means', 'marginal_covariances', 'log_joint', 'inflation', 'joint_positions',
+        'identities',
     ):  # fmt: skip
         np.testing.assert_array_equal(getattr(back, name), getattr(CONTENT, name)[::-1])
     np.testing.assert_array_equal(back.free_energy, CONTENT.free_energy)
@@ -57,6 +60,20 @@ def test_without_joints(messages: RosbagsMessages) -> None:
     back = trajectory_mixture_of(trajectory_mixture_message(messages, content))
     assert back.joint_names == ()
     assert back.joint_positions is None
+
+
+def test_without_identities(messages: RosbagsMessages) -> None:
+    message = trajectory_mixture_message(messages, replace(CONTENT, identities=None))
+    assert trajectory_mixture_of(message).identities.tolist() == [0, 0]
+    # A bag with a definition from before the field.
+    for name, component in enumerate(message.components):
+        kept = {x: getattr(component, x) for x in vars(component) if x != 'id'}
+        message.components[name] = SimpleNamespace(**kept)
+    back = trajectory_mixture_of(message)
+    assert back.identities.tolist() == [0, 0]
+    np.testing.assert_array_equal(back.means, CONTENT.means[::-1])
+    with pytest.raises(MessageError, match=r'identities has shape \(3,\), wanted \(2,\)'):
+        replace(CONTENT, identities=np.arange(3))
 
 
 def test_without_covariances(messages: RosbagsMessages) -> None:
