@@ -26,7 +26,9 @@ from hmt_ros.evaluation.pose_scores import (
     score,
 )
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
+from hmt_ros.smoothing.likelihood import counted
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.selection import choose_hypotheses
 
@@ -36,8 +38,6 @@ NAMES = ('walk', 'exercise', 'charleston')
 # Images that are smoothed together, and how many of them, in the middle, are taken.
 WINDOW, TAKEN = 16, 8
 TRAJECTORIES = 48
-# The errors of neighbouring images have an autocorrelation of about exp(-|dt| / 0.2 s).
-ERROR_CORRELATION = 0.2
 # Kernels, in images, that the modes nearest to the truth are smoothed with.
 KERNELS = (1.0, 2.0, 4.0)
 
@@ -57,13 +57,18 @@ def clips(quick: bool = False) -> dict[str, Any] | str:
 
 
 def of_clip(clip: Clip) -> dict[str, Any]:
-    """Scores of one clip: filter, smoothed likelihoods and smoothed posteriors."""
+    """Scores of one clip: filter, and smoothed likelihoods."""
     tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
-    posteriors, likelihoods = zip(
-        *(tracker.step(image, stamp) for stamp, image in zip(clip.stamps, clip.images, strict=True))
-    )
+    posteriors, likelihoods, errors = [], [], []
+    for stamp, image in zip(clip.stamps, clip.images, strict=True):
+        posterior, likelihood = tracker.step(image, stamp)
+        if posterior is None or likelihood is None:
+            raise ValueError(f'{clip.folder.name}: nobody at {stamp} ns')
+        posteriors.append(posterior)
+        likelihoods.append(likelihood)
+        errors.append(tracker.likelihood_errors)
     truth = true_joints(clip)
-    return compared(tracker.body, clip.stamps, posteriors, likelihoods, truth)
+    return compared(tracker.body, clip.stamps, posteriors, likelihoods, errors, truth)
 
 
 def compared(
@@ -71,17 +76,19 @@ def compared(
     stamps: Sequence[int],
     posteriors: Sequence[GaussianMixture],
     likelihoods: Sequence[GaussianMixture],
+    errors: Sequence[CueErrors],
     truth: Array,
 ) -> dict[str, Any]:
     """Scores of the filter, of what smoothing makes of it, and how much averaging could gain."""
     count = max(len(mixture) for mixture in posteriors)
     filtered = joint_mixtures(body, posteriors)
-    result: dict[str, Any] = {'filter': scores(filtered, filtered, truth)}
-    for what, mixtures in (('likelihoods', likelihoods), ('posteriors', posteriors)):
-        found = smoothed_marginals(body, stamps, mixtures)
-        few = [reduced(body, mixture, count) for mixture in found]
-        result[what] = scores(joint_mixtures(body, few), joint_mixtures(body, found), truth)
-    return {**result, 'oracle': oracle(filtered, truth)}
+    found = smoothed_marginals(body, stamps, likelihoods, errors)
+    few = [reduced(body, mixture, count) for mixture in found]
+    return {
+        'filter': scores(filtered, filtered, truth),
+        'likelihoods': scores(joint_mixtures(body, few), joint_mixtures(body, found), truth),
+        'oracle': oracle(filtered, truth),
+    }
 
 
 def scores(few: list[JointMixture], whole: list[JointMixture], truth: Array) -> dict[str, float]:
@@ -95,14 +102,21 @@ def scores(few: list[JointMixture], whole: list[JointMixture], truth: Array) -> 
 
 
 def smoothed_marginals(
-    body: Body, stamps: Sequence[int], mixtures: Sequence[GaussianMixture]
+    body: Body,
+    stamps: Sequence[int],
+    likelihoods: Sequence[GaussianMixture],
+    errors: Sequence[CueErrors],
 ) -> list[GaussianMixture]:
     """Marginals at all times, from overlapping windows; the motion as the tracker expects it."""
     smoother = MixtureSmoother(
         LinearGaussianDynamics.random_walk(body.rates), body.lower, body.upper,
         max_trajectories=TRAJECTORIES, adapt=(), through_modes=True,
-        error_correlation=ERROR_CORRELATION,
     )  # fmt: skip
+    intervals = np.diff(stamps, prepend=-np.inf) * 1e-9
+    mixtures = [
+        counted(likelihood, one.share(dt))
+        for likelihood, one, dt in zip(likelihoods, errors, intervals, strict=True)
+    ]
     margin = (WINDOW - TAKEN) // 2
     result: list[GaussianMixture] = []
     for first in range(0, len(mixtures), TAKEN):
@@ -163,10 +177,7 @@ def as_rows(result: dict[str, Any]) -> list[list[str]]:
     """A table for people."""
     rows = [['clip', '', 'best of 8, mm', 'heaviest, mm', '90 %', 'joint 90 %', '-log p']]
     for name, entry in result.items():
-        for what, label in (
-            ('filter', 'filter'), ('likelihoods', 'smoothed'),
-            ('posteriors', 'posteriors smoothed'),
-        ):  # fmt: skip
+        for what, label in (('filter', 'filter'), ('likelihoods', 'smoothed')):
             s = entry[what]
             rows.append(
                 [

@@ -31,7 +31,7 @@ STAGES: Stages = (
     (MixtureFilter, '_weigh', 'keeping'),
     (MixtureFilter, '_select', 'keeping'),
     (MixtureFilter, '_fit_shape', 'shape'),
-    (MixtureFilter, 'likelihood_mixture', 'likelihood modes'),
+    (MixtureFilter, 'likelihood', 'likelihood modes'),
 )
 # In these, minimisation is part of the stage.
 WHOLE = ('motion', 'start of the track', 'flesh')

@@ -197,7 +197,9 @@ def _mixture(index: int, kind: MixtureKind) -> Any:
     means[:, elbow] = (0.5 + 0.05 * index, 1.3 + 0.05 * index)
     covariances = np.tile(1e-3 * np.eye(body.dimension), (2, 1, 1))
     mixture = GaussianMixture(np.array([0.6, 0.4]), means, covariances)
-    content = PoseMixture.of_body(body, mixture, kind, 10**18, 'lens')
+    content = PoseMixture.of_body(
+        body, mixture, kind, 10**18, 'lens', error_share=0.4, error_time=0.05
+    )
     return pose_mixture_message(RosbagsMessages(), content)
 
 

@@ -55,6 +55,33 @@ class CueErrors:
         return self.independent * share_of_time(dt, self.time)
 
 
+def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
+    """The one pair (s, tau) that stands for a likelihood made of several cues.
+
+        s = sum_g c_g s_g / C,    s / tau = sum_g c_g s_g / tau_g / C,    C = sum_g c_g
+
+    c_g is how much cue g brings to the likelihood: of the curvature, the number of variables that
+    it determines. At low rates the likelihood then counts with the mean of the shares of its cues,
+    and at high rates a second of images tells what the cues tell in a second; in between the share
+    is an approximation, and exact where all tau_g are one.
+
+    Args:
+        amounts: c_g by name of the cue in `ERRORS`, none negative, not all 0.
+
+    Raises:
+        ValueError: amounts that are negative, not finite, or all 0.
+    """
+    total = sum(amounts.values())
+    if not (0.0 < total < math.inf and min(amounts.values()) >= 0.0):
+        raise ValueError(f'wanted amounts that are not negative, and not all 0, saw {amounts}')
+    parts = [(amount / total, ERRORS[name]) for name, amount in amounts.items() if amount > 0.0]
+    share = sum(part * errors.independent for part, errors in parts)
+    if any(errors.time == 0.0 for _, errors in parts):
+        return CueErrors(share, 0.0)
+    rate = sum(part * errors.independent / errors.time for part, errors in parts)
+    return CueErrors(share, share / rate)
+
+
 # Chosen, not learned, at 30 and 3 images a second: one pair for all cues. The prior of the pose is
 # counted like a cue, because the same pose is judged again in every image.
 ERRORS: Mapping[str, CueErrors] = MappingProxyType(

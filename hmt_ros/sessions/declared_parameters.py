@@ -66,7 +66,8 @@ REMOVED = {
     'background.shadow_threshold': f'the brightness 0.3; {_BACKGROUND}',
     'overlay_quality': 'the JPEG quality is 90',
     'status_interval': 'a line a second while messages arrive; none with --log-level warn',
-    'error_correlation': 'errors last for a time in s: hmt_ros/inference/error_model.py',
+    'error_correlation': 'errors last for a time in s: hmt_ros/inference/error_model.py, and '
+    'error_time of the likelihoods that a smoother takes',
 }
 
 # Metadata of a field that is one parameter or holds several.

@@ -357,6 +357,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             likelihood=likelihood,
             log_likelihoods=tracker.modes.log_likelihoods,
             likelihood_values=tracker.log_likelihoods,
+            likelihood_errors=tracker.likelihood_errors,
             point=tracker.point_estimate,
             ground=tracker.ground,
             contacts=tracker.contacts,

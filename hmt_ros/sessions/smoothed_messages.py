@@ -200,7 +200,7 @@ def nobody_messages(
         publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
 
 
-def _followed(pose: FinalPose, reduced: GaussianMixture) -> dict[str, Array | None]:
+def _followed(pose: FinalPose, reduced: GaussianMixture) -> dict[str, Any]:
     """Identities and velocities of components: those of the trajectories that they stand for.
 
     Each stands for the nearest trajectory, in its standard deviations, that no heavier one has.
@@ -214,7 +214,7 @@ def _followed(pose: FinalPose, reduced: GaussianMixture) -> dict[str, Array | No
         stands_for[k] = np.argmin(distances[k])
         distances[:, stands_for[k]] = np.inf
     velocities = None if pose.velocities is None else pose.velocities[stands_for]
-    return {'identities': 1 + np.array(pose.identities)[stands_for], 'velocities': velocities}
+    return {'identities': np.array(pose.identities)[stands_for], 'velocities': velocities}
 
 
 def _joints(means: Array, body: Body) -> Array:
@@ -236,6 +236,7 @@ def _without_covariances(found: TrajectoryMixture) -> dict[str, Any]:
         'stamps_ns': found.stamps_ns,
         'final_until_ns': before if found.final_until_ns is None else found.final_until_ns,
         'free_energy': found.free_energy,
+        'identities': np.array(found.identities) if found.identities else None,
     }
 
 

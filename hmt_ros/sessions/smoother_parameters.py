@@ -79,11 +79,8 @@ class SmootherParameters(NodeParameters):
         window_length: Number of the newest mixtures that are kept for ~/smooth_window.
         max_trajectories: Maximum number of components of a mixture over trajectories.
         max_hypotheses: Maximum number of components of smoothed_pose_mixture.
-        merge_distance: Distance, in standard deviations, below which two modes of an image are
-            merged.
-        error_correlation: Time over which the errors of images are correlated, s; 0 makes them
-            independent. The longer it is the less evidence is an image, and the wider are the
-            mixtures.
+        merge_distance: Distance, in standard deviations of the whole evidence of an image, below
+            which two modes of it are merged.
         random_seed: Seed of all random numbers; the same mixtures give the same results.
         longest_interval: Interval between two mixtures above which a gap is reported, s; the
             dynamics bridge it.
@@ -104,7 +101,6 @@ class SmootherParameters(NodeParameters):
     max_trajectories: int = parameter_field(16, NEXT_WINDOW, (1, 1024))
     max_hypotheses: int = parameter_field(8, AT_ONCE, (1, 1024))
     merge_distance: float = parameter_field(1.75, NEXT_WINDOW, (0.0, 100.0))
-    error_correlation: float = parameter_field(0.2, NEXT_WINDOW, (0.0, 100.0))
     random_seed: int = parameter_field(0, NEXT_WINDOW, (0, 2**31 - 1))
     longest_interval: float = parameter_field(0.25, AT_ONCE, (0.0, 3600.0))
     publish_covariances: bool = parameter_field(False, AT_ONCE)

@@ -15,6 +15,9 @@ same order give the same bytes. The rules:
   and better.
 - A likelihood without components says that nobody is in view any more: the window ends, and a
   smoothed mixture without components and markers that remove those before go out.
+- Errors of images last: an image counts with a share of its evidence, by the error model that its
+  likelihood carries and the time since the image before (`error_model`). A likelihood without an
+  error model, as in bags of earlier versions, and a forecast, which is no evidence, are skipped.
 - The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
 - What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
@@ -24,6 +27,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +35,7 @@ import numpy as np
 from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.session import Order, Session, SessionState, everything
@@ -44,6 +49,7 @@ from hmt_ros.sessions.smoothed_messages import (
 )
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow
+from hmt_ros.smoothing.likelihood import counted
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
@@ -100,16 +106,35 @@ class SmootherState(SessionState):
         ]
 
 
+class Evidence(NamedTuple):
+    """What an image says of the pose.
+
+    Attributes:
+        stamp: of the image.
+        mixture: the whole of it.
+        errors: how long errors last.
+    """
+
+    stamp: int
+    mixture: GaussianMixture
+    errors: CueErrors
+
+    def since(self, before: int | None) -> GaussianMixture:
+        """What counts of it after an image at the stamp `before`; None: there is none."""
+        dt = math.inf if before is None else (self.stamp - before) / SECOND_NS
+        return counted(self.mixture, self.errors.share(dt))
+
+
 class KeptMixtures(NamedTuple):
     """Likelihoods that have been smoothed since the window began, the newest.
 
     Attributes:
         of: person of the poses; None: no mixture has come.
-        items: (stamp, mixture), as they were received.
+        items: as they were received.
     """
 
     of: SmoothedBody | None
-    items: tuple[tuple[int, GaussianMixture], ...]
+    items: tuple[Evidence, ...]
 
 
 class SmootherSession(Session[SmootherParameters, SmootherState]):
@@ -145,6 +170,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._newest: int | None = None
         self._nobody = False
         self._gaps, self._longest_gap = 0, 0.0
+        self._first_identity = 1
         self.kept = KeptMixtures(None, ())
         self.state = self._present_state()
 
@@ -170,7 +196,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             if content.kind is MixtureKind.LIKELIHOOD and not len(content.weights):
                 self._take_nobody(stamp, content.existence_probability)
                 return
-            mixture, of = content.mixture, self._whose(content)
+            evidence, of = _evidence(content), self._whose(content)
         except MessageError as error:
             self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
             return
@@ -185,6 +211,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             return
         if order is Order.JUMP:
             self._end_window()
+            self._first_identity = 1
         self._begin_track(of)
         p = self.parameters
         if self._newest is not None:
@@ -198,11 +225,11 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 )
         if self._window is None:
             self._window = self._new_window(of.body)
-        used = mixture
+        used = evidence
         if p.merge_distance > 0:
-            used = merged_if_close(mixture, p.merge_distance)
+            used = evidence._replace(mixture=merged_if_close(evidence.mixture, p.merge_distance))
         try:
-            update = self._window.step(stamp, used)
+            update = self._window.step(stamp, used.since(self._newest))
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
             self._log.skip(Fault.ESTIMATE, f'mixture of {stamp} ns can not be smoothed: {text}')
@@ -211,7 +238,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._newest, self._nobody = stamp, False
         self._states[stamp] = content.state, content.existence_probability
         self._log.counts['smoothed'] += 1
-        self.kept = KeptMixtures(of, (*self.kept.items, (stamp, mixture))[-p.window_length :])
+        self.kept = KeptMixtures(of, (*self.kept.items, evidence)[-p.window_length :])
         self._weights = update.trajectories.weights
         window_messages(
             self._messages,
@@ -278,7 +305,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             text = 'mixtures are about another body or another track: a new window begins'
             self._log.note(Fault.NEW_BODY, text)
         self._end_window()
-        self._of = of
+        self._of, self._first_identity = of, 1
         self.kept = KeptMixtures(of, ())
 
     def _new_window(self, body: Body) -> SlidingWindow:
@@ -288,6 +315,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             p.fixed_lag,
             p.random_seed,
             longest_lag=p.longest_lag or math.inf,
+            points=partial(_relative_joints, body),
+            first_identity=self._first_identity,
         )
 
     def _smoother(self, body: Body, closed_form: type[MixtureSmoother]) -> MixtureSmoother:
@@ -299,12 +328,13 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             *_limits(body),
             p.max_trajectories,
             through_modes=p.through_modes,
-            error_correlation=p.error_correlation,
         )
 
     def _end_window(self) -> None:
         """Publishes what is still open, and forgets the window."""
         if self._window is not None and self._of is not None:
+            # A track may go on in another window.
+            self._first_identity = self._window.next_identity
             for pose in self._window.finish():
                 self._publish_final(pose, self._of)
         self.restart()
@@ -340,14 +370,15 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         """
         of, items = self.kept
         chosen = [
-            (stamp, mixture)
-            for stamp, mixture in items
-            if from_ns <= stamp and (to_ns == 0 or stamp <= to_ns)
+            item for item in items if from_ns <= item.stamp and (to_ns == 0 or item.stamp <= to_ns)
         ]
         if of is None or not chosen:
-            kept = f'those from {items[0][0]} to {items[-1][0]} ns are kept' if items else 'none is'
+            kept = 'none is'
+            if items:
+                kept = f'those from {items[0].stamp} to {items[-1].stamp} ns are kept'
             raise ValueError(f'no mixture from {from_ns} to {to_ns} ns: {kept}')
-        stamps, mixtures = zip(*chosen, strict=True)
+        stamps = [item.stamp for item in chosen]
+        mixtures = [item.since(before) for before, item in zip([None, *stamps], chosen)]
         smoother = self._smoother(of.body, MixtureSmoother)
         found = smoother.smooth(mixtures, self.parameters.random_seed, stamps_ns=stamps)
         content = trajectory_content(found, of, covariances=True)
@@ -369,6 +400,36 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             gaps=self._gaps,
             longest_gap=self._longest_gap,
         )
+
+
+def _evidence(content: PoseMixture) -> Evidence:
+    """What a mixture says, and how its errors last; of a kind without errors they do not.
+
+    Raises:
+        MessageError: there are no components or no covariances; a forecast; a likelihood that does
+            not tell how its errors last.
+    """
+    if content.kind is MixtureKind.FORECAST:
+        raise MessageError(
+            'mixture is of the kind FORECAST, wanted LIKELIHOOD: no image speaks of a forecast',
+            MessageFault.KIND,
+        )
+    mixture, share, time = content.mixture, content.error_share, content.error_time
+    if math.isnan(share) or math.isnan(time):
+        if content.kind is MixtureKind.LIKELIHOOD:
+            raise MessageError(
+                f'likelihood has error_share {share:g} and error_time {time:g}, wanted numbers: '
+                'earlier versions lack them; record the bag again with this version',
+                MessageFault.ERRORS,
+            )
+        share, time = 1.0, 0.0
+    return Evidence(content.stamp_ns, mixture, CueErrors(share, time))
+
+
+def _relative_joints(body: Body, poses: Array) -> Array:
+    """Joints (N, J, 3) of poses (N, d) relative to the pelvis, the first of them."""
+    joints = body.joint_positions(poses)
+    return joints - joints[:, :1]
 
 
 def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:

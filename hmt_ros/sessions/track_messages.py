@@ -18,6 +18,7 @@ from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions.fixed_frame import FROM_OPTICAL, FixedFrame, upright
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.session import PublishedTopic
@@ -68,6 +69,7 @@ class TrackedImage:
         posterior, likelihood: mixtures over poses, heaviest first.
         log_likelihoods: (K,) of the image at the means of the posterior.
         likelihood_values: (L,) the same at the means of the likelihood.
+        likelihood_errors: how the errors of the likelihood last, which is undiscounted.
         point: (d,) the point estimate, for those who want one pose.
         ground: gravity and the floor, as far as they are known.
         contacts: probabilities that the feet stand on the floor, by name.
@@ -92,6 +94,7 @@ class TrackedImage:
     likelihood: GaussianMixture
     log_likelihoods: Array
     likelihood_values: Array
+    likelihood_errors: CueErrors
     point: Array
     ground: Ground
     contacts: Mapping[str, float]
@@ -281,6 +284,8 @@ def _mixtures(track: TrackedImage, joints: Array) -> tuple[PoseMixture, PoseMixt
             track_id=track.track_id,
             existence_probability=track.existence_probability,
             log_likelihoods=track.likelihood_values,
+            error_share=track.likelihood_errors.independent,
+            error_time=track.likelihood_errors.time,
         ),
     )
 

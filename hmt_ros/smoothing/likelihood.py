@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
+from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
@@ -223,6 +224,29 @@ class LikelihoodPart:
     ) -> Energy:
         """See `EnergyTerm`; the rows are times from the first on."""
         return self.whole.energy(x, rows + self.first, derivatives=derivatives)
+
+
+def counted(mixture: GaussianMixture, share: float) -> GaussianMixture:
+    """The likelihood of an observation of which a share is told that is new.
+
+        sum_k w_k^a N(m_k, S_k / a) / sum_k w_k^a
+
+    Where errors last, each observation repeats a part of what those before have told, and counts
+    with the share a (`inference.error_model`): log weights and precisions are a times as large.
+
+    Args:
+        mixture: the whole evidence; modes without weight are left out.
+        share: a.
+
+    Raises:
+        ValueError: a share that is not in (0, 1].
+    """
+    if not 0.0 < share <= 1.0:
+        raise ValueError(f'the share of the evidence must lie in (0, 1], saw {share}')
+    some = mixture[mixture.weights > 0]
+    log_weights = share * np.log(some.weights)
+    weights = np.exp(log_weights - logsumexp(log_weights))
+    return GaussianMixture(weights, some.means, some.covariances / share)
 
 
 def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = True) -> None:

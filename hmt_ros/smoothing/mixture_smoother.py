@@ -65,7 +65,7 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False)
 class MixtureSmoother:
-    """Smooths sequences of mixtures.
+    """Smooths sequences of mixtures whose errors are independent; else see `likelihood.counted`.
 
     Attributes:
         dynamics: of the state.
@@ -77,10 +77,6 @@ class MixtureSmoother:
         max_iterations: of the descent of the free energy.
         through_modes: whether, besides the best paths between the ends, those through every single
             mode are starts: more alternatives for each pose, fewer for the whole motion.
-        error_correlation: for how long the errors of observations persist, s; 0: they are
-            independent. Where they last, T images are less than T pieces of evidence: the result
-            is tempered by the share tanh(interval / (2 error_correlation)) that the mean of an
-            autoregressive error leaves (`TrajectoryMixture.tempered`).
 
     Raises:
         ValueError: settings out of range.
@@ -94,7 +90,6 @@ class MixtureSmoother:
     start: str = 'laplace'
     max_iterations: int = 15
     through_modes: bool = False
-    error_correlation: float = 0.0
 
     def __post_init__(self) -> None:
         if self.max_trajectories < 1:
@@ -104,8 +99,6 @@ class MixtureSmoother:
             raise ValueError(f'adapt: no {wrong[0]!r}, wanted some of {ADAPTABLE}')
         if self.start not in ('laplace', 'peak'):
             raise ValueError(f"start must be 'laplace' or 'peak', saw {self.start!r}")
-        if not self.error_correlation >= 0:
-            raise ValueError(f'error_correlation must be 0 s or more, saw {self.error_correlation}')
         self._limits()
 
     def smooth(
@@ -157,14 +150,7 @@ class MixtureSmoother:
             energy = self._free_energy(other, sequence.prior, likelihood, seed)
             if energy < least:
                 best, least = other, energy
-        found = self._fitted(best, sequence.prior, likelihood, seed, stamps_ns)
-        return self.as_evidence(found, sequence.intervals)
-
-    def as_evidence(self, found: TrajectoryMixture, intervals: Array) -> TrajectoryMixture:
-        """Tempered as `error_correlation` says, with intervals (T-1,) in seconds."""
-        if self.error_correlation == 0 or len(intervals) == 0:
-            return found
-        return found.tempered(float(np.tanh(0.5 * intervals.mean() / self.error_correlation)))
+        return self._fitted(best, sequence.prior, likelihood, seed, stamps_ns)
 
     def paths(self, sequence: ModeSequence) -> Paths:
         """The paths that trajectories start from."""
@@ -313,7 +299,6 @@ class MixtureSmoother:
             free_energy=np.empty(0),
             dimension=d,
             stamps_ns=None if stamps_ns is None else tuple(int(stamp) for stamp in stamps_ns),
-            identities=tuple(range(count)),
             lower=low[:d],
             upper=high[:d],
         )
@@ -356,8 +341,7 @@ class PathSmoother(MixtureSmoother):
         if observation is not None:
             raise ValueError('paths are smoothed by the mixtures alone, without an observation')
         found = self._on_paths(sequence, self.paths(sequence))
-        result = self._mixture(found, sequence.prior, sequence.likelihood, stamps_ns)
-        return self.as_evidence(result, sequence.intervals)
+        return self._mixture(found, sequence.prior, sequence.likelihood, stamps_ns)
 
 
 def with_refined_parts(

@@ -15,10 +15,10 @@ the newest pose by a longest time.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
@@ -37,6 +37,9 @@ SECOND_NS = 10**9
 NEGLIGIBLE = 25.0
 MERGE_DISTANCE = 0.6
 MERGE_LOG_DETERMINANT = 0.5
+# A motion goes on as long as no point of it moves by more than this from window to window, in the
+# mean over the times that both have, m: half the length of a forearm, which a flip turns over.
+SAME_MOTION = 0.12
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +84,12 @@ class SlidingWindow:
         seed: of all randomness.
         longest_lag: time by which a final pose may be older than the newest one, s; where poses are
             rare, fewer later ones are seen.
+        points: maps poses (N, d) to points (N, P, 3) by whose distances motions are told apart, m;
+            None: each variable is a point on a line.
+        first_identity: of the first trajectory.
+
+    Attributes:
+        next_identity: that no trajectory has had.
 
     Raises:
         ValueError: a lag that is negative.
@@ -93,6 +102,8 @@ class SlidingWindow:
         seed: int = 0,
         *,
         longest_lag: float = math.inf,
+        points: Callable[[Array], Array] | None = None,
+        first_identity: int = 1,
     ) -> None:
         if fixed_lag < 0:
             raise ValueError(f'fixed_lag must not be negative, saw {fixed_lag}')
@@ -100,15 +111,17 @@ class SlidingWindow:
             raise ValueError(f'longest_lag must not be negative, saw {longest_lag}')
         self.smoother, self.fixed_lag, self.seed = smoother, fixed_lag, seed
         self.longest_lag = longest_lag
+        self.points = points or _variables
+        self.first_identity = first_identity
         self.reset()
 
     def reset(self) -> None:
         """Forgets everything; the next observation is the first."""
+        self.next_identity = self.first_identity
         self._stamps: list[int] = []
         self._mixtures: list[GaussianMixture] = []
         self._first: GaussianMixture | None = None
         self._last: TrajectoryMixture | None = None
-        self._next_identity = 0
         # Poses of the window, the oldest, that are final already.
         self._final = 0
 
@@ -207,28 +220,45 @@ class SlidingWindow:
         return replace(found, identities=self._identities(found))
 
     def _identities(self, found: TrajectoryMixture) -> tuple[int, ...]:
-        """Numbers of the trajectories: of the nearest one before if it is near, or new ones."""
-        numbers = np.full(len(found), -1)
-        last = self._last
-        if last is not None and last.stamps_ns is not None:
-            common = [stamp for stamp in self._stamps if stamp in last.stamps_ns]
-            if common:
-                now = found.means[:, : len(common)]
-                before = last.means[:, -len(common) :]
-                deviation = np.sqrt(
-                    np.einsum(
-                        'm,mtii->ti', last.weights, last.marginal_covariances[:, -len(common) :]
-                    )
-                )
-                scaled = ((now[:, None] - before[None]) / deviation) ** 2
-                distance = scaled.mean((2, 3))
-                rows, columns = linear_sum_assignment(np.minimum(distance, 1e6))
-                near = distance[rows, columns] < 1.0
-                numbers[rows[near]] = np.array(last.identities)[columns[near]]
-        for i in np.flatnonzero(numbers < 0):
-            numbers[i] = self._next_identity
-            self._next_identity += 1
+        """Of the trajectories of a window: the heaviest first, each that of what it continues.
+
+        It continues the nearest trajectory of the window before that no heavier one continues, if
+        no point of it is farther from it than `SAME_MOTION`; else it is a new motion.
+        """
+        numbers = np.zeros(len(found), dtype=np.int64)
+        distances, before = self._distances(found)
+        for i in np.argsort(-found.weights, kind='stable'):
+            j = int(np.argmin(distances[i])) if len(before) else -1
+            if j >= 0 and distances[i, j] <= SAME_MOTION:
+                numbers[i] = before[j]
+                distances[:, j] = np.inf
+            else:
+                numbers[i] = self.next_identity
+                self.next_identity += 1
         return tuple(int(number) for number in numbers)
+
+    def _distances(self, found: TrajectoryMixture) -> tuple[Array, tuple[int, ...]]:
+        """Distances (M, L) from the L trajectories found last, and their identities.
+
+        Of the point that is farthest away in the mean over the times that both windows have.
+        """
+        last = self._last
+        common = 0 if last is None else len({*self._stamps} & {*(last.stamps_ns or ())})
+        if last is None or not common:
+            return np.empty((len(found), 0)), ()
+        now, before = self._points(found.means[:, :common]), self._points(last.means[:, -common:])
+        away = np.linalg.norm(now[:, None] - before, axis=-1)
+        return away.mean(2).max(2), last.identities
+
+    def _points(self, poses: Array) -> Array:
+        """Points (M, T, P, 3) of poses (M, T, d)."""
+        points = self.points(poses.reshape(-1, poses.shape[2]))
+        return points.reshape(*poses.shape[:2], *points.shape[1:])
+
+
+def _variables(poses: Array) -> Array:
+    """The variables (N, d, 1) of poses (N, d), each as a point on a line."""
+    return poses[..., None]
 
 
 def _final_pose(found: TrajectoryMixture, t: int) -> FinalPose:

@@ -10,12 +10,12 @@ velocities, they are integrated out of everything that is returned.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
@@ -34,6 +34,7 @@ class TrajectoryContent(Protocol):
     stamps_ns: tuple[int, ...]
     final_until_ns: int
     free_energy: Array
+    identities: NDArray[np.uint32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,8 @@ class TrajectoryMixture:
         dimension: d.
         stamps_ns: (T,) times; None: not known.
         final_until_ns: poses at or before this time will not be revised.
-        identities: (M,) numbers that trajectories keep from window to window.
+        identities: (M,) numbers, from 1 on, that motions keep from window to window; empty: there
+            is one window, and trajectories have no identity.
         free_energy_fresh: on samples that the descent has not seen, and its standard error.
         lower, upper: (d,) limits; samples beyond them are projected onto them.
 
@@ -196,25 +198,6 @@ class TrajectoryMixture:
         result: Array = np.einsum('m,mtd->td', self.weights, self.means)
         return result
 
-    def tempered(self, share: float) -> TrajectoryMixture:
-        """The mixture if only a share of the evidence counted.
-
-        Proportions a_i^share, and precisions that much smaller: of separate components these are
-        q^share. The trajectories and `free_energy` stay what they are.
-
-        Raises:
-            ValueError: a share that is not in (0, 1].
-        """
-        if not 0 < share <= 1:
-            raise ValueError(f'the share of the evidence must lie in (0, 1], saw {share}')
-        with np.errstate(divide='ignore'):
-            log = share * np.log(self.weights)
-        return replace(
-            self,
-            weights=np.exp(log - logsumexp(log)),
-            inflation=self.inflation / np.sqrt(share),
-        )
-
     def message_content(self) -> dict[str, Any]:
         """What a message needs besides names and frame (`msg_tools.messages`).
 
@@ -233,6 +216,7 @@ class TrajectoryMixture:
             'stamps_ns': self.stamps_ns,
             'final_until_ns': before if self.final_until_ns is None else self.final_until_ns,
             'free_energy': self.free_energy,
+            'identities': np.array(self.identities, dtype=np.uint32) if self.identities else None,
         }
 
     @classmethod
@@ -247,7 +231,7 @@ class TrajectoryMixture:
         """
         if content.marginal_covariances is None:
             raise ValueError('a message without covariances says no density of trajectories')
-        m, times, d = content.means.shape
+        _, times, d = content.means.shape
         scale = content.inflation[:, None, None, None]
         factors = []
         for covariances in content.marginal_covariances / scale**2:
@@ -264,7 +248,7 @@ class TrajectoryMixture:
             dimension=d,
             stamps_ns=tuple(content.stamps_ns),
             final_until_ns=content.final_until_ns,
-            identities=tuple(range(m)),
+            identities=tuple(int(number) for number in content.identities),
         )
 
 

@@ -35,7 +35,11 @@ from hmt_ros.tracking.hypotheses import (
     new_hypotheses,
     relative_joints,
 )
-from hmt_ros.tracking.laplace_approximation import likelihood_modes, posterior_modes
+from hmt_ros.tracking.laplace_approximation import (
+    Likelihood,
+    likelihood_modes,
+    posterior_modes,
+)
 from hmt_ros.tracking.loss import unexplained_share
 from hmt_ros.tracking.motion_states import PredictedStates
 from hmt_ros.tracking.optimisation import Search
@@ -268,10 +272,9 @@ class MixtureFilter:
         )  # fmt: skip
         self._bad_images = self._bad_images + 1 if self.misfit > self.settings.lost_misfit else 0
 
-    def likelihood_mixture(self, observation: Observation) -> tuple[GaussianMixture, Array]:
+    def likelihood(self, observation: Observation) -> Likelihood:
         """See `likelihood_modes`."""
-        seen = self._believed(observation)
-        return likelihood_modes(self.modes, self._posterior, seen, self._dt)
+        return likelihood_modes(self.modes, self._posterior, self._believed(observation))
 
     # The steps.
 

@@ -8,23 +8,46 @@ H is the Gauss-Newton Hessian of the energy at an optimum, H_prior that of body 
 the motion prior. Errors last, so only the share a_g of a cue is believed (`inference.error_model`),
 and what is not known of the shape is not known of the pose: J P J' (`shape_estimation`). A variable
 that rests on its limit hardly varies.
+
+The likelihood alone is passed on whole, with how its errors last beside it: who puts images
+together discounts them, once.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import resting
-from hmt_ros.inference.error_model import ERRORS
+from hmt_ros.inference.error_model import CueErrors, errors_of_cues
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.hypotheses import Modes, Optimised
 from hmt_ros.tracking.motion_states import PredictedStates, fused
-from hmt_ros.tracking.posterior import Posterior, free_covariances
+from hmt_ros.tracking.posterior import ImageFit, Posterior, free_covariances
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
-from hmt_ros.tracking.weighting import normalised
+from hmt_ros.tracking.weighting import at_least, normalised
+
+# No mode of a likelihood is lighter, nats: exp(-690) = 1e-300 is a number still.
+LEAST_LOG_WEIGHT = -690.0
+
+
+@dataclass(frozen=True, eq=False)
+class Likelihood:
+    """The likelihood of an image as a function of the pose, undiscounted.
+
+    Attributes:
+        mixture: whole curvature as covariances, raw energies as weights; heaviest mode first.
+        values: (K,) log likelihoods of the image at its means, nats.
+        errors: how its errors last, all cues together.
+    """
+
+    mixture: GaussianMixture
+    values: Array
+    errors: CueErrors
 
 
 def posterior_modes(
@@ -88,23 +111,17 @@ def posterior_modes(
     )
 
 
-def likelihood_modes(
-    modes: Modes, posterior: Posterior, observation: Observation, dt: float
-) -> tuple[GaussianMixture, Array]:
+def likelihood_modes(modes: Modes, posterior: Posterior, observation: Observation) -> Likelihood:
     """The modes of the likelihood alone, without what was known from the images before.
 
     Around each mode of the posterior the energy of the image and of the body's prior is a
-    parabola; its minimum and curvature make a component, its depth the weight.
+    parabola; its minimum and curvature make a component, its depth the weight, of at least
+    `LEAST_LOG_WEIGHT`. Nothing of it is discounted.
 
     Args:
         modes: of the posterior, K.
         posterior: of the image.
         observation: of the image.
-        dt: time since the image before, s; infinite: there is none.
-
-    Returns:
-        The mixture, heaviest component first, and the log likelihoods (K,) of the image at its
-        means.
     """
     body, poses = posterior.body, modes.poses
     fit = posterior.fit(poses, observation)
@@ -115,8 +132,24 @@ def likelihood_modes(
     limit = 3.0 * np.sqrt(np.einsum('kii->ki', modes.covariances))
     step = np.clip(step, -limit, limit)
     means = np.clip(poses + step, body.lower, body.upper)
-    if observation.evidence or observation.keypoints is not None:
-        covariances = posterior.covariances(fit, free, dt)
-    weights = np.exp(normalised(-ERRORS['image'].share(dt) * fit.energy.value))
+    weights = np.exp(at_least(normalised(-fit.energy.value), LEAST_LOG_WEIGHT))
     mixture = GaussianMixture(weights, means, covariances).sorted()
-    return mixture, posterior.log_likelihoods(mixture.means, observation)
+    values = posterior.log_likelihoods(mixture.means, observation)
+    return Likelihood(mixture, values, _errors(fit, covariances, weights))
+
+
+def _errors(fit: ImageFit, covariances: Array, weights: Array) -> CueErrors:
+    """How errors last of an energy whose Hessian H = sum_g H_g has the inverse S in each mode.
+
+    A cue counts with the number of variables that it determines, tr(S H_g), in the mean over modes.
+    """
+    _, hessian = fit.energy.derivatives()
+    parts = {'image': fit.image_hessian, 'keypoints': fit.keypoint_hessian}
+    parts['prior'] = hessian - fit.image_hessian - fit.keypoint_hessian
+    amounts = {
+        name: max(float(np.einsum('k,kij,kji->', weights, covariances, part)), 0.0)
+        for name, part in parts.items()
+    }
+    if not sum(amounts.values()) > 0.0:
+        amounts['prior'] = 1.0
+    return errors_of_cues(amounts)

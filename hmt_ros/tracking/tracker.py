@@ -24,7 +24,7 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.observation import Box, Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
-from hmt_ros.inference.error_model import seconds
+from hmt_ros.inference.error_model import ERRORS, seconds
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.beginning import FROM_JOINTS, Beginning, Source, Starts, poses_to_search
 from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
@@ -70,6 +70,7 @@ class Tracker:
         evaluations: of the likelihood in the last image.
         log_likelihoods: (K,) of the last tracked image at the means of its likelihood mixture, nats
             up to a constant of the image.
+        likelihood_errors: how the errors of that likelihood last, which is undiscounted.
         track_id: number of the present track, or of the last one; 0 before the first.
         started_from: what that track began from; None before the first.
     """
@@ -94,6 +95,7 @@ class Tracker:
         self.depth = self._observer.depth
         self.evaluations = 0
         self.log_likelihoods: Array = np.empty(0)
+        self.likelihood_errors = ERRORS['image']
         self.track_id = 0
         self.started_from: Source | None = None
         self._seed = seed
@@ -172,9 +174,9 @@ class Tracker:
                 and what is out of range says nothing. None: unknown.
 
         Returns:
-            The posterior p(x_t | R_t) and the likelihood p(r_t | x_t) as mixtures over poses,
-            heaviest first with weights that sum to 1; (None, None) while there is no track, before
-            the first or because nobody is in view.
+            The posterior p(x_t | R_t) and the likelihood p(r_t | x_t), undiscounted (see
+            `likelihood_errors`), as mixtures over poses, heaviest first with weights that sum to 1;
+            (None, None) while there is no track, before the first or because nobody is in view.
 
         Raises:
             ValueError: an image, mask or depth of another size, a stamp that does not increase, or
@@ -383,8 +385,9 @@ class Tracker:
         return self.posterior, self._likelihood(observation)
 
     def _likelihood(self, observation: Observation) -> GaussianMixture:
-        mixture, self.log_likelihoods = self._track.likelihood_mixture(observation)
-        return mixture
+        found = self._track.likelihood(observation)
+        self.log_likelihoods, self.likelihood_errors = found.values, found.errors
+        return found.mixture
 
     def _start_track(
         self, view: View, stamp: int, prediction: PosePrediction | None, *, masked: bool

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.linalg import toeplitz
 
-from hmt_ros.inference.error_model import ERRORS, CueErrors, share_of_time
+from hmt_ros.inference import error_model
+from hmt_ros.inference.error_model import ERRORS, CueErrors, errors_of_cues, share_of_time
 
 
 @pytest.mark.parametrize('dt', [0.01, 0.1, 0.4, 2.0])
@@ -67,3 +68,33 @@ def test_the_rate_hardly_matters_where_errors_last_longer_than_the_interval(time
     fast, slow = (rate * errors.share(1.0 / rate) for rate in (30.0, 8.0))
     assert fast == pytest.approx(0.4 / (2.0 * time), rel=0.02)
     assert slow == pytest.approx(fast, rel=0.02)
+
+
+def test_one_pair_for_several_cues(monkeypatch):
+    """It has the mean share of its cues at low rates of images, and at high rates."""
+    table = {'image': CueErrors(0.2, 0.5), 'keypoints': CueErrors(0.6, 0.05)}
+    monkeypatch.setattr(error_model, 'ERRORS', table)
+    amounts = {'image': 3.0, 'keypoints': 1.0}
+    one = errors_of_cues(amounts)
+
+    def mean(dt):
+        return sum(amount * table[name].share(dt) for name, amount in amounts.items()) / 4.0
+
+    assert one.share(math.inf) == pytest.approx(mean(math.inf), rel=1e-12)
+    assert one.share(1e-5) == pytest.approx(mean(1e-5), rel=1e-6)
+    for dt in (1 / 30, 0.1, 0.3):
+        shares = sorted(errors.share(dt) for errors in table.values())
+        assert shares[0] < one.share(dt) < shares[1]
+    alone = errors_of_cues({'image': 2.0, 'keypoints': 0.0})
+    assert (alone.independent, alone.time) == pytest.approx((0.2, 0.5))
+    for wrong in ({'image': 0.0}, {'image': -1.0, 'keypoints': 2.0}, {'image': math.nan}):
+        with pytest.raises(ValueError, match='not negative, and not all 0'):
+            errors_of_cues(wrong)
+
+
+def test_cues_with_one_pair_have_it_together(monkeypatch):
+    monkeypatch.setattr(error_model, 'ERRORS', dict.fromkeys('ab', CueErrors(0.35, 0.053)))
+    found = errors_of_cues({'a': 0.3, 'b': 2.0})
+    assert (found.independent, found.time) == pytest.approx((0.35, 0.053))
+    monkeypatch.setattr(error_model, 'ERRORS', {'a': CueErrors(1.0, 0.0), 'b': CueErrors(0.5, 1.0)})
+    assert errors_of_cues({'a': 1.0, 'b': 1.0}) == CueErrors(0.75, 0.0)

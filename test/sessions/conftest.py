@@ -12,6 +12,7 @@ import pytest
 
 from hmt_ros.body import Body, Camera, load_body
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions import bme_session, camera_session, track_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
 from hmt_ros.tracking.beginning import Source
@@ -26,6 +27,7 @@ from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixt
 
 FRAME_NS = 100_000_000
 START_NS = 1_700_000_000_000_000_000
+INDEPENDENT, UNKNOWN = CueErrors(1.0, 0.0), CueErrors(np.nan, np.nan)
 JOINTS = ('left_hip', 'right_hip', 'left_shoulder', 'right_shoulder', 'head')
 
 
@@ -54,6 +56,7 @@ class StubTracker:
         self.track_id, self.started_from = 0, None
         self.existence_probability = 0.875
         self.log_likelihoods = np.array([-1.5, -2.5])
+        self.likelihood_errors = CueErrors(0.25, 0.125)
         self.known_ground = known_ground
         up = np.array([0.0, -1.0, 0.0]) if known_ground.up is None else known_ground.up
         self.ground = Ground(up, 0.1, known_ground.camera_height, 0.02)
@@ -346,9 +349,14 @@ class Likelihoods:
             kind=int(MixtureKind.PREDICTION),
         )
 
-    def message(self, index, body=None, kind=MixtureKind.LIKELIHOOD):
-        body, mixture = self.body if body is None else body, self.mixture(index)
-        content = PoseMixture.of_body(body, mixture, kind, self.stamp(index), 'lens')
+    def message(
+        self, index, body=None, kind=MixtureKind.LIKELIHOOD, errors=INDEPENDENT, mixture=None
+    ):
+        body = self.body if body is None else body
+        content = PoseMixture.of_body(
+            body, mixture or self.mixture(index), kind, self.stamp(index), 'lens',
+            error_share=errors.independent, error_time=errors.time,
+        )  # fmt: skip
         return pose_mixture_message(self.messages, content)
 
 

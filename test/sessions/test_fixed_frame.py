@@ -252,8 +252,9 @@ def test_the_smoother_smooths_a_person_before_a_camera_that_moves(outputs):
             if in_room:
                 (noisy, _), frame = fixed.placed(body, noisy), fixed.optical
             content = PoseMixture.of_body(
-                body, noisy, MixtureKind.LIKELIHOOD, 10**18 + index * 10**8, frame
-            )
+                body, noisy, MixtureKind.LIKELIHOOD, 10**18 + index * 10**8, frame,
+                error_share=1.0, error_time=0.0,
+            )  # fmt: skip
             one.take(MIXTURE, pose_mixture_message(RosbagsMessages(), content))
         one.finish()
         found = [

@@ -5,17 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.smoothed_messages import TOPICS
 from hmt_ros.sessions.smoother_parameters import SmootherDynamics, SmootherParameters
 from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
 from hmt_ros.smoothing import MixtureSmoother
+from hmt_ros.smoothing.likelihood import counted
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import EARLIEST_NS, header_message, time_ns
 from msg_tools.messages.pose_mixtures import MixtureKind, TrackState, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
 
 LAG = 2
+INDEPENDENT, UNKNOWN = CueErrors(1.0, 0.0), CueErrors(np.nan, np.nan)
 WINDOW = ['trajectory_mixture', 'trajectory_markers']
 FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
 
@@ -65,7 +68,7 @@ def test_poses_become_final_after_the_lag(session, outputs, likelihoods):
 
 
 def test_final_poses_are_mixtures_that_need_no_kinematics(session, outputs, likelihoods):
-    one = session(error_correlation=0.0)
+    one = session()
     for index in range(6):
         one.take(MIXTURE, likelihoods.message(index))
     one.finish()
@@ -90,14 +93,82 @@ def test_final_poses_are_mixtures_that_need_no_kinematics(session, outputs, like
         assert 0.6 < mixture.weights[straight].sum() < 0.95
 
 
-def test_errors_that_last_make_mixtures_wider(session, outputs, likelihoods):
-    for time in (0.0, 0.1):
-        one = session(error_correlation=time, max_trajectories=1)
-        for index in range(3):
-            one.take(MIXTURE, likelihoods.message(index))
-    narrow, wide = (pose_mixture_of(m).mixture for m in read(outputs, 'smoothed_pose_mixture'))
-    np.testing.assert_allclose(wide.covariances * np.tanh(0.5), narrow.covariances, rtol=1e-9)
-    assert np.array_equal(wide.means, narrow.means)
+@pytest.mark.parametrize('method', ['paths', 'variational'])
+def test_errors_that_last_are_discounted_once(session, outputs, likelihoods, method):
+    """The first of three poses, by the dense joint precision of each variable."""
+    body, one = likelihoods.body, session(max_trajectories=1, method=method)
+    errors, stamps, means = CueErrors(0.5, 0.1), (0, 1, 3), []
+    for index in stamps:
+        mixture = likelihoods.mixture(index)[:1].normalised()
+        means.append(mixture.means[0])
+        message = likelihoods.message(index, errors=errors, mixture=mixture)
+        assert one.take(MIXTURE, message).faults == ()
+    # What counts of each image, and the random walk between the poses.
+    shares = 0.5 * np.array([1.0, np.tanh(0.5), np.tanh(1.0)])
+    links = 1.0 / (body.rates[:, None] * [0.1, 0.2])
+    precisions = np.zeros((body.dimension, 3, 3))
+    precisions[:, range(3), range(3)] = shares / 1e-3
+    for i in range(2):
+        precisions[:, i : i + 2, i : i + 2] += links[:, i, None, None] * [[1, -1], [-1, 1]]
+    covariances = np.linalg.inv(precisions)
+    pulls = shares[:, None] / 1e-3 * np.array(means)
+    wanted = np.einsum('dij,jd->id', covariances, pulls)
+    (first,) = (pose_mixture_of(m).mixture for m in read(outputs, 'smoothed_pose_mixture'))
+    exact = method == 'paths'
+    np.testing.assert_allclose(first.means[0], wanted[0], atol=1e-6 if exact else 0.01)
+    found = np.diagonal(first.covariances[0])
+    np.testing.assert_allclose(found, covariances[:, 0, 0], rtol=1e-6 if exact else 0.3)
+
+
+def test_likelihoods_without_an_error_model_are_refused(session, outputs, likelihoods):
+    """Those of earlier versions are discounted already; what comes after them is smoothed."""
+    one = session(longest_interval=1.0)
+    handled = [
+        one.take(MIXTURE, likelihoods.message(index, errors=UNKNOWN if index < 2 else INDEPENDENT))
+        for index in range(5)
+    ]
+    assert [len(h.faults) for h in handled] == [1, 1, 0, 0, 0]
+    assert [len(h.warnings) for h in handled] == [1, 0, 0, 0, 0]
+    (text,) = handled[0].warnings
+    assert text.endswith(
+        'likelihood has error_share nan and error_time nan, wanted numbers: earlier versions lack '
+        'them; record the bag again with this version'
+    )
+    assert one.state.counts == {'received': 5, 'smoothed': 3, 'skipped': 2}
+    assert one.state.faults == {'error_share and error_time': 2}
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(index) for index in (2, 3, 4)]
+    # Somebody leaves: there is nothing to discount.
+    nobody = change(likelihoods.message(5, errors=UNKNOWN), components=[])
+    assert one.take(MIXTURE, nobody).faults == ()
+
+
+def test_forecasts_are_no_evidence(session, outputs, likelihoods):
+    one = session()
+    for index in range(3):
+        kind = MixtureKind.FORECAST if index == 1 else MixtureKind.LIKELIHOOD
+        handled = one.take(MIXTURE, likelihoods.message(index, kind=kind))
+        assert len(handled.faults) == (index == 1)
+    assert one.state.faults == {'kind': 1}
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(0), likelihoods.stamp(2)]
+
+
+def test_a_span_is_discounted_from_its_first_image_on(session, likelihoods):
+    """As `MixtureSmoother` of what counts of each image."""
+    errors, one = CueErrors(0.5, 0.1), session(max_trajectories=2)
+    for index in range(4):
+        one.take(MIXTURE, likelihoods.message(index, errors=errors))
+    first, last = likelihoods.stamp(1), likelihoods.stamp(3)
+    found = trajectory_mixture_of(one.smooth_span(first, last))
+    share = 0.5 * np.tanh(0.5)
+    mixtures = [counted(likelihoods.mixture(i), 0.5 if i == 1 else share) for i in (1, 2, 3)]
+    smoother = one._smoother(likelihoods.body, MixtureSmoother)
+    wanted = smoother.smooth(mixtures, stamps_ns=[likelihoods.stamp(i) for i in (1, 2, 3)])
+    np.testing.assert_allclose(found.means, wanted.means, atol=1e-9)
+    np.testing.assert_allclose(found.weights, wanted.weights, atol=1e-9)
+    # Another run of the same span would number them otherwise.
+    assert not found.identities.any()
 
 
 def test_smoothed_poses_tell_state_track_and_motion(session, outputs, likelihoods):
@@ -150,6 +221,27 @@ def test_another_track_is_another_window(session, outputs, likelihoods):
     one.finish()
     tracks = [message.track_id for message in read(outputs, 'smoothed_pose_mixture')]
     assert tracks == [1, 1, 2, 2]
+
+
+def test_motions_have_the_same_numbers_in_both_messages(session, outputs, likelihoods):
+    one = session(max_trajectories=2)
+    for index in range(6):
+        one.take(MIXTURE, likelihoods.message(index))
+    windows = [trajectory_mixture_of(m) for m in read(outputs, 'trajectory_mixture')]
+    poses = [pose_mixture_of(m) for m in read(outputs, 'smoothed_pose_mixture')]
+    elbow = likelihoods.body.dof_names.index('left_elbow')
+    for window, pose in zip(windows[LAG:], poses, strict=True):
+        bent = window.identities[window.means[:, 0, elbow].argmax()]
+        assert sorted(window.identities) == [1, 2]
+        assert bent == pose.identities[pose.means[:, elbow].argmax()]
+        assert bent == windows[LAG].identities[windows[LAG].means[:, 0, elbow].argmax()]
+    # Another window of the same track takes other numbers, another track begins with 1 again.
+    one.finish()
+    one.take(MIXTURE, likelihoods.message(6))
+    assert min(trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1]).identities) == 3
+    one.take(MIXTURE, change(likelihoods.message(7), track_id=8))
+    one.take(MIXTURE, change(likelihoods.message(8), track_id=9))
+    assert min(trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1]).identities) == 1
 
 
 def test_trajectories_need_no_kinematics(session, outputs, likelihoods):
@@ -389,7 +481,7 @@ def test_time_that_jumps_back_begins_a_new_window(session, outputs, likelihoods)
 
 
 def test_gaps_are_bridged_and_told(session, outputs, likelihoods):
-    one = session(longest_interval=0.15, error_correlation=0.0)
+    one = session(longest_interval=0.15)
     handled = [one.take(MIXTURE, likelihoods.message(index)) for index in (0, 1, 6, 7, 14)]
     assert [len(h.faults) for h in handled] == [0] * 5
     assert [len(h.warnings) for h in handled] == [0, 0, 1, 0, 0]

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import forward
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions.overlay import draw_modes
 from hmt_ros.sessions.track_messages import TOPICS, Presentation, TrackedImage, track_messages
 from hmt_ros.tracking.ground import Ground
@@ -46,6 +47,7 @@ def track(body):
         likelihood=GaussianMixture(np.array([0.6, 0.4]), poses[:2], covariances[:2]),
         log_likelihoods=np.array([-3.0, -2.0, -1.0]),
         likelihood_values=np.array([-2.5, -1.5]),
+        likelihood_errors=CueErrors(0.25, 0.125),
         point=poses[1],
         ground=Ground(np.array([0.0, -0.8, -0.6]), 0.05, 1.5, 0.1),
         contacts={'left_foot': 0.75, 'right_foot': 0.25},
@@ -88,6 +90,10 @@ def test_mixtures(track, body):
     assert np.array_equal(
         [c.log_likelihood for c in found['likelihood_mixture'].components], [-2.5, -1.5]
     )
+    # The likelihood is undiscounted, and tells how its errors last.
+    likelihood, posterior = found['likelihood_mixture'], found['pose_mixture']
+    assert (likelihood.error_share, likelihood.error_time) == (0.25, 0.125)
+    assert np.isnan([posterior.error_share, posterior.error_time]).all()
 
 
 def test_joint_states_are_those_of_the_point_estimate(track, body):

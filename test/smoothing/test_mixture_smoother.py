@@ -8,6 +8,7 @@ from scipy.stats import multivariate_normal
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother, TrajectoryMixture
+from hmt_ros.smoothing.likelihood import counted
 from hmt_ros.smoothing.mixture_smoother import LONG
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.trajectory_refinement import refine
@@ -211,25 +212,24 @@ def test_not_a_number_is_refused_where_it_comes_in():
         GaussianMixture([1.0], [[np.nan]], [[[1.0]]])
 
 
-def test_errors_that_last_leave_less_evidence(modes, walk):
-    mixtures = modes(4.0)
-    independent = MixtureSmoother(walk).smooth(mixtures)
-    found = MixtureSmoother(walk, error_correlation=2.0).smooth(mixtures)
-    share = np.tanh(0.25)
-    # The variance of the mean of an AR(1) error with rho = exp(-dt / tau) grows by
-    # (1 + rho) / (1 - rho).
-    rho = np.exp(-0.5)
-    assert share == pytest.approx((1 - rho) / (1 + rho))
-    np.testing.assert_allclose(
-        found.marginal_covariances, independent.marginal_covariances / share, rtol=1e-9
-    )
-    np.testing.assert_array_equal(found.means, independent.means)
-    log = share * np.log(independent.weights)
-    np.testing.assert_allclose(np.diff(np.log(found.weights)), np.diff(log), rtol=1e-6, atol=1e-9)
-    with pytest.raises(ValueError, match='error_correlation'):
-        MixtureSmoother(walk, error_correlation=-1.0)
-    with pytest.raises(ValueError, match='share of the evidence'):
-        independent.tempered(0.0)
+def test_what_counts_of_an_observation_is_a_power_of_it():
+    """Where modes are apart, log q = a log p up to a constant, near either of them."""
+    spread = np.array([[0.5, 0.2], [0.2, 0.3]])
+    means = np.array([[-9.0, 0.0], [9.0, 4.0]])
+    mixture = GaussianMixture([0.9, 0.1], means, [spread, spread])
+    rng = np.random.default_rng(0)
+    points = means[[0, 1] * 5] + rng.normal(size=(10, 2))
+    for share in (1.0, 0.3):
+        found = counted(mixture, share)
+        assert found.weights.sum() == pytest.approx(1.0)
+        offset = found.log_density(points) - share * mixture.log_density(points)
+        np.testing.assert_allclose(offset, offset[0], atol=1e-6)
+    # A mode without weight stays without; one that hardly has any comes nearer.
+    light = counted(GaussianMixture([1.0, 1e-300, 0.0], [[0.0], [1.0], [2.0]], [[[1.0]]] * 3), 0.1)
+    np.testing.assert_allclose(light.weights, [1.0, 1e-30], rtol=1e-9)
+    for share in (0.0, -0.5, 1.5):
+        with pytest.raises(ValueError, match='share of the evidence'):
+            counted(mixture, share)
 
 
 def test_parts_of_a_long_sequence_lead_to_the_same_optima(modes):

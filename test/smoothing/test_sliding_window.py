@@ -67,7 +67,7 @@ def test_velocities_of_final_poses(walk, moving):
     for t, pose in enumerate(final):
         tolerance = 0.8 * 0.4**t if moving else 0.0
         np.testing.assert_allclose(pose.velocities, [[2.0, -1.0]], atol=0.02 + tolerance)
-        assert pose.identities == (0,)
+        assert pose.identities == (1,)
     # Of one pose alone nothing is known.
     _, (alone,) = run(SlidingWindow(MixtureSmoother(walk), fixed_lag=3), mixtures[:1])
     assert alone.velocities is None
@@ -115,6 +115,38 @@ def test_hypotheses_keep_their_identity(modes, walk):
         left = int(np.argmin(found.means[:, -1, 0]))
         seen.append((found.identities[left], len(found)))
     assert len(set(seen[2:])) == 1
+
+
+def test_a_motion_that_splits_goes_on_as_the_heavier_part(walk):
+    window = SlidingWindow(MixtureSmoother(walk, max_trajectories=2), fixed_lag=3)
+    sharp = [1e-4 * np.eye(2)]
+    place, left, right = [0.0, 0.0], [-1.0, 0.0], [1.0, 0.0]
+    found = window.step(0, GaussianMixture([1.0], [place], sharp)).trajectories
+    assert found.identities == (1,)
+    mixture = GaussianMixture([0.3, 0.7], [left, right], 2 * sharp)
+    found = window.step(10**9, mixture).trajectories
+    assert found.identities == (1, 2)
+    assert found.means[0, -1, 0] > 0.9
+    # Later the other one is the heavier, and both keep their numbers.
+    mixture = GaussianMixture([0.9, 0.1], [left, right], 2 * sharp)
+    found = window.step(2 * 10**9, mixture).trajectories
+    assert found.means[0, -1, 0] < -0.9
+    assert found.identities == (2, 1)
+    assert window.next_identity == 3
+
+
+def test_a_motion_that_is_revised_by_more_than_the_bound_is_another_one():
+    """The points that a motion is seen by decide, not its variables."""
+    dynamics = LinearGaussianDynamics.random_walk([1.0])
+    for scale, wanted in ((1.0, (2,)), (0.1, (1,))):
+        window = SlidingWindow(
+            MixtureSmoother(dynamics), 3, points=lambda poses, s=scale: s * poses[..., None]
+        )
+        window.step(0, GaussianMixture([1.0], [[0.0]], [[[1.0]]]))
+        # The pose before moves by half a metre.
+        found = window.step(10**9, GaussianMixture([1.0], [[1.0]], [[[0.1]]])).trajectories
+        assert found.means[0, 0, 0] == pytest.approx(1.0 / 2.1, abs=0.02)
+        assert found.identities == wanted
 
 
 def test_gaps_are_bridged_by_the_dynamics(modes, walk, exact):

@@ -25,6 +25,7 @@ from hmt_ros.tracking import (
     Tracker,
     TrackerSettings,
 )
+from hmt_ros.tracking.posterior import WIDEST
 
 ONLY_KEYPOINTS = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
 OFF = GroundSettings(0.0, 0.0, 0.0, 0.0)
@@ -154,14 +155,28 @@ def test_heaviest_modes_explain_the_joints(follow, camera, human32, motion, keyp
 def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     follow, camera, human32, motion, keypoints_of
 ):
-    """exp(-share * energy) at the modes of the posterior, normalised, with the ground off."""
+    """exp(-energy) at the modes of the posterior, normalised, with the ground off.
+
+    And the whole curvature: nothing is discounted.
+    """
     tracker, mixtures, _ = follow(frames=4, ground=OFF)
     posterior, likelihood = mixtures[-1]
     seen = Observation(keypoints=keypoints_of(human32, motion[3], 1.0, 3))
     likelihood_of = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).given(seen)
-    energies = likelihood_of.energy(posterior.means).value
-    weights = np.exp(-ERRORS['image'].share(0.1) * (energies - energies.min()))
-    assert np.allclose(likelihood.weights, np.sort(weights / weights.sum())[::-1], atol=1e-12)
+    energy = likelihood_of.energy(posterior.means)
+    weights = np.exp(energy.value.min() - energy.value)
+    order = np.argsort(-weights, kind='stable')
+    assert np.allclose(likelihood.weights, (weights / weights.sum())[order], rtol=1e-9)
+    lower, upper = human32.lower + 1e-6, human32.upper - 1e-6
+    for k, precision in zip(order, np.linalg.inv(likelihood.covariances), strict=True):
+        inside = (posterior.means[k] > lower) & (posterior.means[k] < upper)
+        wanted = energy.hessian[k] + WIDEST**-2.0 * np.eye(len(inside))
+        both = np.ix_(inside, inside)
+        assert inside.sum() > len(inside) / 2
+        assert np.allclose(precision[both], wanted[both], rtol=1e-6, atol=1e-3)
+    # All cues have one error model today; the mean over those that speak is among theirs.
+    shares = [errors.independent for errors in ERRORS.values()]
+    assert min(shares) <= tracker.likelihood_errors.independent <= max(shares)
     # Its log at the means is that of the image, without the prior of the body.
     frames = forward(tracker.body.skeleton, likelihood.means)
     term = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).keypoint_term(seen, None)

@@ -21,7 +21,9 @@ from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
 ENDS = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
 KEPT_TRAJECTORIES = 8
 _TRAJECTORIES = 'trajectories'
-_ORDER = ('posterior', 'smoothed', 'likelihood', 'prediction', 'ground_truth', _TRAJECTORIES)
+_ORDER = (
+    'posterior', 'smoothed', 'forecast', 'likelihood', 'prediction', 'ground_truth', _TRAJECTORIES,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ from hmt_ros.app.replay.inputs import recorded_input
 from hmt_ros.body import load_body
 from hmt_ros.experts import load_predictor
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions import track_start
 from hmt_ros.sessions.smoothed_messages import TOPICS as SMOOTHED_TOPICS
 from hmt_ros.sessions.track_messages import TOPICS
@@ -84,6 +85,7 @@ class StandingStill:
         self.body, self.camera, self.settings, self.seed = body, camera, settings, seed
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
         self.existence_probability = 1.0
+        self.likelihood_errors = CueErrors(0.25, 0.125)
         self.track_id, self.started_from = 1, None
         self.keypoints, self.positions, self.predictions, self.masks = [], [], [], []
         self.depths = []
