@@ -53,7 +53,15 @@ from hmt_ros.image.likelihood import OFF
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.tracking import PosePrediction, Subject, Tracker, TrackerSettings, read_subject
+from hmt_ros.tracking import (
+    Lagged,
+    LaggedWeights,
+    PosePrediction,
+    Subject,
+    Tracker,
+    TrackerSettings,
+    read_subject,
+)
 
 Item = TypeVar('Item')
 Result = TypeVar('Result')
@@ -68,6 +76,8 @@ JOINTS = (ORIGIN, *EVALUATED_JOINTS)
 USUAL_RATE = 30.0
 # Images after which everything is compiled.
 WARMING = 2
+# Images after which the modes of an image are weighed by what became of them.
+LAG = 10
 # Streams of random numbers of a seed.
 OF_BLIND_CONTROL = 5
 
@@ -132,6 +142,7 @@ class Record:
         cpu_seconds: (T,) of processor time that a step took, all threads together; empty: unknown.
         statuses: (N,) what the tracker was doing in each image of the run, the value of its status;
             empty: unknown.
+        lagged: (T, K) weights by what became of the modes in the next `LAG` images; empty: unknown.
     """
 
     stamps: NDArray[np.int64]
@@ -150,6 +161,7 @@ class Record:
     views: NDArray[np.float64]
     cpu_seconds: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     statuses: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, dtype='<U1'))
+    lagged: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 def keypoints_only(settings: TrackerSettings) -> TrackerSettings:
@@ -222,6 +234,7 @@ def follow(
     points: list[NDArray[np.float64]] = []
     stamps: list[int] = []
     evaluations, seconds, cpu_seconds, statuses = [], [], [], []
+    lagged, later = LaggedWeights(LAG), list[Lagged]()
     for stamp, image in zip(clip.stamps, clip.images, strict=True):
         start, cpu_start = time.perf_counter(), time.process_time()
         seen = None if keypoints is None else keypoints.get(stamp)
@@ -232,6 +245,8 @@ def follow(
         posterior, _ = tracker.step(image, stamp, seen, prediction)
         spent, cpu_spent = time.perf_counter() - start, time.process_time() - cpu_start
         statuses.append(tracker.status.value)
+        if posterior is not None:
+            later += lagged.update(stamp, posterior, tracker.origins)
         if posterior is not None and stamp in clip.truth.joints:
             bodies.append(tracker.body)
             mixtures.append(posterior)
@@ -241,7 +256,22 @@ def follow(
             seconds.append(spent)
             cpu_seconds.append(cpu_spent)
     record = recorded(clip, bodies, mixtures, points, stamps, evaluations, seconds, seed)
-    return replace(record, cpu_seconds=np.array(cpu_seconds), statuses=np.array(statuses))
+    return replace(
+        record,
+        cpu_seconds=np.array(cpu_seconds),
+        statuses=np.array(statuses),
+        lagged=_lagged_weights([*later, *lagged.finish()], record),
+    )
+
+
+def _lagged_weights(later: Sequence[Lagged], record: Record) -> NDArray[np.float64]:
+    """Lagged weights (T, K) of the modes of a record."""
+    by_stamp = {one.stamp: one.posterior.weights for one in later}
+    result = np.zeros_like(record.weights)
+    for row, stamp in zip(result, record.stamps, strict=True):
+        own = by_stamp[int(stamp)]
+        row[: len(own)] = own
+    return result
 
 
 def recorded(

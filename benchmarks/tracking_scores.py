@@ -27,9 +27,9 @@ LONGEST_INTERVAL = 1.5
 DRAWS = 2000
 # Keys of what `scores_of` returns besides `by_joint_90`.
 SCORES = (
-    'heaviest_mm', 'hips_mm', 'expected_mm', 'point_mm', 'best_mm', 'blind_mm', 'aligned_mm',
-    'root_percent', 'depth_percent', 'path_percent', 'path_length_percent', 'kept', 'weights',
-    'coverage_50', 'coverage_90', 'joint_coverage_50', 'joint_coverage_90',
+    'heaviest_mm', 'lagged_mm', 'hips_mm', 'expected_mm', 'point_mm', 'best_mm', 'blind_mm',
+    'aligned_mm', 'root_percent', 'depth_percent', 'path_percent', 'path_length_percent', 'kept',
+    'weights', 'coverage_50', 'coverage_90', 'joint_coverage_50', 'joint_coverage_90',
     'negative_log_likelihood', 'acceleration', 'feet', 'wrong_way', 'wrong_way_images',
     'wrong_sign', 'nobody', 'evaluations', 'evaluations_99', 'ms', 'cpu_ms',
 )  # fmt: skip
@@ -50,7 +50,8 @@ def scores_of(record: Record) -> dict[str, Any]:
     """Means over the images of a run.
 
     Returns:
-        Mean distances of the joints in mm: `heaviest_mm` of the heaviest mode, `expected_mm` of the
+        Mean distances of the joints in mm: `heaviest_mm` of the heaviest mode, `lagged_mm` of the
+        heaviest one by what became of the modes in the next `LAG` images, `expected_mm` of the
         weighted mean of the modes, `point_mm` of the point estimate, `best_mm` of the best mode,
         `blind_mm` of the blind control, `aligned_mm` of the point estimate after the similarity
         that fits best. Of the point estimate also `root_percent`, distance of the origin from its
@@ -89,6 +90,7 @@ def scores_of(record: Record) -> dict[str, Any]:
     by_joint[known[1:]] = [coverage(levels, 0.9) for levels in record.joint_levels.T]
     return {
         'heaviest_mm': 1e3 * heaviest.mean(),
+        'lagged_mm': lagged_error(record, error),
         'hips_mm': hips_error(record, known[1:]),
         'expected_mm': 1e3 * _distances(expected, true).mean(),
         'point_mm': 1e3 * _distances(point, true).mean(),
@@ -126,6 +128,18 @@ def scores_of_nobody() -> dict[str, Any]:
         'kept': 0.0,
         'by_joint_90': np.full(len(EVALUATED_JOINTS), np.nan),
     }
+
+
+def lagged_error(record: Record, errors: Array) -> float:
+    """Mean error of the mode that later images make the heaviest, mm; NaN: unknown.
+
+    Args:
+        record: of a run.
+        errors: (T, K) of the modes, m.
+    """
+    if record.lagged.shape != errors.shape:
+        return float('nan')
+    return float(1e3 * errors[np.arange(len(errors)), record.lagged.argmax(1)].mean())
 
 
 def heaviest_joints(record: Record) -> Array:

@@ -35,6 +35,7 @@ class Column(NamedTuple):
 
 
 HEAVIEST, POINT = Column('heaviest', 'heaviest_mm'), Column('point', 'point_mm')
+LAGGED = Column('lag 10', 'lagged_mm')
 BEST, BLIND = Column('best of K', 'best_mm'), Column('blind', 'blind_mm')
 KEPT = Column('kept, %', 'kept', factor=100.0)
 WEIGHTS = Column('weights', 'weights', '+.2f')
@@ -47,7 +48,7 @@ WRONG_SIGN = Column('wrong sign, %', 'wrong_sign', '.1f', 100.0)
 NOBODY = Column('nobody, %', 'nobody', '.1f', 100.0)
 CPU = Column('CPU, ms', 'cpu_ms')
 ERRORS = (
-    HEAVIEST, HIPS, EXPECTED, POINT, Column('PA', 'aligned_mm'), BEST, BLIND,
+    HEAVIEST, LAGGED, HIPS, EXPECTED, POINT, Column('PA', 'aligned_mm'), BEST, BLIND,
     KEPT, Column('root, %', 'root_percent', '.1f'), Column('depth, %', 'depth_percent', '+.1f'),
     Column('path, %', 'path_percent', '.1f'),
     Column('path length, %', 'path_length_percent', '+.1f'),
@@ -68,8 +69,8 @@ MISTAKES = (
 COMPARED = tuple(
     column._replace(form=column.form.replace('.0f', '.1f'))
     for column in (
-        HEAVIEST, HIPS, EXPECTED, POINT, BEST, KEPT, WEIGHTS, JOINT_90, WRONG_WAY, WRONG_SIGN,
-        NOBODY, EVALUATIONS, CPU,
+        HEAVIEST, LAGGED, HIPS, EXPECTED, POINT, BEST, KEPT, WEIGHTS, JOINT_90, WRONG_WAY,
+        WRONG_SIGN, NOBODY, EVALUATIONS, CPU,
     )
 )  # fmt: skip
 # Of the tracker without a rule.

@@ -142,6 +142,17 @@ def test_errors_of_a_record():
     assert (found['evaluations'], found['ms']) == (200.0, pytest.approx(100.0))
 
 
+def test_the_error_of_the_mode_that_later_images_prefer():
+    record = made_record()
+    assert np.isnan(scores_of(record)['lagged_mm'])
+    lagged = record.weights.copy()
+    lagged[1:] = [0.2, 0.7, 0.1]
+    found = scores_of(replace(record, lagged=lagged))
+    images = len(lagged)
+    assert found['lagged_mm'] == pytest.approx((100.0 + 40.0 * (images - 1)) / images)
+    assert found['heaviest_mm'] == pytest.approx(100.0)
+
+
 def standing_person(images=4):
     """Positions (T, J, 3) of a person who faces the camera, arms out, forearms towards it."""
     places = {
@@ -268,6 +279,10 @@ def test_a_run_at_a_lower_rate(clip):
     assert record.stamps.tolist() == clip.stamps[:4:2]
     assert (record.images.tolist(), record.statuses.tolist()) == ([2], ['tracking'] * 2)
     assert (record.cpu_seconds > 0).all()
+    # Later images move weights between the modes of an image, but not of the last one.
+    assert record.lagged.shape == record.weights.shape
+    assert record.lagged.sum(1) == pytest.approx(1.0)
+    assert np.array_equal(record.lagged[-1], record.weights[-1])
 
 
 def test_a_foot_stands_if_it_does_in_images_that_are_left_out(clip, tmp_path):
@@ -554,13 +569,15 @@ def test_records_of_another_checkout_are_found(tmp_path):
     assert np.array_equal(records_of([one], tmp_path)[0].true, first.true)
     # What older records do not tell is unknown, or usual.
     content = {
-        name: x for name, x in vars(first).items() if name not in ('statuses', 'cpu_seconds')
+        name: x
+        for name, x in vars(first).items()
+        if name not in ('statuses', 'cpu_seconds', 'lagged')
     }
     np.savez(tmp_path / 'old.npz', **content)
     told = {name: x for name, x in replace(one, rate=0.0).identity.items() if name != 'rate'}
     (tmp_path / 'old.json').write_text(json.dumps(told))
     (found,) = records_of([replace(one, rate=0.0)], tmp_path)
-    assert np.isnan(scores_of(found)['nobody'])
+    assert np.isnan([scores_of(found)[name] for name in ('nobody', 'lagged_mm')]).all()
     (tmp_path / 'empty').mkdir()
     with pytest.raises(ValueError, match='no records'):
         records_of([one], tmp_path / 'empty')

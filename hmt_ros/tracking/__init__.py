@@ -1,6 +1,7 @@
 """The filter: proposals and mixture density propagation over images (KJS)."""
 
 from hmt_ros.tracking.ground import Ground, GroundSettings, KnownGround
+from hmt_ros.tracking.lagged_weights import Lagged, LaggedWeights
 from hmt_ros.tracking.proposals import PosePrediction
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.status import Status
@@ -11,6 +12,8 @@ __all__ = [
     'Ground',
     'GroundSettings',
     'KnownGround',
+    'Lagged',
+    'LaggedWeights',
     'PosePrediction',
     'Status',
     'Subject',

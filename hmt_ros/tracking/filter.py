@@ -51,7 +51,7 @@ from hmt_ros.tracking.reliability import SilhouetteRecall
 from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
-from hmt_ros.tracking.weighting import Continuity, at_least, normalised
+from hmt_ros.tracking.weighting import Continuity, at_least, normalised, pooled_origins
 
 # How often the shape is fitted to the first image.
 FIRST_FITS = 3
@@ -208,7 +208,7 @@ class MixtureFilter:
         rows = self._distinct(optimised, log_weights)
         optimised, log_weights = optimised[rows], log_weights[rows]
         self._facing.start(self.body, optimised.minima.x, log_weights)
-        self._select(optimised, log_weights, None, observation)
+        self._select(optimised, log_weights, np.empty((0, len(rows))), None, observation)
         self._stand(None)
 
     # One image after another.
@@ -252,8 +252,7 @@ class MixtureFilter:
         candidates, *others = (x.propose(search, base, predicted, self._rng) for x in proposals)
         for more in others:
             candidates = candidates.joined(more)
-        optimised, log_weights = self._weigh(search, search.optimise(candidates))
-        self._select(optimised, log_weights, states, seen)
+        self._select(*self._weigh(search, search.optimise(candidates)), states, seen)
         self._stand(dt)
         self._images += 1
         self._shape_age += dt
@@ -283,8 +282,8 @@ class MixtureFilter:
         joints = relative_joints(self.body, optimised.minima.x)
         return distinct_hypotheses(joints, log_weights, self.settings.hypothesis_merge_distance)
 
-    def _weigh(self, search: Search, optimised: Optimised) -> tuple[Optimised, Array]:
-        """Hypotheses that are distinct, and their log weights."""
+    def _weigh(self, search: Search, optimised: Optimised) -> tuple[Optimised, Array, Array]:
+        """N hypotheses that are distinct, their log weights, and log w_k p(x_n | x_k), (K, N)."""
         optimised = _finite(optimised)
         evidence = search.evidence(optimised)
         # Of those that meet, one that has moved there is kept before one that has jumped.
@@ -294,21 +293,24 @@ class MixtureFilter:
         rows = self._distinct(optimised, -np.arange(len(order), dtype=np.float64))
         optimised, evidence = optimised[rows], evidence[rows]
         poses = optimised.minima.x
+        transitions = search.continuity.log_transitions(poses)
+        histories = search.continuity.log_histories(transitions)
         log_weights = self._facing.weigh(
             self.body,
             poses,
-            search.continuity.log_transitions(poses),
-            search.continuity.log_priors(poses) - evidence,
+            transitions,
+            np.logaddexp.reduce(histories, axis=0) - evidence,
             evidence,
             np.asarray(~optimised.hypotheses.jumped.all(1)),
             search.dt,
         )
-        return optimised, log_weights
+        return optimised, log_weights, histories
 
     def _select(
         self,
         optimised: Optimised,
         log_weights: Array,
+        histories: Array,
         states: PredictedStates | None,
         observation: Observation,
     ) -> None:
@@ -317,6 +319,7 @@ class MixtureFilter:
         Args:
             optimised: hypotheses at their optima.
             log_weights: (N,) of the hypotheses.
+            histories: (K, N) log w_k p(x_n | x_k), of K modes before; K is 0 where modes begin.
             states: of the ancestors, predicted; None: the modes begin.
             observation: of the image.
         """
@@ -333,9 +336,10 @@ class MixtureFilter:
         weights = at_least(normalised(kept.log_weights), s.least_log_weight)
         order = np.argsort(-weights, kind='stable')
         selected, posterior = optimised[kept.chosen[order]], self._posterior
+        origins = pooled_origins(histories, log_weights, kept.owner)[order]
         self._modes = modes = posterior_modes(
-            selected, weights[order], posterior, observation, self.shape, self.dynamics, states,
-            self._identities_of(selected.hypotheses, anew=states is None), self._dt,
+            selected, weights[order], origins, posterior, observation, self.shape, self.dynamics,
+            states, self._identities_of(selected.hypotheses, anew=states is None), self._dt,
         )  # fmt: skip
         posterior.exchanges.update(
             posterior.likelihood, observation, modes.poses,

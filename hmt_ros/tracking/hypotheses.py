@@ -104,6 +104,8 @@ class Modes(Hypotheses):
             they are `filtered`; with velocities only a share of the images is believed, because
             their errors last.
         identities: (N,) see `Identities`.
+        origins: (N, M) probability that each continues mode m of the image before; M is 0 where
+            the modes begin.
     """
 
     velocities: Array
@@ -112,6 +114,7 @@ class Modes(Hypotheses):
     log_likelihoods: Array
     state_covariances: Array
     identities: Index
+    origins: Array
 
     @property
     def mixture(self) -> GaussianMixture:

@@ -53,6 +53,7 @@ class Likelihood:
 def posterior_modes(
     selected: Optimised,
     log_weights: Array,
+    origins: Array,
     posterior: Posterior,
     observation: Observation,
     shape: ShapeEstimate,
@@ -66,6 +67,7 @@ def posterior_modes(
     Args:
         selected: K hypotheses at their optima, heaviest first.
         log_weights: (K,) normalised.
+        origins: (K, M) probability that each comes from mode m of the image before.
         posterior: of the image.
         observation: of the image.
         shape: of the person, as far as it is known.
@@ -108,6 +110,7 @@ def posterior_modes(
         log_likelihoods=-fit.image_energy,
         state_covariances=state_covariances,
         identities=identities,
+        origins=origins,
     )
 
 

@@ -1,14 +1,17 @@
-"""One pose for those who want one: the expected pose of one way to face, steady over time.
+"""One pose for those who want one: that of the motion which faces the likelier way.
 
-    m      = the mode of least expected joint error     sum_k w_k d(m, k), among those that face as
-                                                        the estimate before
-    x_t^0  = sum_k w_k x_k / sum_k w_k                  over the modes that face like m
-    x_t    = p_t + a (x_t^0 - p_t),    p_t = x_(t-1) + c v_(t-1)
-    v_t    = c v_(t-1) + b (x_t^0 - p_t)
+    z = sum_k w_k x_k,    R = sum_k w_k R_k        over the modes that face as the motion does  (1)
+    (x, v) ~ N(A (x, v), A P A' + Q)                                                            (2)
+    (x, v) <- (x, v) + G (z - x),    G = P_.x (P_xx + R)^-1                                     (3)
 
-A mean over poses that face opposite ways is no pose: the estimate keeps its way until modes of the
-other have `SWITCH` of the weight, and then takes the other at once. The filter with gains a and b
-takes away what trembles from image to image; errors that last stay.
+The modes of an image that face alike go on as one motion: a Gaussian over pose and velocity, moved
+by the dynamics of the tracker (2) and conditioned on what the image found (3). R_k are the
+covariances of the modes, which believe only a share of an image, because errors last: how far the
+pose follows an image depends on what the image fixes, and on the time since the last one. What the
+modes disagree in is not in R: their weights know all images, not this one alone.
+
+A mean over poses that face opposite ways is no pose. The motion keeps its way as long as the weight
+of the other one is within what a single image may say by mistake, and then turns at once.
 """
 
 from __future__ import annotations
@@ -16,18 +19,12 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.mirror import left_directions, root_angles, root_rotation_dofs, root_rotations
+from hmt_ros.body.mirror import left_directions, root_rotation_dofs
 from hmt_ros.inference.arrays import Array, Mask
-from hmt_ros.tracking.camera_motion import CameraMotion
-from hmt_ros.tracking.hypotheses import relative_joints
-
-# Weight of the other way to face above which the estimate turns about.
-SWITCH = 0.6
-# Gains a and b, and the share c of the velocity that lasts, from image to image at 30 Hz.
-GAIN, VELOCITY_GAIN, KEPT = 0.45, 0.08, 0.9
-RATE = 30.0  # Hz
-# Errors of a joint count up to this, m.
-CAP = 0.4
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
+from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking.camera_motion import CameraMotion, propagated
+from hmt_ros.tracking.classes import VALID
 
 
 class PointEstimate:
@@ -39,74 +36,106 @@ class PointEstimate:
 
     def __init__(self) -> None:
         self.pose: Array | None = None
-        self._velocity = np.zeros(0)
+        # (n,) and (n, n): the motion, n = d where poses have no velocities, else 2 d.
+        self._mean = self._covariance = np.empty(0)
+        # (d,) the heaviest mode of the motion in its last image, which says what way it faces: the
+        # mean of modes that are seen from the side may face between two ways.
+        self._leader = np.empty(0)
 
     def carry(self, body: Body, motion: CameraMotion) -> None:
-        """Takes the estimate into the camera frame of the next image."""
+        """Takes the motion into the camera frame of the next image."""
         if self.pose is None:
             return
-        before = self.pose[None]
+        d = body.dimension
+        before = self._mean[None, :d]
         self.pose = motion.poses(body, before)[0]
-        self._velocity = motion.jacobians(body, before, self.pose[None])[0] @ self._velocity
+        self._leader = motion.poses(body, self._leader[None])[0]
+        turned = motion.jacobians(body, before, self.pose[None])
+        whole = np.kron(np.eye(len(self._mean) // d), turned[0])
+        self._mean = np.concatenate([self.pose, (whole @ self._mean)[d:]])
+        self._covariance = propagated(whole[None], self._covariance[None])[0]
 
-    def update(self, body: Body, poses: Array, weights: Array, dt: float) -> Array:
-        """Takes in the modes of an image; returns the pose (d,).
+    def expect(self, body: Body, dynamics: LinearGaussianDynamics, dt: float) -> None:
+        """Shows where the motion goes in dt seconds after its last image, in which none is seen."""
+        moved, _ = self._predicted(dynamics, dt)
+        self.pose = np.clip(moved[: body.dimension], body.lower, body.upper)
+
+    def update(
+        self,
+        body: Body,
+        dynamics: LinearGaussianDynamics,
+        posterior: GaussianMixture,
+        dt: float | None,
+    ) -> None:
+        """Takes in the posterior of an image.
 
         Args:
             body: of the poses.
-            poses: (K, d).
-            weights: (K,), not all 0.
-            dt: since the last image, s; 0: there was none.
+            dynamics: of the poses.
+            posterior: over the poses.
+            dt: time since the image before, s; None: the modes begin with this image.
         """
-        weights = weights / weights.sum()
-        alike, steady = self._way(body, poses, weights)
-        share = np.where(alike, weights, 0.0)
-        leader = _least_expected_error(body, poses, share)
-        near = left_directions(body, poses) @ left_directions(body, poses[leader][None])[0] > 0
-        share = np.where(near, share, 0.0)
-        expected = _mean_pose(body, poses, share / share.sum(), leader)
-        if self.pose is None or not steady or dt <= 0:
-            self.pose, self._velocity = expected, np.zeros_like(expected)
-            return expected
-        images = dt * RATE
-        kept = KEPT**images
-        predicted = self.pose + kept * images * self._velocity
-        offset = expected - predicted
-        root = root_rotation_dofs(body.skeleton)
-        offset[root] = (offset[root] + np.pi) % (2.0 * np.pi) - np.pi
-        pose = predicted + (1.0 - (1.0 - GAIN) ** images) * offset
-        self._velocity = kept * self._velocity + VELOCITY_GAIN / images * offset
-        self.pose = np.clip(pose, body.lower, body.upper)
-        return self.pose
+        turns = self._choose_way(body, posterior, begins=dt is None)
+        found, uncertain = _moments(body, posterior, self._leader)
+        if dt is None or turns:
+            at_rest = dynamics.initial_mean[body.dimension :]
+            self._mean = np.concatenate([found, at_rest])
+            self._covariance = dynamics.states(uncertain[None])[0]
+        else:
+            self._condition(body, *self._predicted(dynamics, dt), found, uncertain)
+        self.pose = self._mean[: body.dimension].copy()
 
-    def _way(self, body: Body, poses: Array, weights: Array) -> tuple[Mask, bool]:
-        """Modes (K,) that face as the estimate does from now on, and whether it did before."""
-        if self.pose is None:
-            return np.ones(len(poses), dtype=np.bool_), False
-        before = left_directions(body, self.pose[None])[0]
-        alike = left_directions(body, poses) @ before >= 0
-        if weights[~alike].sum() > SWITCH or not alike.any():
-            return np.asarray(~alike, dtype=np.bool_), False
-        return np.asarray(alike, dtype=np.bool_), True
+    def _choose_way(self, body: Body, posterior: GaussianMixture, *, begins: bool) -> bool:
+        """Takes the mode that leads from now on; whether it faces another way than before."""
+        weights = posterior.weights
+        alike = np.ones(len(weights), dtype=np.bool_)
+        turns = False
+        if not begins:
+            alike = _faces_as(body, posterior.means, self._leader)
+            turns = not alike.any() or weights[~alike].sum() > VALID * weights.sum()
+            alike = ~alike if turns else alike
+        self._leader = posterior.means[int(np.argmax(np.where(alike, weights, -1.0)))]
+        return turns
+
+    def _predicted(self, dynamics: LinearGaussianDynamics, dt: float) -> tuple[Array, Array]:
+        """Mean (n,) and covariance (n, n) of the motion after dt seconds."""
+        means, covariances = dynamics.predict(self._mean[None], self._covariance[None], dt)
+        return means[0], covariances[0]
+
+    def _condition(
+        self, body: Body, mean: Array, covariance: Array, found: Array, uncertain: Array
+    ) -> None:
+        """Conditions a prediction on a pose (d,) that was found, of a covariance (d, d)."""
+        d = body.dimension
+        gain = np.linalg.solve(covariance[:d, :d] + uncertain, covariance[:d]).T
+        offset = _differences(body, found[None], mean[:d])[0]
+        moved = mean + gain @ offset
+        # The root counts its turns as the modes do.
+        moved[:d] += found - mean[:d] - offset
+        moved[:d] = np.clip(moved[:d], body.lower, body.upper)
+        left = covariance - gain @ covariance[:d]
+        self._mean, self._covariance = moved, 0.5 * (left + left.T)
 
 
-def _least_expected_error(body: Body, poses: Array, weights: Array) -> int:
-    """The mode with the least expected distance of its joints from those of the others."""
-    joints = relative_joints(body, poses)
-    apart = np.linalg.norm(joints[:, None] - joints[None], axis=3)
-    cost = np.minimum(apart, CAP).mean(2) @ weights
-    return int(np.argmin(np.where(weights > 0, cost, np.inf)))
+def _moments(body: Body, posterior: GaussianMixture, leader: Array) -> tuple[Array, Array]:
+    """Mean (d,) and covariance (d, d), as in (1), of the modes that face as one of them does."""
+    own = posterior[np.flatnonzero(_faces_as(body, posterior.means, leader))].normalised()
+    mean = leader + own.weights @ _differences(body, own.means, leader)
+    covariance = np.tensordot(own.weights, own.covariances, axes=1)
+    return np.clip(mean, body.lower, body.upper), np.asarray(covariance, dtype=np.float64)
 
 
-def _mean_pose(body: Body, poses: Array, weights: Array, leader: int) -> Array:
-    """Weighted mean (d,) of poses (K, d); rotations of the root as rotations."""
-    mean: Array = weights @ poses
-    u, _, v = np.linalg.svd(np.einsum('k,kij->ij', weights, root_rotations(body, poses)))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+def _faces_as(body: Body, poses: Array, reference: Array) -> Mask:
+    """Which of poses (N, d) are turned by at most 90 degrees from a reference pose (d,)."""
+    if not body.trunk_pairs:
+        return np.ones(len(poses), dtype=np.bool_)
+    left = left_directions(body, np.concatenate([reference[None], poses]))
+    return np.asarray(left[1:] @ left[0] >= 0, dtype=np.bool_)
+
+
+def _differences(body: Body, poses: Array, reference: Array) -> Array:
+    """Poses (N, d) minus a reference pose (d,), rotations of the root the short way round."""
+    result = poses - reference
     root = root_rotation_dofs(body.skeleton)
-    angles = root_angles(body, rotation[None])[0]
-    # The turn nearest to that of the leader.
-    turns = np.round((poses[leader, root] - angles) / (2.0 * np.pi))
-    mean[root] = angles + 2.0 * np.pi * turns
-    result: Array = np.clip(mean, body.lower, body.upper)
+    result[:, root] = (result[:, root] + np.pi) % (2.0 * np.pi) - np.pi
     return result

@@ -106,6 +106,8 @@ class Tracker:
         self._point = PointEstimate()
         self._existence = Existence()
         self._nobody = False
+        # Whether the last posterior is no more than a prediction.
+        self._foreseen = False
         self._last_stamp: int | None = None
         self._followed: int | None = None
         self._camera_path = CameraPath()
@@ -287,7 +289,7 @@ class Tracker:
 
     @property
     def point_estimate(self) -> Array:
-        """One pose (d,) for those who want one, steady over time; see `PointEstimate`.
+        """The pose (d,) of the likeliest motion, for those who want one; see `PointEstimate`.
 
         Raises:
             ValueError: there is no track.
@@ -295,6 +297,18 @@ class Tracker:
         if self._point.pose is None:
             raise ValueError('there is no track yet')
         return self._point.pose
+
+    @property
+    def origins(self) -> Array:
+        """Probabilities (K, M) that component k of the posterior continues component m before.
+
+        M is the number of components of the image before, 0 where a track begins or is found again;
+        see `LaggedWeights`.
+
+        Raises:
+            ValueError: there is no track.
+        """
+        return np.eye(len(self.modes)) if self._foreseen else self.modes.origins
 
     @property
     def velocities(self) -> Array | None:
@@ -349,7 +363,7 @@ class Tracker:
         self, view: View, stamp: int, prediction: PosePrediction | None, mask: Mask | None
     ) -> tuple[GaussianMixture, GaussianMixture] | tuple[None, None]:
         """See `step`."""
-        masked, existence = mask is not None, self._existence
+        masked, existence, self._foreseen = mask is not None, self._existence, False
         if self._track.begun:
             existence.look(view, stamp, self.body)
             if existence.nobody:
@@ -358,6 +372,7 @@ class Tracker:
                 return None, None
             if not existence.seen and (existence.hidden or view.silhouette is not None):
                 # Nothing is there to fit modes to.
+                self._foreseen = True
                 return self._expected(stamp), self._likelihood(Observation())
             if existence.elsewhere:
                 view = self._observer.seen_anywhere(view, mask)
@@ -376,7 +391,8 @@ class Tracker:
         if self.settings.ground.on:
             resting = min(self.contacts.values(), default=RESTING)
             self._ground.update(self.body, self.modes, resting, dt)
-        self._point.update(self.body, self.modes.poses, np.exp(self.modes.log_weights), dt)
+        follows = self.modes.origins.shape[1] > 0
+        self._point.update(self.body, self._track.dynamics, self.posterior, dt if follows else None)
         self._observer.last_image, self._followed = view.image, stamp
         self.depth.update(self.body, self.modes.poses[0], self._observer.depths)
         if self._existence.seen:
@@ -445,6 +461,7 @@ class Tracker:
         assert self._followed is not None
         dt = seconds(stamp - self._followed)
         motion = self.settings.motion
+        self._point.expect(self.body, self._track.dynamics, dt)
         return expected_poses(self.modes, self.posterior.weights, self.body, motion, dt)
 
     def _begin(self, observation: Observation, beginning: Beginning, stamp: int) -> None:

@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.tracking.hypotheses import relative_joints
 
 # Mean squared distance q by which joints leave their prediction, m^2/s, and the degrees of freedom
@@ -69,12 +69,14 @@ class Continuity:
         )
         return result
 
-    def log_priors(self, poses: Array) -> Array:
-        """log sum_k w_k p(x_n | x_k), (N,), of all poses (N, d) of an image, equation (2)."""
-        logs = self.log_transitions(poses)
-        total = np.logaddexp(np.logaddexp.reduce(logs, axis=1), -ENDS)
-        result: Array = np.logaddexp.reduce((self.log_weights - total)[:, None] + logs, axis=0)
-        return result
+    def log_histories(self, transitions: Array) -> Array:
+        """log w_k p(x_n | x_k), (K, N), of all hypotheses of an image, equation (2).
+
+        Args:
+            transitions: (K, N) of these hypotheses; see `log_transitions`.
+        """
+        total = np.logaddexp(np.logaddexp.reduce(transitions, axis=1), -ENDS)
+        return np.asarray((self.log_weights - total)[:, None] + transitions)
 
 
 def normalised(log_weights: Array) -> Array:
@@ -85,3 +87,25 @@ def normalised(log_weights: Array) -> Array:
 def at_least(log_weights: Array, least: float) -> Array:
     """Normalised log weights (N,), those below `least` raised to it: a mode that may come back."""
     return normalised(np.maximum(log_weights, least))
+
+
+def pooled_origins(histories: Array, log_weights: Array, owner: Index) -> Array:
+    """Probability (M, K) that each kept mode comes from mode k of the image before.
+
+        P(k | m) = sum_n w_n P(k | x_n) / sum_n w_n,    over the hypotheses n that m stands for
+        P(k | x_n) = w_k p(x_n | x_k) / sum_j w_j p(x_n | x_j)
+
+    What the image says is a factor of w_n alone, and cancels in P(k | x_n).
+
+    Args:
+        histories: (K, N) log w_k p(x_n | x_k).
+        log_weights: (N,).
+        owner: (N,) the kept mode that stands for each hypothesis, 0 to M - 1.
+    """
+    origins = np.exp(histories - np.logaddexp.reduce(histories, axis=0)).T
+    shares = np.exp(log_weights - log_weights.max())
+    result = np.zeros((int(owner.max()) + 1, len(histories)))
+    total = np.zeros((len(result), 1))
+    np.add.at(result, owner, shares[:, None] * origins)
+    np.add.at(total, owner, shares[:, None])
+    return np.asarray(result / total)

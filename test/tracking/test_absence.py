@@ -124,7 +124,7 @@ def test_nobody_from_the_start(film, tracked):
 
 def test_what_is_not_seen_moves_on_and_gets_wider(film, tracked):
     _, _, _, tracker = tracked(film[1][:4])
-    before = tracker.posterior
+    before, point = tracker.posterior, tracker.point_estimate
     empty = nothing(film, 'empty', 2)
     first, likelihood = tracker.step(empty[0], 4 * FRAME)
     second, _ = tracker.step(empty[1], 5 * FRAME)
@@ -132,6 +132,9 @@ def test_what_is_not_seen_moves_on_and_gets_wider(film, tracked):
     volumes = [np.linalg.slogdet(x.covariances)[1] for x in (before, first, second)]
     assert (np.diff(volumes, axis=0) > 0).all()
     assert np.array_equal(first.weights, before.weights)
+    # Each component is the same mode. Poses of this body walk randomly: the best guess stays.
+    assert np.array_equal(tracker.origins, np.eye(len(second)))
+    assert np.array_equal(tracker.point_estimate, point)
     # Such an image says nothing of where the person is.
     depth = likelihood.covariances[:, 2, 2]
     assert (depth > 1.0).all()

@@ -54,7 +54,7 @@ def single(pose: np.ndarray, velocity: np.ndarray | None = None) -> Modes:
     return Modes(
         **vars(start), velocities=velocities, covariances=one, filtered=one,
         log_likelihoods=np.zeros(1), state_covariances=one,
-        identities=np.ones(1, dtype=np.intp),
+        identities=np.ones(1, dtype=np.intp), origins=np.ones((1, 1)),
     )  # fmt: skip
 
 

@@ -37,6 +37,7 @@ def modes_of(body: Body) -> Modes:
         log_likelihoods=np.zeros(K),
         state_covariances=states,
         identities=np.arange(1, K + 1),
+        origins=np.eye(K),
     )
 
 

@@ -327,11 +327,13 @@ def jumped(motion):
 def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion, keypoints_of):
     tracker = started(lost_images=2)
     other = jumped(motion)
-    seen, misfits, errors = [], [], []
+    seen, misfits, errors, begins, places = [], [], [], [], []
     for i in range(8):
         pose = motion[i] if i < 3 else other
         posterior, _ = tracker.step(black, i * FRAME, keypoints_of(human32, pose, 1.0, i))
         seen.append(tracker.status)
+        begins.append(tracker.origins.shape[1] == 0)
+        places.append(tracker.point_estimate[:3])
         misfits.append(tracker.misfit)
         errors.append(best_error(tracker.body, posterior, human32, pose))
     tracking, lost = Status.TRACKING, Status.LOST
@@ -343,6 +345,9 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     assert max(errors[5:]) < 0.06
     # The place too, not only the posture.
     assert np.abs(posterior.means[:, :3] - other[:3]).max(1).min() < 0.2
+    # Modes that are placed anew have no history, and the point estimate does not travel to them.
+    assert begins == [True, *[False] * 4, True, *[False] * 2]
+    assert np.abs(places[5] - other[:3]).max() < 0.3
 
 
 def predicted(body, pose) -> PosePrediction:

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from hmt_ros.body.mirror import reverse_depth
-from hmt_ros.tracking.weighting import ENDS, SPREAD, TAILS, Continuity, at_least, normalised
+from hmt_ros.tracking.weighting import (
+    ENDS,
+    SPREAD,
+    TAILS,
+    Continuity,
+    at_least,
+    normalised,
+    pooled_origins,
+)
 
 DT = 0.1
 
@@ -41,6 +49,12 @@ def transition(body, pose, expected, all_poses, dt):
     return np.exp(log_transition(body, pose, expected, dt)) / (sum(every) + np.exp(-ENDS))
 
 
+def log_priors(continuity, poses):
+    """log sum_k w_k p(x_n | x_k), (N,)."""
+    histories = continuity.log_histories(continuity.log_transitions(poses))
+    return np.logaddexp.reduce(histories, axis=0)
+
+
 @pytest.mark.parametrize('dt', [0.01, 0.1, 3.0])
 def test_transitions_are_a_student_density_of_the_joints(human32, poses_near, dt):
     before, poses = poses_near(3, 1), poses_near(5, 2, 0.3)
@@ -69,7 +83,7 @@ def test_weights_are_the_sum_over_all_paths(human32, poses_near):
     log_weights = normalised(first - evidence[0])
     for t in range(1, images):
         continuity = Continuity(human32, moved[t - 1], log_weights, gaps[t - 1])
-        log_weights = normalised(continuity.log_priors(poses[t]) - evidence[t])
+        log_weights = normalised(log_priors(continuity, poses[t]) - evidence[t])
     wanted = np.zeros(count)
     for path in itertools.product(range(count), repeat=images):
         share = np.exp(first[path[0]] - evidence[0, path[0]])
@@ -100,14 +114,14 @@ def test_a_mode_without_continuation_ends(human32, poses_near):
     apart = log_transition(human32, near[0], far[0], dt)
     assert apart < -ENDS - 1.0
     continuity = Continuity(human32, both, np.log([0.5, 0.5]), dt)
-    left = np.exp(continuity.log_priors(near))
+    left = np.exp(log_priors(continuity, near))
     stayed = 1.0 / (1.0 + np.exp(-ENDS))
     crossed = np.exp(apart) / (np.exp(apart) + np.exp(-ENDS))
     assert left == pytest.approx(0.5 * (stayed + crossed), rel=1e-6)
     # Of the mode that has no continuation, most is lost.
     assert crossed < np.exp(apart + ENDS) < 0.3
     # With one for each, nearly nothing is.
-    assert np.exp(continuity.log_priors(both)).sum() > 0.98
+    assert np.exp(log_priors(continuity, both)).sum() > 0.98
 
 
 @pytest.mark.parametrize('copies', [2, 10, 100])
@@ -120,7 +134,7 @@ def test_copies_of_a_continuation_do_not_multiply_the_mass_of_a_mode(human32, po
     near = np.clip(near, human32.lower, human32.upper)
     dt = 1e-5
     continuity = Continuity(human32, np.concatenate([a, b]), np.log([0.7, 0.3]), dt)
-    weights = np.exp(continuity.log_priors(np.concatenate([a, near])))
+    weights = np.exp(log_priors(continuity, np.concatenate([a, near])))
     assert weights[0] == pytest.approx(0.7, rel=0.02)
     assert weights[1:].sum() == pytest.approx(0.3, rel=0.1)
     # Each alone would have as much as the mode itself.
@@ -131,11 +145,11 @@ def test_copies_of_a_continuation_do_not_multiply_the_mass_of_a_mode(human32, po
 def test_gaps_of_any_length_give_finite_numbers(human32, poses_near, dt):
     before, poses = poses_near(3, 1), poses_near(4, 2, 1.0)
     continuity = Continuity(human32, before, np.log([0.9, 0.1, 1e-6]), dt)
-    for found in (continuity.log_priors(poses), continuity.rated(poses)):
+    for found in (log_priors(continuity, poses), continuity.rated(poses)):
         assert np.isfinite(found).all()
     if dt > 1.0:
         # After so long every pose goes on from every mode alike.
-        assert np.exp(continuity.log_priors(poses)) == pytest.approx(0.25, rel=0.02)
+        assert np.exp(log_priors(continuity, poses)) == pytest.approx(0.25, rel=0.02)
 
 
 def test_weights_are_normalised():
@@ -148,3 +162,22 @@ def test_no_mode_falls_below_the_least_weight():
     assert np.exp(raised).sum() == pytest.approx(1.0, abs=1e-15)
     assert raised[2] == pytest.approx(-10.0, abs=1e-3)
     assert raised[0] - raised[1] == pytest.approx(5.0, abs=1e-12)
+
+
+def test_origins_of_modes_that_stand_for_several():
+    rng = np.random.default_rng(0)
+    histories, log_weights = rng.normal(size=(3, 6)), rng.normal(size=6)
+    owner = np.array([0, 1, 0, 2, 2, 0])
+    found = pooled_origins(histories, log_weights, owner)
+    for m in range(3):
+        wanted, total = np.zeros(3), 0.0
+        for n in np.flatnonzero(owner == m):
+            own = np.exp(histories[:, n]) / np.exp(histories[:, n]).sum()
+            wanted += np.exp(log_weights[n]) * own
+            total += np.exp(log_weights[n])
+        assert found[m] == pytest.approx(wanted / total, abs=1e-12)
+
+
+def test_modes_that_begin_have_no_origins():
+    found = pooled_origins(np.empty((0, 3)), np.zeros(3), np.array([0, 1, 1]))
+    assert found.shape == (2, 0)
