@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ from hmt_ros.body.camera import Viewpoint
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
+from hmt_ros.tracking import Status
 from msg_tools.files.plain_yaml import read_plain_yaml
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -403,3 +405,25 @@ def test_absence_counts_wrong_states():
     assert 'not NOBODY' in absence.as_text(result)
     with pytest.raises(ValueError, match='no clip is called moon'):
         absence.measure(ROOT / 'bags', ['moon'])
+
+
+@pytest.mark.parametrize('given', [0, 1])
+def test_absence_tells_tracks_of_nobody_and_late_states(given):
+    """A track in the first empty image, one of a person, and one that goes on for too long."""
+    counts = absence.Counts(tracks=given)
+    for i, (track, status) in enumerate(
+        [(1, 'TRACKING'), (1, 'NOBODY'), (2, 'TRACKING'), (2, 'LOST'), (2, 'LOST'), (2, 'LOST')]
+    ):
+        tracker = SimpleNamespace(
+            track_id=track, status=Status[status], existence_probability=1.0 - 0.1 * i
+        )
+        counts.add(tracker, 0.6 * i, here=i == 2, empty=i != 2)
+    result = counts.result()
+    assert (result['images'], result['nobody'], result['least_probability']) == (1, 0, 0.8)
+    assert (result['tracks'], result['started']) == (2, 1 - given)
+    # 1.2 s after the start of the second empty time.
+    assert (result['empty'], result['unnoticed']) == (1, 1)
+    case = {'inputs': 'images', 'clip': 'park', 'rate': 2.0} | result
+    assert absence.as_text({'scenes': [case]}).split()[-9:] == [
+        'images', '2', '1', '1', '0', '1', '1', str(1 - given), 'park',
+    ]  # fmt: skip

@@ -11,16 +11,23 @@ from hmt_ros.image.terms.keypoints import Keypoints
 FEWEST_KEYPOINTS = 6
 # A keypoint of this confidence is where it says.
 CONFIDENT = 0.5
+# Detectors find small people in the legs of a table and in leaves, with full confidence. Keypoints
+# of no larger extent than this say nothing, of twice as much all that they can, px.
+LEAST_EXTENT = 50.0
 
 
 def keypoint_evidence(keypoints: Keypoints) -> float:
     """How far a detector sees somebody, from -1, nobody, to 1.
 
     It is 1 where the confidences sum to as much as the fewest keypoints that are a person have, and
-    -1 below a third of that. Fewer joints are no person; they are no empty image, either.
+    -1 below a third of that. Fewer joints are no person; they are no empty image, either. Nor is a
+    pattern of a few pixels.
     """
     seen = keypoints.confidences[keypoints.seen]
-    most = 1.0 if len(seen) >= FEWEST_KEYPOINTS else 0.0
+    most = 0.0
+    if len(seen) >= FEWEST_KEYPOINTS:
+        extent = float(np.ptp(keypoints.pixels[keypoints.seen], axis=0).max())
+        most = min(max(extent / LEAST_EXTENT - 1.0, 0.0), 1.0)
     whole = float(seen.sum()) / (FEWEST_KEYPOINTS * CONFIDENT)
     return float(np.clip(3.0 * whole - 2.0, -1.0, most))
 

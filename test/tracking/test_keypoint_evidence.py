@@ -13,10 +13,11 @@ from hmt_ros.tracking.keypoint_evidence import keypoint_evidence
 NONE = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 
 
-def keypoints(count, confidence):
+def keypoints(count, confidence, extent=100.0):
+    """They lie on a line down the image, px."""
     return Keypoints(
         tuple(f'joint_{i}' for i in range(count)),
-        np.full((count, 2), 100.0),
+        np.linspace((100.0, 20.0), (100.0, 20.0 + extent), count),
         np.tile(np.eye(2), (count, 1, 1)),
         np.full(count, confidence),
     )
@@ -35,6 +36,9 @@ def keypoints(count, confidence):
         (keypoints(10, 0.25), 0.5),
         (keypoints(6, 0.5), 1.0),
         (keypoints(12, 0.9), 1.0),
+        (keypoints(12, 0.9, 75.0), 0.5),
+        (keypoints(12, 0.9, 30.0), 0.0),
+        (keypoints(12, 0.0, 30.0), -1.0),
     ],
 )
 def test_evidence(seen, wanted):
