@@ -174,7 +174,7 @@ class Existence:
             cues['silhouette'] = part * found.evidence, CLEAR
             apart = found.by_place < 0.0 < found.by_area
         if view.keypoints is not None:
-            value = keypoint_evidence(view.keypoints)
+            value = keypoint_evidence(view.keypoints, body)
             if value > 0.0:
                 part = 1.0 if suffices(view.keypoints, body) else PART
                 cues['detector'] = part * value, CLEAR

@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
+
 import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array
 
 # Fewest keypoints that are a person, as a number of joints.
 FEWEST_KEYPOINTS = 6
 # A keypoint of this confidence is where it says.
 CONFIDENT = 0.5
 # Detectors find small people in the legs of a table and in leaves, with full confidence. Keypoints
-# of no larger extent than this say nothing, of twice as much all that they can, px.
-LEAST_EXTENT = 50.0
+# of a person with this magnification say nothing, with twice as much all that they can, px/m.
+LEAST_MAGNIFICATION = 30.0
 
 
-def keypoint_evidence(keypoints: Keypoints) -> float:
+def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:
     """How far a detector sees somebody, from -1, nobody, to 1.
 
     It is 1 where the confidences sum to as much as the fewest keypoints that are a person have, and
     -1 below a third of that. Fewer joints are no person; they are no empty image, either. Nor is a
-    pattern of a few pixels.
+    person of a few pixels.
     """
     seen = keypoints.confidences[keypoints.seen]
     most = 0.0
     if len(seen) >= FEWEST_KEYPOINTS:
-        extent = float(np.ptp(keypoints.pixels[keypoints.seen], axis=0).max())
-        most = min(max(extent / LEAST_EXTENT - 1.0, 0.0), 1.0)
+        most = min(max(_magnification(keypoints, body) / LEAST_MAGNIFICATION - 1.0, 0.0), 1.0)
     whole = float(seen.sum()) / (FEWEST_KEYPOINTS * CONFIDENT)
     return float(np.clip(3.0 * whole - 2.0, -1.0, most))
 
@@ -47,7 +50,7 @@ def suffices(keypoints: Keypoints | None, body: Body) -> bool:
 
 def shows_a_part(keypoints: Keypoints | None, body: Body) -> bool:
     """Whether keypoints are a person, and tell which way the person faces."""
-    if keypoints is None or keypoint_evidence(keypoints) < 1.0:
+    if keypoints is None or keypoint_evidence(keypoints, body) < 1.0:
         return False
     names = _confident(keypoints)
     return any(left in names and right in names for left, right in body.trunk_pairs)
@@ -56,3 +59,21 @@ def shows_a_part(keypoints: Keypoints | None, body: Body) -> bool:
 def _confident(keypoints: Keypoints) -> set[str]:
     sure = keypoints.seen & (keypoints.confidences >= CONFIDENT)
     return {keypoints.names[i] for i in np.flatnonzero(sure)}
+
+
+def _magnification(keypoints: Keypoints, body: Body) -> float:
+    """About how many px a metre has at the person: the extent of joints over that in standing."""
+    standing = _standing(body)
+    known = [i for i in np.flatnonzero(keypoints.seen) if keypoints.names[i] in standing]
+    if not known:
+        return math.inf
+    joints = np.array([standing[keypoints.names[i]] for i in known])
+    extent = np.ptp(keypoints.pixels[known], axis=0).max()
+    return float(extent / max(np.ptp(joints, axis=0).max(), 1e-3))
+
+
+@lru_cache(maxsize=8)
+def _standing(body: Body) -> dict[str, Array]:
+    """Positions (3,) of the joints of a person who stands, m."""
+    joints = body.joint_positions(body.prior_mean[None])[0]
+    return dict(zip(body.joint_names, joints, strict=True))

@@ -300,10 +300,9 @@ def test_colours_that_are_the_same_everywhere_say_nothing(film, watched):
 
 
 def keypoints(count, confidence, at=(100.0, 100.0)):
-    """They lie on a line down the image, around a pixel."""
     return Keypoints(
         tuple(f'joint_{i}' for i in range(count)),
-        at + np.linspace((0.0, -60.0), (0.0, 60.0), count),
+        np.tile(at, (count, 1)),
         np.tile(np.eye(2), (count, 1, 1)),
         np.full(count, confidence),
     )

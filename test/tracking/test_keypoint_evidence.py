@@ -13,11 +13,10 @@ from hmt_ros.tracking.keypoint_evidence import keypoint_evidence
 NONE = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 
 
-def keypoints(count, confidence, extent=100.0):
-    """They lie on a line down the image, px."""
+def keypoints(count, confidence):
     return Keypoints(
         tuple(f'joint_{i}' for i in range(count)),
-        np.linspace((100.0, 20.0), (100.0, 20.0 + extent), count),
+        np.full((count, 2), 100.0),
         np.tile(np.eye(2), (count, 1, 1)),
         np.full(count, confidence),
     )
@@ -36,10 +35,23 @@ def keypoints(count, confidence, extent=100.0):
         (keypoints(10, 0.25), 0.5),
         (keypoints(6, 0.5), 1.0),
         (keypoints(12, 0.9), 1.0),
-        (keypoints(12, 0.9, 75.0), 0.5),
-        (keypoints(12, 0.9, 30.0), 0.0),
-        (keypoints(12, 0.0, 30.0), -1.0),
     ],
 )
-def test_evidence(seen, wanted):
-    assert keypoint_evidence(seen) == pytest.approx(wanted)
+def test_evidence(seen, wanted, human32):
+    assert keypoint_evidence(seen, human32) == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize(('metre', 'wanted'), [(100.0, 1.0), (45.0, 0.5), (25.0, 0.0)])
+@pytest.mark.parametrize('part', ['', 'shoulder elbow wrist'])
+def test_a_small_person_is_a_mistake(human32, metre, wanted, part):
+    """Wherever it is, and whether a part of it is seen; it is no empty image, either."""
+    joints = human32.joint_positions(human32.prior_mean[None])[0]
+    rows = [i for i, x in enumerate(human32.joint_names) if any(y in x for y in part.split(' '))]
+    seen = Keypoints(
+        tuple(human32.joint_names[i] for i in rows),
+        metre * joints[rows, :2] + [200.0, 100.0],
+        np.tile(np.eye(2), (len(rows), 1, 1)),
+        np.full(len(rows), 0.9),
+    )
+    assert keypoint_evidence(seen, human32) == pytest.approx(wanted)
+    assert keypoint_evidence(replace(seen, confidences=0.0 * seen.confidences), human32) == -1.0
