@@ -218,7 +218,7 @@ def rig_body(rig: Rig, name: str, unit_to_m: float) -> Body:
         stature_lengths=tuple(upright),
         stature_extra=SKULL_AND_HEEL * sum(lengths[k] for k in upright),
         default_lengths=values,
-        symmetries=read_body('human37').symmetries,
+        symmetries=load_body('human37').symmetries,
     )
 
 

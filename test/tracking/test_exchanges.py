@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.mirror import left_directions
