@@ -181,7 +181,7 @@ class MixtureFilter:
 
         found = settle(poses, 3 * self.settings.iterations)
         for _ in range(FIRST_FITS):
-            if not self._fit_shape(seen, ERRORS['image'].independent / FIRST_FITS):
+            if not self._fit_shape(seen, ERRORS['shape'].independent / FIRST_FITS):
                 break
             found = settle(found, self.settings.iterations)
         self._learn_recall(seen)
@@ -259,7 +259,7 @@ class MixtureFilter:
         if self._images < s.shape_images or (
             s.shape_interval > 0 and self._images % s.shape_interval == 0
         ):
-            self._fit_shape(seen, ERRORS['image'].independent)
+            self._fit_shape(seen, ERRORS['shape'].independent)
         self._learn_recall(seen)
         self.assess(observation)
 
