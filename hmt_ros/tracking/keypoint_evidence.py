@@ -50,7 +50,7 @@ def suffices(keypoints: Keypoints | None, body: Body) -> bool:
 
 def shows_a_part(keypoints: Keypoints | None, body: Body) -> bool:
     """Whether keypoints are a person, and tell which way the person faces."""
-    if keypoints is None or keypoint_evidence(keypoints, body) < 1.0:
+    if keypoints is None or keypoint_evidence(keypoints, body) <= 0.0:
         return False
     names = _confident(keypoints)
     return any(left in names and right in names for left, right in body.trunk_pairs)

