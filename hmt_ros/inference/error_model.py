@@ -82,9 +82,9 @@ def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
     return CueErrors(share, share / rate)
 
 
-# Chosen, not learned, at 30 and 3 images a second (docs/tracking.md). The prior of the pose is counted
-# like a cue, because the same pose is judged again in every image. `shape` is what an image says of
-# lengths and flesh: poses that differ tell of these apart, whatever error they share.
+# Chosen, not learned, at 30 and 3 images a second (docs/tracking.md). The prior of the pose is
+# counted like a cue, because the same pose is judged again in every image. `shape` is what an image
+# says of lengths and flesh: poses that differ tell of these apart, whatever error they share.
 ERRORS: Mapping[str, CueErrors] = MappingProxyType(
     {
         'image': CueErrors(0.15, 0.019),
