@@ -34,6 +34,7 @@ PAGES = {
     'kernels': 'likelihood.md',
     'contour_noise': 'likelihood.md',
     'depth': 'likelihood.md',
+    'error_model': 'tracking.md',
     'keypoint_noise': 'keypoints.md',
     'motion_prior': 'motion_prior.md',
     'people': 'people.md',
