@@ -287,9 +287,9 @@ def test_command_line(capsys, tmp_path):
     assert 'tracking' in capsys.readouterr().out
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
-        "benchmarks: no 'flops', wanted one of absence, bags, contour_noise, depth, experts, "
-        'flips, keypoint_noise, kernels, kjs, live, motion_prior, nodes, people, smoothing, soak, '
-        'tracking, votes'
+        "benchmarks: no 'flops', wanted one of absence, bags, contour_noise, depth, error_model, "
+        'experts, flips, keypoint_noise, kernels, kjs, live, motion_prior, nodes, people, '
+        'smoothing, soak, tracking, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1

@@ -17,7 +17,7 @@ FEWEST_KEYPOINTS = 6
 CONFIDENT = 0.5
 # Detectors find small people in the legs of a table and in leaves, with full confidence. Keypoints
 # of a person with this magnification say nothing, with twice as much all that they can, px/m.
-LEAST_MAGNIFICATION = 35.0
+LEAST_MAGNIFICATION = 22.0
 
 
 def keypoint_evidence(keypoints: Keypoints, body: Body) -> float:

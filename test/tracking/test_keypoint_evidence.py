@@ -41,7 +41,7 @@ def test_evidence(seen, wanted, human32):
     assert keypoint_evidence(seen, human32) == pytest.approx(wanted)
 
 
-@pytest.mark.parametrize(('metre', 'wanted'), [(100.0, 1.0), (52.5, 0.5), (25.0, 0.0)])
+@pytest.mark.parametrize(('metre', 'wanted'), [(100.0, 1.0), (33.0, 0.5), (15.0, 0.0)])
 @pytest.mark.parametrize('part', ['', 'shoulder elbow wrist'])
 def test_a_small_person_is_a_mistake(human32, metre, wanted, part):
     """Wherever it is, and whether a part of it is seen; it is no empty image, either."""
