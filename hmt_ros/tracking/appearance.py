@@ -116,10 +116,23 @@ class Appearance:
             _evidence(place / self._share), _evidence(area), piece is not None and piece.cut
         )
 
-    def colour_evidence(self, view: View) -> float | None:
-        """What the colours say, from -1, nobody, to 1; None: nothing."""
-        score = self.colours.score(_coarse(view))
-        return None if score is None else float(np.clip(2.0 * score - 1.0, -1.0, 1.0))
+    def colour_evidence(self, view: View) -> tuple[bool, float] | None:
+        """Whether the colours speak for somebody, and how much, from 0 to 1; None: not at all.
+
+        Against somebody they may speak with nothing: the person is not where the colours were
+        learned, and the scene is another one.
+        """
+        image = _coarse(view)
+        score = self.colours.score(image)
+        if score is None:
+            return None
+        if score > 0.5:
+            return True, min(2.0 * score - 1.0, 1.0)
+        most = self.colours.score(image, unseen=1.0)
+        if most is None:
+            return None
+        against = float(np.clip(1.0 - 2.0 * most, 0.0, 1.0))
+        return False, against * self.colours.stillness(image)
 
     def is_apart(self, view: View, stamp: int) -> bool:
         """Whether most keypoints lie beside the box around the model, where a person may have gone.

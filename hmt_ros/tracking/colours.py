@@ -9,6 +9,15 @@ person is, and its usual maximum over boxes beside the person: the score is abou
 shows somebody in these colours, wherever that is, and about 0 in a room without the person. Where
 the two are alike the colours say nothing, and where the colours of the image are not those of the
 images before: a covered lens, another light.
+
+That they are nowhere speaks against the person only where the scene is the one that they were
+learned in:
+
+    stillness = 1 - changed pixels beyond the model / (UNDECIDED pixels of the model), at least 0
+
+Else `elsewhere` is that of another scene: the camera has moved, and what has gone may be a thing
+that the model was on. Somebody who moves beyond the model changes as much. A colour that no image
+had may be the person's, who turns about.
 """
 
 from __future__ import annotations
@@ -20,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.tracking.person_shape import counted
 
 # Time constant of what is usual for a track, s.
 MEMORY = 2.0
@@ -27,6 +37,12 @@ MEMORY = 2.0
 LEAST_CONTRAST = 0.15
 # Bins of a colour channel.
 BINS = 8
+# A pixel that differs by more than this in a channel shows something else, grey levels; the means
+# of 3 x 3 pixels of the raster do not differ by that much from noise.
+OTHER = 24
+# Beyond the model as many pixels may change as this share of those of the person, or of those
+# beyond if they are fewer: a shadow goes with the person. Of more the scene is another one.
+UNDECIDED = 0.25
 
 
 class Colours:
@@ -43,16 +59,34 @@ class Colours:
         self.here = self.elsewhere = math.nan
         self._inside: Array | None = None
         self._around = self._scene = np.zeros(BINS**3)
+        # The last image that was learned, and what the model did not cover in it.
+        self._image: Image | None = None
+        self._beyond: Mask | None = None
 
-    def score(self, image: Image) -> float | None:
-        """How far an image (h, w, 3) BGR shows the person's colours; None: nothing can be told."""
+    def score(self, image: Image, *, unseen: float = 0.0) -> float | None:
+        """How far an image (h, w, 3) BGR shows the person's colours; None: nothing can be told.
+
+        Args:
+            image: on the raster.
+            unseen: p(M | colour) of a colour that no image has had.
+        """
         contrast = self.here - self.elsewhere
         if self._inside is None or not contrast >= LEAST_CONTRAST:
             return None
         bins = binned(image)
         if np.minimum(shares(bins), self._scene).sum() < 0.5:  # most of it has other colours
             return None
-        return float((self._means(bins).max() - self.elsewhere) / contrast)
+        return float((self._means(bins, unseen).max() - self.elsewhere) / contrast)
+
+    def stillness(self, image: Image) -> float:
+        """How far an image (h, w, 3) is of the scene that was learned last, from 0 to 1."""
+        if self._image is None or self._beyond is None:
+            return 0.0
+        changed = cv2.absdiff(cv2.blur(image, (3, 3)), self._image).max(axis=2) > OTHER
+        outside = counted(self._beyond)
+        least = min(self._beyond.size - outside, outside)
+        share = counted(changed & self._beyond) / max(least, 1)
+        return max(1.0 - share / UNDECIDED, 0.0)
 
     def learn(self, image: Image, model: Mask, dt: float) -> None:
         """Takes in an image (h, w, 3) with the person on the pixels (h, w) of the model.
@@ -73,6 +107,7 @@ class Colours:
         self._scene = self._scene + gain * (scene - self._scene)
         x, y, width, height = cv2.boundingRect(model.view(np.uint8))
         self.size = width, height
+        self._image, self._beyond = np.asarray(cv2.blur(image, (3, 3)), np.uint8), beyond(model)
         means = self._means(bins)
         row, column = y + height // 2, x + width // 2
         here = float(means[row, column])
@@ -83,12 +118,14 @@ class Colours:
         if elsewhere >= 0.0:
             self.elsewhere = _moved(self.elsewhere, elsewhere, gain)
 
-    def _means(self, bins: NDArray[np.uint16]) -> NDArray[np.float32]:
+    def _means(self, bins: NDArray[np.uint16], unseen: float = 0.0) -> NDArray[np.float32]:
         """Mean of p(M | colour) over a box at each pixel (h, w); beyond the image it is 0."""
         assert self._inside is not None
         # A colour of less than a pixel is nobody's.
         whole = self._inside + self._around + 1.0 / bins.size
         ratio = (self._inside / whole).astype(np.float32)
+        if unseen:
+            ratio[self._scene < 1.0 / bins.size] = unseen
         size = (max(self.size[0], 1), max(self.size[1], 1))
         means = cv2.boxFilter(ratio[bins], cv2.CV_32F, size, borderType=cv2.BORDER_CONSTANT)
         return np.asarray(means, dtype=np.float32)
@@ -116,11 +153,16 @@ def surroundings(model: Mask) -> Mask:
     """Pixels (H, W) around those that the model covers, up to half its size away."""
     x, y, width, height = cv2.boundingRect(model.view(np.uint8))
     margin = max(width, height) // 2
-    near = max(margin // 5, 1)
-    size = (2 * near + 1, 2 * near + 1)
-    grown = cv2.dilate(model.view(np.uint8), np.ones(size, np.uint8))
-    result = np.zeros(model.shape, dtype=np.bool_)
     rows = slice(max(y - margin, 0), y + height + margin)
     columns = slice(max(x - margin, 0), x + width + margin)
-    result[rows, columns] = grown[rows, columns] == 0
+    result = np.zeros(model.shape, dtype=np.bool_)
+    result[rows, columns] = beyond(model)[rows, columns]
     return result
+
+
+def beyond(model: Mask) -> Mask:
+    """Pixels (H, W) that are farther from those of the model than a tenth of its size."""
+    *_, width, height = cv2.boundingRect(model.view(np.uint8))
+    near = max(max(width, height) // 10, 1)
+    size = (2 * near + 1, 2 * near + 1)
+    return np.asarray(cv2.dilate(model.view(np.uint8), np.ones(size, np.uint8)) == 0)

@@ -15,11 +15,14 @@ nobody by cue g, and a_g the share that is left to it because its errors last (`
                  the shape of a person / usual area), asked in the whole image
     detector     sum of the confidences of the keypoints
     predictor    whether it expects somebody; that it does, only where there is no silhouette
-    colours      whether the person's are anywhere; only where nothing else shows somebody
+    colours      whether the person's are anywhere; only where nothing else shows somebody, and
+                 against somebody only where the scene is the one they were learned in
 
-An image most of which has changed says nothing: a covered lens, a flash, noise. Of a person whom
-others hide nothing speaks but the keypoints that are seen. So only an image that shows the place
-empty ends a track: without it r tends to b / (b + l), which is far above `ABSENT`.
+An image most of which has changed says nothing: a covered lens, a flash, noise. Nor do the colours
+of a track speak against somebody when the camera has moved: what is gone may be a thing that the
+track was on. Of a person whom others hide nothing speaks but the keypoints that are seen. So only
+an image that shows the place empty ends a track: without it r tends to b / (b + l), which is far
+above `ABSENT`.
 """
 
 from __future__ import annotations
@@ -186,8 +189,10 @@ class Existence:
         if found is None and not any(value > 0.0 for value, _ in cues.values()):
             colours = self._appearance.colour_evidence(view)
             # Where most of the image has changed, the colours may have, too.
-            if colours is not None and (usable or colours > 0.0):
-                cues['colours'] = colours, DOUBTFUL
+            if colours is not None and (usable or colours[0]):
+                there, part = colours
+                nats = part * DOUBTFUL.nats
+                cues['colours'] = 1.0 if there else -1.0, DOUBTFUL._replace(nats=nats)
         return cues, usable, apart
 
     def _time_since(self, cue: str, stamp: int) -> float:

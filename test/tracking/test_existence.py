@@ -275,21 +275,65 @@ def test_colours_are_asked_where_the_background_is_of_no_use(film, watched):
 
 
 def test_colours_decide_where_there_is_no_background(film, watched):
-    """Also for somebody who has moved through the image in a gap."""
     _, images, _, empty = film
     found, seen, watching = watched([View(image) for image in images[:8]])
     assert seen == [True] * 8
     assert found.min() > PRESENT
+    found, seen, _ = watched([View(empty)] * 20, watching=watching, first=8)
+    assert not any(seen)
+    assert watching.nobody
+    assert 0.4 < 0.1 * (1 + np.argmax(found < ABSENT)) < 2.0
+
+
+def test_colours_say_nothing_against_somebody_in_another_scene(film, watched):
+    """Somebody has moved through the image in a gap; then the camera turns."""
+    _, images, _, empty = film
+    _, _, watching = watched([View(image) for image in images[:8]])
     aside = [View(np.roll(image, 90, axis=1)) for image in images[:5]]
     found, *_ = watched(
         aside, watching=watching, first=60,
         pose_of=lambda pose, _: pose + 90 / 330 * pose[2] * (np.arange(len(pose)) == 0),
     )  # fmt: skip
     assert found[-1] > PRESENT
-    found, seen, _ = watched([View(empty)] * 12, watching=watching, first=65)
+    found, seen, _ = watched([View(empty)] * 50, watching=watching, first=65)
     assert not any(seen)
-    assert watching.nobody
-    assert 0.4 < 0.1 * (1 + np.argmax(found < ABSENT)) < 1.5
+    assert watching.llr == 0.0
+    assert found.min() > 5 * ABSENT
+
+
+@pytest.mark.parametrize('rate', [10.0, 5.0, 2.7])
+def test_a_thing_that_was_taken_for_somebody_leaves_the_image(film, watched, rate):
+    """A track is on a thing and the camera turns: the person is in view as before."""
+    _, images, _, _ = film
+
+    def aside(pose, _=0):
+        return pose - 0.9 * (np.arange(len(pose)) == 0)
+
+    def with_a_thing(image):
+        result = image.copy()
+        result[60:, 40:115] = 20, 110, 230
+        return result
+
+    before = [View(with_a_thing(image)) for image in images]
+    _, _, watching = watched(before, rate, pose_of=aside)
+    _, seen, _ = watched(before, rate, pose_of=aside, watching=watching, first=len(before))
+    assert all(seen)
+    turned = [View(np.roll(image, 60, axis=1)) for image in images]
+    found, seen, _ = watched(turned * 3, rate, watching=watching, first=2 * len(before))
+    assert not any(seen)  # it is not what was learned
+    assert not watching.somebody
+    assert found.min() > 5 * ABSENT
+
+
+def test_who_turns_about_may_have_other_colours(film, watched):
+    """The back is blue, which nothing was so far."""
+    _, images, masks, _ = film
+    _, _, watching = watched([View(image) for image in images[:8]])
+    back = images[7].copy()
+    back[masks[7]] = 255, 40, 10
+    found, *_ = watched([View(back)] * 30, watching=watching, first=8)
+    assert not watching.nobody
+    assert found.min() > 5 * ABSENT
 
 
 def test_colours_that_are_the_same_everywhere_say_nothing(film, watched):
