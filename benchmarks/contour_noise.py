@@ -46,7 +46,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-CLIPS = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick')
+CLIPS = ('walk', 'charleston', 'wander', 'shoot', 'signals', 'scoop', 'kick', 'exercise')
 EVERY = 12  # images
 QUICK = 2  # clips
 # Of the true silhouettes, to which the flesh is fitted.
