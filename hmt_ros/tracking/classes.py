@@ -52,6 +52,16 @@ class Facing:
         if back.any():
             self.log_odds = max(float(log_weights[back].max() - log_weights[~back].max()), ABSENT)
 
+    def lacks_a_way(self, log_weights: Array) -> bool:
+        """Whether the modes, log weights (K,), have lost one of the two ways.
+
+        It has no mode, or one that the odds could not make up for.
+        """
+        back = self.back
+        if not back.any() or back.all():
+            return True
+        return bool(log_weights[back].max() > log_weights[~back].max() + MOST)
+
     def lead(self, body: Body, poses: Array) -> None:
         """The first of the modes, poses (K, d), says from now on how the track faces."""
         before = self._lead

@@ -244,8 +244,7 @@ class MixtureFilter:
         )
         search = Search(posterior, seen, states, precisions, continuity)
         proposals: list[Proposal] = [self._proposal]
-        back = self._facing.back
-        if not back.any() or back[np.argmax(search.rated(base.x, base.value))]:
+        if self._facing.lacks_a_way(search.rated(base.x, base.value)):
             proposals.insert(0, Reversals())
         if expected is not None:
             proposals.insert(0, PredictedPoses(self.body, expected.seen_as(self.body)))

@@ -48,6 +48,7 @@ from hmt_ros.tracking.view import View
 # Share of the time for which somebody stands on both feet, where contact is unknown.
 RESTING = 0.3
 
+
 class Tracker:
     """Follows one person through images; the posterior over poses is a mixture.
 

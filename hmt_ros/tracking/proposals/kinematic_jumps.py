@@ -32,7 +32,9 @@ from hmt_ros.tracking.selection import choose_hypotheses
 
 # Groups of modes with a trunk of their own whose products are rated.
 MOST_GROUPS = 3
-# Trunks, and configurations of a limb, are distinct when some joint is further apart, m.
+# Modes have the same trunk when its joints are nowhere further apart, m.
+SAME_TRUNK = 0.06
+# Configurations of a limb are distinct when some joint is further apart, m.
 DISTINCT = 0.08
 
 
@@ -156,7 +158,7 @@ class KinematicJumps:
         groups = []
         while left:
             gaps = np.linalg.norm(trunk[left] - trunk[left[0]], axis=2).max(1)
-            near = gaps < DISTINCT
+            near = gaps < SAME_TRUNK
             groups.append(np.array([i for i, ok in zip(left, near) if ok], dtype=np.intp))
             left = [i for i, ok in zip(left, near) if not ok]
         return groups

@@ -21,7 +21,14 @@ from hmt_ros.image.texture import Textures
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import minimise
 from hmt_ros.inference.energy import Derivatives, Restricted, Student, Sum
-from hmt_ros.tracking.posterior import TOLERANCE, Posterior, step_scale
+from hmt_ros.tracking.posterior import Posterior
+
+# Degrees of freedom of the Student prior that keeps a limb near its prediction: heavy tails.
+TAILS = 4.0
+# Number of samples that are put where the keypoints are, and of Newton steps that do it.
+PLACED, PLACING_STEPS = 4, 8
+# Factor on the standard deviations of the body's prior, of the samples that are drawn from it.
+WIDE = 1.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +79,7 @@ class LimbSearch:
         body, own, s = self.posterior.body, self.dofs, self.posterior.settings
         block = covariance[np.ix_(own, own)]
         samples = self._draw(pose[own], block, rng)
-        spread = samples[:: max(len(samples) // s.search.refined, 1)]
-        placed = self._placed(pose, spread, observation)
+        placed = self._placed(pose, samples[:: max(len(samples) // PLACED, 1)], observation)
         samples = np.concatenate([samples, placed])
         others = self._rest.energies(
             forward(body.skeleton, pose[None]), observation, derivatives=False
@@ -84,7 +90,7 @@ class LimbSearch:
         term = Sum(
             (
                 Restricted(Posed(body.skeleton, seen), pose, own),
-                Student(pose[own], np.asarray(np.linalg.inv(block)), s.tails),
+                Student(pose[own], np.asarray(np.linalg.inv(block)), TAILS),
             )
         )
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
@@ -92,8 +98,7 @@ class LimbSearch:
         self.posterior.evaluations += len(samples) + s.search.refined * s.search.iterations
         return minimise(
             term, best, body.lower[own], body.upper[own],
-            step_scale=step_scale(body)[own], damping=1.0, max_iterations=s.search.iterations,
-            tolerance=TOLERANCE,
+            step_scale=0.4, damping=1.0, max_iterations=s.search.iterations, tolerance=0.05,
         ).x  # fmt: skip
 
     def _placed(self, pose: Array, starts: Array, observation: Observation) -> Array:
@@ -103,8 +108,7 @@ class LimbSearch:
             return starts[:0]
         return minimise(
             Restricted(placing, pose, own), starts, body.lower[own], body.upper[own],
-            step_scale=step_scale(body)[own], damping=1.0,
-            max_iterations=self.posterior.settings.search.iterations, tolerance=TOLERANCE,
+            step_scale=0.4, damping=1.0, max_iterations=PLACING_STEPS, tolerance=0.05,
         ).x  # fmt: skip
 
     def _draw(self, angles: Array, block: Array, rng: np.random.Generator) -> Array:
@@ -115,7 +119,7 @@ class LimbSearch:
         near = noise @ np.linalg.cholesky(block).T
         near[n // 3 :] *= search.stretch
         result = angles + near
-        wide = body.prior_mean[own] + body.prior_sigma[own] * noise
+        wide = body.prior_mean[own] + WIDE * body.prior_sigma[own] * noise
         result[2 * n // 3 :] = wide[2 * n // 3 :]
         result[0] = angles
         return np.clip(result, body.lower[own], body.upper[own])

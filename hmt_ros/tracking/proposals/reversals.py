@@ -17,6 +17,9 @@ from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.optimisation import Search
 
+# Newton steps from the reversal of a mode to its optimum, before candidates are compared.
+ITERATIONS = 8
+
 
 @dataclass(frozen=True)
 class Reversals:
@@ -33,9 +36,11 @@ class Reversals:
     ) -> Hypotheses:
         """See `Proposal`."""
         best = np.argsort(-search.rated(base.x, base.value), kind='stable')[: self.count]
-        posterior, steps = search.posterior, search.posterior.settings.iterations
+        posterior = search.posterior
         reversed_poses = reverse_depth(posterior.body, base.x[best])
-        moved = posterior.minimise(posterior.of_image(search.observation), reversed_poses, steps).x
+        moved = posterior.minimise(
+            posterior.of_image(search.observation), reversed_poses, ITERATIONS
+        ).x
         # The other side of the body was not seen in the last image: no texture can be compared.
         nothing = np.full(len(best), -1)
         return Hypotheses(
