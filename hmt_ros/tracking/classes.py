@@ -1,6 +1,7 @@
 """Which way the person faces: a two-state chain, whose evidence lasts as long as the track.
 
-    S_t- = max(logit [exp(Q dt)] p_(t-1), max log t(x_k, x_j)),    j as the track faces, k not  (1)
+    S_t- = max(logit [exp(Q dt)] p_(t-1), max min(log t(x_k, x_j), log h(x_k, x_j))),
+                                                                   j as the track faces, k not  (1)
     S_t  = S_t- + b(min e_k (as the track faces) - min e_k (the other way))                     (2)
     b(d) = log (v e^d + 1 - v) - log (v + (1 - v) e^d)                                          (3)
 
@@ -9,10 +10,11 @@ come right by small steps. S = logit p are the log odds that the person faces th
 heaviest mode, Q the rate of the symmetry `reversal` (`body.symmetries`), e_k what an image says
 against mode k. Nobody turns about from one image to the next: a hypothesis that faces the other way
 is another history of the track, and weighs what all images so far say of that history, whether a
-mode was kept of it or not. Seen from the side the two histories meet (1). The best motion of either
-way stands for it (2), as the number of its modes says nothing; one that was not followed is no
-evidence, as nothing held it. An image speaks of the way to face with the probability v, or of
-something else, as a flash does or a covered lens (3): no single one turns a track about.
+mode was kept of it or not. Seen from the side the two histories meet (1): t is the transition of
+the joints (`weighting`), h that of the heading, which wanders at the rate of the body. The best
+motion of either way stands for it (2), as the number of its modes says nothing; one that was not
+followed is no evidence, as nothing held it. An image speaks of the way to face with the probability
+v, or of something else, as a flash does or a covered lens (3): no single one turns a track about.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from __future__ import annotations
 import numpy as np
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.mirror import faces_back
+from hmt_ros.body.mirror import faces_back, left_directions, root_rotation_dofs
 from hmt_ros.inference.arrays import Array, Mask
 
 # Probability v that what an image says of the way to face is about the person.
@@ -84,6 +86,7 @@ class Facing:
         evidence: Array,
         followed: Mask,
         dt: float,
+        predicted: Array,
     ) -> Array:
         """Log weights (N,) of poses (N, d), in which either way has the weight of its history.
 
@@ -95,11 +98,15 @@ class Facing:
             evidence: (N,) what the image says against each, nats.
             followed: (N,) which have moved on from a mode.
             dt: time since the image before, s.
+            predicted: (K, d) poses that the modes are moved to.
         """
         if self._lead is None or not body.trunk_pairs:
             return log_weights
         back = faces_back(body, poses, self._lead)
-        across = transitions[np.ix_(~self.back, back)]
+        across = np.minimum(
+            transitions[np.ix_(~self.back, back)],
+            log_turns(body, predicted[~self.back], poses[back], dt),
+        )
         stayed = body.symmetries['reversal'].after(self.log_odds, dt)
         log_odds = max(stayed, float(across.max(initial=-np.inf)))
         on, off = followed & ~back, followed & back
@@ -116,6 +123,17 @@ class Facing:
             share = -np.logaddexp(0.0, -odds)
             result[which] += share - np.logaddexp.reduce(log_weights[which])
         return result
+
+
+def log_turns(body: Body, first: Array, last: Array, dt: float) -> Array:
+    """How well people turn from poses (M, d) to poses (N, d) in dt s, (M, N), nats below the best.
+
+    They turn about as far as their pelvis wanders about the vertical by itself (`Body.rates`).
+    """
+    cosines = left_directions(body, first) @ left_directions(body, last).T
+    angles = np.arccos(np.clip(cosines, -1.0, 1.0))
+    variance = body.rates[root_rotation_dofs(body.skeleton)[0]] * dt
+    return np.asarray(-0.5 * angles**2 / variance)
 
 
 def believed(evidence: float) -> float:

@@ -302,6 +302,7 @@ class MixtureFilter:
             evidence,
             np.asarray(~optimised.hypotheses.jumped.all(1)),
             search.dt,
+            search.continuity.predicted,
         )
         return optimised, log_weights, histories
 

@@ -14,7 +14,7 @@ from hmt_ros.body.mirror import (
     root_rotation_dofs,
     root_rotations,
 )
-from hmt_ros.tracking.classes import ABSENT, MOST, VALID, Facing, believed
+from hmt_ros.tracking.classes import ABSENT, MOST, VALID, Facing, believed, log_turns
 from hmt_ros.tracking.weighting import Continuity
 
 DT = 0.1
@@ -53,7 +53,10 @@ def weigh(human32, both):
         before = np.zeros(len(poses)) if before is None else before
         far = np.full((len(facing.back), len(poses)), -100.0)
         evidence = np.asarray(evidence, dtype=float)
-        return facing.weigh(human32, poses, far, before, evidence, np.asarray(followed), dt)
+        predicted = np.repeat(poses[:1], len(far), axis=0)
+        return facing.weigh(
+            human32, poses, far, before, evidence, np.asarray(followed), dt, predicted
+        )
 
     return step
 
@@ -154,9 +157,24 @@ def test_seen_from_the_side_either_way_may_go_on(human32, both, weigh):
     """Where a way is near the other one, what was known of the ways is gone."""
     facing = begun(human32, both[:1], log_odds=-8.0)
     transitions = np.array([[0.0, -0.01]])
-    log_weights = facing.weigh(human32, both, transitions, np.zeros(2), np.zeros(2), KNOWN, DT)
+    log_weights = facing.weigh(
+        human32, both, transitions, np.zeros(2), np.zeros(2), KNOWN, DT, both[1:]
+    )
     assert np.exp(log_weights) == pytest.approx(0.5, abs=0.01)
     assert facing.log_odds == pytest.approx(-0.01)
+
+
+def test_nobody_turns_about_between_two_images(human32, both, turned):
+    """However near the joints of the two ways are."""
+    near = np.zeros((1, 2))
+    for dt, known in ((0.03, True), (0.3, True), (30.0, False)):
+        facing = begun(human32, both[:1], log_odds=-5.0)
+        facing.weigh(human32, both, near, np.zeros(2), np.zeros(2), KNOWN, dt, both[:1])
+        assert (facing.log_odds < -4.0) == known
+    for angle in (0.1, 0.5, 3.0):
+        (found,) = log_turns(human32, both[:1], turned(both[0], angle), 0.5)[0]
+        variance = 0.5 * human32.rates[root_rotation_dofs(human32.skeleton)[0]]
+        assert found == pytest.approx(-0.5 * angle**2 / variance, rel=1e-3)
 
 
 def test_a_person_who_turns_away_leads_the_track_along(human32, both, turned):
@@ -174,12 +192,14 @@ def test_a_person_who_turns_away_leads_the_track_along(human32, both, turned):
     transitions = continuity.log_transitions(poses)
     assert transitions[0, 1] > -0.5
     log_weights = facing.weigh(
-        human32, poses, transitions, np.zeros(2), np.array([3.0, 0.0]), KNOWN, 1.0
+        human32, poses, transitions, np.zeros(2), np.array([3.0, 0.0]), KNOWN, 1.0, before
     )
     assert log_weights[1] > log_weights[0] + 1.0
     # Also if nothing else is left.
     facing = begun(human32, before, log_odds=-8.0)
-    facing.weigh(human32, poses[1:], transitions[:, 1:], np.zeros(1), np.zeros(1), KNOWN[:1], 1.0)
+    facing.weigh(
+        human32, poses[1:], transitions[:, 1:], np.zeros(1), np.zeros(1), KNOWN[:1], 1.0, before
+    )
     facing.lead(human32, poses[1:])
     assert facing.log_odds == pytest.approx(transitions[0, 1])
 
@@ -221,7 +241,7 @@ def test_a_body_without_a_trunk_is_left_alone(human32, both):
     facing.lead(Trunkless(), both)
     before = np.log([0.2, 0.8])
     found = facing.weigh(
-        Trunkless(), both, np.zeros((2, 2)), before, np.array([9.0, 0.0]), KNOWN, DT
+        Trunkless(), both, np.zeros((2, 2)), before, np.array([9.0, 0.0]), KNOWN, DT, both
     )
     assert found is before
     assert facing.log_odds == ABSENT

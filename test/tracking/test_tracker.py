@@ -374,7 +374,7 @@ def test_a_prediction_starts_a_track(human32, camera, black, motion, keypoints_o
 def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, motion, keypoints_of):
     few = ('left_hip', 'right_knee', 'left_wrist', 'right_elbow', 'left_toe')
     other = jumped(motion)
-    errors, first = {}, np.zeros(1, dtype=np.intp)
+    errors = {}
     for given in (False, True):
         tracker = started(lost_images=2)
         statuses = []
@@ -388,7 +388,7 @@ def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, mot
             statuses.append(tracker.status)
         assert statuses[4] is Status.LOST
         assert (statuses[5] is Status.TRACKING) == given
-        errors[given] = best_error(tracker.body, posterior[first], human32, other)
+        errors[given] = best_error(tracker.body, posterior, human32, other)
     assert errors[True] < 0.6 * errors[False]
 
 
