@@ -22,16 +22,14 @@ from benchmarks.tracking_means import difference_entries, grouped, paired
 from benchmarks.tracking_scores import scores_of
 from hmt_ros.tracking import TrackerSettings
 
-WEIGHTS, CUES, ABSENCE, PROPOSALS = 'weights', 'cues', 'absence', 'proposals'
-GROUPS_OF_RULES = (WEIGHTS, CUES, ABSENCE, PROPOSALS)
+WEIGHTS, CUES, PROPOSALS = 'weights', 'cues', 'proposals'
+GROUPS_OF_RULES = (WEIGHTS, CUES, PROPOSALS)
 WITH_IMAGES = (IMAGES, BOTH)
 # Scores whose differences are told.
 COMPARED_SCORES = (
     'heaviest_mm', 'expected_mm', 'best_mm', 'blind_mm', 'negative_log_likelihood', 'weights',
     'wrong_way', 'nobody', 'evaluations', 'cpu_ms',
 )  # fmt: skip
-# A number of images that no track reaches.
-NO_IMAGE = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -79,9 +77,7 @@ RULES = (
     Rule('floor', CUES, (('ground.floor_weight', 0.0),)),
     Rule('balance', CUES, (('ground.balance_weight', 0.0),)),
     Rule('contact', CUES, (('ground.contact_weight', 0.0),)),
-    Rule('shape', CUES, (('shape_images', 0),)),
-    Rule('later_shape', CUES, (('shape_interval', 0),)),
-    Rule('restarts', ABSENCE, (('lost_images', NO_IMAGE),)),
+    Rule('shape', CUES, (('estimate_shape', False),)),
     Rule('limb_search', PROPOSALS, (('searched_chains', 0),)),
     Rule('alternatives', PROPOSALS, (('alternatives', 1),)),
     Rule('kinematic_jumps', PROPOSALS, (('proposals', 'css'),)),

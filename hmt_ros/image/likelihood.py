@@ -175,6 +175,7 @@ class ImageLikelihood:
             self.body.skeleton, self.camera, observation.keypoints,
             replace(self.settings.keypoints, weight=share * self.settings.keypoints.weight),
             observation.magnification, exchanges,
+            None if observation.beliefs is None else observation.beliefs.keypoints,
         )  # fmt: skip
 
     @cached_property
@@ -264,14 +265,17 @@ class ImageLikelihood:
         """What the kernels of all terms read, for so many poses; textures may be missing."""
         beliefs = observation.beliefs
         if beliefs is None:
-            beliefs = np.ones(len(self.body.skeleton.parents))
-        request = Request(poses, explained, beliefs)
+            request = Request(poses, explained, np.ones(len(self.body.skeleton.parents)))
+        else:
+            request = Request(poses, explained, beliefs.segments)
         result = []
         for term in TERMS:
             s: TermSettings = getattr(self.settings, term.name)
             evidence = observation.evidence.get(term.name)
             on = evidence is not None and (textured or not term.needs_texture)
             weight = float(s.weight) if on else 0.0
+            if beliefs is not None:
+                weight *= beliefs.of_term(term.name)
             weighting = Weighting(
                 weight, float(s.sigma), float(s.scale), float(observation.magnification),
                 float(s.growth),

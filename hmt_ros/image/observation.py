@@ -24,6 +24,27 @@ MARGIN = 48
 
 
 @dataclass(frozen=True, eq=False)
+class Beliefs:
+    """Probabilities that the cues of an image show the person: factors on their energies.
+
+    Attributes:
+        silhouette: that of the silhouette's outline.
+        segments: (S,) that the silhouette shows each segment.
+        keypoints: (G,) of the groups of keypoints, see `terms.keypoints`.
+        depth: of the depths.
+    """
+
+    silhouette: float
+    segments: Array
+    keypoints: Array
+    depth: float
+
+    def of_term(self, name: str) -> float:
+        """Factor on the weight of an image term."""
+        return {'coverage': self.silhouette, 'depth': self.depth}.get(name, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
 class Observation:
     """An image and what was taken from it.
 
@@ -32,7 +53,8 @@ class Observation:
         keypoints: joints seen in the image, or None.
         evidence: by the name of the term; what the image lacks is left out.
         foreground: (H, W) what differs from the background, believed or not; None: unknown.
-        beliefs: (S,) how far the silhouette is believed on each segment, 0 to 1; None: wholly.
+        depths: m, believed or not; None: unknown.
+        beliefs: in the cues; None: all are believed.
         magnification: px for a metre at the distance of the person; 0: unknown, the contours of
             people are taken to be as the model's.
     """
@@ -41,7 +63,8 @@ class Observation:
     keypoints: Keypoints | None = None
     evidence: Mapping[str, Any] = field(default_factory=dict)
     foreground: Mask | None = None
-    beliefs: Array | None = None
+    depths: ImageMap | None = None
+    beliefs: Beliefs | None = None
     magnification: float = 0.0
 
     @property

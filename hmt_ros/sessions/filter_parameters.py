@@ -16,7 +16,6 @@ from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
-    FRACTION,
     NEXT_CONFIGURE,
     NEXT_TRACK,
     NOT_NEGATIVE,
@@ -33,10 +32,6 @@ _TRACKER = {
     'max_hypotheses': (1, 64),
     'candidates': (1, 1024),
     'searched_chains': (0, 64),
-    'shape_images': (0, 100_000),
-    'shape_interval': (0, 100_000),
-    'lost_misfit': FRACTION,
-    'lost_images': (1, 100_000),
     **{f'likelihood.{term.name}.weight': NOT_NEGATIVE for term in TERMS},
     'likelihood.keypoints.weight': NOT_NEGATIVE,
 }

@@ -302,7 +302,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 depth=waiting.depth,
             )
             report_change(self._log, before, self._tracker, self.start.initial, stamp)
-            if waiting.depth is not None and not self._tracker.depth.believed:
+            if waiting.depth is not None and not self._tracker.validity.believes('depth'):
                 self._log.note(Fault.DEPTH_ELSEWHERE, depth_elsewhere(stamp))
             if posterior is not None and likelihood is not None:
                 self._publish_track(self._tracker, waiting, posterior, likelihood)
@@ -425,6 +425,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             track_id=self._tracks if self._tracker is None else self._tracker.track_id,
             existence=math.nan if self._tracker is None else self._tracker.existence_probability,
             started_from='' if source is None else source.value,
+            beliefs={} if tracker is None else tracker.validity.shown,
         )
 
     def _status(self) -> tuple[str, str]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from hmt_ros.body import Body
 from hmt_ros.sessions.camera_session import CAMERA_MOVED
@@ -28,6 +29,7 @@ class FilterState(SessionState):
         track_id: number of the present track, or of the last one; 0 before the first.
         started_from: what that track began from; '' before the first.
         existence: probability that a person is in view; NaN: no image yet.
+        beliefs: probability that each cue shows the person, and that the track has the person.
     """
 
     body: Body | None = None
@@ -40,6 +42,7 @@ class FilterState(SessionState):
     track_id: int = 0
     started_from: str = ''
     existence: float = math.nan
+    beliefs: Mapping[str, float] = field(default_factory=dict)
 
     def summary(self) -> str:
         """The present estimate in a few words."""
@@ -65,6 +68,7 @@ class FilterState(SessionState):
             ('modes', str(self.modes)),
             ('entropy of the weights, nats', f'{self.entropy:.3f}'),
             ('misfit', f'{self.misfit:.3f}'),
+            *((f'belief in {cue}', f'{p:.2f}') for cue, p in self.beliefs.items()),
             ('background', self.background),
             ('evaluations of the likelihood', str(self.evaluations)),
         ]

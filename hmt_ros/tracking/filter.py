@@ -18,6 +18,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.mirror import faces_back
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.error_model import ERRORS
@@ -40,17 +41,32 @@ from hmt_ros.tracking.laplace_approximation import (
     likelihood_modes,
     posterior_modes,
 )
-from hmt_ros.tracking.loss import unexplained_share
+from hmt_ros.tracking.misfit import (
+    Misfit,
+    of_depth_at_best,
+    of_keypoints,
+    of_outline,
+    of_segments,
+    outline_costs,
+)
 from hmt_ros.tracking.motion_states import PredictedStates
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.prediction import dynamics_of, follow_flow, predict
 from hmt_ros.tracking.proposals import PROPOSALS, PosePrediction, PredictedPoses, Proposal
 from hmt_ros.tracking.proposals.reversals import Reversals
-from hmt_ros.tracking.reliability import SilhouetteRecall
 from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
+from hmt_ros.tracking.validity import (
+    DEPTH,
+    ENOUGH,
+    KEYPOINTS,
+    OUTLINE,
+    SEGMENTS,
+    SILHOUETTE,
+    Validity,
+)
 from hmt_ros.tracking.weighting import Continuity, at_least, normalised, pooled_origins
 
 # How often the shape is fitted to the first image.
@@ -75,7 +91,7 @@ class MixtureFilter:
         body: with the lengths and the flesh that have been estimated.
         shape: the estimate of them.
         misfit: share of the last image that no mode explains.
-        recall: how far silhouettes are believed.
+        validity: how far its cues are believed, and the track.
     """
 
     def __init__(
@@ -95,13 +111,10 @@ class MixtureFilter:
         self._modes: Modes | None = None
         self._identities = Identities()
         self.shape = ShapeEstimate(body)
-        self.recall = SilhouetteRecall(len(body.skeleton.parents))
+        self.validity = Validity(len(body.skeleton.parents))
         self._observed: tuple[Observation, Observation] | None = None
         self._outline_costs = np.empty((0, 0))
-        self._bad_images = 0
-        self._images = 0
         self._dt = np.inf
-        self._shape_age = 0.0
         self._posterior = Posterior(body, camera, settings, extra, ground)
         self.contacts = FootContacts()
         self._facing = Facing()
@@ -139,8 +152,8 @@ class MixtureFilter:
 
     @property
     def lost(self) -> bool:
-        """Whether the last images were explained too badly."""
-        return self._bad_images >= self.settings.lost_images
+        """Whether the modes more likely are elsewhere than the person."""
+        return self.validity.lost
 
     # The start.
 
@@ -184,17 +197,17 @@ class MixtureFilter:
             if not self._fit_shape(seen, ERRORS['shape'].independent / FIRST_FITS):
                 break
             found = settle(found, self.settings.iterations)
-        self._learn_recall(seen)
         self.assess(observation)
 
     def begin_anew(self, poses: Array, observation: Observation) -> None:
         """Starts from an image, the present modes and poses (N, d) to search from."""
         self.evaluations = 0
+        self._believed(observation)  # as it was before
+        self.validity.search()
         poses = np.concatenate([self.modes.poses, poses])
         term = self._posterior.of_image(observation)
         solved = self._posterior.minimise(term, poses, 3 * self.settings.iterations)
         self._hold(Optimised(new_hypotheses(solved.x, np.zeros(len(poses))), solved), observation)
-        self._bad_images = 0
         self.assess(observation)
 
     def _hold(self, optimised: Optimised, observation: Observation) -> None:
@@ -233,6 +246,7 @@ class MixtureFilter:
         s, modes, posterior = self.settings, self.modes, self._posterior
         self.evaluations = 0
         self._dt = dt
+        self.validity.predict(dt)
         seen = self._believed(observation)
         posterior.exchanges.predict(dt)
         predicted, states = predict(modes, self.body, self.dynamics, dt)
@@ -253,22 +267,58 @@ class MixtureFilter:
             candidates = candidates.joined(more)
         self._select(*self._weigh(search, search.optimise(candidates)), states, seen)
         self._stand(dt)
-        self._images += 1
-        self._shape_age += dt
-        if self._images < s.shape_images or (
-            s.shape_interval > 0 and self._images % s.shape_interval == 0
-        ):
-            self._fit_shape(seen, ERRORS['shape'].independent)
-        self._learn_recall(seen)
-        self.assess(observation)
+        self._fit_shape(seen, ERRORS['shape'].share(dt), dt)
+        self.assess(seen)
 
     def assess(self, observation: Observation) -> None:
-        """Takes in how much of an image no mode explains, and whether the track is lost."""
-        self.misfit = unexplained_share(
-            self.body, self.camera, self.modes.poses, observation, self._outline_costs,
-            self.settings.likelihood,
-        )  # fmt: skip
-        self._bad_images = self._bad_images + 1 if self.misfit > self.settings.lost_misfit else 0
+        """Takes in how much of each cue of an image no mode explains."""
+        body, modes, s = self.body, self.modes, self.settings.likelihood
+        belief = 1.0 if observation.beliefs is None else observation.beliefs.silhouette
+        self.misfit = of_outline(self._outline_costs, s.coverage, belief)
+        found = self._misfits_of_silhouette(observation, belief)
+        if observation.keypoints is not None and s.keypoints.weight > 0:
+            term = self._posterior.likelihood.keypoint_term(observation, None)
+            found[KEYPOINTS], missed = of_keypoints(term, modes.poses)
+            self.misfit = max(self.misfit, missed)
+        self.validity.update(found, self._dt)
+        self.check_depths(body, modes.poses[0], observation.depths, self._dt)
+
+    def check_depths(self, body: Body, pose: Array, depths: ImageMap | None, dt: float) -> None:
+        """Takes in how far depths, if there are some, show a body at a pose (d,).
+
+        Args:
+            body, pose: of the best mode.
+            depths: of the image.
+            dt: time since the image before, s; infinite: there is none.
+        """
+        if depths is not None:
+            share = of_depth_at_best(body, self.camera, pose, depths)
+            whole = Misfit(np.array([share]), np.array([ENOUGH]))
+            self.validity.update({DEPTH: whole}, dt)
+
+    def _misfits_of_silhouette(self, observation: Observation, belief: float) -> dict[str, Misfit]:
+        """By segment, of all and of the outline, which is asked even where it is left out.
+
+        An empty silhouette only says that nobody is there, unless keypoints place somebody.
+        """
+        found: dict[str, Misfit] = {}
+        foreground, coverage = observation.foreground, self.settings.likelihood.coverage
+        if foreground is None or coverage.weight == 0:
+            return found
+        costs = self._outline_costs
+        if observation.outline is None:
+            poses, belief = self.modes.poses, 1.0
+            costs = outline_costs(self.body, self.camera, poses, foreground, coverage)
+        share = of_outline(costs, coverage, belief)
+        found[OUTLINE] = Misfit(np.array([share]), np.array([costs.shape[1]]))
+        textures = self.modes.textures
+        if textures is not None and (foreground.any() or observation.keypoints is not None):
+            row, segments = int(self.modes.texture_rows[0]), len(self.body.skeleton.parents)
+            found[SEGMENTS] = each = of_segments(textures, row, foreground, segments)
+            total = each.counts.sum(keepdims=True)
+            missed = (each.shares @ each.counts) / np.maximum(total, 1.0)
+            found[SILHOUETTE] = Misfit(missed, total)
+        return found
 
     def likelihood(self, observation: Observation) -> Likelihood:
         """See `likelihood_modes`."""
@@ -385,21 +435,13 @@ class MixtureFilter:
     def _believed(self, observation: Observation) -> Observation:
         """An observation with what this track has learned of its cues."""
         if self._observed is None or self._observed[0] is not observation:
-            believed = replace(observation, beliefs=self.recall.beliefs)
+            believed = replace(observation, beliefs=self.validity.beliefs)
             self._observed = observation, believed
         return self._observed[1]
 
-    def _learn_recall(self, observation: Observation) -> None:
-        textures = self.modes.textures
-        # An empty silhouette says that nobody is there, and nothing of the clothes.
-        foreground = observation.foreground
-        if textures is not None and foreground is not None and foreground.any():
-            row = int(self.modes.texture_rows[0])
-            self.recall.update(textures, row, foreground)
-
-    def _fit_shape(self, observation: Observation, trust: float) -> bool:
+    def _fit_shape(self, observation: Observation, trust: float, dt: float = 0.0) -> bool:
         """Moves the shape by what an image says of it; False where that is nothing."""
-        if self.settings.shape_images == 0:
+        if not self.settings.estimate_shape:
             return False
         if observation.outline is None and observation.keypoints is None:
             return False
@@ -408,9 +450,8 @@ class MixtureFilter:
         gradients, covariances = self._posterior.given_way(poses, observation)
         body = self.shape.update(
             self._posterior.likelihood, observation, poses[best], weights / weights.sum(),
-            gradients[best], covariances[best], trust=trust, dt=self._shape_age,
+            gradients[best], covariances[best], trust=trust, dt=dt,
         )  # fmt: skip
-        self._shape_age = 0.0
         self._posterior.evaluations += len(weights)
         self._use_body(body)
         return True

@@ -36,10 +36,11 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise
 from hmt_ros.inference.energy import Derivatives, EnergyFunction, EnergyTerm, Quadratic
 from hmt_ros.inference.mixture import GaussianMixture
-from hmt_ros.tracking.depth_belief import LARGEST_MISFIT, depth_misfits
 from hmt_ros.tracking.gravity import Gravity
+from hmt_ros.tracking.misfit import of_depth
 from hmt_ros.tracking.start_depth import FEWEST, JointDepths, joint_depths
 from hmt_ros.tracking.subject import Subject
+from hmt_ros.tracking.validity import UNDECIDED
 
 # Standard deviation of a length that was measured on the person, and of the stature, which also has
 # a skull and a heel that are not the model's, m.
@@ -96,9 +97,9 @@ def start_from_keypoints(
     """
     if depths is not None:
         start = _start(body, camera, subject, prior_weight, upright, depths)
-        misfits = depth_misfits(start.body, camera, start.poses[:1], depths)
+        (misfit,) = of_depth(start.body, camera, start.poses[:1], depths)
         sized = _sized(body, subject)
-        if _is_a_stature(sized, start.body.skeleton.lengths) and misfits[0] <= LARGEST_MISFIT:
+        if _is_a_stature(sized, start.body.skeleton.lengths) and misfit <= UNDECIDED[DEPTH.name]:
             return start
     return _start(body, camera, subject, prior_weight, upright, None)
 

@@ -18,14 +18,13 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
-from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
-from hmt_ros.tracking.depth_belief import DepthBelief
 from hmt_ros.tracking.person_shape import raster_step
 from hmt_ros.tracking.silhouettes import Silhouettes, region_of
+from hmt_ros.tracking.validity import SILHOUETTE, Validity
 from hmt_ros.tracking.view import View
 
 
@@ -39,16 +38,12 @@ class Observer:
 
     Attributes:
         last_image: (H, W, 3) that the optical flow starts from; None: there is no flow.
-        depth: belief in depth images.
-        depths: of the last observation, believed or not; None: there were none.
     """
 
     def __init__(
         self, camera: Camera, settings: LikelihoodSettings, silhouettes: Silhouettes
     ) -> None:
         self.last_image: Image | None = None
-        self.depth = DepthBelief(camera)
-        self.depths: ImageMap | None = None
         self._camera = camera
         self._settings = settings
         self._silhouettes = silhouettes
@@ -114,13 +109,13 @@ class Observer:
             return view
         return view._replace(silhouette=found.foreground, unsure=found.unsure)
 
-    def observation(self, view: View, pose: Array | None, *, believed: bool) -> Observation:
+    def observation(self, view: View, pose: Array | None, validity: Validity) -> Observation:
         """What an image says of a person.
 
         Args:
             view: what it shows.
             pose: (d,) that the person is about at; None: unknown.
-            believed: whether the silhouette is.
+            validity: of the cues: what more likely is of something else is left out.
         """
         weighed = [term for term in TERMS if getattr(self._settings, term.name).weight > 0]
         wanted = {'containment', 'coverage'} | {term.name for term in weighed}
@@ -130,16 +125,17 @@ class Observer:
         if keypoints is not None and not keypoints.seen.any():
             keypoints = None
         found = observe(
-            view.image, view.silhouette if believed else None, keypoints,
+            view.image, view.silhouette if validity.believes(SILHOUETTE) else None, keypoints,
             last_image=self.last_image, wanted=wanted, unsure=view.unsure,
             others=view.others,
             depth=view.depth,
         )  # fmt: skip
         evidence = dict(found.evidence)
-        self.depths = evidence.get(DEPTH.name)
-        if not self.depth.believed:
+        depths = evidence.get(DEPTH.name)
+        if not validity.believes(DEPTH.name):
             evidence.pop(DEPTH.name, None)
         magnification = 0.0 if pose is None else self._camera.magnification(float(pose[2]))
         return replace(
-            found, evidence=evidence, foreground=view.silhouette, magnification=magnification
-        )
+            found, evidence=evidence, foreground=view.silhouette, depths=depths,
+            magnification=magnification,
+        )  # fmt: skip

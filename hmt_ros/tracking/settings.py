@@ -49,12 +49,7 @@ class TrackerSettings:
             rates of the body.
         tails: Degrees of freedom of the Student motion prior; small numbers give heavy tails.
         least_log_weight: Smallest log weight of a mode that is kept, nats.
-        shape_images: Number of images at the start of a track that are all used to estimate the
-            lengths and the flesh of the person; 0 keeps those that the track started with.
-        shape_interval: After these, one image of so many is used to estimate them; 0 uses none.
-        lost_misfit: Fraction of the outline, or of the keypoints, left unexplained by every mode
-            above which an image counts as lost.
-        lost_images: Number of consecutive lost images after which the track restarts.
+        estimate_shape: Whether lengths and flesh of the person are estimated while the track lasts.
         likelihood: settings of the likelihood.
         search: settings of the search of limbs.
         ground: settings of what is known of gravity and floor.
@@ -73,10 +68,7 @@ class TrackerSettings:
     motion: str = 'learned'
     tails: float = 10.0
     least_log_weight: float = -14.0
-    shape_images: int = 15
-    shape_interval: int = 3
-    lost_misfit: float = 0.35
-    lost_images: int = 5
+    estimate_shape: bool = True
     likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
     search: LimbSearchSettings = field(default_factory=LimbSearchSettings)
     ground: GroundSettings = field(default_factory=GroundSettings)
@@ -91,7 +83,7 @@ class TrackerSettings:
                 f'wanted 1 <= max_hypotheses <= candidates, saw {self.max_hypotheses} and '
                 f'{self.candidates}'
             )
-        least = {'samples': 1, 'iterations': 1, 'lost_images': 1}
+        least = {'samples': 1, 'iterations': 1}
         least |= {'combinations': 1, 'alternatives': 1}
         for name, bound in least.items():
             if not getattr(self, name) >= bound:

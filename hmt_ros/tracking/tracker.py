@@ -43,6 +43,7 @@ from hmt_ros.tracking.silhouettes import Silhouettes
 from hmt_ros.tracking.start_depth import depths_of
 from hmt_ros.tracking.status import Status
 from hmt_ros.tracking.subject import Subject
+from hmt_ros.tracking.validity import SILHOUETTE, Validity
 from hmt_ros.tracking.view import View
 
 # Share of the time for which somebody stands on both feet, where contact is unknown.
@@ -65,7 +66,6 @@ class Tracker:
 
     Attributes:
         silhouettes: where those of the images come from.
-        depth: belief in depth images.
         ground: the present estimate of gravity and of the floor.
         contacts: probabilities that the feet stand on the floor, by name.
         evaluations: of the likelihood in the last image.
@@ -93,7 +93,6 @@ class Tracker:
         self.camera = camera
         self.silhouettes = Silhouettes(background or BackgroundModel(), shared=shared_background)
         self._observer = Observer(camera, self.settings.likelihood, self.silhouettes)
-        self.depth = self._observer.depth
         self.evaluations = 0
         self.log_likelihoods: Array = np.empty(0)
         self.likelihood_errors = ERRORS['image']
@@ -280,6 +279,11 @@ class Tracker:
         return self._track.misfit
 
     @property
+    def validity(self) -> Validity:
+        """How far each cue of the images is believed to show the person, and the track."""
+        return self._track.validity
+
+    @property
     def modes(self) -> Modes:
         """The present modes, heaviest first.
 
@@ -358,7 +362,6 @@ class Tracker:
         self._ground.reset()
         self._observer.last_image, self._followed = None, None
         self._existence.meet()
-        self.depth.reset()
 
     def _take(
         self, view: View, stamp: int, prediction: PosePrediction | None, mask: Mask | None
@@ -395,7 +398,6 @@ class Tracker:
         follows = self.modes.origins.shape[1] > 0
         self._point.update(self.body, self._track.dynamics, self.posterior, dt if follows else None)
         self._observer.last_image, self._followed = view.image, stamp
-        self.depth.update(self.body, self.modes.poses[0], self._observer.depths)
         if self._existence.seen:
             self._existence.learn(view, stamp, self.body, self.camera, self.modes.poses[0])
         self.evaluations = self._track.evaluations
@@ -440,10 +442,11 @@ class Tracker:
                 if self.silhouettes.doubted:
                     view = view._replace(silhouette=None, anywhere=None, unsure=None)
             if beginning.source in FROM_JOINTS:
-                self.depth.update(beginning.body, beginning.best[0], depths_of(view.depth))
+                pose, depths = beginning.best[0], depths_of(view.depth)
+                self._track.check_depths(beginning.body, pose, depths, np.inf)
             observation = self._observe(view, beginning.best[0])
             self._begin(observation, beginning, stamp)
-            if not self._track.recall.believed:
+            if not self.validity.believes(SILHOUETTE):
                 # The start is where the person is; the silhouette is not.
                 observation = self._observe(view, beginning.best[0])
                 self._begin(observation, beginning, stamp)
@@ -491,4 +494,4 @@ class Tracker:
 
     def _observe(self, view: View, pose: Array | None) -> Observation:
         """What an image says of a person who is about at a pose (d,), if it is known."""
-        return self._observer.observation(view, pose, believed=self._track.recall.believed)
+        return self._observer.observation(view, pose, self.validity)

@@ -17,6 +17,7 @@ from hmt_ros.sessions import bme_session, camera_session, track_start
 from hmt_ros.tracking import PosePrediction, Status, Subject, TrackerSettings
 from hmt_ros.tracking.beginning import Source
 from hmt_ros.tracking.ground import Ground
+from hmt_ros.tracking.validity import Validity
 from msg_tools import RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.depth_images import depth_message
@@ -51,7 +52,7 @@ class StubTracker:
             known='known',
             watch=SimpleNamespace(moved=False, shift=0.0),
         )
-        self.depth = SimpleNamespace(believed=True)
+        self.validity = Validity(1)
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.track_id, self.started_from = 0, None
         self.existence_probability = 0.875

@@ -63,6 +63,8 @@ def test_images_become_messages_in_their_order(session, outputs, small_camera):
     assert (one.state.status, one.state.modes, one.state.wants) == ('tracking', 2, '')
     assert np.isclose(one.state.entropy, -(0.75 * np.log(0.75) + 0.25 * np.log(0.25)))
     assert (one.state.misfit, one.state.evaluations) == (0.125, 7)
+    told = dict(one.state.values())
+    assert [float(told[f'belief in {cue}']) for cue in ('silhouette', 'track')] == [0.95, 0.95]
 
 
 def mixtures_of(outputs, topic='pose_mixture'):

@@ -17,7 +17,7 @@ from hmt_ros.rendering.scene import Scene
 from hmt_ros.tracking import PosePrediction, Status, Tracker, TrackerSettings
 
 FRAME = 100_000_000  # ns
-SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, searched_chains=1, shape_images=0)
+SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, searched_chains=1, estimate_shape=False)
 # As little search as there can be, for what depends on existence alone.
 QUICK = replace(SETTINGS, candidates=2, max_hypotheses=2, searched_chains=0)
 TRACKING, LOST, NOBODY = Status.TRACKING, Status.LOST, Status.NOBODY

@@ -12,7 +12,7 @@ from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings
 
 FRAME = 100_000_000  # ns
 SMALL = TrackerSettings(
-    candidates=8, max_hypotheses=4, shape_images=0, searched_chains=1, combinations=32
+    candidates=8, max_hypotheses=4, estimate_shape=False, searched_chains=1, combinations=32
 )
 
 

@@ -259,7 +259,7 @@ def test_a_tracker_knows_its_ground(ground, human32, camera, motion, keypoints_o
     """A body that reaches for things before a level camera 1.2 m above the floor."""
     likelihood = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
     settings = TrackerSettings(
-        candidates=8, max_hypotheses=4, likelihood=likelihood, shape_images=0, ground=ground,
+        candidates=8, max_hypotheses=4, likelihood=likelihood, estimate_shape=False, ground=ground,
     )  # fmt: skip
     up = np.array([0.0, -1.0, 0.0])
     black = np.zeros((camera.height, camera.width, 3), np.uint8)

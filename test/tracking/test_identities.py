@@ -46,7 +46,9 @@ def test_the_heaviest_descendant_keeps_the_number(ancestors, jumped, expected):
 
 def test_numbers_of_a_track(human32, camera, filmed):
     poses, images, empty = filmed('reach', 0.8, camera)
-    settings = TrackerSettings(candidates=8, max_hypotheses=4, searched_chains=1, shape_images=0)
+    settings = TrackerSettings(
+        candidates=8, max_hypotheses=4, searched_chains=1, estimate_shape=False
+    )
     start = GaussianMixture(np.ones(1), poses[:1], 1e-3 * np.eye(human32.dimension)[None])
     runs = []
     for _ in range(2):

@@ -13,7 +13,7 @@ from hmt_ros.tracking import LaggedWeights, Tracker, TrackerSettings
 from hmt_ros.tracking.weighting import pooled_origins
 
 SMALL = TrackerSettings(
-    candidates=8, max_hypotheses=4, shape_images=0, searched_chains=1, combinations=32
+    candidates=8, max_hypotheses=4, estimate_shape=False, searched_chains=1, combinations=32
 )
 
 

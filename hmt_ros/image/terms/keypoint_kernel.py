@@ -107,12 +107,12 @@ def slope_residual(slopes, k, e, columns):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def exchange_log_posterior(energies, weight, exchanged, log_prior, result):  # type: ignore[no-untyped-def]
+def exchange_log_posterior(energies, weights, exchanged, log_prior, result):  # type: ignore[no-untyped-def]
     """Log probabilities (E,) of exchanges; returns minus the log of their sum before.
 
     Args:
         energies: (G, 2) of the groups, as they are called and exchanged, of weight 1.
-        weight: factor on the energies.
+        weights: (G,) factors on the energies.
         exchanged: (E, G) 1 where an exchange exchanges a group.
         log_prior: (E,).
         result: (E,).
@@ -121,7 +121,7 @@ def exchange_log_posterior(energies, weight, exchanged, log_prior, result):  # t
     for e in range(len(exchanged)):
         total = log_prior[e]
         for g in range(len(energies)):
-            total -= weight * energies[g, exchanged[e, g]]
+            total -= weights[g] * energies[g, exchanged[e, g]]
         result[e] = total
         top = max(top, total)
     mass = 0.0
@@ -135,7 +135,7 @@ def exchange_log_posterior(energies, weight, exchanged, log_prior, result):  # t
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def add_keypoints(  # type: ignore[no-untyped-def]
-    points, slopes, tree, lens, scale, weight, exchanged, log_priors, columns, origins, axes,
+    points, slopes, tree, lens, scale, weights, exchanged, log_priors, columns, origins, axes,
     dof_origins, value, gradient, hessian,
 ):  # fmt: skip
     """Adds energy, gradient and Hessian of poses (N,), one prior (E,) of the exchanges each."""
@@ -147,7 +147,7 @@ def add_keypoints(  # type: ignore[no-untyped-def]
     pixels, projections, place = np.empty((1, 2)), np.empty((1, 2, 3)), np.empty(3)
     for n in range(len(value)):
         group_energies(points, slopes, lens, scale, columns[n], origins[n], energies)
-        value[n] += exchange_log_posterior(energies, weight, exchanged, log_priors[n], posterior)
+        value[n] += exchange_log_posterior(energies, weights, exchanged, log_priors[n], posterior)
         if len(hessian) == 0:
             continue
         shares[:] = 0.0
@@ -158,8 +158,8 @@ def add_keypoints(  # type: ignore[no-untyped-def]
         stiffnesses[:] = 0.0
         for k in range(len(points.groups)):
             for e in range(2):
-                share = weight * shares[points.groups[k], e]
-                if share < 1e-6 * weight or not point_residual(
+                share = weights[points.groups[k]] * shares[points.groups[k], e]
+                if share < 1e-6 or not point_residual(
                     points, k, e, lens, columns[n], origins[n], pixels, projections, place
                 ):
                     continue
@@ -176,8 +176,8 @@ def add_keypoints(  # type: ignore[no-untyped-def]
                     )  # fmt: skip
         for k in range(len(slopes.groups)):
             for e in range(2):
-                share = weight * shares[slopes.groups[k], e]
-                if share < 1e-6 * weight:
+                share = weights[slopes.groups[k]] * shares[slopes.groups[k], e]
+                if share < 1e-6:
                     continue
                 residual, d0, d1, d2 = slope_residual(slopes, k, e, columns[n])
                 _, pull, curvature = geman_mcclure(residual, scale, share)

@@ -179,6 +179,7 @@ class KeypointTerm:
         magnification: px for a metre at the person; 0: unknown.
         exchanges: (R, E) log probability of each exchange before the image, a row for each problem
             or one for all; None: nothing is exchanged.
+        beliefs: (G,) factors on the energies of the groups of landmarks; None: 1.
 
     Raises:
         KeyError: a keypoint that is not a joint of the body.
@@ -190,6 +191,7 @@ class KeypointTerm:
     settings: TermSettings = KEYPOINTS
     magnification: float = 0.0
     exchanges: Array | None = None
+    beliefs: Array | None = None
 
     def energy(
         self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
@@ -201,7 +203,7 @@ class KeypointTerm:
         value, gradient, hessian = np.zeros(n), np.zeros((poses, d)), np.zeros((poses, d, d))
         add_keypoints(
             measured.points, measured.slopes, tree_of(self.skeleton), lens_of(self.camera),
-            float(self.settings.scale), float(self.settings.weight), *self._priors(rows, n),
+            float(self.settings.scale), self.weights, *self._priors(rows, n),
             *frames.by_pose(), *frames.dofs_by_pose(), value, gradient, hessian,
         )  # fmt: skip
         return Energy(value, gradient, hessian) if derivatives else Energy(value)
@@ -218,9 +220,7 @@ class KeypointTerm:
                 measured.points, measured.slopes, lens_of(self.camera), float(self.settings.scale),
                 columns[n], origins[n], energies,
             )  # fmt: skip
-            exchange_log_posterior(
-                energies, float(self.settings.weight), exchanged, priors[n], result[n]
-            )
+            exchange_log_posterior(energies, self.weights, exchanged, priors[n], result[n])
         return result
 
     def residuals(self, frames: Frames) -> tuple[Index, Array, Array, Array, Array]:
@@ -239,7 +239,7 @@ class KeypointTerm:
         by_point = np.einsum('kab,bik->kai', whiteners, projection[..., shown])
         s = self.settings
         shrink = 1.0 / (1.0 + error**2 / s.scale**2)
-        curvature = s.weight * shrink**2
+        curvature = self.weights[points.groups[shown]][:, None] * shrink**2
         return (
             np.repeat(joints[shown], 2),
             np.repeat(places[shown], 2, axis=0),
@@ -277,6 +277,12 @@ class KeypointTerm:
             return EXCHANGED[:1], np.zeros((count, 1))
         chosen = self.exchanges[rows] if len(self.exchanges) > 1 else self.exchanges[[0] * count]
         return EXCHANGED, np.ascontiguousarray(chosen)
+
+    @property
+    def weights(self) -> Array:
+        """Factors (G,) on the energies of the groups."""
+        beliefs = np.ones(EXCHANGED.shape[1]) if self.beliefs is None else self.beliefs
+        return np.asarray(self.settings.weight * beliefs, dtype=np.float64)
 
     @property
     def measured(self) -> MeasuredKeypoints:

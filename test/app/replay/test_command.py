@@ -22,6 +22,7 @@ from hmt_ros.sessions.smoothed_messages import TOPICS as SMOOTHED_TOPICS
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.tracking import Status
 from hmt_ros.tracking.ground import Ground
+from hmt_ros.tracking.validity import Validity
 from msg_tools import BagError, BagReader, BagWriter, RosbagsMessages
 from msg_tools.bags.contents import absolute_name
 from msg_tools.messages.bodies import body_of
@@ -93,7 +94,7 @@ class StandingStill:
         self.silhouettes = SimpleNamespace(
             doubted=False, known='known', watch=SimpleNamespace(moved=False, shift=0.0)
         )
-        self.depth = SimpleNamespace(believed=True)
+        self.validity = Validity(1)
         StandingStill.made.append(self)
 
     def reset(self, start, *, box=None):

@@ -17,7 +17,6 @@ SMALL = [
     'candidates=6',
     'max_hypotheses=4',
     'searched_chains=1',
-    'shape_images=0',
 ]
 
 

@@ -1,0 +1,135 @@
+"""How much of each cue of an image no mode explains, from 0 to 1.
+
+    silhouette   visible points of the model outside it
+    segments     those of each segment
+    outline      samples of the silhouette's outline that are further than 4 sigmas from the model's
+    keypoints    those of a group that are further than 4 sigmas from their landmarks
+    depth        energy of the visible surface, as a share of the largest that there is
+
+Clothes in the colours of the scene are no foreground where the person is, nor is the person in the
+mask of another image. A depth image that is late or not registered shows the background where the
+model has limbs, so that most points cost what their kernel allows, whatever the pose.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.observation import Observation, observe
+from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.terms.depth import DEPTH
+from hmt_ros.image.terms.image_term import TermSettings
+from hmt_ros.image.terms.keypoints import EXCHANGED, KeypointTerm
+from hmt_ros.image.texture import Textures
+from hmt_ros.inference.arrays import Array, Mask
+from hmt_ros.tracking.start_depth import moved_to_depth
+
+# A sample of the outline or a keypoint further away than this from where it should be is
+# unexplained, in sigmas.
+UNEXPLAINED = 4.0
+
+
+class Misfit(NamedTuple):
+    """How much of a cue is not explained, by group.
+
+    Attributes:
+        shares: (G,) from 0, all is explained, to 1.
+        counts: (G,) number of measurements; 0: nothing is known.
+    """
+
+    shares: Array
+    counts: Array
+
+
+def of_segments(textures: Textures, row: int, foreground: Mask, segments: int) -> Misfit:
+    """Visible points of each segment that are no foreground.
+
+    Args:
+        textures: of the modes, with the pixels that their points were seen at.
+        row: of the mode that is believed.
+        foreground: (H, W).
+        segments: number of segments, S.
+    """
+    n = int(textures.counts[row])
+    column, line = textures.pixels[row, :n].T.round().astype(np.intp)
+    height, width = foreground.shape
+    inside = (column >= 0) & (line >= 0) & (column < width) & (line < height)
+    missed = ~foreground[line[inside], column[inside]]
+    owners = textures.segments[row, :n][inside].astype(np.intp)
+    counts = np.bincount(owners, minlength=segments).astype(np.float64)
+    found = np.bincount(owners, weights=missed, minlength=segments)
+    return Misfit(found / np.maximum(counts, 1.0), counts)
+
+
+def of_outline(costs: Array, term: TermSettings, belief: float) -> float:
+    """Share of the samples of the silhouette's outline that the best mode does not explain.
+
+    Args:
+        costs: (K, M) what each sample costs each mode.
+        term: that they cost it by: its weight, shared among the samples, and its kernel.
+        belief: factor on the weight.
+    """
+    if costs.size == 0:
+        return 0.0
+    most = 0.5 * belief * term.weight / costs.shape[1] * term.scale**2
+    limit = UNEXPLAINED**2 / (UNEXPLAINED**2 + term.scale**2)
+    return float((costs > limit * most).mean(1).min())
+
+
+def outline_costs(
+    body: Body, camera: Camera, poses: Array, foreground: Mask, term: TermSettings
+) -> Array:
+    """What samples of the outline of a silhouette cost poses (K, d), (K, M).
+
+    Args:
+        body, camera, poses: that it is compared with.
+        foreground: (H, W), of which the likelihood makes nothing.
+        term: that samples cost poses by.
+    """
+    if not foreground.any():
+        return np.empty((len(poses), 0))
+    likelihood = ImageLikelihood(body, camera, LikelihoodSettings.of_terms(coverage=term))
+    seen = observe(np.zeros((*foreground.shape, 3), np.uint8), foreground, wanted=('coverage',))
+    return likelihood.energies(forward(body.skeleton, poses), seen, derivatives=False).costs
+
+
+def of_keypoints(term: KeypointTerm, poses: Array) -> tuple[Misfit, float]:
+    """Keypoints that the best of poses (K, d) does not explain, by group, and of all.
+
+    Each pose is given the exchange of sides that is likeliest there.
+    """
+    groups = term.measured.points.groups
+    count = EXCHANGED.shape[1]
+    counts = np.bincount(groups, minlength=count).astype(np.float64)
+    if len(groups) == 0:
+        return Misfit(np.zeros(count), counts), 0.0
+    distances = [term.distances(forward(term.skeleton, pose[None])) for pose in poses]
+    missed = ~(np.stack(distances) < UNEXPLAINED)
+    best = missed[missed.mean(1).argmin()]
+    found = np.bincount(groups, weights=best, minlength=count)
+    return Misfit(found / np.maximum(counts, 1.0), counts), float(best.mean())
+
+
+def of_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap) -> Array:
+    """Share of the visible surface (N,) that poses (N, d) have elsewhere than depths show it."""
+    likelihood = ImageLikelihood(body, camera, LikelihoodSettings.of_terms(depth=DEPTH.settings))
+    seen = Observation(evidence={DEPTH.name: depths})
+    found = likelihood.energies(forward(body.skeleton, poses), seen, derivatives=False)
+    s = DEPTH.settings
+    result: Array = found.terms[DEPTH.name] / (0.5 * s.weight * s.scale**2)
+    return result
+
+
+def of_depth_at_best(body: Body, camera: Camera, pose: Array, depths: ImageMap) -> float:
+    """The same of one pose (d,), or of the pose moved to the depth that was measured.
+
+    A track without depth is not at its distance.
+    """
+    poses = np.concatenate([pose[None], moved_to_depth(body, camera, pose[None], depths)])
+    return float(of_depth(body, camera, poses, depths).min())

@@ -1,0 +1,196 @@
+"""Which cues of the images are about the person, and whether the track is: two-state chains.
+
+    P <- [exp(Q dt)] x ... x [exp(Q dt)] P          the track and each cue fail, and come back   (1)
+    e_g = E_outlier - E_inlier = N (u - m_g)        m_g: share of cue g that is not explained    (2)
+    log P(v) <- log P(v) + a(dt) v_0 (e_0 + sum_g v_g e_g)                                       (3)
+
+P is the joint probability of v = (v_0, v_1, ..), 1 where a mode of the track is about where the
+person is (v_0) and where cue g shows the person (v_g); a(dt) = tanh(dt / (2 tau)) is the share that
+is left to an image because misfits last (`error_model`). What is not explained is put down to the
+cue or to the track, whichever of the two is less likely with all that the others say: (3) is exact,
+and summed over v_g it is minus the energy -log(p exp(-E_inlier) + (1 - p) exp(-E_outlier)).
+e_0 is what the outline of the silhouette says of the track, whether the silhouette is whole or not:
+clothes in the colours of the room leave holes in it, and the rest of it is where the person is.
+
+A part of the body may be misplaced in a mode of a track that is right, and cover anything: the e_g
+of parts is log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), at most log w / (1 - w) either way.
+The silhouette is believed by segments, too. Segments and depths, whose misfit is that of a pose
+moved to where they place it, say nothing of the track: each has a chain of its own, which takes in
+log(P(v_0) exp(e_g) + 1 - P(v_0)).
+
+In an image each cue counts with the energy p_g E_g, to which the energy above is equal in first
+order around E_outlier, with the p_g of (1), before the image: weights and optima hold the same sum.
+A silhouette and depths that more likely are of something else are left out wholly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from hmt_ros.image.observation import Beliefs
+from hmt_ros.image.terms.keypoints import EXCHANGED
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.error_model import share_of_time
+from hmt_ros.tracking.misfit import Misfit
+
+# Rates at which a cue ceases to show the person, or a track to follow, and the rates back, 1/s.
+FAILS, RECOVERS = 0.05, 1.0
+USUAL = RECOVERS / (FAILS + RECOVERS)
+# What a cue says that is wholly explained or not at all, N u and N (1 - u), nats in all, and how
+# many of its measurements say so much: neighbours err together.
+NATS, ENOUGH = 16.0, 4
+# How long misfits last, s.
+TAU = 0.1
+# What one image can say of a cue at most, nats: it may be of something that nobody has thought of.
+MOST = 3.5
+
+SILHOUETTE, SEGMENTS, KEYPOINTS, DEPTH = 'silhouette', 'segments', 'keypoints', 'depth'
+# What of a silhouette's outline is not explained tells of the track alone.
+OUTLINE = 'outline'
+# Misfit u at which a cue is as likely to be of something else: between those of images that show
+# the person and those that do not. Clothes in the colours of the room leave holes in a silhouette.
+UNDECIDED = {SILHOUETTE: 0.4, OUTLINE: 0.4, SEGMENTS: 0.25, KEYPOINTS: 0.25, DEPTH: 0.15}
+# Cues by part of the body, and the probability w that a mode has the part where it is: limbs lag
+# behind, and hide before the trunk. Where a track begins the pose was given.
+BY_PART, PLACED = (SEGMENTS, KEYPOINTS), 0.8
+# Axes of the joint probability: the track, and after it the cues with their groups.
+TRACK = 0
+AXES = {SILHOUETTE: slice(1, 2), KEYPOINTS: slice(2, 2 + EXCHANGED.shape[1])}
+CHAINS = AXES[KEYPOINTS].stop
+# States (2^n, n), one row for each v.
+STATES = np.array(np.unravel_index(np.arange(2**CHAINS), (2,) * CHAINS)).T
+
+
+class Validity:
+    """What is believed of the cues of one track, and of the track.
+
+    Args:
+        segments: number of segments of the body, S.
+
+    Attributes:
+        joint: (2, .., 2) probability of the track and of the cues of `AXES`, in their order.
+        alone: by name the probabilities of the groups of the other cues.
+    """
+
+    def __init__(self, segments: int) -> None:
+        self.joint = np.where(STATES == 1, USUAL, 1.0 - USUAL).prod(1).reshape((2,) * CHAINS)
+        self.alone = {SEGMENTS: np.full(segments, USUAL), DEPTH: np.full(1, USUAL)}
+
+    @property
+    def track(self) -> float:
+        """Probability that some mode is about where the person is."""
+        return float(self._chains[TRACK])
+
+    @property
+    def cues(self) -> dict[str, Array]:
+        """By name the probabilities that the groups of a cue show the person.
+
+        Of the whole silhouette (1,), of the silhouette by segment (S,), of keypoints by group (3,)
+        and of depths (1,).
+        """
+        return {name: self._chains[axes] for name, axes in AXES.items()} | self.alone
+
+    def believes(self, cue: str) -> bool:
+        """Whether a cue is more likely to show the person than not; who is lost asks all."""
+        return self.lost or bool(self.cues[cue].max() >= 0.5)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the modes more likely are elsewhere than the person."""
+        return self.track < 0.5
+
+    @property
+    def beliefs(self) -> Beliefs:
+        """Factors on the cues of the next image."""
+        cues = self.cues
+        silhouette, depth = (float(cues[name][0]) for name in (SILHOUETTE, DEPTH))
+        return Beliefs(silhouette, cues[SEGMENTS], cues[KEYPOINTS], depth)
+
+    @property
+    def shown(self) -> dict[str, float]:
+        """The probabilities by name, as diagnostics tell them; of the segments the mean."""
+        cues = self.cues
+        trunk, arms, legs = (float(p) for p in cues[KEYPOINTS])
+        return {
+            'silhouette': float(cues[SILHOUETTE][0]),
+            'segments': float(cues[SEGMENTS].mean()),
+            'keypoints/trunk': trunk,
+            'keypoints/arms': arms,
+            'keypoints/legs': legs,
+            'depth': float(cues[DEPTH][0]),
+            'track': self.track,
+        }
+
+    def predict(self, dt: float) -> None:
+        """Goes on by dt seconds, equation (1)."""
+        self.alone = {name: moved_on(p, dt) for name, p in self.alone.items()}
+        valid = moved_on(np.array([0.0, 1.0]), dt)
+        for axis in range(CHAINS):
+            transition = np.stack([1.0 - valid, valid])
+            moved = np.tensordot(transition, self.joint, axes=(1, axis))
+            self.joint = np.moveaxis(moved, 0, axis)
+
+    def search(self) -> None:
+        """The track begins anew: nothing is known of its modes."""
+        of_cues = self.joint.sum(TRACK)
+        self.joint = np.stack([(1.0 - USUAL) * of_cues, USUAL * of_cues], TRACK)
+
+    def update(self, misfits: Mapping[str, Misfit], dt: float) -> None:
+        """Takes in how far the modes explain the cues of an image.
+
+        Args:
+            misfits: by cue, and of the outline of the silhouette.
+            dt: time since the image before, s; infinite: there is none.
+        """
+        share, begun = share_of_time(dt, TAU), bool(np.isfinite(dt))
+        says = {
+            name: np.clip(share * evidence_of(name, x, begun=begun), -MOST, MOST)
+            for name, x in misfits.items()
+        }
+        for name in self.alone.keys() & says.keys():
+            self.alone[name] = _updated(self.alone[name], _mixed(self.track, says[name]))
+        of_track = np.zeros(CHAINS)
+        of_track[TRACK] = says.get(OUTLINE, np.zeros(1))[0]
+        for name in AXES.keys() & says.keys():
+            of_track[AXES[name]] = says[name]
+        log_ratios = np.where(STATES[:, TRACK] == 1, STATES @ of_track, 0.0)
+        log_joint = np.log(self.joint.ravel()) + log_ratios
+        joint = np.exp(log_joint - log_joint.max())
+        self.joint = (joint / joint.sum()).reshape(self.joint.shape)
+
+    @property
+    def _chains(self) -> Array:
+        return np.asarray(self.joint.ravel() @ STATES)
+
+
+def evidence_of(cue: str, misfit: Misfit, *, begun: bool = True) -> Array:
+    """Log likelihood ratios e_g of valid against not, (G,), equation (2), nats.
+
+    Args:
+        cue: by name, or the outline.
+        misfit: of its groups.
+        begun: whether there was an image before.
+    """
+    certainty = np.minimum(misfit.counts / ENOUGH, 1.0)
+    e = np.asarray(NATS * certainty * (UNDECIDED[cue] - misfit.shares))
+    return _mixed(PLACED, e) - _mixed(1.0 - PLACED, e) if cue in BY_PART and begun else e
+
+
+def moved_on(p: Array, dt: float) -> Array:
+    """Probabilities of being valid, dt seconds later, equation (1)."""
+    total = FAILS + RECOVERS
+    return np.asarray(p - math.expm1(-total * dt) * (RECOVERS / total - p))
+
+
+def _mixed(p: Array | float, evidence: Array) -> Array:
+    """log(p exp(e) + 1 - p)."""
+    return np.asarray(np.logaddexp(np.log(p) + evidence, np.log1p(-p)))
+
+
+def _updated(p: Array, evidence: Array) -> Array:
+    """Probabilities after log likelihood ratios."""
+    log_odds = np.log(p) - np.log1p(-p) + evidence
+    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * log_odds)))

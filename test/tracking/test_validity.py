@@ -1,0 +1,241 @@
+"""What is believed of cues and of a track, against what hidden Markov models say."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from hmt_ros.image.texture import Textures
+from hmt_ros.inference.error_model import share_of_time
+from hmt_ros.tracking.misfit import Misfit, of_segments
+from hmt_ros.tracking.validity import (
+    DEPTH,
+    ENOUGH,
+    FAILS,
+    KEYPOINTS,
+    MOST,
+    NATS,
+    OUTLINE,
+    PLACED,
+    RECOVERS,
+    SEGMENTS,
+    SILHOUETTE,
+    TAU,
+    UNDECIDED,
+    USUAL,
+    Validity,
+    evidence_of,
+    moved_on,
+)
+
+RATE = 30.0
+
+
+def whole(share, groups=1):
+    """A cue of which so much is not explained."""
+    return Misfit(np.full(groups, share), np.full(groups, ENOUGH))
+
+
+def seconds(validity, misfits, until, rate=RATE, longest=5.0):
+    """Time for which images say the same until something is true, s; NaN: it does not come."""
+    for i in range(int(longest * rate)):
+        if until(validity):
+            return i / rate
+        validity.predict(1.0 / rate)
+        validity.update(misfits, 1.0 / rate)
+    return np.nan
+
+
+def test_between_images_it_is_the_chain_of_the_rates():
+    rates = np.array([[-FAILS, FAILS], [RECOVERS, -RECOVERS]])
+    for dt in (0.0, 1 / 30, 0.5, 1000.0):
+        wanted = np.array([0.8, 0.2]) @ expm(rates * dt)
+        assert moved_on(np.array([0.8]), dt) == pytest.approx(wanted[0])
+    assert moved_on(moved_on(np.array([0.1]), 0.2), 0.3) == pytest.approx(
+        moved_on(np.array([0.1]), 0.5)
+    )
+
+
+def test_images_are_those_of_a_hidden_markov_model():
+    """The joint states of the track, the silhouette and three groups of keypoints, written out."""
+    rng = np.random.default_rng(0)
+    rates = np.array([[-RECOVERS, RECOVERS], [FAILS, -FAILS]])
+    states = np.array(list(itertools.product((0, 1), repeat=5)))
+    usual = np.array([1.0 - USUAL, USUAL])
+    p = usual[states].prod(1)
+    validity = Validity(2)
+    for dt in (0.03, 0.1, 0.4, 0.03, 2.0):
+        one = expm(rates * dt)
+        p = p @ np.kron(one, np.kron(one, np.kron(one, np.kron(one, one))))
+        shares = rng.uniform(0.1, 0.6, 5)
+        counts = np.full(3, ENOUGH)
+        misfits = {
+            OUTLINE: whole(shares[0]),
+            SILHOUETTE: whole(shares[1]),
+            KEYPOINTS: Misfit(shares[2:], counts),
+        }
+        each = [evidence_of(name, misfit) for name, misfit in misfits.items()]
+        says = np.clip(share_of_time(dt, TAU) * np.concatenate(each), -MOST, MOST)
+        track, cues = states[:, 0], states[:, 1:]
+        p *= np.exp(track * (says[0] + cues @ says[1:]))
+        p /= p.sum()
+        validity.predict(dt)
+        validity.update(misfits, dt)
+        assert validity.track == pytest.approx(p @ track)
+        assert validity.cues[SILHOUETTE] == pytest.approx(p @ cues[:, :1])
+        assert validity.cues[KEYPOINTS] == pytest.approx(p @ cues[:, 1:])
+
+
+def test_a_search_leaves_what_is_known_of_the_cues():
+    validity = Validity(1)
+    for _ in range(9):
+        validity.predict(0.1)
+        validity.update({SILHOUETTE: whole(0.9), OUTLINE: whole(0.0)}, 0.1)
+    before = validity.cues[SILHOUETTE].copy()
+    validity.search()
+    assert validity.track == pytest.approx(USUAL)
+    assert validity.cues[SILHOUETTE] == pytest.approx(before)
+
+
+def test_what_measurements_say():
+    few = Misfit(np.array([0.0, 1.0, 1.0]), np.array([0, 1, 100]))
+    undecided = UNDECIDED[KEYPOINTS]
+    wanted = NATS * np.array([0.0, (undecided - 1) / ENOUGH, undecided - 1])
+    assert evidence_of(KEYPOINTS, few, begun=False) == pytest.approx(wanted)
+    # A part may be misplaced in a mode that is right.
+    most = np.log(PLACED / (1 - PLACED))
+    for e in (1e3, -1e3):
+        counts, share = np.array([ENOUGH]), undecided - e / NATS
+        found = evidence_of(KEYPOINTS, Misfit(np.array([share]), counts))
+        assert found == pytest.approx(np.sign(e) * most)
+
+
+def test_depths_follow_given_the_track():
+    validity = Validity(1)
+    p, q, dt = USUAL, USUAL, 0.1
+    e = share_of_time(dt, TAU) * NATS * (UNDECIDED[DEPTH] - 0.3)
+    validity.update({DEPTH: whole(0.3)}, dt)
+    valid = p * (q * np.exp(e) + 1 - q)
+    assert validity.cues[DEPTH] == pytest.approx(valid / (valid + 1 - p))
+    assert validity.track == pytest.approx(q)
+
+
+def test_one_image_says_no_more_than_it_can():
+    validity = Validity(1)
+    validity.update({OUTLINE: whole(0.0)}, np.inf)
+    odds = validity.track / (1 - validity.track)
+    assert np.log(odds) == pytest.approx(np.log(RECOVERS / FAILS) + MOST)
+
+
+@pytest.mark.parametrize('rate', [60.0, 15.0, 5.0])
+def test_what_a_second_says_does_not_depend_on_the_rate(rate):
+    """But for the image in which it happens."""
+    for cue in (DEPTH, SILHOUETTE):
+        validity, usual = Validity(2), Validity(2)
+        for each, r in ((validity, rate), (usual, RATE)):
+            seconds(each, {cue: whole(0.0)}, lambda v: False, r, longest=2.0)
+        bad = {cue: whole(0.8), KEYPOINTS: whole(0.0, 3)}
+        times = [
+            seconds(each, bad, lambda v, cue=cue: not v.believes(cue), r)
+            for each, r in ((validity, rate), (usual, RATE))
+        ]
+        assert times[0] == pytest.approx(times[1], abs=1.5 / min(rate, RATE))
+        assert 0.05 < times[1] < 1.0
+
+
+@pytest.mark.parametrize('cue', [SILHOUETTE, DEPTH, KEYPOINTS])
+def test_a_cue_is_believed_again_within_a_second(cue):
+    groups = len(Validity(1).cues[cue])
+    validity = Validity(1)
+    other = KEYPOINTS if cue != KEYPOINTS else SILHOUETTE
+    fine = {other: whole(0.0, len(validity.cues[other]))}
+    bad = {cue: whole(1.0, groups)} | fine
+    seconds(validity, bad, lambda v: False, longest=10.0)
+    assert not validity.believes(cue)
+    assert not validity.lost
+    good = {cue: whole(0.0, groups)} | fine
+    assert seconds(validity, good, lambda v: v.believes(cue)) < 1.0
+
+
+def test_groups_fail_one_by_one():
+    """A detector whose arms are wrong, and a segment in the colours of the room."""
+    validity = Validity(3)
+    misfits = {
+        KEYPOINTS: Misfit(np.array([0.0, 1.0, 0.0]), np.full(3, 4)),
+        SEGMENTS: Misfit(np.array([0.0, 0.0, 1.0]), np.array([9, 0, 9])),
+        SILHOUETTE: whole(0.1),
+    }
+    seconds(validity, misfits, lambda v: False, longest=2.0)
+    beliefs = validity.beliefs
+    assert (beliefs.keypoints > 0.9).tolist() == [True, False, True]
+    assert beliefs.keypoints[1] < 0.3
+    assert (beliefs.segments > 0.9).tolist() == [True, True, False]
+    assert beliefs.segments[2] < 0.3
+    assert beliefs.silhouette > 0.9
+    assert not validity.lost
+
+
+@pytest.mark.parametrize('rate', [30.0, 10.0, 3.0])
+@pytest.mark.parametrize(
+    'cues', [(KEYPOINTS,), (SILHOUETTE, OUTLINE), (KEYPOINTS, SILHOUETTE, OUTLINE)]
+)
+def test_a_track_is_lost_when_no_cue_is_explained(rate, cues):
+    """And then it is the track that is not believed, not the cues."""
+    validity = Validity(1)
+    sizes = {KEYPOINTS: 3}
+    fine, gone = ({name: whole(share, sizes.get(name, 1)) for name in cues} for share in (0.0, 1.0))
+    seconds(validity, fine, lambda v: False, rate, longest=2.0)
+    assert 0.05 < seconds(validity, gone, lambda v: v.lost, rate) < 0.2 + 3.0 / rate
+    assert validity.lost
+    assert all(validity.cues[cue].min() > 0.4 for cue in gone if cue != OUTLINE)
+    validity.search()
+    assert not validity.lost
+    seconds(validity, fine, lambda v: False, longest=0.2)
+    assert validity.track > 0.95
+
+
+@pytest.mark.parametrize(('right', 'wrong'), [(SILHOUETTE, KEYPOINTS), (KEYPOINTS, SILHOUETTE)])
+def test_one_cue_that_is_explained_keeps_a_track(right, wrong):
+    validity = Validity(1)
+    sizes = {name: len(p) for name, p in validity.cues.items()}
+    misfits = {right: whole(0.1, sizes[right]), wrong: whole(1.0, sizes[wrong])}
+    assert np.isnan(seconds(validity, misfits, lambda v: v.lost))
+    assert validity.believes(right)
+    assert not validity.believes(wrong)
+
+
+def test_nothing_measured_says_nothing():
+    validity = Validity(2)
+    nothing = Misfit(np.ones(3), np.zeros(3))
+    before = validity.track
+    validity.update({KEYPOINTS: nothing}, 0.1)
+    assert validity.track == pytest.approx(before)
+    assert validity.cues[KEYPOINTS] == pytest.approx(Validity(2).cues[KEYPOINTS])
+
+
+def seen(segments, pixels):
+    n = len(segments)
+    return Textures(
+        np.array([n]), np.array([segments]), np.zeros((1, n, 3)), np.array([pixels], float),
+        np.zeros((1, n, 3)),
+    )  # fmt: skip
+
+
+def test_points_of_a_segment_that_are_no_foreground():
+    """Ten points of segment 0 in column 1, ten of segment 2 in column 3, of which half are seen."""
+    points = [(1, i) for i in range(10)] + [(3, i) for i in range(10)]
+    foreground = np.zeros((10, 5), dtype=bool)
+    foreground[:, 1], foreground[:5, 3] = True, True
+    shares, counts = of_segments(seen([0] * 10 + [2] * 10, points), 0, foreground, 3)
+    assert shares.tolist() == [0.0, 0.0, 0.5]
+    assert counts.tolist() == [10.0, 0.0, 10.0]
+
+
+def test_points_outside_the_image_say_nothing():
+    beside = seen([0, 0], [(-3, 0), (7, 0)])
+    assert of_segments(beside, 0, np.zeros((4, 4), dtype=bool), 1).counts.tolist() == [0.0]
+    nothing = seen([], np.zeros((0, 2)))
+    assert of_segments(nothing, 0, np.zeros((4, 4), dtype=bool), 1).counts.tolist() == [0.0]
