@@ -26,7 +26,7 @@ class Constants(NamedTuple):
         parents: (S,) segment above; -1: none.
         dof_segments, dof_is_rotation: (d,).
         moves: (S, d) whether a degree of freedom moves a segment.
-        weights: (4,) of the terms: upright, floor, balance, contact; 0: off.
+        weights: (3,) of the terms: upright, floor, balance; 0: off.
         up: (3,) against gravity.
         height: of the camera over the floor, m.
         upright: (U,) segments that are upright.
@@ -38,8 +38,6 @@ class Constants(NamedTuple):
         shares, centres: (S,), (S, 3) masses of the segments and their places, m.
         margin: distance from the support that costs nothing, m.
         vertical: what the uncertain vertical adds to the deviation of the balance, m.
-        per_rest, per_rest_height: 1 / deviation of a resting point from its anchor and from the
-            height of the floor, 1/m; 0: unknown.
         lean_tails, tails: degrees of freedom of the robust costs, of the lean and of the others.
     """
 
@@ -60,25 +58,22 @@ class Constants(NamedTuple):
     centres: Array
     margin: float
     vertical: float
-    per_rest: float
-    per_rest_height: float
     lean_tails: float
     tails: float
 
 
 @njit(cache=True, nogil=True)
 def add_ground_energies(  # type: ignore[no-untyped-def]
-    c, contact, anchors, balance_sigma, grounded, columns, origins, axes, dof_origins,
-    terms, gradient, hessian,
+    c, balance_sigma, grounded, columns, origins, axes, dof_origins, terms, gradient, hessian,
 ):  # fmt: skip
     """Adds the terms of N poses.
 
     Args:
         c: the constants.
-        contact, anchors, balance_sigma, grounded: of each pose, as in `Stance`.
+        balance_sigma, grounded: of each pose, as in `Stance`.
         columns, origins: (N, S, 3, 3), (N, S, 3) frames of the segments.
         axes, dof_origins: (N, d, 3) of the degrees of freedom.
-        terms: (N, 4) is added to.
+        terms: (N, 3) is added to.
         gradient, hessian: (N, d), (N, d, d) are added to; of no length: not wanted.
     """
     count, d, points = len(columns), axes.shape[1], len(c.soles)
@@ -90,7 +85,7 @@ def add_ground_energies(  # type: ignore[no-untyped-def]
     for n in range(count):
         if c.weights[0] > 0:
             terms[n, 0] += _upright(c, columns[n], axes[n], row, n, wanted, gradient, hessian)
-        if c.weights[1] + c.weights[2] + c.weights[3] == 0:
+        if c.weights[1] + c.weights[2] == 0:
             continue
         for p in range(points):
             s = c.soles[p]
@@ -107,14 +102,6 @@ def add_ground_energies(  # type: ignore[no-untyped-def]
                 c, columns[n], origins[n], axes[n], dof_origins[n], place, moved, mass, moment,
                 balance_sigma[n], grounded[n], row, n, wanted, gradient, hessian,
             )  # fmt: skip
-        if c.weights[3] > 0:
-            for p in range(points):
-                if contact[n, p] > 0:
-                    high = _height(c.up, c.height, place[p]) * c.per_rest_height
-                    terms[n, 3] += _contact(
-                        c.weights[3], c.up, c.per_rest, c.per_rest_height, contact[n, p],
-                        anchors[n, p], high, place[p], moved[p], row, n, wanted, gradient, hessian,
-                    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
@@ -214,28 +201,6 @@ def _floor(c, place, moved, row, n, wanted, gradient, hessian):  # type: ignore[
             k = c.weights[1] * factor
             _add(row, k * r, k, gradient[n], hessian[n])
     return total
-
-
-@njit(cache=True, nogil=True)
-def _contact(  # type: ignore[no-untyped-def]
-    weight, up, per, per_height, probability, anchor, high, place, moved, row, n, wanted, gradient,
-    hessian,
-):  # fmt: skip
-    """Minus the logarithm of a mixture: the point rests, or it does not."""
-    square = high * high
-    for k in range(3):
-        square += ((place[k] - anchor[k]) * per) ** 2
-    rests, free = probability * np.exp(-0.5 * square), 1.0 - probability
-    if wanted:
-        k = weight * rests / (rests + free)
-        for i in range(3):
-            for j in range(len(row)):
-                row[j] = moved[i, j] * per
-            _add(row, k * (place[i] - anchor[i]) * per, k, gradient[n], hessian[n])
-        if per_height > 0:
-            _project(up, moved, per_height, row)
-            _add(row, k * high, k, gradient[n], hessian[n])
-    return -weight * np.log(rests + free)
 
 
 @njit(cache=True, nogil=True)

@@ -1,15 +1,13 @@
-"""Energy of poses against gravity and a floor: upright, above the floor, balanced, feet at rest.
+"""Energy of poses against gravity and a floor: upright, above the floor, balanced.
 
     E(x) = w_u sum_s rho(lean_s) + w_f sum_p rho([-h_p]+ / sigma_f)
-         + w_b g rho([|c - q| - m]+ / sigma_b) - w_c sum_p log(1 - P_p + P_p exp(-S_p / 2))
+         + w_b g rho([|c - q| - m]+ / sigma_b)
     rho(r) = (nu + k) / 2 log(1 + r^2 / nu),     k the dimension of r
 
 `lean_s` is the direction of gravity in the frame of pelvis or trunk, less that of somebody
 upright; h_p the height of a point of the sole over the floor; c the centre of mass and q the
-nearest point of its support, both seen from above; S_p the squared distance of a point of the sole
-from where it rested before, and from the floor, in standard deviations. All tails are heavy: people
-bend, jump, lean on things and slide, and of a contact both hypotheses count, that the point rests
-with the probability P_p and that it does not.
+nearest point of its support, both seen from above. All tails are heavy: people bend, jump and lean
+on things.
 """
 
 from __future__ import annotations
@@ -42,8 +40,6 @@ SUPPORT_MARGIN, BALANCE_SIGMA = 0.05, 0.06
 # Height of the centre of mass over the floor, of a person of 1.75 m, m: it turns an error of the
 # vertical into one of the balance.
 MASS_HEIGHT = 1.0
-# How far a point of the sole that rests moves in an image, and how high over the floor it is, m.
-REST_SIGMA, REST_HEIGHT_SIGMA = 0.015, 0.03
 # Degrees of freedom nu of the heavy tails, of the lean and of the other terms.
 LEAN_TAILS, TAILS = 2.0, 4.0
 
@@ -58,26 +54,22 @@ class GroundSettings:
         floor_weight: Factor on the energy of feet below the floor; 0 switches it off.
         balance_weight: Factor on the energy of a centre of mass that is not over the feet; 0
             switches it off.
-        contact_weight: Factor on the energy of resting feet that move; 0 switches it off.
     """
 
     upright_weight: float = 1.0
     floor_weight: float = 1.0
     balance_weight: float = 1.0
-    contact_weight: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ('upright_weight', 'floor_weight', 'balance_weight', 'contact_weight'):
+        for name in ('upright_weight', 'floor_weight', 'balance_weight'):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise ValueError(f'ground.{name} must be a number of at least 0, saw {value}')
 
     @property
     def weights(self) -> Array:
-        """(4,) in the order of the attributes."""
-        return np.array(
-            [self.upright_weight, self.floor_weight, self.balance_weight, self.contact_weight]
-        )
+        """(3,) in the order of the attributes."""
+        return np.array([self.upright_weight, self.floor_weight, self.balance_weight])
 
     @property
     def on(self) -> bool:
@@ -104,30 +96,21 @@ class FloorPlane:
 
 @dataclass(frozen=True, eq=False)
 class Stance:
-    """How K poses stood in the image before: what contact and balance of their successors refer to.
+    """How K poses stood in the image before: what the balance of their successors refers to.
 
     Attributes:
-        contact: (K, P) probability that a point of the soles rests until the next image.
-        anchors: (K, P, 3) where it rests, camera frame, m.
         balance_sigma: (K,) deviation of the centre of mass from the support, m, that motion allows.
         grounded: (K,) factor on the balance, from 0 in the air to 1 on the floor.
     """
 
-    contact: Array
-    anchors: Array
     balance_sigma: Array
     grounded: Array
 
-    @property
-    def of_first(self) -> Stance:
-        """What any successor of the first pose may do: its balance, and no contact."""
-        first = self[np.zeros(1, dtype=np.intp)]
-        return replace(first, contact=np.zeros_like(first.contact))
+    def __getitem__(self, rows: Index | slice) -> Stance:
+        return Stance(self.balance_sigma[rows], self.grounded[rows])
 
-    def __getitem__(self, rows: Index) -> Stance:
-        return Stance(
-            self.contact[rows], self.anchors[rows], self.balance_sigma[rows], self.grounded[rows]
-        )
+
+STANDING = Stance(np.array([BALANCE_SIGMA]), np.ones(1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +121,7 @@ class GroundTerm:
         body: of the poses.
         settings: weights; a weight of 0 leaves a term out.
         plane: gravity and floor.
-        stance: of each problem; None: nothing rests, and all stand still.
+        stance: of each problem; None: all stand still.
     """
 
     body: Body
@@ -163,30 +146,23 @@ class GroundTerm:
     def parts(self, frames: Frames, rows: Index) -> dict[str, Array]:
         """The terms one by one: name -> (N,)."""
         terms, _, _ = self._evaluated(frames, rows, False)
-        return dict(zip(('upright', 'floor', 'balance', 'contact'), terms.T, strict=True))
+        return dict(zip(('upright', 'floor', 'balance'), terms.T, strict=True))
 
     def _evaluated(
         self, frames: Frames, rows: Index, derivatives: bool
     ) -> tuple[Array, Array, Array]:
         n, d = frames.count, self.body.dimension
-        terms = np.zeros((n, 4))
+        terms = np.zeros((n, 3))
         gradient = np.zeros((n if derivatives else 0, d))
         hessian = np.zeros((n if derivatives else 0, d, d))
-        stance = self.stance or self._standing
+        stance = self.stance or STANDING
         # One stance is that of all problems.
         stance = stance[rows if len(stance.grounded) > 1 else np.zeros(n, dtype=np.intp)]
         add_ground_energies(
-            self._constants, stance.contact, stance.anchors, stance.balance_sigma, stance.grounded,
+            self._constants, stance.balance_sigma, stance.grounded,
             *frames.by_pose(), *frames.dofs_by_pose(), terms, gradient, hessian,
         )  # fmt: skip
         return terms, gradient, hessian
-
-    @cached_property
-    def _standing(self) -> Stance:
-        points = len(soles(self.body))
-        return Stance(
-            np.zeros((1, points)), np.zeros((1, points, 3)), np.array([BALANCE_SIGMA]), np.ones(1)
-        )
 
     @cached_property
     def _constants(self) -> Constants:
@@ -200,7 +176,6 @@ class GroundTerm:
         weights[2] *= mass.known
         lean = np.hypot(upright.sigma, plane.up_sigma)
         floor = float(np.hypot(FLOOR_SIGMA, plane.height_sigma))
-        rest_height = float(np.hypot(REST_HEIGHT_SIGMA, plane.height_sigma))
         return Constants(
             np.array(skeleton.parents, dtype=np.int64),
             np.array(skeleton.dof_segments, dtype=np.int64),
@@ -219,8 +194,6 @@ class GroundTerm:
             mass.centres,
             SUPPORT_MARGIN,
             plane.up_sigma * MASS_HEIGHT * body.scale,
-            1.0 / REST_SIGMA,
-            0.0 if plane.height is None else 1.0 / rest_height,
             LEAN_TAILS,
             TAILS,
         )

@@ -70,6 +70,13 @@ def soles(body: Body) -> Soles:
     return Soles(np.array(segments, dtype=np.intp), np.array(local), feet)
 
 
+def sole_points(body: Body, poses: Array) -> Array:
+    """Points (N, P, 3) of the soles of poses (N, d), camera frame, m."""
+    feet = soles(body)
+    points = forward(body.skeleton, poses).points(feet.segments, feet.local)
+    return np.ascontiguousarray(points.transpose(2, 0, 1))
+
+
 def _down_and_ahead(body: Body, ankle: int, toe: int, carrier: int) -> tuple[Array, Array]:
     """Unit vectors towards the sole and the toe, in the frame of the foot.
 

@@ -58,6 +58,7 @@ from hmt_ros.tracking.proposals.reversals import Reversals
 from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
+from hmt_ros.tracking.stance import stance_of
 from hmt_ros.tracking.validity import (
     DEPTH,
     ENOUGH,
@@ -231,7 +232,6 @@ class MixtureFilter:
         self._modes = motion.modes(self.body, self.modes)
         self._facing.carry(self.body, self._modes.poses)
         self.contacts.carry(motion)
-        self._posterior.stance = self.contacts.stance
 
     def propagate(
         self, observation: Observation, dt: float, expected: PosePrediction | None
@@ -428,7 +428,7 @@ class MixtureFilter:
             self.contacts.begin(body, plane, modes)
         else:
             self.contacts.update(body, plane, modes, dt, still=ground.still)
-        self._posterior.stance = self.contacts.stance
+        self._posterior.stance = stance_of(body, plane, modes)
 
     # What is learned.
 

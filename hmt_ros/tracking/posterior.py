@@ -132,7 +132,7 @@ class Posterior:
         ground = self._ground
         if ground is None:
             return self.extra
-        stance = None if self.stance is None else self.stance.of_first
+        stance = None if self.stance is None else self.stance[:1]
         return (*self.extra, ground.following(stance))
 
     @property

@@ -11,19 +11,21 @@ from hmt_ros.body import load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.ground_terms import GroundSettings
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.soles import soles
+from hmt_ros.body.soles import sole_points, soles
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import Observation
+from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.tracking import KnownGround, Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.contact import FootContacts
 from hmt_ros.tracking.ground import LEAST_UP_SIGMA, UP_SIGMA, GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.posterior import Posterior
+from hmt_ros.tracking.stance import stance_of
 
 RATE = 30.0
 PITCHED = Viewpoint(distance=3.5, height=1.4, pitch=np.radians(20.0))
-OFF = GroundSettings(0.0, 0.0, 0.0, 0.0)
+OFF = GroundSettings(0.0, 0.0, 0.0)
 
 
 @pytest.fixture(scope='module')
@@ -62,6 +64,18 @@ def after(estimator: GroundEstimator, body, poses: np.ndarray) -> GroundEstimato
     for pose in poses:
         estimator.update(body, single(pose), 1.0, 1.0 / RATE)
     return estimator
+
+
+def contacts_of(body, plane, poses, rate: float, *, still: bool = True) -> list[list[float]]:
+    """Probabilities that the left and the right foot rest, image by image."""
+    contacts, found = FootContacts(), []
+    for t, pose in enumerate(poses):
+        if t == 0:
+            contacts.begin(body, plane, single(pose))
+        else:
+            contacts.update(body, plane, single(pose), 1.0 / rate, still=still)
+        found.append(list(contacts.by_foot().values()))
+    return found
 
 
 def degrees_between(a: np.ndarray, b: np.ndarray) -> float:
@@ -154,62 +168,59 @@ def test_newer_directions_replace_the_known_one():
         estimator.set_gravity([0.0, 0.0, 0.0])
 
 
-def test_contacts_are_those_of_a_walker(body, walking):
+@pytest.mark.parametrize('rate', [10.0, 30.0, 60.0])
+def test_contacts_are_those_of_a_walker(body, rate):
     """Points of the soles that rest in the motion rest, and those that swing do not."""
-    estimator, contacts, found = (
-        GroundEstimator(KnownGround(up_of(PITCHED), 1.4)),
-        FootContacts(),
-        [],
-    )
-    for t, pose in enumerate(walking):
-        velocity = RATE * (pose - walking[max(t - 1, 0)])
-        contacts.update(body, estimator.plane, single(pose, velocity), 1.0 / RATE, still=True)
-        found.append([contacts.by_foot()[f'{side}_foot'] for side in ('left', 'right')])
-    rests = np.array(found)[5:] > 0.5
-    ankles = body.joint_positions(walking)[
-        :, body.skeleton.joint_index(('left_ankle', 'right_ankle'))
-    ]
-    toes = body.joint_positions(walking)[:, body.skeleton.joint_index(('left_toe', 'right_toe'))]
-    speed = RATE * np.minimum(
-        *(np.linalg.norm(np.diff(x, axis=0), axis=2)[4:] for x in (ankles, toes))
-    )
+    poses = procedural_motion('walk', body, 3.0, rate, 1, viewpoint=PITCHED)
+    plane = GroundEstimator(KnownGround(up_of(PITCHED), 1.4)).plane
+    found = contacts_of(body, plane, poses, rate)
+    # Each foot moves as its slowest point does.
+    points = sole_points(body, poses).reshape(len(poses), 2, 2, 3)
+    speed = rate * np.linalg.norm(np.diff(points, axis=0), axis=3).min(2)
+    late = slice(round(0.15 * rate), None)
+    rests, speed = (np.array(found)[1:] > 0.5)[late], speed[late]
     stands, swings = speed < 0.05, speed > 0.8
-    assert stands.sum() > 40
-    assert swings.sum() > 30
+    assert stands.mean() > 0.2
+    assert swings.mean() > 0.2
     assert rests[stands].mean() > 0.9
-    assert rests[swings].mean() < 0.1
+    assert rests[swings].mean() < 0.2
 
 
-def test_anchors_rest_with_the_foot(body, reaching):
-    """Noise of the pose is averaged in the anchors of a foot that stands."""
-    estimator, contacts = GroundEstimator(KnownGround(up_of(PITCHED), 1.4)), FootContacts()
-    rng, feet = np.random.default_rng(0), soles(body)
-    moved = []
-    for pose in reaching[:45]:
-        noisy = pose.copy()
-        noisy[:3] += 0.008 * rng.normal(size=3)
-        contacts.update(body, estimator.plane, single(noisy), 1.0 / RATE, still=True)
-        points = forward(body.skeleton, pose[None]).points(feet.segments, feet.local)
-        moved.append(contacts.stance.anchors[0] - points[..., 0])
-    spread = np.std(np.array(moved)[20:], axis=0)
-    assert spread.max() < 0.005
+@pytest.mark.parametrize('rate', [3.0, 10.0, 30.0, 120.0])
+def test_feet_rest_at_any_rate(body, rate):
+    """The poses of somebody who stands err from image to image as they do in tracks."""
+    poses = procedural_motion('reach', body, 4.0, rate, 1, viewpoint=PITCHED)
+    rng, kept = np.random.default_rng(0), np.exp(-1.0 / (rate * ERRORS['image'].time))
+    error = 0.008 * rng.normal(size=3)
+    for pose in poses:
+        pose[:3] += error
+        error = kept * error + 0.008 * np.sqrt(1.0 - kept**2) * rng.normal(size=3)
+    plane = GroundEstimator(KnownGround(up_of(PITCHED), 1.4)).plane
+    found = np.array(contacts_of(body, plane, poses, rate))
+    assert (found[len(found) // 4 :] > 0.5).mean() > 0.9
 
 
-def test_nothing_rests_before_a_camera_that_moves(body, reaching):
-    estimator, contacts = GroundEstimator(), FootContacts()
-    for pose in reaching[:5]:
-        contacts.update(body, estimator.plane, single(pose), 1.0 / RATE, still=False)
-    assert (contacts.stance.contact[0] == 0.0).all()
+def test_before_a_camera_that_moves_only_heights_tell_of_contact(body, reaching):
+    plane = GroundEstimator(KnownGround(up_of(PITCHED), 1.4)).plane
+    pose, slid, aloft = reaching[0].copy(), reaching[0].copy(), reaching[0].copy()
+    slid[:3] += 0.3 * np.cross(up_of(PITCHED), [0.0, 0.0, 1.0])
+    aloft[:3] += 0.3 * up_of(PITCHED)
+    rests = {
+        (name, still): min(contacts_of(body, plane, [pose, other], RATE, still=still)[1])
+        for name, other in (('stays', pose), ('slides', slid), ('rises', aloft))
+        for still in (True, False)
+    }
+    assert rests['slides', True] < 0.5 < rests['stays', True]
+    assert rests['slides', False] == pytest.approx(rests['stays', False])
+    assert rests['rises', False] < 0.5 < rests['slides', False]
 
 
 def test_who_is_in_the_air_is_not_out_of_balance(body, reaching):
-    estimator, contacts = GroundEstimator(KnownGround(up_of(PITCHED), 1.4)), FootContacts()
-    contacts.begin(body, estimator.plane, single(reaching[0]))
-    assert contacts.stance.grounded[0] > 0.95
+    plane = GroundEstimator(KnownGround(up_of(PITCHED), 1.4)).plane
+    assert stance_of(body, plane, single(reaching[0])).grounded[0] > 0.95
     aloft = reaching[0].copy()
     aloft[:3] += 0.4 * up_of(PITCHED)
-    contacts.begin(body, estimator.plane, single(aloft))
-    assert contacts.stance.grounded[0] < 0.01
+    assert stance_of(body, plane, single(aloft)).grounded[0] < 0.01
 
 
 def test_weights_of_zero_leave_the_terms_out(body, camera, reaching):
