@@ -33,9 +33,10 @@ from hmt_ros.tracking.hypotheses import Modes
 LONGEST_GUESS = 0.5
 # Most that the entries of R R' differ from those of the identity.
 NOT_ORTHOGONAL = 1e-3
-# Shift of the still scene above which a background is that of another view, px, and the distance at
-# which translations are turned into pixels, m.
-SHIFTED, SCENE_DISTANCE = 2.0, 3.0
+# Shift of the still scene above which a background is that of another view, px.
+SHIFTED = 2.0
+# Distance of people and of the scene, where it is unknown, m.
+USUAL_DISTANCE = 3.0
 
 
 class CameraPose(NamedTuple):
@@ -79,7 +80,7 @@ class CameraPose(NamedTuple):
         """About how far the images of still points are apart from the two poses, px."""
         angle = Rotation.from_matrix(self.rotation.T @ other.rotation).magnitude()
         apart = float(np.linalg.norm(self.position - other.position))
-        return float(max(camera.fx, camera.fy) * (angle + apart / SCENE_DISTANCE))
+        return float(max(camera.fx, camera.fy) * (angle + apart / USUAL_DISTANCE))
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,8 +27,8 @@ from hmt_ros.inference.arrays import Array, Mask
 
 # Probability v that what an image says of the way to face is about the person.
 VALID = 0.9
-# Log odds of a way to face that a start does not contain, and the largest that are counted, nats.
-ABSENT, MOST = -10.0, 10.0
+# Largest log odds that are counted, nats: those against a way that a start does not contain.
+MOST = 10.0
 
 
 class Facing:
@@ -40,19 +40,19 @@ class Facing:
     """
 
     def __init__(self) -> None:
-        self.log_odds = ABSENT
+        self.log_odds = -MOST
         self.back: Mask = np.zeros(0, dtype=np.bool_)
         self._lead: Array | None = None
 
     def start(self, body: Body, poses: Array, log_weights: Array) -> None:
         """Takes in poses (N, d) at the start of a track, with their log weights (N,)."""
-        self.log_odds = ABSENT
+        self.log_odds = -MOST
         self._lead = poses[np.argmax(log_weights)]
         if not body.trunk_pairs:
             return
         back = faces_back(body, poses, self._lead)
         if back.any():
-            self.log_odds = max(float(log_weights[back].max() - log_weights[~back].max()), ABSENT)
+            self.log_odds = max(float(log_weights[back].max() - log_weights[~back].max()), -MOST)
 
     def lacks_a_way(self, log_weights: Array) -> bool:
         """Whether the modes, log weights (K,), have lost one of the two ways.

@@ -20,7 +20,7 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mass import masses
 from hmt_ros.body.soles import soles
 from hmt_ros.inference.arrays import Array
-from hmt_ros.tracking.camera_motion import CameraMotion
+from hmt_ros.tracking.camera_motion import USUAL_DISTANCE, CameraMotion
 from hmt_ros.tracking.hypotheses import Modes
 
 __all__ = ['Ground', 'GroundEstimator', 'GroundSettings', 'KnownGround']
@@ -32,18 +32,16 @@ GIVEN_UP_SIGMA, GIVEN_HEIGHT_SIGMA = 0.01, 0.02
 IMAGE_UP = np.array([0.0, -1.0, 0.0])
 UP_SIGMA, MOST_TILT = np.radians(15.0), np.radians(35.0)
 # Deviation of the axis of a standing body from the vertical, across and along the line of sight,
-# rad, and the time for which its error lasts, s.
+# rad, and the time for which its error lasts, s. That of the vertical never undercuts the first.
 AXIS_SIGMA, AXIS_DEPTH_SIGMA, AXIS_TIME = np.radians(4.0), np.radians(9.0), 1.0
-# Deviation of the vertical that is never undercut, rad, and how fast it is forgotten, rad/sqrt(s).
-LEAST_UP_SIGMA, UP_DRIFT = np.radians(4.0), np.radians(1.0)
+# How fast the vertical is forgotten, rad/sqrt(s).
+UP_DRIFT = np.radians(1.0)
 # Time over which the lowest sole is followed, s; its quantile that is the floor; deviations of the
 # floor from it, and of the first image, m.
 LEVEL_TIME, LEVEL_QUANTILE = 2.0, 0.75
 LEVEL_SIGMA, FIRST_LEVEL_SIGMA = 0.04, 0.10
 # Change of the direction of gravity from image to image above which the camera turns, rad.
 TURNED = 0.003
-# Distance of a person before the first image, m.
-USUAL_DISTANCE = 3.0
 
 
 @dataclass(frozen=True)
@@ -115,7 +113,7 @@ class GroundEstimator:
     time, and jumps at times, so it is a high quantile of the last seconds. The vertical is near
     that of the image, and near the axis of a body that stands, from the middle of the feet to the
     centre of mass. Errors of that axis last, so its images count as one per `AXIS_TIME`, and the
-    deviation never goes below `LEAST_UP_SIGMA`.
+    deviation never goes below `AXIS_SIGMA`.
 
     Args:
         known: what is known; None: nothing.
@@ -227,7 +225,7 @@ class GroundEstimator:
             mean = np.cos(MOST_TILT) * IMAGE_UP + np.sin(MOST_TILT) * aside
         self._mean = mean
         values, vectors = np.linalg.eigh(covariance - gain @ covariance)
-        values = np.clip(values, LEAST_UP_SIGMA**2, UP_SIGMA**2)
+        values = np.clip(values, AXIS_SIGMA**2, UP_SIGMA**2)
         self._covariance = (vectors * values) @ vectors.T
 
     def _conclude(self) -> None:

@@ -14,7 +14,7 @@ from hmt_ros.body.mirror import (
     root_rotation_dofs,
     root_rotations,
 )
-from hmt_ros.tracking.classes import ABSENT, MOST, VALID, Facing, believed, log_turns
+from hmt_ros.tracking.classes import MOST, VALID, Facing, believed, log_turns
 from hmt_ros.tracking.weighting import Continuity
 
 DT = 0.1
@@ -61,7 +61,7 @@ def weigh(human32, both):
     return step
 
 
-def begun(body, poses, log_odds=ABSENT):
+def begun(body, poses, log_odds=-MOST):
     facing = Facing()
     facing.start(body, poses, np.zeros(len(poses)))
     facing.lead(body, poses)
@@ -218,9 +218,9 @@ def test_a_start_says_which_way(human32, both):
     facing.start(human32, both, np.log([0.8, 0.2]))
     assert facing.log_odds == pytest.approx(np.log(0.25))
     facing.start(human32, both[:1], np.zeros(1))
-    assert facing.log_odds == ABSENT
+    assert facing.log_odds == -MOST
     facing.start(human32, both, np.array([0.0, -1e9]))
-    assert facing.log_odds == ABSENT
+    assert facing.log_odds == -MOST
 
 
 def test_the_only_way_that_is_left_leads(human32, both, weigh):
@@ -244,4 +244,4 @@ def test_a_body_without_a_trunk_is_left_alone(human32, both):
         Trunkless(), both, np.zeros((2, 2)), before, np.array([9.0, 0.0]), KNOWN, DT, both
     )
     assert found is before
-    assert facing.log_odds == ABSENT
+    assert facing.log_odds == -MOST
