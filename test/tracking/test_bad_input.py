@@ -40,9 +40,9 @@ class Errors(NamedTuple):
 
 @pytest.fixture(scope='module')
 def film(human32, camera):
-    """Poses and frames of 4.4 s of a person who reaches for things, and the empty scene."""
+    """Poses and frames of 4.4 s of a person who dances, and the empty scene."""
     view = Viewpoint(distance=3.2)
-    poses = procedural_motion('reach', human32, 4.4, float(RATE), 3, viewpoint=view)
+    poses = procedural_motion('dance', human32, 4.4, float(RATE), 3, viewpoint=view)
     scene = Scene(viewpoint=view, seed=2)
     frames = list(render_frames(human32, poses, camera, scene))
     empty = np.rint(scene.background(camera)).astype(np.uint8)
@@ -127,7 +127,7 @@ def alterations(film, human32, camera, keypoints_of):
     noise = np.random.default_rng(0).integers(0, 256, (2 * RATE, *shape), dtype=np.uint8)
     view = Viewpoint(distance=3.2)
     scene = Scene(viewpoint=view, seed=2)
-    others = procedural_motion('dance', human32, 1.0, float(RATE), 5, viewpoint=view)
+    others = procedural_motion('reach', human32, 1.0, float(RATE), 5, viewpoint=view)
 
     def show(picture):
         # The detector sees nothing in it, either, and does not say so.
@@ -218,9 +218,8 @@ WITHOUT_KEYPOINTS = (
     'flash', 'covered lens', 'noise', 'wall in the colours of the clothes', 'wrong prediction',
     'mask from left to right', 'mask without legs', 'shifted depth',
 )  # fmt: skip
-# The heaviest mode may face the other way for longer than the good second: the odds of the two ways
-# are nearly even in this film, and which one leads hangs on the random numbers.
-MAY_TURN = pytest.mark.xfail(strict=False, reason='the heaviest mode may face the other way')
+# By images alone the modes may hold other poses of the same outlines for longer than a good second.
+MAY_ERR = pytest.mark.xfail(strict=False, reason='images alone may leave the wrong pose')
 
 
 @pytest.mark.parametrize('name', CASES)
@@ -231,7 +230,6 @@ def test_bad_input_leaves_numbers_and_a_person(altered, usual, name):
     assert np.isfinite(errors).all()
 
 
-@MAY_TURN
 @pytest.mark.parametrize('name', CASES)
 def test_a_second_after_bad_input_the_pose_is_found_again(altered, usual, name):
     errors = altered(name).heaviest
@@ -247,11 +245,19 @@ def test_then_it_is_among_the_modes(altered, usual, name):
     assert np.median(errors[last]) < np.median(usual.best[last]) + MORE
 
 
-@pytest.mark.parametrize('name', WITHOUT_KEYPOINTS)
+@pytest.mark.parametrize(
+    'name',
+    [
+        # The person is soon taken to be nearer or further away, and returns slowly.
+        pytest.param(name, marks=MAY_ERR if name.startswith('wall') else ())
+        for name in WITHOUT_KEYPOINTS
+    ],
+)
 def test_without_keypoints_the_place_is_found_again(altered, name):
     assert np.median(altered(name, keypoints=False).place[-JUDGED:]) < 0.3
 
 
+@MAY_ERR
 @pytest.mark.parametrize('name', WITHOUT_KEYPOINTS)
 def test_so_is_the_pose(altered, unaided, name):
     """Images alone hardly tell which way a person faces: the heaviest mode may turn round."""
@@ -304,7 +310,6 @@ def test_a_rate_that_falls_in_the_middle(slowed, usual):
     assert errors[BAD:early].mean() < usual.heaviest[which[BAD:early]].mean() + MORE
 
 
-@MAY_TURN
 def test_at_the_lower_rate_the_pose_stays_known(slowed, usual):
     which, errors = slowed
     assert errors[-JUDGED:].mean() < usual.heaviest[which[-JUDGED:]].mean() + MORE
