@@ -40,7 +40,7 @@ UP_DRIFT = np.radians(1.0)
 # floor from it, and of the first image, m.
 LEVEL_TIME, LEVEL_QUANTILE = 2.0, 0.75
 LEVEL_SIGMA, FIRST_LEVEL_SIGMA = 0.04, 0.10
-# Change of the direction of gravity from image to image above which the camera turns, rad.
+# Change of a given direction of gravity that no noise of a sensor makes: the camera turns, rad.
 TURNED = 0.003
 
 
