@@ -23,7 +23,7 @@ def test_file_of_the_node_is_what_it_declares():
 def test_other_values_survive(tmp_path):
     changed = with_values(
         FilterParameters(),
-        {'subject_file': "it's: #1", 'lost_misfit': 1e-5, 'publish_tf': False,
+        {'subject_file': "it's: #1", 'keypoint_sigma_px': 1e-5, 'publish_tf': False,
          'likelihood.edges.weight': float('inf')},
     )  # fmt: skip
     path = tmp_path / 'changed.yaml'

@@ -18,7 +18,7 @@ from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.tracking import KnownGround, Subject, Tracker, TrackerSettings
 from hmt_ros.tracking.contact import FootContacts
-from hmt_ros.tracking.ground import LEAST_UP_SIGMA, UP_SIGMA, GroundEstimator
+from hmt_ros.tracking.ground import AXIS_SIGMA, UP_SIGMA, GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.stance import stance_of
@@ -140,7 +140,7 @@ def test_the_vertical_is_found_slowly_and_never_surely(body, reaching):
     assert errors[0] == pytest.approx(20.0, abs=0.1)
     assert errors[-1] < 10.0
     assert all(a > b - 0.5 for a, b in pairwise(errors))
-    assert estimator.estimate.up_sigma >= LEAST_UP_SIGMA * 0.99
+    assert estimator.estimate.up_sigma >= AXIS_SIGMA * 0.99
     # Where the person is, the floor is under the soles all the same.
     feet, plane = soles(body), estimator.plane
     points = forward(body.skeleton, reaching[-1:]).points(feet.segments, feet.local)[..., 0]
