@@ -200,9 +200,16 @@ class MixtureFilter:
             found = settle(found, self.settings.iterations)
         self.assess(observation)
 
-    def begin_anew(self, poses: Array, observation: Observation) -> None:
-        """Starts from an image, the present modes and poses (N, d) to search from."""
+    def begin_anew(self, poses: Array, observation: Observation, dt: float) -> None:
+        """Starts from an image, the present modes and poses (N, d) to search from.
+
+        Args:
+            poses: to search from.
+            observation: of the image.
+            dt: since the last image, s.
+        """
         self.evaluations = 0
+        self.validity.predict(dt)
         self._believed(observation)  # as it was before
         self.validity.search()
         poses = np.concatenate([self.modes.poses, poses])

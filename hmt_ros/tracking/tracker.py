@@ -480,11 +480,11 @@ class Tracker:
         assert self._followed is not None
         search = self._track.lost or self._existence.elsewhere
         poses = self._poses_to_search(observation, prediction) if search else None
+        dt = seconds(stamp - self._followed)
         if poses is None:
-            dt = seconds(stamp - self._followed)
             self._track.propagate(observation, dt, prediction)
         else:
-            self._track.begin_anew(poses, observation)
+            self._track.begin_anew(poses, observation, dt)
 
     def _poses_to_search(
         self, observation: Observation, prediction: PosePrediction | None

@@ -403,6 +403,23 @@ def test_a_lost_track_starts_anew_from_a_prediction(human32, started, black, mot
     assert errors[True] < 0.6 * errors[False]
 
 
+def test_nothing_becomes_certain_while_a_lost_track_is_sought(
+    human32, started, black, motion, keypoints_of
+):
+    other, tracker = jumped(motion), started()
+    for i in range(LOST_WITHIN + 20):
+        seen = keypoints_of(human32, motion[i] if i < 3 else other, 1.0, i)
+        # Starts anew in each image, at a place where nobody is.
+        prediction = predicted(human32, motion[0]) if tracker.status is Status.LOST else None
+        joints = seen.names if prediction is None else ('left_hip', 'right_knee')
+        rows = [seen.names.index(name) for name in joints]
+        seen = Keypoints(joints, seen.pixels[rows], seen.covariances[rows], np.ones(len(rows)))
+        tracker.step(black, i * FRAME, seen, prediction)
+    chances = np.concatenate([[tracker.validity.track], *tracker.validity.cues.values()])
+    assert chances.min() > 1e-4
+    assert chances.max() < 0.9999
+
+
 def test_predictions_are_among_the_hypotheses(human32, started, black, motion, keypoints_of):
     """Nothing else finds the jump in its image."""
     errors = {}
