@@ -29,7 +29,6 @@ from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image import likelihood as likelihood_module
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import observe
-from hmt_ros.image.texture import capture_textures
 from hmt_ros.inference import gaussian_pairs
 from hmt_ros.inference.block_tridiagonal import add_band_product
 from hmt_ros.inference.energy import Derivatives
@@ -87,24 +86,20 @@ def _likelihoods(seconds: float) -> Iterator[dict[str, Any]]:
     camera = Camera(660.0, 660.0, 319.5, 239.5, 640, 480)
     view = Viewpoint(distance=3.6)
     shown = procedural_motion('walk', body, 0.8, 10.0, 3, viewpoint=view)[4:6]
-    before, now = render_frames(body, shown, camera, Scene(viewpoint=view))
-    observation = observe(now.image, now.mask, last_image=before.image)
-    intensity = observe(before.image, before.mask).intensity
-    assert intensity is not None
-    textures = capture_textures(body, camera, forward(body.skeleton, shown[:1]), intensity)
+    _, now = render_frames(body, shown, camera, Scene(viewpoint=view))
+    observation = observe(now.image, now.mask)
     likelihood = ImageLikelihood(body, camera)
     rng = np.random.default_rng(0)
     for batch in (8, 32, 128):
         poses = shown[1] + 0.1 * rng.normal(size=(batch, body.dimension))
         poses[:, :3] = shown[1, :3] + 0.03 * rng.normal(size=(batch, 3))
         poses = np.clip(poses, body.lower, body.upper)
-        which = np.zeros(batch, dtype=np.intp)
 
-        def compiled(x: Any = poses, w: Any = which) -> Any:
-            return likelihood.energies(forward(body.skeleton, x), observation, textures, w)
+        def compiled(x: Any = poses) -> Any:
+            return likelihood.energies(forward(body.skeleton, x), observation)
 
-        def vectorised(x: Any = poses, w: Any = which) -> Any:
-            return numpy_likelihood.image_energy(likelihood, x, observation, textures, w)
+        def vectorised(x: Any = poses) -> Any:
+            return numpy_likelihood.image_energy(likelihood, x, observation)
 
         found, wanted = compiled(), vectorised()
         difference = max(

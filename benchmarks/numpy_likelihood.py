@@ -18,13 +18,13 @@ from hmt_ros.body import Body, Camera
 from hmt_ros.body.kinematics import Frames, assemble, forward, segment_sums
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.optical_flow import SCALE, SHARE, SIGMA
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
+from hmt_ros.image.surface_points import FACING, SurfacePoints, coarse_mesh
 from hmt_ros.image.terms.edges import FEWEST
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.silhouette import SPACING, TURN, Outline
-from hmt_ros.image.terms.texture import FLOW_ERROR
-from hmt_ros.image.texture import FACING, Textures, coarse_mesh
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -62,12 +62,10 @@ def image_energies(
     likelihood: ImageLikelihood,
     poses: Array,
     observation: Observation,
-    textures: Textures | None = None,
-    which: Index | None = None,
 ) -> dict[str, Energy]:
-    """The terms of the image, by name; arguments as `ImageLikelihood.energy`."""
+    """The terms of the image, by name; arguments as `ImageLikelihood.energies`."""
     frames = forward(likelihood.body.skeleton, poses)
-    found = _terms(likelihood, frames, observation, textures, which)
+    found = _terms(likelihood, frames, observation)
     return {name: _assembled(frames, [term]) for name, term in found.items()}
 
 
@@ -75,12 +73,10 @@ def image_energy(
     likelihood: ImageLikelihood,
     poses: Array,
     observation: Observation,
-    textures: Textures | None = None,
-    which: Index | None = None,
 ) -> Energy:
     """Their sum, assembled once."""
     frames = forward(likelihood.body.skeleton, poses)
-    found = _terms(likelihood, frames, observation, textures, which)
+    found = _terms(likelihood, frames, observation)
     return _assembled(frames, list(found.values()))
 
 
@@ -88,8 +84,6 @@ def _terms(
     likelihood: ImageLikelihood,
     frames: Frames,
     observation: Observation,
-    textures: Textures | None,
-    which: Index | None,
 ) -> dict[str, Residuals]:
     body, camera, s = likelihood.body, likelihood.camera, likelihood.settings
     result: dict[str, Residuals] = {}
@@ -100,11 +94,6 @@ def _terms(
         if name in seen:
             own = getattr(s, name)
             result[name] = term(surface, seen[name], own, np.hypot(own.sigma, blur))
-    if textures is None or which is None:
-        return result
-    for name, textured in (('intensity', intensity), ('motion', motion)):
-        if name in seen:
-            result[name] = textured(frames, camera, textures, which, seen[name], getattr(s, name))
     return result
 
 
@@ -329,62 +318,33 @@ def edges(surface: Surface, image_map: ImageMap, term: TermSettings, sigma: Arra
     return Residuals(rho.sum(0), surface.segments, surface.points, directions, pull, curvature)
 
 
-def intensity(
-    frames: Frames, camera: Camera, textures: Textures, which: Index, image_map: ImageMap,
-    term: TermSettings,
-) -> Residuals:  # fmt: skip
-    """Differences in colour between the texture and the image under it."""
-    segments, points, pixels, projection, each = _textured(frames, camera, textures, which, term)
-    at = np.broadcast_to(pixels[:, None], (2, 3, *pixels.shape[1:]))
-    value, slope = sample(image_map, at, np.arange(3)[:, None, None])  # (3, Q, N), (2, 3, Q, N)
-    error = (value - textures.colours[which].transpose(2, 1, 0)) / term.sigma
-    slope = slope / term.sigma
-    rho, _, curvature = geman_mcclure(np.sqrt((error * error).sum(0)), term.scale, each)
-    gradient = np.einsum('cqn,acqn->aqn', error, slope)
-    hessian = np.einsum('acqn,bcqn->abqn', slope, slope) + 1e-9 * np.eye(2)[:, :, None, None]
-    # As two residuals a point: with the Hessian G = L L^T, directions L^T and pulls L^-1 g.
-    l00 = np.sqrt(hessian[0, 0])
-    l10 = hessian[0, 1] / l00
-    l11 = np.sqrt(np.maximum(hessian[1, 1] - l10 * l10, 1e-12))
-    first = gradient[0] / l00
-    second = (gradient[1] - l10 * first) / l11
-    along = l00 * projection[0] + l10 * projection[1]  # (3, Q, N)
-    return _pairs(rho, segments, points, along, l11 * projection[1], first, second, curvature)
-
-
-def motion(
-    frames: Frames, camera: Camera, textures: Textures, which: Index, flow: ImageMap,
-    term: TermSettings,
-) -> Residuals:  # fmt: skip
-    """Differences between the motion of the texture in the image and the optical flow."""
-    segments, points, pixels, projection, each = _textured(frames, camera, textures, which, term)
-    start = textures.pixels.transpose(2, 0, 1)  # (2, K, Q)
-    at = np.broadcast_to(start[:, None], (2, 2, *start.shape[1:]))
-    moved, _ = sample(flow, at, np.arange(2)[:, None, None])  # (2, K, Q)
-    inverse = 1.0 / (term.sigma + FLOW_ERROR * np.hypot(moved[0], moved[1]))[which].T
-    error = (pixels - (start + moved)[:, which].transpose(0, 2, 1)) * inverse
-    rho, _, curvature = geman_mcclure(np.hypot(error[0], error[1]), term.scale, each)
-    return _pairs(
-        rho, segments, points, projection[0] * inverse, projection[1] * inverse, error[0],
-        error[1], curvature,
-    )  # fmt: skip
-
-
-def _textured(
-    frames: Frames, camera: Camera, textures: Textures, which: Index, term: TermSettings
-) -> tuple[Index, Array, Array, Array, Array]:
-    """Where the points of the textures are: segments, points, pixels, projections, weights."""
-    segments = textures.segments[which].T  # (Q, N)
-    local = textures.local[which].transpose(1, 2, 0)
+def flow_energy(
+    frames: Frames, camera: Camera, points: SurfacePoints, which: Index, flow: ImageMap,
+    weight: float,
+) -> Energy:  # fmt: skip
+    """Where poses, which have rows (N,) of the points, move them against the optical flow."""
+    segments = points.segments[which].T  # (Q, N)
+    local = points.local[which].transpose(1, 2, 0)
     batch = np.arange(frames.count)
     columns = frames.columns[segments, :, :, batch]  # (Q, N, 3, 3)
-    points = np.einsum('qnix,qin->qxn', columns, local)
-    points += frames.origins[segments, :, batch].transpose(0, 2, 1)
-    pixels, projection = camera.project_with_derivative(points.transpose(1, 0, 2))
-    present = np.arange(len(segments))[:, None] < textures.counts[which]
-    each = term.weight / np.maximum(textures.counts[which], FEWEST)
+    places = np.einsum('qnix,qin->qxn', columns, local)
+    places += frames.origins[segments, :, batch].transpose(0, 2, 1)
+    pixels, projection = camera.project_with_derivative(places.transpose(1, 0, 2))
+    present = np.arange(len(segments))[:, None] < points.counts[which]
+    each = weight / np.maximum(points.counts[which], FEWEST)
     each = np.where(present & np.isfinite(pixels[0]), each, 0.0)
-    return segments, points, np.nan_to_num(pixels), np.nan_to_num(projection), each
+    pixels, projection = np.nan_to_num(pixels), np.nan_to_num(projection)
+    start = points.pixels.transpose(2, 0, 1)  # (2, K, Q)
+    at = np.broadcast_to(start[:, None], (2, 2, *start.shape[1:]))
+    moved, _ = sample(flow, at, np.arange(2)[:, None, None])  # (2, K, Q)
+    inverse = 1.0 / (SIGMA + SHARE * np.hypot(moved[0], moved[1]))[which].T
+    error = (pixels - (start + moved)[:, which].transpose(0, 2, 1)) * inverse
+    rho, _, curvature = geman_mcclure(np.hypot(error[0], error[1]), SCALE, each)
+    residuals = _pairs(
+        rho, segments, places, projection[0] * inverse, projection[1] * inverse, error[0],
+        error[1], curvature,
+    )  # fmt: skip
+    return _assembled(frames, [residuals])
 
 
 def _pairs(
@@ -408,10 +368,8 @@ def _through(gradient: Array, projection: Array) -> Array:
     return result
 
 
-def capture_textures(
-    body: Body, camera: Camera, frames: Frames, intensity_map: ImageMap, points: int = 120
-) -> Textures:
-    """Textures of the surface visible at K poses, as `hmt_ros.image.texture.capture_textures`."""
+def seen_points(body: Body, camera: Camera, frames: Frames, points: int = 120) -> SurfacePoints:
+    """Points of the surface visible at K poses, as `hmt_ros.image.surface_points.seen_points`."""
     mesh = coarse_mesh(body)
     places = frames.points(mesh.segments, mesh.vertices)
     normals = frames.directions(mesh.segments, mesh.normals)
@@ -423,9 +381,9 @@ def capture_textures(
     inside &= (pixels[1] >= 0) & (pixels[1] < camera.height)
     visible = facing & ~hidden & inside
     k = frames.count
-    result = Textures(
+    result = SurfacePoints(
         np.zeros(k, np.int64), np.zeros((k, points), np.int64), np.zeros((k, points, 3)),
-        np.zeros((k, points, 2)), np.zeros((k, points, 3)),
+        np.zeros((k, points, 2)),
     )  # fmt: skip
     for i in range(k):
         seen = np.flatnonzero(visible[:, i])
@@ -436,6 +394,4 @@ def capture_textures(
         result.segments[i, :taken] = mesh.segments[chosen]
         result.local[i, :taken] = mesh.vertices[chosen]
         result.pixels[i, :taken] = at.T
-        both = np.broadcast_to(at[:, None], (2, 3, taken))
-        result.colours[i, :taken] = sample(intensity_map, both, np.arange(3)[:, None])[0].T
     return result

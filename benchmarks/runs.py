@@ -168,7 +168,7 @@ def keypoints_only(settings: TrackerSettings) -> TrackerSettings:
     """The same tracker with the terms of the image off."""
     off: dict[str, Any] = {term.name: OFF for term in TERMS}
     likelihood = replace(settings.likelihood, **off)
-    return replace(settings, likelihood=likelihood)
+    return replace(settings, likelihood=likelihood, flow_weight=0.0)
 
 
 def new_tracker(

@@ -1,1 +1,1 @@
-"""What an image says about a pose: background, observation, texture, likelihood."""
+"""What an image says about a pose: background, observation, optical flow, likelihood."""

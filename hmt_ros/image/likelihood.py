@@ -36,7 +36,6 @@ from hmt_ros.image.terms.registry import (
     record_residuals,
 )
 from hmt_ros.image.terms.residuals import RECORDED, tree_of
-from hmt_ros.image.texture import Textures, no_textures
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
 
@@ -128,32 +127,26 @@ class ImageLikelihood:
     def given(
         self,
         observation: Observation,
-        textures: Textures | None = None,
-        texture_rows: Index | None = None,
         exchanges: Array | None = None,
     ) -> Posed:
         """-log p(image | pose) - log prior(pose), of one observation.
 
         Args:
             observation: of the image.
-            textures: of the last image, for the terms of intensity and motion.
-            texture_rows: (N,) row of the textures that each problem carries; None: none.
             exchanges: of sides, of each problem; see `KeypointTerm`.
         """
-        seen = self.seen(observation, textures, texture_rows, exchanges=exchanges)
+        seen = self.seen(observation, exchanges=exchanges)
         terms = (*seen, *self.priors)
         return Posed(self.body.skeleton, terms)
 
     def seen(
         self,
         observation: Observation,
-        textures: Textures | None = None,
-        texture_rows: Index | None = None,
         explained: Array | None = None,
         exchanges: Array | None = None,
     ) -> tuple[FrameTerm, ...]:
         """The terms of the image and of the keypoints; arguments as for `given`, `energies`."""
-        image = ObservedImage(self, observation, textures, texture_rows, explained)
+        image = ObservedImage(self, observation, explained)
         keypoints, s = observation.keypoints, self.settings.keypoints
         if keypoints is None or s.weight == 0:
             return (image,)
@@ -196,8 +189,6 @@ class ImageLikelihood:
         self,
         frames: Frames,
         observation: Observation,
-        textures: Textures | None = None,
-        texture_rows: Index | None = None,
         *,
         explained: Array | None = None,
         derivatives: bool = True,
@@ -207,28 +198,24 @@ class ImageLikelihood:
         Args:
             frames: of the poses.
             observation: of the image.
-            textures: of the last image, for the terms of intensity and motion.
-            texture_rows: (N,) row of the textures that each pose carries; None: none.
             explained: (N, M) or (1, M) what each sample of the outline costs at most, because
                 something else explains it.
             derivatives: whether gradient and Hessian are wanted.
         """
         n, d = frames.count, self.body.dimension
-        textured = textures is not None and len(textures.counts) > 0
-        inputs = self._inputs(observation, n, explained, textured=textured)
+        inputs = self._inputs(observation, n, explained)
         running = [bool(x.term.weight > 0) for x in inputs]
         energies = np.zeros((n, len(TERMS)))
         gradient = np.zeros((n if derivatives else 0, d))
         hessian = np.zeros((n if derivatives else 0, d, d))
-        rows = np.full(n, -1) if texture_rows is None else texture_rows
         if any(running):
             placement = Placement(*frames.by_pose(), *frames.dofs_by_pose())
             shape = any(on and term.needs_contour for on, term in zip(running, TERMS, strict=True))
 
             def work(first: int, last: int) -> None:
                 add_energies(
-                    first, last, self._model, inputs, shape, textures or no_textures(),
-                    rows, placement, energies, gradient, hessian,
+                    first, last, self._model, inputs, shape, placement, energies, gradient,
+                    hessian,
                 )  # fmt: skip
 
             _in_threads(work, n)
@@ -246,7 +233,7 @@ class ImageLikelihood:
         Returns:
             (M, RECORDED) their points and derivatives; see `residuals.add_residual`.
         """
-        inputs = self._inputs(observation, 1, None, textured=False)
+        inputs = self._inputs(observation, 1, None)
         outline = observation.outline
         samples = 0 if outline is None else len(outline.pixels)
         most = 1 + 6 * len(self._model.flesh.ring_parts) + 2 * samples
@@ -254,15 +241,14 @@ class ImageLikelihood:
         if any(x.term.weight > 0 for x in inputs):
             columns, origins = frames.by_pose()
             record_residuals(
-                self._model, inputs, no_textures(), columns[0], origins[0],
-                np.zeros(len(TERMS)), result,
+                self._model, inputs, columns[0], origins[0], np.zeros(len(TERMS)), result
             )  # fmt: skip
         return result[1 : 1 + int(result[0, 0])]
 
     def _inputs(
-        self, observation: Observation, poses: int, explained: Array | None, *, textured: bool
+        self, observation: Observation, poses: int, explained: Array | None
     ) -> tuple[Any, ...]:
-        """What the kernels of all terms read, for so many poses; textures may be missing."""
+        """What the kernels of all terms read, for so many poses."""
         beliefs = observation.beliefs
         if beliefs is None:
             request = Request(poses, explained, np.ones(len(self.body.skeleton.parents)))
@@ -272,8 +258,7 @@ class ImageLikelihood:
         for term in TERMS:
             s: TermSettings = getattr(self.settings, term.name)
             evidence = observation.evidence.get(term.name)
-            on = evidence is not None and (textured or not term.needs_texture)
-            weight = float(s.weight) if on else 0.0
+            weight = 0.0 if evidence is None else float(s.weight)
             if beliefs is not None:
                 weight *= beliefs.of_term(term.name)
             weighting = Weighting(
@@ -288,44 +273,30 @@ class ImageLikelihood:
         body = self.body
         flesh = flesh_table_of(body)
         count = len(flesh.part_segments)
-        traced = _selected(self.parts, count)
-        textured = np.zeros(len(body.skeleton.parents), dtype=bool)
-        textured[flesh.part_segments[traced]] = True
         return Model(
             tree_of(body.skeleton),
             flesh,
             lens_of(self.camera),
-            traced,
+            _selected(self.parts, count),
             _selected(self.occluders, count),
-            textured,
             0 if self.parts is None else 2 * len(flesh.ring_parts),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedImage:
-    """The image terms of one observation; a `FrameTerm`. Attributes as `ImageLikelihood.energies`.
-
-    Its texture rows are those of the problems, not of the poses of one call.
-    """
+    """The image terms of an observation; a `FrameTerm`. Attributes as for `ImageLikelihood`."""
 
     likelihood: ImageLikelihood
     observation: Observation
-    textures: Textures | None = None
-    texture_rows: Index | None = None
     explained: Array | None = None
 
     def energy(
-        self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+        self, frames: Frames, _rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
         """See `hmt_ros.body.pose_terms.FrameTerm`."""
         found = self.likelihood.energies(
-            frames,
-            self.observation,
-            self.textures,
-            None if self.texture_rows is None else self.texture_rows[rows],
-            explained=self.explained,
-            derivatives=bool(derivatives),
+            frames, self.observation, explained=self.explained, derivatives=bool(derivatives)
         )
         return Energy(found.value, found.gradient, found.hessian)
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hmt_ros.image.optical_flow import optical_flow
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.image_term import ImageWindow
 from hmt_ros.image.terms.keypoints import Keypoints
@@ -54,6 +55,8 @@ class Observation:
         evidence: by the name of the term; what the image lacks is left out.
         foreground: (H, W) what differs from the background, believed or not; None: unknown.
         depths: m, believed or not; None: unknown.
+        flow: from the image before, two channels, px; None: there is none.
+        others: (H, W) pixels that somebody else covers or may cover; None: there are none.
         beliefs: in the cues; None: all are believed.
         magnification: px for a metre at the distance of the person; 0: unknown, the contours of
             people are taken to be as the model's.
@@ -64,6 +67,8 @@ class Observation:
     evidence: Mapping[str, Any] = field(default_factory=dict)
     foreground: Mask | None = None
     depths: ImageMap | None = None
+    flow: ImageMap | None = None
+    others: Mask | None = None
     beliefs: Beliefs | None = None
     magnification: float = 0.0
 
@@ -71,11 +76,6 @@ class Observation:
     def outline(self) -> Outline | None:
         """Samples on the outline of the silhouette, the evidence of the coverage."""
         return self.evidence.get('coverage')
-
-    @property
-    def intensity(self) -> ImageMap | None:
-        """Blurred colours, three channels, the evidence of the intensity: textures hold them."""
-        return self.evidence.get('intensity')
 
 
 def observe(
@@ -97,7 +97,8 @@ def observe(
         keypoints: joints seen in the image.
         window: (left, top, right, bottom) where the person is expected, for images without a
             silhouette; the whole image when None.
-        last_image: the image before, of the same size, for the optical flow.
+        last_image: the image before, of the same size, that the optical flow starts from; None:
+            there is no flow.
         wanted: names of terms; None: all.
         unsure: (H, W) pixels that may belong to the silhouette; None: none.
         others: (H, W) pixels that somebody else covers; None: none.
@@ -142,7 +143,7 @@ def observe(
         for term in TERMS
         if (wanted is None or term.name in wanted) and (found := term.evidence(part)) is not None
     }
-    return Observation(known, keypoints, evidence)
+    return Observation(known, keypoints, evidence, flow=optical_flow(part), others=others)
 
 
 def _box(mask: Mask) -> Box:

@@ -63,6 +63,8 @@ REMOVED = {
     'samples': f'kinematic jumps draw none; {_TRACKER}',
     'sample_scale': f'kinematic jumps draw none; {_TRACKER}',
     'hypothesis_merge_distance': f'modes are merged below 20 mm; {_TRACKER}',
+    'likelihood.intensity.weight': 'colours of the image before bring nothing (docs/tracking.md)',
+    'likelihood.motion.weight': 'predictions follow the optical flow: flow_weight',
     'likelihood.prior_weight': f'the factor 0.5; {_LIKELIHOOD}',
     'likelihood.pose_prior': f'the learned prior, where the body has one; {_LIKELIHOOD}',
     'likelihood.self_intersection_sigma': f'the deviation 30 mm; {_LIKELIHOOD}',

@@ -32,6 +32,7 @@ _TRACKER = {
     'max_hypotheses': (1, 64),
     'candidates': (1, 1024),
     'searched_chains': (0, 64),
+    'flow_weight': NOT_NEGATIVE,
     **{f'likelihood.{term.name}.weight': NOT_NEGATIVE for term in TERMS},
     'likelihood.keypoints.weight': NOT_NEGATIVE,
 }

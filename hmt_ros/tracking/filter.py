@@ -19,6 +19,7 @@ from hmt_ros.body.mirror import faces_back
 from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.error_model import ERRORS
@@ -115,6 +116,7 @@ class MixtureFilter:
         self.validity = Validity(len(body.skeleton.parents))
         self._observed: tuple[Observation, Observation] | None = None
         self._outline_costs = np.empty((0, 0))
+        self._points: SurfacePoints | None = None
         self._dt = np.inf
         self._posterior = Posterior(body, camera, settings, extra, ground)
         self.contacts = FootContacts()
@@ -259,7 +261,7 @@ class MixtureFilter:
         predicted, states = predict(modes, self.body, self.dynamics, dt)
         precisions = np.asarray(np.linalg.inv(states.pose_covariances), dtype=np.float64)
         continuity = Continuity(self.body, predicted.poses, modes.log_weights, dt)
-        predicted = follow_flow(predicted, precisions, seen, posterior)
+        predicted = follow_flow(predicted, precisions, self._points, seen, posterior)
         base = posterior.minimise(
             posterior.given(seen, predicted, precisions), predicted.poses, s.iterations
         )
@@ -318,10 +320,10 @@ class MixtureFilter:
             costs = outline_costs(self.body, self.camera, poses, foreground, coverage)
         share = of_outline(costs, coverage, belief)
         found[OUTLINE] = Misfit(np.array([share]), np.array([costs.shape[1]]))
-        textures = self.modes.textures
-        if textures is not None and (foreground.any() or observation.keypoints is not None):
-            row, segments = int(self.modes.texture_rows[0]), len(self.body.skeleton.parents)
-            found[SEGMENTS] = each = of_segments(textures, row, foreground, segments)
+        points = self._points
+        if points is not None and (foreground.any() or observation.keypoints is not None):
+            segments = len(self.body.skeleton.parents)
+            found[SEGMENTS] = each = of_segments(points, 0, foreground, segments)
             total = each.counts.sum(keepdims=True)
             missed = (each.shares @ each.counts) / np.maximum(total, 1.0)
             found[SILHOUETTE] = Misfit(missed, total)
@@ -403,6 +405,10 @@ class MixtureFilter:
             posterior.exchanges_of(selected.hypotheses),
         )  # fmt: skip
         self._outline_costs = posterior.fit(modes.poses, observation).outline_costs
+        self._points = None
+        seen = observation.foreground is not None and s.likelihood.coverage.weight > 0
+        if s.flow_weight > 0 or seen:
+            self._points = posterior.seen_points(modes.poses, observation)
         self._facing.lead(self.body, modes.poses)
 
     def _best_of_the_other_way(self, poses: Array, log_weights: Array) -> list[int]:

@@ -3,7 +3,7 @@
     predict -> propose -> optimise -> weigh -> select
 
 A hypothesis is born with an ancestor, jumps, and a pose where it is expected. It gets a pose that
-is locally optimal and a weight; if it is selected it is a mode, with covariances and texture.
+is locally optimal and a weight; if it is selected it is a mode, with covariances.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.image.texture import Textures
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.mixture import GaussianMixture
@@ -38,8 +37,6 @@ class Hypotheses:
         ancestors: (N,) mode of the image before that each comes from.
         expected: (N, d) pose that the motion prior is centred at.
         jumped: (N, d) degrees of freedom that did not move there, but jumped.
-        textures: of the last image, of modes of the present one; None: there are none.
-        texture_rows: (N,) row of the textures that each carries.
     """
 
     poses: Array
@@ -47,28 +44,22 @@ class Hypotheses:
     ancestors: Index
     expected: Array
     jumped: NDArray[np.bool_]
-    textures: Textures | None
-    texture_rows: Index
 
     def __len__(self) -> int:
         return len(self.poses)
 
     def __getitem__(self, rows: Index) -> Self:
-        """Some of them; all keep their textures."""
-        parts: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._by_row()}
+        """Some of them."""
+        parts: dict[str, Any] = {x.name: getattr(self, x.name)[rows] for x in fields(self)}
         return replace(self, **parts)
 
     def joined(self, other: Self) -> Self:
-        """These and others, whose textures contain those of these."""
+        """These and others."""
         parts: dict[str, Any] = {
-            name: np.concatenate([getattr(self, name), getattr(other, name)])
-            for name in self._by_row()
+            x.name: np.concatenate([getattr(self, x.name), getattr(other, x.name)])
+            for x in fields(self)
         }
         return replace(other, **parts)
-
-    @classmethod
-    def _by_row(cls) -> list[str]:
-        return [field.name for field in fields(cls) if field.name != 'textures']
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,10 +157,10 @@ class Identities:
 
 
 def new_hypotheses(poses: Array, log_weights: Array) -> Hypotheses:
-    """Hypotheses (N, d) that come from nothing before: each its own ancestor, without texture."""
+    """Hypotheses (N, d) that come from nothing before: each its own ancestor."""
     everyone = np.arange(len(poses))
     still = np.zeros(poses.shape, dtype=np.bool_)
-    return Hypotheses(poses, log_weights, everyone, poses, still, None, everyone)
+    return Hypotheses(poses, log_weights, everyone, poses, still)
 
 
 def relative_joints(body: Body, poses: Array) -> Array:

@@ -102,8 +102,6 @@ def posterior_modes(
         ancestors=h.ancestors,
         expected=h.expected,
         jumped=h.jumped,
-        textures=posterior.textures(poses, observation),
-        texture_rows=np.arange(len(poses)),
         velocities=velocities,
         covariances=covariances,
         filtered=filtered,

@@ -23,10 +23,10 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoints import EXCHANGED, KeypointTerm
-from hmt_ros.image.texture import Textures
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.tracking.start_depth import moved_to_depth
 
@@ -47,21 +47,21 @@ class Misfit(NamedTuple):
     counts: Array
 
 
-def of_segments(textures: Textures, row: int, foreground: Mask, segments: int) -> Misfit:
+def of_segments(points: SurfacePoints, row: int, foreground: Mask, segments: int) -> Misfit:
     """Visible points of each segment that are no foreground.
 
     Args:
-        textures: of the modes, with the pixels that their points were seen at.
+        points: that are seen of the modes.
         row: of the mode that is believed.
         foreground: (H, W).
         segments: number of segments, S.
     """
-    n = int(textures.counts[row])
-    column, line = textures.pixels[row, :n].T.round().astype(np.intp)
+    n = int(points.counts[row])
+    column, line = points.pixels[row, :n].T.round().astype(np.intp)
     height, width = foreground.shape
     inside = (column >= 0) & (line >= 0) & (column < width) & (line < height)
     missed = ~foreground[line[inside], column[inside]]
-    owners = textures.segments[row, :n][inside].astype(np.intp)
+    owners = points.segments[row, :n][inside].astype(np.intp)
     counts = np.bincount(owners, minlength=segments).astype(np.float64)
     found = np.bincount(owners, weights=missed, minlength=segments)
     return Misfit(found / np.maximum(counts, 1.0), counts)

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
 from hmt_ros.tracking.person_shape import raster_step
+from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.silhouettes import Silhouettes, region_of
 from hmt_ros.tracking.validity import SILHOUETTE, Validity
 from hmt_ros.tracking.view import View
@@ -33,16 +33,14 @@ class Observer:
 
     Args:
         camera: that takes the images.
-        settings: of the likelihood; terms of weight 0 need nothing.
+        settings: of the tracker; terms of weight 0 need nothing.
         silhouettes: where those of the images come from.
 
     Attributes:
         last_image: (H, W, 3) that the optical flow starts from; None: there is no flow.
     """
 
-    def __init__(
-        self, camera: Camera, settings: LikelihoodSettings, silhouettes: Silhouettes
-    ) -> None:
+    def __init__(self, camera: Camera, settings: TrackerSettings, silhouettes: Silhouettes) -> None:
         self.last_image: Image | None = None
         self._camera = camera
         self._settings = settings
@@ -91,7 +89,7 @@ class Observer:
         s = self._settings
         silhouettes = self._silhouettes
         found, anywhere, changed = None, None, 0.0
-        if s.containment.weight > 0 or s.coverage.weight > 0:
+        if s.likelihood.containment.weight > 0 or s.likelihood.coverage.weight > 0:
             region = None if poses is None else region_of(body, self._camera, poses, dt=dt)
             found = silhouettes.silhouette(image, mask, region, others)
         if found is not None:
@@ -117,18 +115,16 @@ class Observer:
             pose: (d,) that the person is about at; None: unknown.
             validity: of the cues: what more likely is of something else is left out.
         """
-        weighed = [term for term in TERMS if getattr(self._settings, term.name).weight > 0]
+        likelihood = self._settings.likelihood
+        weighed = [term for term in TERMS if getattr(likelihood, term.name).weight > 0]
         wanted = {'containment', 'coverage'} | {term.name for term in weighed}
-        if any(term.needs_texture for term in weighed):
-            wanted.add('intensity')  # the textures hold it
         keypoints = view.keypoints
         if keypoints is not None and not keypoints.seen.any():
             keypoints = None
         found = observe(
             view.image, view.silhouette if validity.believes(SILHOUETTE) else None, keypoints,
-            last_image=self.last_image, wanted=wanted, unsure=view.unsure,
-            others=view.others,
-            depth=view.depth,
+            last_image=self.last_image if self._settings.flow_weight > 0 else None, wanted=wanted,
+            unsure=view.unsure, others=view.others, depth=view.depth,
         )  # fmt: skip
         evidence = dict(found.evidence)
         depths = evidence.get(DEPTH.name)

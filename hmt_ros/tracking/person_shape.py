@@ -14,7 +14,7 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.background import BackgroundSettings, one_person
-from hmt_ros.image.texture import coarse_mesh
+from hmt_ros.image.surface_points import coarse_mesh
 from hmt_ros.inference.arrays import Array, Mask
 
 # Height of the raster that areas and colours are taken at, px.

@@ -22,9 +22,9 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.ground_terms import GroundTerm, Stance, without_root_lean
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.pose_terms import FrameTerm, Posed
-from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
+from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.texture import Textures, capture_textures
+from hmt_ros.image.surface_points import SurfacePoints, seen_points
 from hmt_ros.inference.arrays import Array, Index, Mask
 from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
 from hmt_ros.inference.energy import (
@@ -111,20 +111,9 @@ class Posterior:
         """Of images."""
         return ImageLikelihood(self.body, self.camera, self.settings.likelihood)
 
-    @cached_property
-    def flow_likelihood(self) -> ImageLikelihood:
-        """Of the optical flow alone."""
-        flow = LikelihoodSettings.of_terms(motion=self.settings.likelihood.motion)
-        return ImageLikelihood(self.body, self.camera, flow)
-
-    def of_image(
-        self,
-        observation: Observation,
-        textures: Textures | None = None,
-        texture_rows: Index | None = None,
-    ) -> EnergyTerm:
+    def of_image(self, observation: Observation) -> EnergyTerm:
         """The energy without what was expected; its evaluations are counted."""
-        return self._of_image(observation, textures, texture_rows, self.known, None)
+        return self._of_image(observation, self.known, None)
 
     @property
     def known(self) -> tuple[FrameTerm, ...]:
@@ -148,12 +137,10 @@ class Posterior:
     def _of_image(
         self,
         observation: Observation,
-        textures: Textures | None,
-        texture_rows: Index | None,
         known: tuple[FrameTerm, ...],
         exchanges: Array | None,
     ) -> EnergyTerm:
-        terms = self.likelihood.given(observation, textures, texture_rows, exchanges).terms
+        terms = self.likelihood.given(observation, exchanges).terms
         return _Counted(Posed(self.body.skeleton, (*terms, *known)), self)
 
     def around(self, observation: Observation, centres: Array, precisions: Array) -> EnergyTerm:
@@ -169,7 +156,7 @@ class Posterior:
         if ground is not None and self.stance is not None:
             known = (*self.extra, ground.following(self.stance[h.ancestors]))
         exchanges = self.exchanges_of(h)
-        image = self._of_image(observation, h.textures, h.texture_rows, known, exchanges)
+        image = self._of_image(observation, known, exchanges)
         return Sum((image, self._motion_prior(h, precisions)))
 
     def exchanges_of(self, hypotheses: Hypotheses) -> Array:
@@ -188,11 +175,9 @@ class Posterior:
         squares = replace(robust, settings=replace(robust.settings, scale=np.inf))
         return Posed(self.body.skeleton, (squares, self.likelihood.pose_prior))
 
-    def values(
-        self, poses: Array, observation: Observation, textures: Textures | None, rows: Index
-    ) -> Array:
-        """Energies (N,) of poses (N, d), with rows (N,) of the textures, by image alone."""
-        image = self.of_image(observation, textures, rows)
+    def values(self, poses: Array, observation: Observation) -> Array:
+        """Energies (N,) of poses (N, d), by image alone."""
+        image = self.of_image(observation)
         return image.energy(poses, np.arange(len(poses)), derivatives=Derivatives.NONE).value
 
     def minimise(self, term: EnergyTerm, poses: Array, iterations: int) -> Minimum:
@@ -275,8 +260,8 @@ class Posterior:
     ) -> Array:
         """What an image adds to minus the log weights of poses (N, d), (N,) nats.
 
-        Textures are left out: each hypothesis carries its own. What a detector takes for what is a
-        chain (`exchanges`): its prior counts whole, the energies by their share.
+        What a detector takes for what is a chain (`exchanges`): its prior counts whole, the
+        energies by their share.
 
         Args:
             poses: (N, d).
@@ -301,12 +286,10 @@ class Posterior:
             total += of([self.likelihood.keypoint_term(observation, exchanges, share['keypoints'])])
         return total
 
-    def textures(self, poses: Array, observation: Observation) -> Textures | None:
-        """What an image shows on the surfaces of poses (K, d)."""
-        if observation.intensity is None:
-            return None
+    def seen_points(self, poses: Array, observation: Observation) -> SurfacePoints:
+        """Points that an image sees of the surfaces of poses (K, d)."""
         frames = forward(self.body.skeleton, poses)
-        return capture_textures(self.body, self.camera, frames, observation.intensity)
+        return seen_points(self.body, self.camera, frames, observation.others)
 
     def _motion_prior(self, hypotheses: Hypotheses, precisions: Array) -> Student:
         return Student(hypotheses.expected, precisions, self.settings.tails)

@@ -15,8 +15,10 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.body.pose_terms import Posed
-from hmt_ros.image.likelihood import ObservedImage
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.optical_flow import FlowTerm
+from hmt_ros.image.surface import lens_of
+from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.energy import Quadratic, Sum
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
@@ -46,12 +48,7 @@ def predict(
     """
     states = predicted_states(modes, modes.state_covariances, body, dynamics, dt)
     moved = np.clip(states.poses, body.lower, body.upper)
-    predicted = replace(
-        new_hypotheses(moved, modes.log_weights),
-        textures=modes.textures,
-        texture_rows=modes.texture_rows,
-    )
-    return predicted, states
+    return new_hypotheses(moved, modes.log_weights), states
 
 
 def predicted_states(
@@ -88,25 +85,29 @@ def expected_poses(
 
 
 def follow_flow(
-    predicted: Hypotheses, precisions: Array, observation: Observation, posterior: Posterior
+    predicted: Hypotheses,
+    precisions: Array,
+    points: SurfacePoints | None,
+    observation: Observation,
+    posterior: Posterior,
 ) -> Hypotheses:
     """Predictions corrected by the optical flow.
 
     Args:
-        predicted: with the textures of the last image.
+        predicted: K of them.
         precisions: (K, d, d) of the predictions.
+        points: that were seen of each mode in the last image; None: nothing was looked for.
         observation: of the image.
         posterior: of the body.
     """
     s, body = posterior.settings, posterior.body
-    if 'motion' not in observation.evidence or s.likelihood.motion.weight == 0:
+    if observation.flow is None or points is None:
         return predicted
-    seen = ObservedImage(
-        posterior.flow_likelihood, observation, predicted.textures, predicted.texture_rows
-    )
+    lens = lens_of(posterior.camera)
+    flow = FlowTerm(body.skeleton, lens, points, observation.flow, s.flow_weight)
     term = Sum(
         (
-            Posed(body.skeleton, (seen, posterior.likelihood.pose_prior)),
+            Posed(body.skeleton, (flow, posterior.likelihood.pose_prior)),
             Quadratic(predicted.poses, precisions),
         )
     )

@@ -92,7 +92,7 @@ class Tracker:
         self.model = body
         self.camera = camera
         self.silhouettes = Silhouettes(background or BackgroundModel(), shared=shared_background)
-        self._observer = Observer(camera, self.settings.likelihood, self.silhouettes)
+        self._observer = Observer(camera, self.settings, self.silhouettes)
         self.evaluations = 0
         self.log_likelihoods: Array = np.empty(0)
         self.likelihood_errors = ERRORS['image']

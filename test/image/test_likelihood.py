@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -19,12 +18,10 @@ from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
 from hmt_ros.image.terms.image_term import TermSettings, Weighting
 from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
 from hmt_ros.image.terms.residuals import contour_sigma
-from hmt_ros.image.texture import capture_textures
 from hmt_ros.inference.energy import Derivatives
 
-IMAGE_TERMS = ('containment', 'coverage', 'edges', 'intensity', 'motion')
+IMAGE_TERMS = ('containment', 'coverage', 'edges')
 MAGNIFICATION = 100.0  # px/m
-CONTOUR_TERMS = IMAGE_TERMS[:3]
 
 LENSES = {
     'pinhole': ((), 'plumb_bob'),
@@ -45,15 +42,8 @@ def keypoints_of(shot, sigma=2.0, seed=0):
 
 @pytest.fixture(scope='module')
 def observation(shot):
-    found = observe(shot.images[1], shot.masks[1], keypoints_of(shot), last_image=shot.images[0])
+    found = observe(shot.images[1], shot.masks[1], keypoints_of(shot))
     return replace(found, magnification=MAGNIFICATION)
-
-
-@pytest.fixture(scope='module')
-def textures(shot):
-    frames = forward(shot.body.skeleton, np.concatenate([shot.poses[:1], shot.near(2, 9)]))
-    before = observe(shot.images[0], shot.masks[0])
-    return capture_textures(shot.body, shot.camera, frames, before.intensity)
 
 
 def only(likelihood, *names):
@@ -64,10 +54,9 @@ def only(likelihood, *names):
     return replace(likelihood, settings=replace(likelihood.settings, **terms))
 
 
-def evaluate(likelihood, poses, observation, textures, **more):
-    which = np.arange(len(poses)) % len(textures.counts)
+def evaluate(likelihood, poses, observation, **more):
     frames = forward(likelihood.body.skeleton, poses)
-    return likelihood.energies(frames, observation, textures, which, **more)
+    return likelihood.energies(frames, observation, **more)
 
 
 def relative_difference(found, wanted):
@@ -77,22 +66,21 @@ def relative_difference(found, wanted):
     return (np.abs(found - wanted) / (scale + 1e-12)).max()
 
 
-def largest_difference(body, camera, poses, observation, textures):
+def largest_difference(body, camera, poses, observation):
     """Of the compiled terms to numpy, relative to the largest entry of each pose."""
     likelihood = ImageLikelihood(body, camera)
-    which = np.arange(len(poses)) % len(textures.counts)
-    wanted = oracle.image_energies(likelihood, poses, observation, textures, which)
+    wanted = oracle.image_energies(likelihood, poses, observation)
     assert tuple(wanted) == IMAGE_TERMS
     differences = []
     for name, energy in wanted.items():
-        found = evaluate(only(likelihood, name), poses, observation, textures)
+        found = evaluate(only(likelihood, name), poses, observation)
         assert list(found.terms) == [name]
         differences += [
             relative_difference(found.value, energy.value),
             relative_difference(found.gradient, energy.gradient),
             relative_difference(found.hessian, energy.hessian),
         ]
-    together = evaluate(only(likelihood, *IMAGE_TERMS), poses, observation, textures)
+    together = evaluate(only(likelihood, *IMAGE_TERMS), poses, observation)
     differences += [
         relative_difference(together.value, sum(e.value for e in wanted.values())),
         relative_difference(together.hessian, sum(e.hessian for e in wanted.values())),
@@ -101,15 +89,15 @@ def largest_difference(body, camera, poses, observation, textures):
 
 
 @pytest.mark.parametrize('lens', LENSES)
-def test_kernels_equal_numpy(shot, observation, textures, lens):
+def test_kernels_equal_numpy(shot, observation, lens):
     c = shot.camera
     distortion, model = LENSES[lens]
     camera = Camera(c.fx, c.fy, c.cx, c.cy, c.width, c.height, distortion, model)
     poses = shot.near(24, 1)
-    assert largest_difference(shot.body, camera, poses, observation, textures) <= 1e-9
+    assert largest_difference(shot.body, camera, poses, observation) <= 1e-9
 
 
-def test_kernels_equal_numpy_far_from_the_truth(shot, observation, textures):
+def test_kernels_equal_numpy_far_from_the_truth(shot, observation):
     """Also where limbs leave the image or come behind the camera."""
     poses = shot.near(24, 2, spread=0.5)
     poses[:6, 2] -= 3.0
@@ -117,7 +105,7 @@ def test_kernels_equal_numpy_far_from_the_truth(shot, observation, textures):
     poses[9:12, 0] += 2.0
     depths = shot.body.joint_positions(poses)[..., 2]
     assert (depths < 0).any()
-    assert largest_difference(shot.body, shot.camera, poses, observation, textures) <= 1e-9
+    assert largest_difference(shot.body, shot.camera, poses, observation) <= 1e-9
 
 
 @pytest.mark.parametrize('name', ['human34', 'human32'])
@@ -126,10 +114,7 @@ def test_kernels_equal_numpy_for_other_bodies(shot, observation, name):
     rng = np.random.default_rng(5)
     poses = np.clip(0.2 * rng.normal(size=(10, body.dimension)), body.lower, body.upper)
     poses[:, :3] = shot.poses[1, :3]
-    frames = forward(body.skeleton, poses[:3])
-    before = observe(shot.images[0], shot.masks[0])
-    textures = capture_textures(body, shot.camera, frames, before.intensity)
-    assert largest_difference(body, shot.camera, poses, observation, textures) <= 1e-9
+    assert largest_difference(body, shot.camera, poses, observation) <= 1e-9
 
 
 def test_kernels_equal_numpy_where_the_image_cuts_the_person(shot):
@@ -138,39 +123,9 @@ def test_kernels_equal_numpy_where_the_image_cuts_the_person(shot):
     assert masks[1][:, 0].any() or masks[1][:, -1].any() or masks[1].any()
     c = shot.camera
     camera = Camera(c.fx, c.fy, c.cx - 130, c.cy, 70, c.height)
-    before = observe(cut[0], masks[0])
-    textures = capture_textures(
-        shot.body, camera, forward(shot.body.skeleton, shot.poses[:1]), before.intensity
-    )
-    observation = observe(cut[1], masks[1], last_image=cut[0])
+    observation = observe(cut[1], masks[1])
     poses = shot.near(12, 3)
-    assert largest_difference(shot.body, camera, poses, observation, textures) <= 1e-9
-
-
-def test_textures_equal_numpy(shot):
-    before = observe(shot.images[0], shot.masks[0])
-    frames = forward(shot.body.skeleton, shot.near(6, 4, spread=0.3))
-    arguments = (shot.body, shot.camera, frames, before.intensity)
-    found, wanted = capture_textures(*arguments), oracle.capture_textures(*arguments)
-    assert np.array_equal(found.counts, wanted.counts)
-    assert found.counts.min() > 40
-    assert np.array_equal(found.segments, wanted.segments)
-    for a, b in zip(found[2:], wanted[2:]):
-        assert np.allclose(a, b, rtol=1e-12, atol=1e-9)
-
-
-def test_textures_are_the_colours_of_the_image(shot):
-    before = observe(shot.images[0], shot.masks[0])
-    found = capture_textures(
-        shot.body, shot.camera, forward(shot.body.skeleton, shot.poses[:1]), before.intensity
-    )
-    count = found.counts[0]
-    u, v = found.pixels[0, :count].astype(int).T
-    assert cv2.dilate(shot.masks[0].astype(np.uint8), np.ones((3, 3)))[v, u].all()
-    blurred = cv2.GaussianBlur(shot.images[0], (0, 0), 1.5).astype(float)
-    around = [blurred[np.minimum(v + i, 239), u + j] for i in (0, 1) for j in (0, 1)]
-    assert (found.colours[0, :count] > np.min(around, axis=0) - 1).all()
-    assert (found.colours[0, :count] < np.max(around, axis=0) + 1).all()
+    assert largest_difference(shot.body, camera, poses, observation) <= 1e-9
 
 
 # Derivatives.
@@ -189,22 +144,7 @@ def relative_errors(found, wanted):
     return np.abs(found - wanted) / np.abs(wanted).max(axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize('name', ['intensity', 'motion'])
-def test_gradients_of_smooth_terms(shot, observation, textures, name):
-    likelihood = only(ImageLikelihood(shot.body, shot.camera), name)
-    poses = shot.near(8, 6)
-
-    def value(x):
-        return evaluate(likelihood, x, observation, textures, derivatives=False).value
-
-    found = evaluate(likelihood, poses, observation, textures).gradient
-    errors = relative_errors(found, numerical_gradient(value, poses))
-    # A pixel may cross into the next cell of the bilinear image within a step.
-    assert np.quantile(errors, 0.99) < 1e-6
-    assert errors.max() < 0.02
-
-
-@pytest.mark.parametrize('name', CONTOUR_TERMS)
+@pytest.mark.parametrize('name', IMAGE_TERMS)
 def test_gradients_of_contour_terms_at_material_points(shot, observation, name):
     """The gradient is that of points which stay where they are on the skin."""
     body, camera = shot.body, shot.camera
@@ -226,23 +166,22 @@ def test_gradients_of_contour_terms_at_material_points(shot, observation, name):
             return oracle.coverage(held, observation.outline, term, sigma).value
         return oracle.edges(held, observation.evidence[name], term, sigma).value
 
-    which = np.full(len(poses), -1)
-    found = likelihood.energies(frames, observation, None, which).gradient
+    found = likelihood.energies(frames, observation).gradient
     errors = relative_errors(found, numerical_gradient(value, poses))
     assert np.quantile(errors, 0.99) < 1e-6
     assert errors.max() < 1e-3
 
 
-@pytest.mark.parametrize('name', CONTOUR_TERMS)
-def test_sliding_of_the_contour_hardly_changes_the_gradient(shot, observation, textures, name):
+@pytest.mark.parametrize('name', IMAGE_TERMS)
+def test_sliding_of_the_contour_hardly_changes_the_gradient(shot, observation, name):
     """On the contour the skin is tangent to the ray: its points slide along the contour only."""
     likelihood = only(ImageLikelihood(shot.body, shot.camera), name)
     poses = shot.near(8, 8)
 
     def value(x):
-        return evaluate(likelihood, x, observation, textures, derivatives=False).value
+        return evaluate(likelihood, x, observation, derivatives=False).value
 
-    found = evaluate(likelihood, poses, observation, textures).gradient
+    found = evaluate(likelihood, poses, observation).gradient
     wanted = numerical_gradient(value, poses)
     assert np.median(relative_errors(found, wanted)) < 2e-3
     cosine = (
@@ -300,7 +239,7 @@ def summed(frames, segments, points, directions, pull, curvature):
     return by_pose.T @ pull, (by_pose * curvature[:, None]).T @ by_pose
 
 
-@pytest.mark.parametrize('names', [*((name,) for name in CONTOUR_TERMS), CONTOUR_TERMS])
+@pytest.mark.parametrize('names', [*((name,) for name in IMAGE_TERMS), IMAGE_TERMS])
 def test_listed_residuals_sum_to_gradient_and_hessian(shot, observation, names):
     likelihood = only(ImageLikelihood(shot.body, shot.camera), *names)
     for pose in shot.near(4, 22, spread=0.3):
@@ -366,7 +305,7 @@ def test_every_part_has_a_noise_of_its_contour(shot):
     assert np.array_equal(left, right)
 
 
-@pytest.mark.parametrize('name', CONTOUR_TERMS)
+@pytest.mark.parametrize('name', IMAGE_TERMS)
 def test_the_nearer_a_person_the_less_a_pixel_says(shot, observation, name):
     """In pixels; a centimetre says the same at any distance where the noise is that of the body."""
     likelihood = only(ImageLikelihood(shot.body, shot.camera), name)
@@ -415,80 +354,74 @@ def test_visibility_agrees_with_marching_along_the_rays(shot):
 # Switches.
 
 
-def test_the_number_of_threads_does_not_matter(shot, observation, textures, monkeypatch):
+def test_the_number_of_threads_does_not_matter(shot, observation, monkeypatch):
     poses = shot.near(23, 13)
     results = []
     for count in (1, 2, 3):
         monkeypatch.setattr(likelihood_module, '_thread_count', lambda count=count: count)
         likelihood = ImageLikelihood(shot.body, shot.camera)
-        found = evaluate(likelihood, poses, observation, textures)
+        found = evaluate(likelihood, poses, observation)
         results.append((found.value, found.gradient, found.hessian, found.costs))
     for other in results[1:]:
         assert all(np.array_equal(a, b) for a, b in zip(results[0], other))
 
 
-def test_a_pose_does_not_depend_on_its_neighbours_in_the_batch(shot, observation, textures):
+def test_a_pose_does_not_depend_on_its_neighbours_in_the_batch(shot, observation):
     poses = shot.near(9, 14)
     likelihood = ImageLikelihood(shot.body, shot.camera)
-    which = np.zeros(9, dtype=int)
-    together = likelihood.given(observation, textures, which).energy(poses)
+    together = likelihood.given(observation).energy(poses)
     for n in (0, 4, 8):
-        alone = likelihood.given(observation, textures, which[:1]).energy(poses[n : n + 1])
+        alone = likelihood.given(observation).energy(poses[n : n + 1])
         for a, b in zip(together, alone):
             assert relative_difference(a[n : n + 1], b) <= 1e-12
 
 
-def test_values_without_derivatives_are_the_same(shot, observation, textures):
+def test_values_without_derivatives_are_the_same(shot, observation):
     likelihood = ImageLikelihood(shot.body, shot.camera)
     poses = shot.near(5, 15)
-    full = evaluate(likelihood, poses, observation, textures)
-    bare = evaluate(likelihood, poses, observation, textures, derivatives=False)
+    full = evaluate(likelihood, poses, observation)
+    bare = evaluate(likelihood, poses, observation, derivatives=False)
     assert bare.gradient is None
     assert np.array_equal(full.value, bare.value)
 
 
-def test_terms_without_evidence_are_off(shot, textures):
+def test_terms_without_evidence_are_off(shot):
     likelihood = ImageLikelihood(shot.body, shot.camera)
     poses = shot.near(2, 16)
     image = shot.images[1]
-    assert set(evaluate(likelihood, poses, observe(image), textures).terms) == {
-        'edges',
-        'intensity',
-    }
+    assert set(evaluate(likelihood, poses, observe(image)).terms) == {'edges'}
     empty = observe(image, np.zeros(image.shape[:2], dtype=bool))
-    assert set(evaluate(likelihood, poses, empty, textures).terms) == {'edges', 'intensity'}
-    full = observe(image, shot.masks[1], last_image=shot.images[0])
-    assert set(evaluate(likelihood, poses, full, textures).terms) == set(IMAGE_TERMS)
+    assert set(evaluate(likelihood, poses, empty).terms) == {'edges'}
+    full = observe(image, shot.masks[1])
+    assert set(evaluate(likelihood, poses, full).terms) == set(IMAGE_TERMS)
     frames = forward(shot.body.skeleton, poses)
-    assert set(likelihood.energies(frames, full).terms) == set(CONTOUR_TERMS)
     nothing = likelihood.energies(frames, Observation())
     assert np.array_equal(nothing.value, np.zeros(2))
     assert not nothing.hessian.any()
 
 
-def test_the_truth_is_better_than_its_neighbours(shot, observation, textures):
+def test_the_truth_is_better_than_its_neighbours(shot, observation):
     likelihood = ImageLikelihood(shot.body, shot.camera)
     near, truth = shot.near(40, 17, spread=0.15), shot.poses[1:]
-    which = np.zeros(41, dtype=int)
     frames = forward(shot.body.skeleton, np.concatenate([truth, near]))
-    found = likelihood.energies(frames, observation, textures, which, derivatives=False)
-    terms = {name: found.terms[name] for name in ('containment', 'coverage', 'edges', 'intensity')}
+    found = likelihood.energies(frames, observation, derivatives=False)
+    terms = {name: found.terms[name] for name in IMAGE_TERMS}
     terms['keypoints'] = keypoint_energy(shot, observation.keypoints, frames.poses).value
     for name, value in terms.items():
         assert np.mean(value[1:] > value[0]) > 0.95, name
 
 
-def test_what_others_explain_costs_no_more_than_that(shot, observation, textures):
+def test_what_others_explain_costs_no_more_than_that(shot, observation):
     likelihood = only(ImageLikelihood(shot.body, shot.camera), 'coverage')
     poses = shot.near(4, 18)
-    free = evaluate(likelihood, poses, observation, textures)
+    free = evaluate(likelihood, poses, observation)
     assert np.allclose(free.costs.sum(1), free.value)
     limit = np.random.default_rng(0).uniform(0, 2 * free.costs.mean(), free.costs.shape)
     for explained in (limit, limit[:1]):
-        found = evaluate(likelihood, poses, observation, textures, explained=explained)
+        found = evaluate(likelihood, poses, observation, explained=explained)
         assert np.allclose(found.costs, np.minimum(free.costs, explained))
         assert np.allclose(found.value, found.costs.sum(1))
-    nothing = evaluate(likelihood, poses, observation, textures, explained=np.zeros_like(limit))
+    nothing = evaluate(likelihood, poses, observation, explained=np.zeros_like(limit))
     assert not nothing.value.any()
     assert not nothing.hessian.any()
 

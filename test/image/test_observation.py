@@ -161,24 +161,6 @@ def test_a_person_cut_by_the_border_or_hardly_seen(mask):
     assert ((found[known] < 0) == mask[known]).all()
 
 
-def test_flow_is_the_shift_between_the_images():
-    rng = np.random.default_rng(1)
-    noise = np.kron(rng.integers(0, 255, (40, 50)), np.ones((4, 4))).astype(np.uint8)
-    big = np.repeat(noise[:, :, None], 3, axis=2)
-    before, after = big[10:130, 10:170].copy(), big[7:127, 5:165].copy()
-    flow = observe(after, disc(radius=40), last_image=before).evidence['motion']
-    middle = [np.median(whole(flow, channel)[40:80, 60:100]) for channel in (0, 1)]
-    assert middle == pytest.approx([5.0, 3.0], abs=0.5)
-
-
-def test_intensity_is_the_blurred_image():
-    image = grey()
-    image[:, 80:] = (10, 120, 250)
-    observation = observe(image, disc())
-    assert [whole(observation.intensity, c)[60, 100] for c in range(3)] == [10, 120, 250]
-    assert [whole(observation.intensity, c)[60, 60] for c in range(3)] == [90, 90, 90]
-
-
 def test_input_that_contradicts_itself_is_refused():
     with pytest.raises(ValueError, match=r'image must be \(H, W, 3\) uint8'):
         observe(np.zeros(SIZE, dtype=np.uint8))

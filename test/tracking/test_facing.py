@@ -87,12 +87,10 @@ def check(posteriors):
 
 def test_both_ways_are_modes_of_one_mixture(film, followed, human32):
     """A person who stands can hardly be told from one who stands back to front."""
-    tracker, posteriors = followed()
+    _, posteriors = followed()
     right = ways(human32, posteriors, film[0])
     assert all(0.05 < share < 0.95 for share in right[:8])
     check(posteriors)
-    assert tracker.modes.textures is not None
-    assert len(tracker.modes.textures.counts) == len(posteriors[-1])
 
 
 @pytest.mark.xfail(strict=True, reason='images alone take the wrong way here, after a second')

@@ -29,8 +29,6 @@ def modes_of(body: Body) -> Modes:
         ancestors=np.zeros(K, dtype=np.intp),
         expected=poses,
         jumped=np.ones((K, d), dtype=np.bool_),
-        textures=None,
-        texture_rows=np.arange(K)[::-1],
         velocities=0.1 * rng.normal(size=(K, d)),
         covariances=np.tile(np.eye(d), (K, 1, 1)),
         filtered=states[:, :d, :d],
@@ -73,7 +71,6 @@ def test_a_prediction_is_its_own_ancestor_and_has_not_jumped(human37):
     assert predicted.ancestors.tolist() == [0, 1, 2]
     assert not predicted.jumped.any()
     assert predicted.expected is predicted.poses
-    assert predicted.texture_rows.tolist() == [2, 1, 0]
     assert predicted.log_weights is modes.log_weights
 
 

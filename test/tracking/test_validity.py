@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from hmt_ros.image.texture import Textures
+from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.tracking.misfit import Misfit, of_segments
 from hmt_ros.tracking.validity import (
@@ -218,10 +218,9 @@ def test_nothing_measured_says_nothing():
 
 def seen(segments, pixels):
     n = len(segments)
-    return Textures(
-        np.array([n]), np.array([segments]), np.zeros((1, n, 3)), np.array([pixels], float),
-        np.zeros((1, n, 3)),
-    )  # fmt: skip
+    return SurfacePoints(
+        np.array([n]), np.array([segments]), np.zeros((1, n, 3)), np.array([pixels], float)
+    )
 
 
 def test_points_of_a_segment_that_are_no_foreground():

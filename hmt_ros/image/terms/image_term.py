@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface import Contour, FleshTable, Lens
-from hmt_ros.image.texture import Textures
 from hmt_ros.inference.arrays import Array, Image, Mask
 
 NO_MAP = ImageMap(np.zeros((2, 2, 2), np.float32))
@@ -30,9 +29,9 @@ class TermSettings:
     Attributes:
         weight: Number of independent measurements that the term counts for (a plain factor for
             keypoints); 0 switches the term off.
-        sigma: Standard deviation of one measurement, px (grey levels for the intensity, a factor on
-            the detector's own deviation for keypoints); that of a contour comes on top of what
-            contours of people differ from the model's, in metres. Of depths, m.
+        sigma: Standard deviation of one measurement, px (a factor on the detector's own deviation
+            for keypoints); that of a contour comes on top of what contours of people differ from
+            the model's, in metres. Of depths, m.
         scale: Width of the Geman-McClure kernel, in standard deviations.
         growth: What the square of a depth adds to the standard deviation of the depth, 1/m.
     """
@@ -119,12 +118,9 @@ class PoseView(NamedTuple):
 
     Attributes:
         number: n, of the poses of this call.
-        texture_row: row of the textures that the pose carries; negative: none.
-        textures: of the last image.
         contour: occluding contour, traced if some term asks for it.
         contour_points: number of contour points that a weight is shared among; 0: those there are.
         owners: (B,) segment of each part of the flesh.
-        textured: (S,) segments whose texture is compared.
         lens: the camera.
         columns, origins: (S, 3, 3), (S, 3) frames of the segments.
         flesh: parts and rings, for terms that trace more than the contour.
@@ -132,12 +128,9 @@ class PoseView(NamedTuple):
     """
 
     number: int
-    texture_row: int
-    textures: Textures
     contour: Contour
     contour_points: int
     owners: NDArray[np.int64]
-    textured: Mask
     lens: Lens
     columns: Array
     origins: Array
@@ -176,7 +169,6 @@ class ImageTerm:
         kernel: compiled `kernel(view, inputs, wrenches, stiffnesses)`: adds the residuals of one
             pose to the sums of the segments, returns the energy.
         needs_contour: whether the contour has to be traced.
-        needs_texture: whether poses without texture are passed over.
     """
 
     name: str
@@ -186,4 +178,3 @@ class ImageTerm:
     inputs: Callable[[Weighting, Any, Request], Any]
     kernel: Any
     needs_contour: bool = False
-    needs_texture: bool = False

@@ -24,10 +24,9 @@ from hmt_ros.image.terms.edges import EDGES
 from hmt_ros.image.terms.image_term import ImageTerm, PoseView
 from hmt_ros.image.terms.residuals import Tree, assemble_pose
 from hmt_ros.image.terms.silhouette import CONTAINMENT, COVERAGE
-from hmt_ros.image.terms.texture import INTENSITY, MOTION
 from hmt_ros.inference.arrays import Array, Mask
 
-TERMS: tuple[ImageTerm, ...] = (CONTAINMENT, COVERAGE, EDGES, DEPTH, INTENSITY, MOTION)
+TERMS: tuple[ImageTerm, ...] = (CONTAINMENT, COVERAGE, EDGES, DEPTH)
 
 
 class Model(NamedTuple):
@@ -37,7 +36,6 @@ class Model(NamedTuple):
         tree, flesh, lens: skeleton, parts and rings, camera.
         traced: (B,) parts whose contour is compared with the image.
         occluders: (B,) parts that can hide others.
-        textured: (S,) segments whose texture is compared.
         contour_points: number of contour points that the weights are for; 0: those there are.
     """
 
@@ -46,7 +44,6 @@ class Model(NamedTuple):
     lens: Lens
     traced: Mask
     occluders: Mask
-    textured: Mask
     contour_points: int
 
 
@@ -72,13 +69,13 @@ def _one_after_the_other(terms: tuple[ImageTerm, ...]) -> Any:
             return
 
         return nothing
-    kernel, needs_texture = terms[0].kernel, terms[0].needs_texture
+    kernel = terms[0].kernel
     others = _one_after_the_other(terms[1:])
 
     @njit(nogil=True)
     def first_and_others(view, inputs, column, energies, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
         own = inputs[0]
-        if own[0].weight > 0.0 and (view.texture_row >= 0 or not needs_texture):
+        if own[0].weight > 0.0:
             energies[column] = kernel(view, own, wrenches, stiffnesses)
         others(view, inputs[1:], column + 1, energies, wrenches, stiffnesses)
 
@@ -89,7 +86,7 @@ _run_terms = _one_after_the_other(TERMS)
 
 
 @njit(cache=True, nogil=True)
-def _view(n, model, textures, texture_row, shape, contour, columns, origins):  # type: ignore[no-untyped-def]
+def _view(n, model, shape, contour, columns, origins):  # type: ignore[no-untyped-def]
     """A pose as kernels see it; fills the contour, if shape is asked for."""
     if shape:
         trace_contour(model.flesh, model.traced, model.lens, columns, origins, contour)
@@ -98,16 +95,15 @@ def _view(n, model, textures, texture_row, shape, contour, columns, origins):  #
             contour.valid, contour.covered, contour.hidden,
         )  # fmt: skip
     return PoseView(
-        n, texture_row, textures, contour, model.contour_points, model.flesh.part_segments,
-        model.textured, model.lens, columns, origins, model.flesh, model.traced, model.occluders,
+        n, contour, model.contour_points, model.flesh.part_segments, model.lens, columns, origins,
+        model.flesh, model.traced, model.occluders,
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
 def add_energies(  # type: ignore[no-untyped-def]
-    first, last, model, inputs, shape, textures, texture_rows, placement,
-    energies, gradients, hessians,
-):  # fmt: skip
+    first, last, model, inputs, shape, placement, energies, gradients, hessians
+):
     """Energies, gradients and Hessians of the poses first to last - 1.
 
     Args:
@@ -115,7 +111,6 @@ def add_energies(  # type: ignore[no-untyped-def]
         model, placement: what is compared with the image.
         inputs: of the kernels, one entry a term, in the order of `TERMS`.
         shape: whether the contour is traced.
-        textures, texture_rows: (N,) row of the textures of each pose; negative: none.
         energies: (N, terms) result.
         gradients, hessians: (N, d), (N, d, d), added to; hessians of no pose: no derivatives
             wanted.
@@ -127,7 +122,7 @@ def add_energies(  # type: ignore[no-untyped-def]
         wrenches[:] = 0.0
         stiffnesses[:] = 0.0
         columns, origins = placement.columns[n], placement.origins[n]
-        view = _view(n, model, textures, texture_rows[n], shape, contour, columns, origins)
+        view = _view(n, model, shape, contour, columns, origins)
         _run_terms(view, inputs, 0, energies[n], wrenches, stiffnesses)
         if len(hessians) > 0:
             assemble_pose(
@@ -137,15 +132,15 @@ def add_energies(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def record_residuals(model, inputs, textures, columns, origins, energies, residuals):  # type: ignore[no-untyped-def]
+def record_residuals(model, inputs, columns, origins, energies, residuals):  # type: ignore[no-untyped-def]
     """Lists the residuals of one pose, instead of summing them.
 
     Args:
-        model, inputs, textures: as for `add_energies`; the contour is traced.
+        model, inputs: as for `add_energies`; the contour is traced.
         columns, origins: (S, 3, 3), (S, 3) frames of the segments.
         energies: (terms,) result.
         residuals: (M, RECORDED) result, see `residuals.add_residual`; entry (0, 0) must be 0.
     """
     contour = empty_contour(len(model.flesh.ring_parts))
-    view = _view(0, model, textures, -1, True, contour, columns, origins)
+    view = _view(0, model, True, contour, columns, origins)
     _run_terms(view, inputs, 0, energies, residuals, np.empty((0, 6, 6)))

@@ -20,7 +20,6 @@ from hmt_ros.flips.best_combinations import Alternatives, best_combinations, dis
 from hmt_ros.flips.interpretation_tree import enumerate_flips, rehang_chain
 from hmt_ros.flips.torso_flips import flip_torso
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.texture import Textures, with_swapped_sides
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.error_model import ERRORS
@@ -46,15 +45,11 @@ class _Lead:
         pose: (d,).
         covariance: (d, d) of its prediction.
         observation: of the image.
-        textures: of the last image.
-        row: of the textures, which the pose carries.
     """
 
     pose: Array
     covariance: Array
     observation: Observation
-    textures: Textures | None
-    row: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +61,6 @@ class _Product:
         alternatives: one entry a chain.
         changes: energy change that each alternative makes alone.
         energy: of the first mode.
-        row: of the textures.
     """
 
     modes: Array
@@ -75,7 +69,6 @@ class _Product:
     alternatives: list[Alternatives]
     changes: list[Array]
     energy: float
-    row: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,25 +85,23 @@ class KinematicJumps:
         self, search: Search, base: Minimum, sources: Hypotheses, rng: np.random.Generator
     ) -> Hypotheses:
         """See `Proposal`."""
-        s, textures, observation = self.posterior.settings, sources.textures, search.observation
+        s, observation = self.posterior.settings, search.observation
         covariances = search.states.searched
         share = ERRORS['image'].share(search.dt)
         symmetries = self.posterior.body.symmetries
         prices = {name: symmetry.price(search.dt) for name, symmetry in symmetries.items()}
-        everything: list[tuple[Array, Index, Array, Index]] = []
+        everything: list[tuple[Array, Index, Array]] = []
         prior = search.rated(base.x, base.value)
         for group in self._groups(base)[:MOST_GROUPS]:
             likely = prior[group].max() > prior.max() - LIKELY
-            lead = _Lead(
-                base.x[group[0]], covariances[sources.ancestors[group[0]]], observation, textures,
-                int(sources.texture_rows[group[0]]),
-            )  # fmt: skip
+            ancestor = sources.ancestors[group[0]]
+            lead = _Lead(base.x[group[0]], covariances[ancestor], observation)
             found = self._search(lead, rng) if likely else {}
             alternatives = [
                 self._alternatives(base.x[group], chain, found.get(chain), prices['limb_flip'])
                 for chain in self.posterior.body.chains
             ]
-            products, textures = self._products(
+            products = self._products(
                 lead, base.x[group], group, sources.log_weights[group], alternatives, prices
             )
             for product in products:
@@ -119,12 +110,9 @@ class KinematicJumps:
                     product.alternatives, product.changes, share, s.combinations,
                 )  # fmt: skip
                 members = product.members[combined.parents]
-                rows = np.full(len(members), product.row)
-                if product.row == lead.row:
-                    rows = sources.texture_rows[members]
-                everything.append((combined.poses, members, combined.energies, rows))
-        poses, members, energies, rows = (
-            np.concatenate([part[i] for part in everything]) for i in range(4)
+                everything.append((combined.poses, members, combined.energies))
+        poses, members, energies = (
+            np.concatenate([part[i] for part in everything]) for i in range(3)
         )
         kept = choose_hypotheses(
             relative_joints(self.posterior.body, poses),
@@ -141,8 +129,6 @@ class KinematicJumps:
             sources.ancestors[members],
             np.where(changed, poses, sources.expected[members]),
             changed | sources.jumped[members],
-            textures,
-            rows[kept],
         )
 
     @cached_property
@@ -171,7 +157,7 @@ class KinematicJumps:
         log_weights: Array,
         alternatives: list[Alternatives],
         prices: Mapping[str, float],
-    ) -> tuple[list[_Product], Textures | None]:
+    ) -> list[_Product]:
         """The product of a group, those with limbs exchanged, and those with the torso flipped.
 
         Args:
@@ -179,12 +165,9 @@ class KinematicJumps:
             modes, members, log_weights: (G, d), (G,), (G,) of the group.
             alternatives: one entry a chain.
             prices: of the symmetries of the body, nats.
-
-        Returns:
-            The products, and the textures of which they have rows.
         """
         changes, energy = self._rate(lead, alternatives)
-        products = [_Product(modes, members, log_weights, alternatives, changes, energy, lead.row)]
+        products = [_Product(modes, members, log_weights, alternatives, changes, energy)]
         weight = np.array([np.logaddexp.reduce(log_weights)])
         exchanged, flipped_over = (weight - prices[name] for name in ('exchange', 'trunk_flip'))
         for pair in self.posterior.body.chain_pairs:
@@ -192,7 +175,6 @@ class KinematicJumps:
             if swapped is None:
                 continue
             other, hung = swapped
-            lead = replace(lead, textures=other.textures)
             rated, energy = self._rate(other, hung)
             choices, joined = [], []
             for chain, change in zip(alternatives, changes, strict=True):
@@ -204,16 +186,12 @@ class KinematicJumps:
                     choices.append(Alternatives(chain.chain, chain.angles, chain.penalties[:1]))
                     joined.append(change)
             products.append(
-                _Product(
-                    other.pose[None], members[:1], exchanged, choices, joined, energy, other.row
-                )
+                _Product(other.pose[None], members[:1], exchanged, choices, joined, energy)
             )
         for flipped, hung in self._torso_flips(lead.pose, [a.chain for a in alternatives]):
             rated, energy = self._rate(replace(lead, pose=flipped), hung)
-            products.append(
-                _Product(flipped[None], members[:1], flipped_over, hung, rated, energy, lead.row)
-            )
-        return products, lead.textures
+            products.append(_Product(flipped[None], members[:1], flipped_over, hung, rated, energy))
+        return products
 
     def _search(self, lead: _Lead, rng: np.random.Generator) -> dict[str, Array]:
         """Configurations of some limbs that fit the image."""
@@ -226,7 +204,7 @@ class KinematicJumps:
         chosen = rng.choice(len(names), size=count, replace=False)
         return {
             names[i]: self._searches[names[i]].find(
-                lead.pose, lead.covariance, lead.observation, lead.textures, lead.row, rng
+                lead.pose, lead.covariance, lead.observation, rng
             )
             for i in sorted(chosen)
         }
@@ -286,7 +264,7 @@ class KinematicJumps:
         Limbs that cross in the image are easily taken for each other, and one alone that changes
         sides leaves its own place empty.
         """
-        pose, textures, row = lead.pose, lead.textures, lead.row
+        pose = lead.pose
         base, alternatives = pose.copy(), []
         for chain, sibling in (pair, pair[::-1]):
             own = self.posterior.body.skeleton.chain_dofs[chain]
@@ -301,11 +279,7 @@ class KinematicJumps:
                 apart=DISTINCT, most=self.posterior.settings.alternatives,
             )  # fmt: skip
             alternatives.append(distinct)
-        if textures is not None and lead.row >= 0:
-            row = len(textures.counts)
-            segments = (self.posterior.body.skeleton.chains[chain] for chain in pair)
-            textures = with_swapped_sides(textures, lead.row, *segments)
-        return replace(lead, pose=base, textures=textures, row=row), alternatives
+        return replace(lead, pose=base), alternatives
 
     def _rate(self, lead: _Lead, alternatives: list[Alternatives]) -> tuple[list[Array], float]:
         """Energy change that each alternative makes alone, and the energy of the pose itself."""
@@ -314,11 +288,6 @@ class KinematicJumps:
             block = np.repeat(lead.pose[None], len(chain.angles), axis=0)
             block[:, self.posterior.body.skeleton.chain_dofs[chain.chain]] = chain.angles
             poses.append(block)
-        value = self._values(lead, np.concatenate(poses))
+        value = self.posterior.values(np.concatenate(poses), lead.observation)
         ends = np.cumsum([1] + [len(c.angles) for c in alternatives])
         return [value[a:b] - value[0] for a, b in pairwise(ends)], float(value[0])
-
-    def _values(self, lead: _Lead, poses: Array) -> Array:
-        """Energies (N,) of poses (N, d) that carry the textures of a lead."""
-        rows = np.full(len(poses), lead.row)
-        return self.posterior.values(poses, lead.observation, lead.textures, rows)

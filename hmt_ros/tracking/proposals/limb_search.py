@@ -17,7 +17,6 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.body.pose_terms import Posed
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.texture import Textures
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import minimise
 from hmt_ros.inference.energy import Derivatives, Restricted, Student, Sum
@@ -63,8 +62,6 @@ class LimbSearch:
         pose: Array,
         covariance: Array,
         observation: Observation,
-        textures: Textures | None,
-        row: int,
         rng: np.random.Generator,
     ) -> Array:
         """Angles (A, chain dofs) of the limb that fit the image, distinct from each other or not.
@@ -73,7 +70,6 @@ class LimbSearch:
             pose: (d,) whose other limbs are kept.
             covariance: (d, d) how far the limb may have moved.
             observation: of the image.
-            textures, row: of the last image, and the one that the pose carries.
             rng: source of randomness.
         """
         body, own, s = self.posterior.body, self.dofs, self.posterior.settings
@@ -84,8 +80,7 @@ class LimbSearch:
         others = self._rest.energies(
             forward(body.skeleton, pose[None]), observation, derivatives=False
         )
-        rows = np.full(len(samples), row)
-        seen = self._own.seen(observation, textures, rows, explained=others.costs)
+        seen = self._own.seen(observation, explained=others.costs)
         seen = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
         term = Sum(
             (

@@ -93,6 +93,4 @@ class PredictedPoses:
             sources.ancestors[nearest],
             poses,
             np.ones(poses.shape, dtype=np.bool_),
-            sources.textures,
-            sources.texture_rows[nearest],
         )

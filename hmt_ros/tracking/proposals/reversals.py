@@ -41,14 +41,10 @@ class Reversals:
         moved = posterior.minimise(
             posterior.of_image(search.observation), reversed_poses, ITERATIONS
         ).x
-        # The other side of the body was not seen in the last image: no texture can be compared.
-        nothing = np.full(len(best), -1)
         return Hypotheses(
             moved,
             sources.log_weights[best],
             sources.ancestors[best],
             moved,
             np.ones(moved.shape, dtype=np.bool_),
-            sources.textures,
-            nothing,
         )

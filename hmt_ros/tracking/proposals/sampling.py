@@ -84,9 +84,7 @@ class CovarianceScaledSamples:
         drawn = self.draw(body, sources.expected, covariances, each, s.sample_scale, rng)
         poses = np.concatenate([base.x, drawn.reshape(-1, body.dimension)])
         rows = np.concatenate([np.arange(k), np.repeat(np.arange(k), each)])
-        energies = self.posterior.values(
-            poses, observation, sources.textures, sources.texture_rows[rows]
-        )
+        energies = self.posterior.values(poses, observation)
         kept = choose_hypotheses(
             relative_joints(body, poses),
             search.rated(poses, energies),
@@ -100,8 +98,6 @@ class CovarianceScaledSamples:
             sources.ancestors[rows],
             sources.expected[rows],
             np.zeros((len(rows), body.dimension), dtype=np.bool_),
-            sources.textures,
-            sources.texture_rows[rows],
         )
 
 

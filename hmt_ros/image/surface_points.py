@@ -1,8 +1,7 @@
-"""Texture of the body's surface, taken from an image at a pose and looked up at another."""
+"""Points of the body's surface that a camera sees at a pose, which flow and silhouette tell of."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,103 +12,71 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import Frames
-from hmt_ros.image.sampling import ImageMap, sample
 from hmt_ros.image.surface import flesh_table_of, lens_of, mark_visibility, project
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Mask
 
 Ints = NDArray[np.int64]
 
-# A surface that faces the camera less than this (cosine) is seen too flat to carry a texture.
+# A surface that faces the camera less than this (cosine) is seen too flat.
 FACING = 0.3
 
 
-class Textures(NamedTuple):
+class SurfacePoints(NamedTuple):
     """Up to Q points on the visible surface of each of K poses.
 
     Attributes:
         counts: (K,) points of each pose; the rest of its row is not used.
         segments: (K, Q).
         local: (K, Q, 3) places in the frames of the segments, m.
-        pixels: (K, Q, 2) where they were seen.
-        colours: (K, Q, 3) what was seen there.
+        pixels: (K, Q, 2) where they are seen.
     """
 
     counts: Ints
     segments: Ints
     local: Array
     pixels: Array
-    colours: Array
 
 
-def with_swapped_sides(
-    textures: Textures, row: int, left: Sequence[int], right: Sequence[int]
-) -> Textures:
-    """The textures and one row more: that of a pose, had two limbs been taken for each other.
+def seen_points(
+    body: Body, camera: Camera, frames: Frames, others: Mask | None = None, points: int = 120
+) -> SurfacePoints:
+    """Points of the surface visible at K poses.
 
-    Args:
-        textures: of K poses.
-        row: of the pose.
-        left, right: segments of the limbs, in the same order; their frames mirror each other.
-    """
-    mirror = np.arange(1 + max(int(textures.segments.max(initial=0)), *left, *right))
-    mirror[list(left)], mirror[list(right)] = right, left
-    segments = mirror[textures.segments[row]]
-    local = textures.local[row].copy()
-    local[segments != textures.segments[row], 0] *= -1.0
-    added = (
-        textures.counts[row], segments, local, textures.pixels[row], textures.colours[row]
-    )  # fmt: skip
-    return Textures(*(np.concatenate([a, b[None]]) for a, b in zip(textures, added, strict=True)))
-
-
-def no_textures() -> Textures:
-    """Textures of no pose."""
-    return Textures(
-        np.zeros(0, np.int64), np.zeros((0, 1), np.int64), np.zeros((0, 1, 3)),
-        np.zeros((0, 1, 2)), np.zeros((0, 1, 3)),
-    )  # fmt: skip
-
-
-def capture_textures(
-    body: Body, camera: Camera, frames: Frames, intensity: ImageMap, points: int = 120
-) -> Textures:
-    """Textures of the surface visible at K poses.
-
-    The points are spread evenly over the visible vertices of a coarse mesh, the same way every
-    time.
+    They are spread evenly over the visible vertices of a coarse mesh, the same way every time.
 
     Args:
         body: with flesh.
-        camera: that took the image.
+        camera: that sees it.
         frames: of the K poses.
-        intensity: the blurred image, three channels.
+        others: (H, W) pixels that show or may show somebody else; None: there are none.
         points: at most so many a pose, Q.
     """
     k = frames.count
     mesh = coarse_mesh(body)
-    result = Textures(
+    result = SurfacePoints(
         np.zeros(k, np.int64), np.zeros((k, points), np.int64), np.zeros((k, points, 3)),
-        np.zeros((k, points, 2)), np.zeros((k, points, 3)),
+        np.zeros((k, points, 2)),
     )  # fmt: skip
     columns, origins = frames.by_pose()
     flesh, lens = flesh_table_of(body), lens_of(camera)
+    hidden = np.zeros((0, 0), np.bool_) if others is None else np.ascontiguousarray(others)
     size = np.array([camera.width, camera.height])
     for i in range(k):
-        _capture(
+        _see(
             flesh, mesh.vertices, mesh.normals, mesh.segments, mesh.parts, lens, size,
-            columns[i], origins[i], intensity, i, result,
+            columns[i], origins[i], hidden, i, result,
         )  # fmt: skip
     return result
 
 
 def coarse_mesh(body: Body) -> Mesh:
-    """The mesh whose vertices carry the texture."""
+    """The mesh whose vertices are such points."""
     return body.flesh.mesh(stacks=5, slices=10)
 
 
 @njit(cache=True, nogil=True)
-def _capture(  # type: ignore[no-untyped-def]
-    flesh, vertices, normals, segments, parts, lens, size, columns, origins, intensity, k, result
+def _see(  # type: ignore[no-untyped-def]
+    flesh, vertices, normals, segments, parts, lens, size, columns, origins, others, k, result
 ):
     count = len(vertices)
     points = np.empty((count, 3))
@@ -134,9 +101,10 @@ def _capture(  # type: ignore[no-untyped-def]
         if visible[i]:
             u, v = pixels[i, 0], pixels[i, 1]
             visible[i] = 0.0 <= u < size[0] and 0.0 <= v < size[1]
-        if visible[i]:
-            # Somebody else is there.
-            visible[i] = not np.isnan(sample(intensity, 0, pixels[i, 0], pixels[i, 1])[0])
+        if visible[i] and len(others) > 0:
+            row = min(int(pixels[i, 1] + 0.5), len(others) - 1)
+            column = min(int(pixels[i, 0] + 0.5), others.shape[1] - 1)
+            visible[i] = not others[row, column]
     covered, hidden = np.empty(count, np.bool_), np.empty(count, np.bool_)
     everything = np.ones(len(flesh.part_segments), np.bool_)
     mark_visibility(flesh, everything, columns, origins, parts, points, visible, covered, hidden)
@@ -148,6 +116,4 @@ def _capture(  # type: ignore[no-untyped-def]
         result.segments[k, q] = segments[i]
         result.local[k, q] = vertices[i]
         result.pixels[k, q] = pixels[i]
-        for c in range(3):
-            result.colours[k, q, c] = sample(intensity, c, pixels[i, 0], pixels[i, 1])[0]
     result.counts[k] = taken

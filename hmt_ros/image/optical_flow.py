@@ -1,0 +1,142 @@
+"""Where the optical flow takes the surface of the body from one image to the next (KJS 2).
+
+    E(x) = w / Q sum_q rho(|u_q(x) - p_q - f(p_q)| / (sigma + 0.15 |f(p_q)|))
+
+Q points of the surface were seen at pixels p_q of the image before; the pose x moves them to
+u_q(x), and f is the flow. Predictions follow it; it is no evidence about which mode is right, since
+each compares points of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import njit
+
+from hmt_ros.body.kinematics import Frames
+from hmt_ros.body.skeleton import Skeleton
+from hmt_ros.image.sampling import ImageMap, sample
+from hmt_ros.image.surface import Lens, project
+from hmt_ros.image.surface_points import SurfacePoints
+from hmt_ros.image.terms.image_term import ImageWindow
+from hmt_ros.image.terms.residuals import (
+    add_residual,
+    assemble_pose,
+    geman_mcclure,
+    tree_of,
+)
+from hmt_ros.inference.arrays import Index
+from hmt_ros.inference.energy import Derivatives, Energy
+
+# Standard deviation of the flow, px, and what it errs by besides, as a share of the displacement.
+SIGMA, SHARE = 1.5, 0.15
+# Width of the Geman-McClure kernel, in standard deviations.
+SCALE = 2.0
+# Fewer points than this do not make each of them count more.
+FEWEST = 20
+# Flow of smaller images is none, px.
+SMALLEST = 32
+
+
+def optical_flow(window: ImageWindow) -> ImageMap | None:
+    """Dense flow from the last image to this one, two channels, px [Kroeger et al., ECCV 2016].
+
+    NaN where somebody else is; None: there is no last image.
+    """
+    if window.last_image is None:
+        return None
+    grey = [cv2.cvtColor(x, cv2.COLOR_BGR2GRAY) for x in (window.last_image, window.image)]
+    if min(grey[0].shape) < SMALLEST:
+        return window.as_map(np.zeros((2, *grey[0].shape), np.float32))
+    # The stubs do not know that there may be no flow to start from.
+    method: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    flow = method.calc(grey[0], grey[1], None)
+    channels = np.ascontiguousarray(flow.transpose(2, 0, 1))
+    if window.others is not None:
+        channels[:, window.others > 0] = np.nan
+    return window.as_map(channels)
+
+
+@dataclass(frozen=True, eq=False)
+class FlowTerm:
+    """The energy of poses against the flow; a `FrameTerm`.
+
+    Attributes:
+        skeleton: of the body.
+        lens: of the camera.
+        points: of K poses in the image before, one for each problem.
+        flow: from that image to this one.
+        weight: w, number of independent measurements.
+    """
+
+    skeleton: Skeleton
+    lens: Lens
+    points: SurfacePoints
+    flow: ImageMap
+    weight: float
+
+    def energy(
+        self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
+    ) -> Energy:
+        """See `FrameTerm`."""
+        n, d = frames.count, self.skeleton.dimension
+        value = np.zeros(n)
+        gradient = np.zeros((n if derivatives else 0, d))
+        hessian = np.zeros((n if derivatives else 0, d, d))
+        _add_flow(
+            tree_of(self.skeleton), self.lens, self.points, np.ascontiguousarray(rows), self.flow,
+            float(self.weight), *frames.by_pose(), *frames.dofs_by_pose(),
+            value, gradient, hessian,
+        )  # fmt: skip
+        return Energy(value, gradient, hessian) if derivatives else Energy(value)
+
+
+@njit(cache=True, nogil=True)
+def _add_flow(  # type: ignore[no-untyped-def]
+    tree, lens, points, rows, flow, weight, columns, origins, axes, dof_origins,
+    value, gradients, hessians,
+):  # fmt: skip
+    """Energies (N,), and unless hessians has no pose gradients (N, d), Hessians (N, d, d)."""
+    segments = len(tree.parents)
+    wrenches, stiffnesses = np.empty((segments, 6)), np.empty((segments, 6, 6))
+    pixel, projection = np.empty((1, 2)), np.empty((1, 2, 3))
+    for n in range(len(value)):
+        wrenches[:] = 0.0
+        stiffnesses[:] = 0.0
+        t = rows[n]
+        count = points.counts[t]
+        each = weight / max(count, FEWEST)
+        for q in range(count):
+            s = points.segments[t, q]
+            x, y, z = points.local[t, q, 0], points.local[t, q, 1], points.local[t, q, 2]
+            axis, origin = columns[n, s], origins[n, s]
+            p0 = origin[0] + axis[0, 0] * x + axis[1, 0] * y + axis[2, 0] * z
+            p1 = origin[1] + axis[0, 1] * x + axis[1, 1] * y + axis[2, 1] * z
+            p2 = origin[2] + axis[0, 2] * x + axis[1, 2] * y + axis[2, 2] * z
+            if not project(lens, p0, p1, p2, 0, pixel, projection):
+                continue
+            u, v = points.pixels[t, q, 0], points.pixels[t, q, 1]
+            fu, _, _ = sample(flow, 0, u, v)
+            fv, _, _ = sample(flow, 1, u, v)
+            if np.isnan(fu):
+                # Somebody else hides it: it costs what is usual, wherever it is.
+                value[n] += geman_mcclure(1.0, SCALE, each)[0]
+                continue
+            inverse = 1.0 / (SIGMA + SHARE * np.sqrt(fu * fu + fv * fv))
+            e0, e1 = (pixel[0, 0] - u - fu) * inverse, (pixel[0, 1] - v - fv) * inverse
+            rho, _, curvature = geman_mcclure(np.sqrt(e0 * e0 + e1 * e1), SCALE, each)
+            value[n] += rho
+            for a in range(2):
+                error = e0 if a == 0 else e1
+                add_residual(
+                    wrenches, stiffnesses, s, p0, p1, p2, projection[0, a, 0] * inverse,
+                    projection[0, a, 1] * inverse, projection[0, a, 2] * inverse,
+                    curvature * error, curvature,
+                )  # fmt: skip
+        if len(hessians) > 0:
+            assemble_pose(
+                tree, axes[n], dof_origins[n], wrenches, stiffnesses, gradients[n], hessians[n]
+            )
