@@ -25,6 +25,7 @@ SHARED = Path(os.environ.get('HMT_SHARED', Path(__file__).resolve().parents[3] /
 FAST = TrackerSettings(
     candidates=8, max_hypotheses=4, searched_chains=1,
     likelihood=LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints),
+    flow_weight=0.0,
 )  # fmt: skip
 # What COCO's detectors see.
 NAMES = tuple(

@@ -35,7 +35,13 @@ FRAME = 100_000_000  # ns
 
 def keypoint_settings(**values) -> TrackerSettings:
     return TrackerSettings(
-        **{'candidates': 8, 'likelihood': ONLY_KEYPOINTS, 'estimate_shape': False, **values}
+        **{
+            'candidates': 8,
+            'likelihood': ONLY_KEYPOINTS,
+            'flow_weight': 0.0,
+            'estimate_shape': False,
+            **values,
+        }
     )
 
 
