@@ -40,6 +40,7 @@ def pose_mixture() -> Any:
     mixture.state = PoseMixture.STATE_LOST
     mixture.track_id = 12
     mixture.existence_probability = 0.75
+    mixture.cue_names, mixture.cue_probabilities = ['depth', 'track'], [0.25, 0.5]
     mixture.error_share, mixture.error_time = 0.5, 0.125
     for weight, log_likelihood in ((0.75, -12.5), (0.25, math.nan)):
         component = PoseComponent(weight=weight, log_likelihood=log_likelihood)

@@ -365,6 +365,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             state=TrackState.LOST if tracker.status is Status.LOST else TrackState.TRACKING,
             track_id=tracker.track_id,
             existence_probability=tracker.existence_probability,
+            cue_probabilities=tracker.validity.shown,
             identities=tracker.modes.identities,
             velocities=tracker.velocities,
             up=known.up,

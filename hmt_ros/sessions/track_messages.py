@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -77,6 +77,8 @@ class TrackedImage:
         state: of the track.
         track_id: number of the track.
         existence_probability: that a person is in view; NaN: unknown.
+        cue_probabilities: that each cue of the images shows the person, by its name, and that the
+            track has the person; empty: unknown.
         identities: (K,) of the components of the posterior.
         velocities: (K, d) of the components of the posterior, per second; None: unknown.
         up: (3,) unit vector against gravity in the camera frame; None: it is not known, at most
@@ -102,6 +104,7 @@ class TrackedImage:
     state: TrackState = TrackState.UNKNOWN
     track_id: int = 0
     existence_probability: float = math.nan
+    cue_probabilities: Mapping[str, float] = field(default_factory=dict)
     identities: Index | None = None
     velocities: Array | None = None
     up: Array | None = None
@@ -271,6 +274,7 @@ def _mixtures(track: TrackedImage, joints: Array) -> tuple[PoseMixture, PoseMixt
             state=track.state,
             track_id=track.track_id,
             existence_probability=track.existence_probability,
+            cue_probabilities=_in_range(track.cue_probabilities),
             identities=track.identities,
             velocities=velocities,
         ),
@@ -300,9 +304,13 @@ def _ground_state(track: TrackedImage) -> GroundState:
         ground.up_sigma,
         ground.height,
         math.nan if ground.height is None else ground.height_sigma,
-        # Rounding may take a probability a little out of its range.
-        {foot: min(max(float(p), 0.0), 1.0) for foot, p in track.contacts.items()},
+        _in_range(track.contacts),
     )
+
+
+def _in_range(probabilities: Mapping[str, float]) -> dict[str, float]:
+    """Probabilities by name, which rounding may have taken a little out of their range."""
+    return {name: min(max(float(p), 0.0), 1.0) for name, p in probabilities.items()}
 
 
 def _link_transforms(messages: MessageFactory, track: TrackedImage, prefix: str) -> Any:

@@ -111,7 +111,7 @@ class Validity:
 
     @property
     def shown(self) -> dict[str, float]:
-        """The probabilities by name, as diagnostics tell them; of the segments the mean."""
+        """The probabilities by name, for messages and diagnostics; of the segments the mean."""
         cues = self.cues
         trunk, arms, legs = (float(p) for p in cues[KEYPOINTS])
         return {

@@ -163,18 +163,26 @@ def check_names(names: tuple[str, ...], wanted: Sequence[str] | None, what: str)
 
 
 def lengths_of(message: Any, what: str) -> dict[str, float]:
-    """Segment lengths of a message by name, m; empty where it has none.
+    """Segment lengths of a message by name, m; see `named_numbers`."""
+    return named_numbers(message, 'segment_names', 'segment_lengths', what)
+
+
+def named_numbers(message: Any, names: str, values: str, what: str) -> dict[str, float]:
+    """The numbers in a field of a message, by the names in another; empty where it has none.
 
     Bags older than the fields carry a definition without them: such a message has none, either.
 
+    Args:
+        message: has the fields.
+        names, values: their names.
+        what: the message is, for errors.
+
     Raises:
-        MessageError: a name that is there twice, another number of lengths than of names.
+        MessageError: a name that is there twice, another number of values than of names.
     """
-    names = names_of(getattr(message, 'segment_names', ()), f'{what}: segment_names')
-    lengths = numbers(
-        getattr(message, 'segment_lengths', ()), (len(names),), f'{what}: segment_lengths'
-    )
-    return dict(zip(names, lengths.tolist(), strict=True))
+    keys = names_of(getattr(message, names, ()), f'{what}: {names}')
+    found = numbers(getattr(message, values, ()), (len(keys),), f'{what}: {values}')
+    return dict(zip(keys, found.tolist(), strict=True))
 
 
 def check_lengths(lengths: Mapping[str, float], what: str) -> None:

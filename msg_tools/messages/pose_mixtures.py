@@ -29,6 +29,7 @@ from msg_tools.messages.message_error import (
     freeze_arrays,
     identities_of,
     lengths_of,
+    named_numbers,
     names_of,
     numbers,
 )
@@ -93,6 +94,9 @@ class PoseMixture:
         joint_velocities: (K, J, 3) m/s, in the frame of the header; None: unknown.
         existence_probability: that a person is in view, given all images so far; NaN: unknown, as
             in messages of other publishers and in bags older than this field.
+        cue_probabilities: that each cue of the images shows the person, by the name of the cue; of
+            the name 'track', that some component is about where the person is. Empty: unknown, as
+            in all but posteriors of the filter and in bags older than this field.
         error_share: share of the evidence of one image that is independent, in (0, 1], beside a
             likelihood; NaN: unknown, as in bags older than this field.
         error_time: time for which errors last, s; NaN: unknown.
@@ -123,6 +127,7 @@ class PoseMixture:
     joint_covariances_relative: Array | None = None
     error_share: float = math.nan
     error_time: float = math.nan
+    cue_probabilities: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'mixture: dof_names'))
@@ -158,6 +163,11 @@ class PoseMixture:
             raise MessageError(
                 f'mixture: existence_probability must lie in [0, 1] or be NaN, saw {existence}'
             )
+        for cue, probability in self.cue_probabilities.items():
+            if not 0.0 <= probability <= 1.0:
+                raise MessageError(
+                    f'mixture: cue_probabilities of {cue!r} must lie in [0, 1], saw {probability}'
+                )
         if not (math.isnan(self.error_share) or 0.0 < self.error_share <= 1.0):
             raise MessageError(
                 f'mixture: error_share must lie in (0, 1] or be NaN, saw {self.error_share}'
@@ -187,6 +197,7 @@ class PoseMixture:
         existence_probability: float = math.nan,
         error_share: float = math.nan,
         error_time: float = math.nan,
+        cue_probabilities: Mapping[str, float] | None = None,
     ) -> PoseMixture:
         """A mixture over the poses of a body at its present lengths.
 
@@ -203,6 +214,7 @@ class PoseMixture:
             kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities,
                 existence_probability, error_share, error_time: see the attributes.
             velocities: (K, d) of the poses, per second; None: unknown.
+            cue_probabilities: see the attributes; None: unknown.
 
         Raises:
             MessageError: shapes or values that a message must not have.
@@ -240,6 +252,7 @@ class PoseMixture:
             existence_probability=existence_probability,
             error_share=error_share,
             error_time=error_time,
+            cue_probabilities=cue_probabilities or {},
         )
 
     @cached_property
@@ -295,6 +308,8 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
         state=int(content.state),
         track_id=content.track_id,
         existence_probability=content.existence_probability,
+        cue_names=list(content.cue_probabilities),
+        cue_probabilities=np.array(list(content.cue_probabilities.values()), dtype=np.float64),
         error_share=content.error_share,
         error_time=content.error_time,
         components=components,
@@ -375,6 +390,7 @@ def pose_mixture_of(
         joint_covariances_relative=_optional(
             components, 'joint_covariances_relative', (len(joints), 3, 3)
         ),
+        cue_probabilities=named_numbers(message, 'cue_names', 'cue_probabilities', 'mixture'),
         **_errors(message),
     )
 

@@ -87,6 +87,12 @@ def test_mixtures_tell_state_track_and_identities(session, outputs, small_camera
         assert [content.track_id for content in found] == [1, 1, 1]
     ids = [content.identities.tolist() for content in mixtures_of(outputs)]
     assert ids == [[1, 77], [2, 77], []]
+    # What the cues are believed, as long as there is a track.
+    shown = stub_tracker.made[-1].validity.shown
+    told = [dict(content.cue_probabilities) for content in mixtures_of(outputs)]
+    assert told == [shown, shown, {}]
+    likelihoods = mixtures_of(outputs, 'likelihood_mixture')
+    assert [content.cue_probabilities for content in likelihoods] == [{}, {}, {}]
     likelihoods = mixtures_of(outputs, 'likelihood_mixture')
     assert [content.identities.tolist() for content in likelihoods] == [[0, 0], [0, 0], []]
 
@@ -119,6 +125,7 @@ def test_a_lost_track_is_told(session, outputs, small_camera, stub_tracker, monk
     one.take(IMAGE, small_camera.image(0))
     assert [content.state for content in mixtures_of(outputs)] == [TrackState.LOST]
     assert [content.existence_probability for content in mixtures_of(outputs)] == [0.875]
+    assert [len(content.cue_probabilities) for content in mixtures_of(outputs)] == [7]
 
 
 def test_a_reset_starts_a_new_track(session, outputs, small_camera):

@@ -52,6 +52,8 @@ def track(body):
         ground=Ground(np.array([0.0, -0.8, -0.6]), 0.05, 1.5, 0.1),
         contacts={'left_foot': 0.75, 'right_foot': 0.25},
         starts=True,
+        # As rounding may leave them.
+        cue_probabilities={'depth': 0.25, 'track': 1.0 + 1e-15},
     )
 
 
@@ -94,6 +96,12 @@ def test_mixtures(track, body):
     likelihood, posterior = found['likelihood_mixture'], found['pose_mixture']
     assert (likelihood.error_share, likelihood.error_time) == (0.25, 0.125)
     assert np.isnan([posterior.error_share, posterior.error_time]).all()
+    # The posterior tells what the cues are believed.
+    assert (posterior.cue_names, list(posterior.cue_probabilities)) == (
+        ['depth', 'track'],
+        [0.25, 1.0],
+    )
+    assert (likelihood.cue_names, len(likelihood.cue_probabilities)) == ([], 0)
 
 
 def test_joint_states_are_those_of_the_point_estimate(track, body):

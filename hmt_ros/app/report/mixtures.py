@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -34,11 +35,15 @@ class Moment:
         stamp_ns: time of the poses.
         weights: (K,) heaviest first.
         joints: (K, J, 3) camera optical frame, m.
+        existence: probability that a person is in view; NaN: unknown.
+        cues: probability that each cue of the images shows the person, by its name; empty: unknown.
     """
 
     stamp_ns: int
     weights: Array
     joints: Array
+    existence: float = math.nan
+    cues: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +212,13 @@ def _pose_layer(topic: str, message: Any) -> Layer[Moment] | None:
         return None
     order = np.argsort(-content.weights, kind='stable')
     stamp, kind = content.stamp_ns, content.kind.name.lower()
-    moment = Moment(stamp, content.weights[order], content.joint_positions[order])
+    moment = Moment(
+        stamp,
+        content.weights[order],
+        content.joint_positions[order],
+        content.existence_probability,
+        content.cue_probabilities,
+    )
     return Layer(topic, kind, content.frame_id, content.joint_names, {stamp: moment})
 
 

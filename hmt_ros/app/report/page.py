@@ -9,6 +9,8 @@ from __future__ import annotations
 import base64
 import html
 import json
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
@@ -67,7 +69,9 @@ def data_size(mixtures: RecordedMixtures) -> int:
     for layer in mixtures.layers:
         # Positions of 6 bytes and pixels of 4 in base64; weight and error as text.
         each = len(layer.joint_names) * 10 * 4 // 3 + 16
-        size += sum(len(moment.weights) * each for moment in layer.mixtures.values())
+        for moment in layer.mixtures.values():
+            # Probabilities as text.
+            size += len(moment.weights) * each + 8 * (1 + len(moment.cues))
     for topic in mixtures.trajectories:
         for window in topic.mixtures.values():
             ways = 0 if window.ways is None else window.ways[..., 0].size
@@ -174,9 +178,30 @@ def _layer(layer: Layer[Moment], content: Content, grid: _Grid) -> dict[str, Any
         ]
         if errors
         else None,
+        **_beliefs([moments.get(stamp) for stamp in content.stamps]),
         'positions': grid.encoded(everything),
         'pixels': _pixels(content.images, everything),
     }
+
+
+def _beliefs(moments: Sequence[Moment | None]) -> dict[str, Any]:
+    """What is believed over time: `existence`, None if unknown, and the `cues` by name."""
+    existence = [None if one is None else _probability(one.existence) for one in moments]
+    names = dict.fromkeys(name for one in moments if one is not None for name in one.cues)
+    return {
+        'existence': None if all(p is None for p in existence) else existence,
+        'cues': {
+            name: [
+                None if one is None else _probability(one.cues.get(name, math.nan))
+                for one in moments
+            ]
+            for name in names
+        },
+    }
+
+
+def _probability(value: float) -> float | None:
+    return None if math.isnan(value) else _rounded(value, 3)
 
 
 def _skeleton(names: tuple[str, ...], content: Content) -> dict[str, Any]:

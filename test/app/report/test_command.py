@@ -19,6 +19,7 @@ from hmt_ros.inference import GaussianMixture
 from msg_tools import BagReader, BagWriter
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.ground import GroundState, ground_message
+from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
@@ -63,6 +64,28 @@ def test_modes_are_those_of_the_bag(made, data, body, topic):
     assert np.abs(positions(data, layer['positions'], *joints.shape[:2]) - joints).max() < 3e-4
     pixels = integers(layer['pixels']).reshape(*joints.shape[:2], 2) * data['pixel'] * CAMERA.width
     assert np.abs(pixels - CAMERA.project(joints)).max() < CAMERA.width / 8000
+
+
+def with_beliefs(message):
+    """A mixture that tells, if it is a posterior, what is believed; of depth not the last."""
+    if message.kind == MixtureKind.POSTERIOR:
+        i = STAMPS.index(time_ns(message.header.stamp))
+        message.existence_probability = 1.0 - 0.1 * i
+        message.cue_names = ['silhouette', 'track', 'depth'][: 2 if i == FRAMES - 1 else 3]
+        message.cue_probabilities = np.array([0.125 * i, 0.5, 0.25])[: len(message.cue_names)]
+    return message
+
+
+def test_beliefs_are_those_of_the_bag(data, body, poses, tmp_path):
+    assert [(layer['existence'], layer['cues']) for layer in data['layers']] == [(None, {})] * 2
+    out = write_out(tmp_path / 'out', body, poses, change=with_beliefs)
+    posterior, smoothed = data_of(make(out, tmp_path / 'report'))['layers']
+    assert (smoothed['existence'], smoothed['cues']) == (None, {})
+    assert np.allclose(posterior['existence'], 1.0 - 0.1 * np.arange(FRAMES))
+    assert list(posterior['cues']) == ['silhouette', 'track', 'depth']
+    assert np.allclose(posterior['cues']['silhouette'], 0.125 * np.arange(FRAMES))
+    assert posterior['cues']['track'] == [0.5] * FRAMES
+    assert posterior['cues']['depth'] == [*[0.25] * (FRAMES - 1), None]
 
 
 def test_bones_connect_the_joints_of_the_pictures(data):

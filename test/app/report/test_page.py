@@ -10,7 +10,7 @@ import subprocess
 import pytest
 
 from test.app.conftest import FRAMES, TRAJECTORIES, make, write_out
-from test.app.report.test_command import with_ground
+from test.app.report.test_command import with_beliefs, with_ground
 
 BROWSERS = ('chromium', 'chromium-browser', 'google-chrome', 'google-chrome-stable', 'chrome')
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
@@ -217,6 +217,35 @@ def test_pages_with_less_in_them(made, body, poses, tmp_path):
     )
     seen = visit(single, "look('space'); get('play').click(); await pause(200);", tmp_path)
     assert seen['space drawn'] > 1000
+
+
+@in_a_browser
+def test_beliefs_are_drawn_where_a_topic_has_them(page, body, poses, tmp_path):
+    steps = """
+        const tell = (name) => {
+          seen[name] = get('beliefs-figure').hidden ? null : get('beliefs-caption').textContent;
+        };
+        tell('first'); look('beliefs', 'beliefs');
+        get('time').value = 3; get('time').dispatchEvent(new Event('input'));
+        look('later', 'beliefs');
+        get('chosen').value = 1; get('chosen').dispatchEvent(new Event('change')); tell('second');
+        get('chosen').value = 0; get('chosen').dispatchEvent(new Event('change')); tell('again');
+        const place = get('beliefs').getBoundingClientRect();
+        pointer(get('beliefs'), 'pointerdown', place.right - 12, place.top + 20);
+        seen.clock = get('clock').value;
+    """
+    assert visit(page, steps, tmp_path)['first'] is None
+    known = make(write_out(tmp_path / 'out', body, poses, change=with_beliefs), tmp_path / 'known')
+    seen = visit(known, steps, tmp_path)
+    assert ' '.join(seen['first'].split()) == (
+        'person in view silhouette track depth '
+        'What the cues of the images are believed in posterior (/pose_mixture): the probability '
+        'that each shows the person; of the track, that some mode is about where the person is.'
+    )
+    assert seen['beliefs drawn'] > 1000
+    assert seen['beliefs'] != seen['later']
+    assert (seen['second'], seen['again']) == (None, seen['first'])
+    assert seen['clock'] == f'0.60 s, {FRAMES} of {FRAMES}'
 
 
 @in_a_browser

@@ -193,6 +193,32 @@ def test_probability_of_existence(pose_mixture: PoseMixture, messages: RosbagsMe
             replace(pose_mixture, existence_probability=wrong)
 
 
+def test_probabilities_of_cues(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:
+    """By name, in their order; empty where they are unknown, as in older bags."""
+    told = {'silhouette': 0.25, 'keypoints/legs': 0.0, 'track': 1.0}
+    message = pose_mixture_message(messages, replace(pose_mixture, cue_probabilities=told))
+    back = pose_mixture_of(deserialise(serialise(message), POSE_MIXTURE))
+    assert list(back.cue_probabilities.items()) == list(told.items())
+    unknown = pose_mixture_message(messages, pose_mixture)
+    assert pose_mixture_of(unknown).cue_probabilities == {}
+    for wrong in (-0.1, 1.1, math.nan):
+        error = r"cue_probabilities of 'track' must lie in \[0, 1\], saw"
+        with pytest.raises(MessageError, match=error):
+            replace(pose_mixture, cue_probabilities={'depth': 0.5, 'track': wrong})
+    # A bag carries its own definition: a message of an older one has no such fields.
+    store = typestore()
+    definition, _ = store.generate_msgdef(POSE_MIXTURE, ros_version=2)
+    for field in ('string[] cue_names\n', 'float64[] cue_probabilities\n'):
+        assert definition.count(field) == 1
+        definition = definition.replace(field, '')
+    old = typestore_of_definition(POSE_MIXTURE, 'ros2msg', definition)
+    data = bytes(old.serialize_cdr(message, POSE_MIXTURE))
+    assert len(data) < len(serialise(message))
+    older = pose_mixture_of(deserialise(data, POSE_MIXTURE, old))
+    assert older.cue_probabilities == {}
+    np.testing.assert_array_equal(older.means, back.means)
+
+
 def test_whose_poses_they_are() -> None:
     model = load_body('human37')
     person = model.with_stature(1.6)
@@ -255,6 +281,9 @@ def asymmetric() -> Any:
         (bend('segment_names', ['a', 'a']), r"segment_names has the name 'a' twice"),
         (bend('segment_names', ['a']), r'segment_lengths has 2 values, wanted 1'),
         (bend('segment_lengths', np.array([1, np.inf])), r'segment_lengths has values that are n'),
+        (bend('cue_names', ['depth']), r'cue_probabilities has 0 values, wanted 1'),
+        (bend('cue_names', ['depth', 'depth']), r"cue_names has the name 'depth' twice"),
+        (bend('cue_probabilities', np.ones(2)), r'cue_probabilities has 2 values, wanted 0'),
         (bend('0.weight', -0.5), r'mixture has the weight -0.5, wanted numbers from 0 to 1'),
         (bend('0.weight', np.nan), r'mixture has the weight nan'),
         (bend('0.weight', 0.51), r'mixture has weights that sum to 1.01, wanted 1'),

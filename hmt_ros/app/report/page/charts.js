@@ -200,6 +200,27 @@ function errorsChart(layer) {
   };
 }
 
+/** Curves of what is believed of a layer over time: that a person is in view, then each cue. */
+const CUES = [...[0, 1, 2, 3, 4, 5].map((i) => ({ series: `series-${i}`, dash: [] })), { series: 'muted', dash: [2, 3] }];
+function beliefCurves(layer) {
+  const person = { name: 'person in view', series: 'ink', dash: [5, 3], values: layer.existence };
+  const cues = Object.entries(layer.cues).map(([name, values], i) => ({ name, values, ...CUES[i % CUES.length] }));
+  return [...(layer.existence ? [person] : []), ...cues];
+}
+
+function beliefsChart(layer) {
+  const y = [0, 1];
+  return {
+    x: timeRange(), y, labels: ['time, s', 'probability'],
+    draw(context, u, v) {
+      beliefCurves(layer).forEach(({ series, dash, values }) => {
+        curve(context, u, v, TIMES, values, { colour: colour(series), dash });
+      });
+      drawNow(context, u, v, y);
+    },
+  };
+}
+
 /** A range around values, which may be equal. */
 function around(values) {
   const [low, high] = [Math.min(...values), Math.max(...values)];

@@ -28,6 +28,7 @@ const choices = [
 ];
 const chosen = () => choices[shown.chosen];
 const errorsKnown = () => Boolean(chosen().layer && chosen().layer.errors_mm);
+const beliefsKnown = () => Boolean(chosen().layer && beliefCurves(chosen().layer).length);
 
 const hasFreeEnergy = trajectories.some((topic) => topic.windows.some((w) => w.free_energy.length));
 const calibrated = report.scores
@@ -37,6 +38,7 @@ const seek = (seconds) => goTo(nearest(seconds));
 const charts = {
   weights: new Chart(element('weights'), () => weightsChart(chosen().weightsAt), seek),
   errors: new Chart(element('errors'), () => errorsChart(chosen().layer), seek),
+  beliefs: new Chart(element('beliefs'), () => beliefsChart(chosen().layer), seek),
   freeEnergy: new Chart(element('free-energy'), freeEnergyChart, seek),
   iterations: new Chart(element('iterations'), iterationsChart),
   together: new Chart(element('together'), () => calibrationChart('together')),
@@ -48,6 +50,7 @@ function drawAll() {
   if (film) film.draw();
   charts.weights.draw();
   if (errorsKnown()) charts.errors.draw();
+  if (beliefsKnown()) charts.beliefs.draw();
   if (hasFreeEnergy) { charts.freeEnergy.draw(); charts.iterations.draw(); }
   tellTime();
   tellModes();
@@ -120,17 +123,30 @@ function choose(index) {
   element('weights-caption').textContent = `Weights of the ${what}, heaviest at the bottom. Click to select a time.`;
   element('errors-figure').hidden = !errorsKnown();
   if (errorsKnown()) {
-    const keys = ERRORS.map(({ name: text, series }) => {
-      const key = made('span');
-      key.append(swatch(series), ` ${text}  `);
-      return key;
-    });
     element('errors-caption').replaceChildren(
-      ...keys, `of ${name}: mean over the evaluated joints, pelvis on pelvis.`,
+      ...keys(ERRORS), `of ${name}: mean over the evaluated joints, pelvis on pelvis.`,
     );
     element('errors').setAttribute('aria-label', `Errors of ${name} over time`);
   }
+  element('beliefs').setAttribute('aria-label', `Probabilities of the person and of the cues of ${name} over time`);
+  element('beliefs-figure').hidden = !beliefsKnown();
+  if (beliefsKnown()) {
+    const text = Object.keys(chosen().layer.cues).length
+      ? `What the cues of the images are believed in ${name}: the probability that each shows the person; `
+        + 'of the track, that some mode is about where the person is.'
+      : `The probability in ${name}.`;
+    element('beliefs-caption').replaceChildren(...keys(beliefCurves(chosen().layer)), made('div', text));
+  }
   drawAll();
+}
+
+/** The names of curves, each beside its colour. */
+function keys(curves) {
+  return curves.map(({ name, series }) => {
+    const key = made('span', '', { class: 'key' });
+    key.append(swatch(series), ` ${name} `);
+    return key;
+  });
 }
 
 function swatch(...names) {
