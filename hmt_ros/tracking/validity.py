@@ -14,6 +14,15 @@ clothes in the colours of the room leave holes in it, and the rest of it is wher
 
 A part of the body may be misplaced in a mode of a track that is right, and cover anything: the e_g
 of parts is log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), at most log w / (1 - w) either way.
+A silhouette of something else leads the modes x to itself, which then explain it. Where they leave
+most of the keypoints, a pose x' by keypoints alone (`proposals.keypoint_poses`) stands for the
+states without the silhouette:
+
+    a sum_g v_g e_g  <-  log t(x_v) + a sum_g v_g min(e_g(x_v), 0)        x_v: x' where v_s = 0  (4)
+
+What a pose explains of the cue that led it there is no evidence. t is how well it went on from the
+image before (`weighting`) when the two parted.
+
 The silhouette is believed by segments, too. Segments and depths, whose misfit is that of a pose
 moved to where they place it, say nothing of the track: each has a chain of its own, which takes in
 log(P(v_0) exp(e_g) + 1 - P(v_0)).
@@ -27,6 +36,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,6 +49,8 @@ from hmt_ros.tracking.misfit import Misfit
 # Rates at which a cue ceases to show the person, or a track to follow, and the rates back, 1/s.
 FAILS, RECOVERS = 0.05, 1.0
 USUAL = RECOVERS / (FAILS + RECOVERS)
+# The same of a detector as a whole, which sees somebody else, 1/s.
+DETECTOR_FAILS = 0.02
 # What a cue says that is wholly explained or not at all, N u and N (1 - u), nats in all, and how
 # many of its measurements say so much: neighbours err together.
 NATS, ENOUGH = 16.0, 4
@@ -56,12 +68,28 @@ UNDECIDED = {SILHOUETTE: 0.4, OUTLINE: 0.4, SEGMENTS: 0.25, KEYPOINTS: 0.25, DEP
 # Cues by part of the body, and the probability w that a mode has the part where it is: limbs lag
 # behind, and hide before the trunk. Where a track begins the pose was given.
 BY_PART, PLACED = (SEGMENTS, KEYPOINTS), 0.8
-# Axes of the joint probability: the track, and after it the cues with their groups.
-TRACK = 0
-AXES = {SILHOUETTE: slice(1, 2), KEYPOINTS: slice(2, 2 + EXCHANGED.shape[1])}
+# Axes of the joint probability: the track, the detector of keypoints, and the cues.
+TRACK, DETECTOR = 0, 1
+AXES = {SILHOUETTE: slice(2, 3), KEYPOINTS: slice(3, 3 + EXCHANGED.shape[1])}
 CHAINS = AXES[KEYPOINTS].stop
-# States (2^n, n), one row for each v.
+# Chains (2^n, n) in each state, and what is valid then, v: no group of a detector that fails is.
 STATES = np.array(np.unravel_index(np.arange(2**CHAINS), (2,) * CHAINS)).T
+VALID = STATES.copy()
+VALID[:, AXES[KEYPOINTS]] *= STATES[:, [DETECTOR]]
+WITHOUT_SILHOUETTE = (VALID[:, AXES[SILHOUETTE]] == 0).all(1)
+
+
+class ByKeypoints(NamedTuple):
+    """A pose by keypoints alone, where modes that follow the silhouette leave most of them.
+
+    Attributes:
+        keypoints: what it leaves of them.
+        gain: how much better than the heaviest mode it went on when the two parted, nats, in the
+            first image that is told of.
+    """
+
+    keypoints: Misfit
+    gain: float
 
 
 class Validity:
@@ -71,12 +99,13 @@ class Validity:
         segments: number of segments of the body, S.
 
     Attributes:
-        joint: (2, .., 2) probability of the track and of the cues of `AXES`, in their order.
+        joint: (2, .., 2) probability of the track, of the detector and of the cues of `AXES`.
         alone: by name the probabilities of the groups of the other cues.
     """
 
     def __init__(self, segments: int) -> None:
-        self.joint = np.where(STATES == 1, USUAL, 1.0 - USUAL).prod(1).reshape((2,) * CHAINS)
+        usual = RECOVERS / (_fails() + RECOVERS)
+        self.joint = np.where(STATES == 1, usual, 1.0 - usual).prod(1).reshape((2,) * CHAINS)
         self.alone = {SEGMENTS: np.full(segments, USUAL), DEPTH: np.full(1, USUAL)}
 
     @property
@@ -127,8 +156,8 @@ class Validity:
     def predict(self, dt: float) -> None:
         """Goes on by dt seconds, equation (1)."""
         self.alone = {name: moved_on(p, dt) for name, p in self.alone.items()}
-        valid = moved_on(np.array([0.0, 1.0]), dt)
-        for axis in range(CHAINS):
+        for axis, fails in enumerate(_fails()):
+            valid = moved_on(np.array([0.0, 1.0]), dt, fails)
             transition = np.stack([1.0 - valid, valid])
             moved = np.tensordot(transition, self.joint, axes=(1, axis))
             self.joint = np.moveaxis(moved, 0, axis)
@@ -138,12 +167,15 @@ class Validity:
         of_cues = self.joint.sum(TRACK)
         self.joint = np.stack([(1.0 - USUAL) * of_cues, USUAL * of_cues], TRACK)
 
-    def update(self, misfits: Mapping[str, Misfit], dt: float) -> None:
+    def update(
+        self, misfits: Mapping[str, Misfit], dt: float, alone: ByKeypoints | None = None
+    ) -> None:
         """Takes in how far the modes explain the cues of an image.
 
         Args:
             misfits: by cue, and of the outline of the silhouette.
             dt: time since the image before, s; infinite: there is none.
+            alone: the pose by keypoints alone; None: the modes explain most of them.
         """
         share, begun = share_of_time(dt, TAU), bool(np.isfinite(dt))
         says = {
@@ -156,14 +188,34 @@ class Validity:
         of_track[TRACK] = says.get(OUTLINE, np.zeros(1))[0]
         for name in AXES.keys() & says.keys():
             of_track[AXES[name]] = says[name]
-        log_ratios = np.where(STATES[:, TRACK] == 1, STATES @ of_track, 0.0)
+        log_ratios = np.asarray(VALID @ of_track, dtype=np.float64)
+        if alone is not None:
+            log_ratios = _divided(of_track, share, alone)
+        log_ratios = np.where(VALID[:, TRACK] == 1, log_ratios, 0.0)
         log_joint = np.log(self.joint.ravel()) + log_ratios
         joint = np.exp(log_joint - log_joint.max())
         self.joint = (joint / joint.sum()).reshape(self.joint.shape)
 
     @property
     def _chains(self) -> Array:
-        return np.asarray(self.joint.ravel() @ STATES)
+        return np.asarray(self.joint.ravel() @ VALID)
+
+
+def _divided(of_track: Array, share: float, alone: ByKeypoints) -> Array:
+    """Log likelihood ratios (2^n,) of the states, where silhouette and keypoints contradict, (4).
+
+    Args:
+        of_track: (n,) of the cues at the modes.
+        share: of an image.
+        alone: the pose by keypoints.
+    """
+    own = of_track.copy()
+    for axes in AXES.values():
+        own[axes] = np.minimum(own[axes], 0.0)
+    at_modes = VALID @ own
+    own[AXES[KEYPOINTS]] = np.minimum(share * evidence_of(KEYPOINTS, alone.keypoints), 0.0)
+    by_keypoints = VALID @ own + alone.gain
+    return np.asarray(np.where(WITHOUT_SILHOUETTE, by_keypoints, at_modes), dtype=np.float64)
 
 
 def evidence_of(cue: str, misfit: Misfit, *, begun: bool = True) -> Array:
@@ -179,9 +231,16 @@ def evidence_of(cue: str, misfit: Misfit, *, begun: bool = True) -> Array:
     return _mixed(PLACED, e) - _mixed(1.0 - PLACED, e) if cue in BY_PART and begun else e
 
 
-def moved_on(p: Array, dt: float) -> Array:
+def _fails() -> Array:
+    """Rates (n,) at which the chains fail, 1/s."""
+    result = np.full(CHAINS, FAILS)
+    result[DETECTOR] = DETECTOR_FAILS
+    return result
+
+
+def moved_on(p: Array, dt: float, fails: float = FAILS) -> Array:
     """Probabilities of being valid, dt seconds later, equation (1)."""
-    total = FAILS + RECOVERS
+    total = fails + RECOVERS
     return np.asarray(p - math.expm1(-total * dt) * (RECOVERS / total - p))
 
 

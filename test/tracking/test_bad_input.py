@@ -287,6 +287,14 @@ def test_a_wrong_cue_is_doubted(altered, name, cues):
     assert cues == ['depth'] or believed[-JUDGED:].min() > 0.7
 
 
+@pytest.mark.parametrize('name', ['mask from left to right', 'mask without legs'])
+def test_a_wrong_mask_does_not_lead_away_from_keypoints(altered, usual, name):
+    """After half a second of it the pose is as good as without it."""
+    errors = altered(name).heaviest
+    last = slice(len(errors) - SECOND - JUDGED, len(errors) - SECOND)
+    assert np.median(errors[last]) < usual.heaviest[last].mean() + MORE
+
+
 @pytest.mark.parametrize('gap', [0.1, 1.0, 10.0, 1000.0])
 def test_gaps(run, usual, gap):
     count = BAD + SECOND

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 
 import numpy as np
@@ -13,6 +14,8 @@ from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.tracking.misfit import Misfit, of_segments
 from hmt_ros.tracking.validity import (
     DEPTH,
+    DETECTOR,
+    DETECTOR_FAILS,
     ENOUGH,
     FAILS,
     KEYPOINTS,
@@ -26,6 +29,7 @@ from hmt_ros.tracking.validity import (
     TAU,
     UNDECIDED,
     USUAL,
+    ByKeypoints,
     Validity,
     evidence_of,
     moved_on,
@@ -60,16 +64,17 @@ def test_between_images_it_is_the_chain_of_the_rates():
 
 
 def test_images_are_those_of_a_hidden_markov_model():
-    """The joint states of the track, the silhouette and three groups of keypoints, written out."""
+    """The joint states of track, detector, silhouette and groups of keypoints, written out."""
     rng = np.random.default_rng(0)
-    rates = np.array([[-RECOVERS, RECOVERS], [FAILS, -FAILS]])
-    states = np.array(list(itertools.product((0, 1), repeat=5)))
-    usual = np.array([1.0 - USUAL, USUAL])
-    p = usual[states].prod(1)
+    fails = np.full(6, FAILS)
+    fails[DETECTOR] = DETECTOR_FAILS
+    rates = [np.array([[-RECOVERS, RECOVERS], [x, -x]]) for x in fails]
+    states = np.array(list(itertools.product((0, 1), repeat=6)))
+    usual = RECOVERS / (fails + RECOVERS)
+    p = np.where(states == 1, usual, 1.0 - usual).prod(1)
     validity = Validity(2)
     for dt in (0.03, 0.1, 0.4, 0.03, 2.0):
-        one = expm(rates * dt)
-        p = p @ np.kron(one, np.kron(one, np.kron(one, np.kron(one, one))))
+        p = p @ functools.reduce(np.kron, [expm(x * dt) for x in rates])
         shares = rng.uniform(0.1, 0.6, 5)
         counts = np.full(3, ENOUGH)
         misfits = {
@@ -79,7 +84,8 @@ def test_images_are_those_of_a_hidden_markov_model():
         }
         each = [evidence_of(name, misfit) for name, misfit in misfits.items()]
         says = np.clip(share_of_time(dt, TAU) * np.concatenate(each), -MOST, MOST)
-        track, cues = states[:, 0], states[:, 1:]
+        track, detector, cues = states[:, 0], states[:, 1], states[:, 2:].copy()
+        cues[:, 1:] *= detector[:, None]
         p *= np.exp(track * (says[0] + cues @ says[1:]))
         p /= p.sum()
         validity.predict(dt)
@@ -188,7 +194,7 @@ def test_a_track_is_lost_when_no_cue_is_explained(rate, cues):
     sizes = {KEYPOINTS: 3}
     fine, gone = ({name: whole(share, sizes.get(name, 1)) for name in cues} for share in (0.0, 1.0))
     seconds(validity, fine, lambda v: False, rate, longest=2.0)
-    assert 0.05 < seconds(validity, gone, lambda v: v.lost, rate) < 0.2 + 3.0 / rate
+    assert 0.05 < seconds(validity, gone, lambda v: v.lost, rate) < 0.3 + 3.0 / rate
     assert validity.lost
     assert all(validity.cues[cue].min() > 0.4 for cue in gone if cue != OUTLINE)
     validity.search()
@@ -205,6 +211,56 @@ def test_one_cue_that_is_explained_keeps_a_track(right, wrong):
     assert np.isnan(seconds(validity, misfits, lambda v: v.lost))
     assert validity.believes(right)
     assert not validity.believes(wrong)
+
+
+@pytest.mark.parametrize('rate', [30.0, 10.0, 3.0])
+def test_a_silhouette_that_keypoints_contradict_is_doubted(rate):
+    """The modes have gone to it and explain it; a pose by keypoints leaves nothing of these."""
+    validity = Validity(1)
+    fine = {SILHOUETTE: whole(0.0), OUTLINE: whole(0.0), KEYPOINTS: whole(0.0, 3)}
+    seconds(validity, fine, lambda v: False, rate, longest=2.0)
+    misfits = fine | {KEYPOINTS: whole(0.8, 3)}
+    for i in range(max(round(rate), 4)):
+        if not validity.believes(SILHOUETTE):
+            break
+        validity.predict(1.0 / rate)
+        # The first image tells which of the two left the person.
+        alone = ByKeypoints(whole(0.0, 3), 2.0 if i == 0 else 0.0)
+        validity.update(misfits, 1.0 / rate, alone)
+    assert not validity.believes(SILHOUETTE)
+    assert validity.cues[KEYPOINTS].min() > 0.6
+    assert validity.track > 0.9
+
+
+def test_keypoints_that_leave_the_person_are_doubted():
+    """A pose that goes with them has to go far, and the modes have not."""
+    validity = Validity(1)
+    misfits = {SILHOUETTE: whole(0.0), OUTLINE: whole(0.0), KEYPOINTS: whole(0.8, 3)}
+    alone = ByKeypoints(whole(0.0, 3), -3.0)
+    for i in range(60):
+        validity.predict(1 / RATE)
+        # The first image tells which of the two left the person.
+        validity.update(misfits, 1 / RATE, alone if i == 0 else ByKeypoints(whole(0.0, 3), 0.0))
+    assert validity.cues[SILHOUETTE].min() > 0.6
+    assert validity.cues[KEYPOINTS].max() < 0.3
+
+
+@pytest.mark.parametrize('gain', [-1.0, 0.0, 2.0])
+def test_the_pose_by_keypoints_stands_for_the_states_without_the_silhouette(gain):
+    """Enumerated: silhouette and one group of keypoints, at the modes and by keypoints alone."""
+    validity, dt = Validity(1), 0.1
+    before, share = validity.joint.copy(), share_of_time(dt, TAU)
+    none = Misfit(np.zeros(3), np.array([0, 4, 0]))
+    groups = Misfit(np.array([0.0, 0.9, 0.0]), np.array([0, 4, 0]))
+    at_modes = share * evidence_of(KEYPOINTS, groups)[1]
+    assert at_modes < 0
+    validity.update({SILHOUETTE: whole(0.1), KEYPOINTS: groups}, dt, ByKeypoints(none, gain))
+    for v in itertools.product((0, 1), repeat=before.ndim):
+        track, silhouette, group = v[0], v[2], v[1] * v[4]
+        # What either pose explains does not count, as it was led there.
+        wanted = at_modes * group if silhouette else gain
+        before[v] *= np.exp(wanted if track else 0.0)
+    np.testing.assert_allclose(validity.joint, before / before.sum(), atol=1e-12)
 
 
 def test_nothing_measured_says_nothing():
