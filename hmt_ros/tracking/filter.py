@@ -20,7 +20,7 @@ from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.surface_points import SurfacePoints
-from hmt_ros.image.terms.keypoints import Keypoints, KeypointTerm
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
@@ -55,7 +55,7 @@ from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.prediction import dynamics_of, follow_flow, predict
 from hmt_ros.tracking.proposals import PROPOSALS, PosePrediction, PredictedPoses, Proposal
-from hmt_ros.tracking.proposals.keypoint_poses import KeypointPoses, pose_by_keypoints
+from hmt_ros.tracking.proposals.keypoint_poses import KeypointHistory, KeypointPoses
 from hmt_ros.tracking.proposals.reversals import Reversals
 from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
 from hmt_ros.tracking.settings import TrackerSettings
@@ -68,8 +68,6 @@ from hmt_ros.tracking.validity import (
     OUTLINE,
     SEGMENTS,
     SILHOUETTE,
-    UNDECIDED,
-    ByKeypoints,
     Validity,
 )
 from hmt_ros.tracking.weighting import Continuity, at_least, normalised, pooled_origins
@@ -120,8 +118,7 @@ class MixtureFilter:
         self._observed: tuple[Observation, Observation] | None = None
         self._outline_costs = np.empty((0, 0))
         self._points: SurfacePoints | None = None
-        self._pose_by_keypoints: Array | None = None
-        self._gain = 0.0
+        self._by_keypoints = KeypointHistory()
         self._dt = np.inf
         self._posterior = Posterior(body, camera, settings, extra, ground)
         self.contacts = FootContacts()
@@ -227,7 +224,7 @@ class MixtureFilter:
 
     def _hold(self, optimised: Optimised, observation: Observation) -> None:
         """Makes modes at rest."""
-        self._pose_by_keypoints = None
+        self._by_keypoints = KeypointHistory()
         self._posterior.stance = None
         self._posterior.exchanges.forget()
         self._dt = np.inf
@@ -246,8 +243,8 @@ class MixtureFilter:
         """Takes everything that has a place into the camera frame of the next image."""
         self._modes = motion.modes(self.body, self.modes)
         self._facing.carry(self.body, self._modes.poses)
-        if self._pose_by_keypoints is not None:
-            self._pose_by_keypoints = motion.poses(self.body, self._pose_by_keypoints)
+        if self._by_keypoints.pose is not None:
+            self._by_keypoints.pose = motion.poses(self.body, self._by_keypoints.pose)
         self.contacts.carry(motion)
 
     def propagate(
@@ -277,7 +274,7 @@ class MixtureFilter:
         proposals: list[Proposal] = [self._proposal]
         if self._facing.lacks_a_way(search.rated(base.x, base.value)):
             proposals.insert(0, Reversals())
-        if self._pose_by_keypoints is not None and posterior.placing(seen) is not None:
+        if self._by_keypoints.contradicted and posterior.placing(seen) is not None:
             proposals.insert(0, KeypointPoses())
         if expected is not None:
             proposals.insert(0, PredictedPoses(self.body, expected.seen_as(self.body)))
@@ -306,26 +303,9 @@ class MixtureFilter:
             found[KEYPOINTS], missed = of_keypoints(term, modes.poses)
             self.misfit = max(self.misfit, missed)
             if search is not None and SILHOUETTE in found:
-                alone = self._by_keypoints(term, search, found[KEYPOINTS])
+                alone = self._by_keypoints.follow(search, modes.poses[0], term, found[KEYPOINTS])
         self.validity.update(found, self._dt, alone)
         self.check_depths(body, modes.poses[0], observation.depths, self._dt)
-
-    def _by_keypoints(
-        self, term: KeypointTerm, search: Search, missed: Misfit
-    ) -> ByKeypoints | None:
-        """Where keypoints have led since modes miss a group of them; None: they agree on most."""
-        before, continuity = self._pose_by_keypoints, search.continuity
-        pose = pose_by_keypoints(search, before)
-        if before is None:
-            both = np.stack([pose[0], self.modes.poses[0]])
-            self._gain = float(np.subtract(*continuity.rated(both)))
-        parted = (missed.shares > UNDECIDED[KEYPOINTS]) & (missed.counts > 0)
-        self._pose_by_keypoints = pose if parted.any() else None
-        share = missed.shares @ missed.counts / max(missed.counts.sum(), 1.0)
-        if share <= UNDECIDED[KEYPOINTS]:
-            return None
-        gain, self._gain = self._gain, 0.0
-        return ByKeypoints(of_keypoints(term, pose)[0], gain)
 
     def check_depths(self, body: Body, pose: Array, depths: ImageMap | None, dt: float) -> None:
         """Takes in how far depths, if there are some, show a body at a pose (d,).

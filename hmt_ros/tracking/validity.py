@@ -29,7 +29,8 @@ log(P(v_0) exp(e_g) + 1 - P(v_0)).
 
 In an image each cue counts with the energy p_g E_g, to which the energy above is equal in first
 order around E_outlier, with the p_g of (1), before the image: weights and optima hold the same sum.
-A silhouette and depths that more likely are of something else are left out wholly.
+What more likely is of something else as a whole is left out: a silhouette, depths, a detection. The
+p_g of groups of keypoints are those of a detector that sees the person.
 """
 
 from __future__ import annotations
@@ -136,7 +137,10 @@ class Validity:
         """Factors on the cues of the next image."""
         cues = self.cues
         silhouette, depth = (float(cues[name][0]) for name in (SILHOUETTE, DEPTH))
-        return Beliefs(silhouette, cues[SEGMENTS], cues[KEYPOINTS], depth)
+        of_person = self.joint.ravel() * STATES[:, DETECTOR]
+        detector = float(of_person.sum())
+        groups = (of_person @ VALID[:, AXES[KEYPOINTS]]) / detector
+        return Beliefs(silhouette, cues[SEGMENTS], groups * (detector >= 0.5), depth)
 
     @property
     def shown(self) -> dict[str, float]:

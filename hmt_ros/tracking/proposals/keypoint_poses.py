@@ -2,8 +2,9 @@
 
     x' = argmin sum_p d_p(x)^2 / 2 + E_prior(x) + (x - f)' P (x - f) / 2
 
-d_p is the distance to keypoint p in deviations, f where the heaviest mode is predicted, and P the
-precision of that prediction.
+d_p is the distance to keypoint p in deviations, f where the heaviest mode is predicted, or x' of
+the image before while silhouette and keypoints go different ways, P the precision of the
+prediction.
 """
 
 from __future__ import annotations
@@ -12,42 +13,77 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hmt_ros.image.terms.keypoints import KeypointTerm
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.energy import Quadratic, Sum
 from hmt_ros.tracking.hypotheses import Hypotheses
+from hmt_ros.tracking.misfit import Misfit, of_keypoints
 from hmt_ros.tracking.optimisation import Search
+from hmt_ros.tracking.validity import KEYPOINTS, UNDECIDED, ByKeypoints
 
 
-def pose_by_keypoints(search: Search, before: Array | None = None) -> Array:
-    """A pose moved to the keypoints of an image, whatever its silhouette, (1, d).
+class KeypointHistory:
+    """Where keypoints alone have led since the modes left some of them.
 
-    Args:
-        search: of the image.
-        before: (1, d) by the keypoints of the image before; None: the heaviest mode.
-
-    Raises:
-        ValueError: there are no keypoints.
+    Attributes:
+        pose: (1, d) of the last image; None: the modes explain every group of keypoints.
+        contradicted: whether the modes left most keypoints of that image.
     """
-    posterior = search.posterior
-    first = search.continuity.predicted[:1] if before is None else before
-    placing = posterior.placing(search.observation)
-    if placing is None:
-        raise ValueError('there are no keypoints to move a pose to')
-    term = Sum((placing, Quadratic(first, search.precisions[:1])))
-    return posterior.minimise(term, first, posterior.settings.iterations).x
+
+    def __init__(self) -> None:
+        self.pose: Array | None = None
+        self._gain = 0.0
+        self.contradicted = False
+
+    def follow(
+        self, search: Search, mode: Array, term: KeypointTerm, missed: Misfit
+    ) -> ByKeypoints | None:
+        """Goes on to the keypoints of an image.
+
+        Args:
+            search: of the image.
+            mode: (d,) the heaviest.
+            term: of the keypoints.
+            missed: what the modes leave of them.
+
+        Returns:
+            What the pose by keypoints says of the cues; None: the modes explain most keypoints.
+        """
+        first = self.pose is None
+        pose = _by_keypoints(search, self.pose)
+        if first:
+            self._gain = float(np.subtract(*search.continuity.rated(np.stack([pose[0], mode]))))
+        parted = (missed.shares > UNDECIDED[KEYPOINTS]) & (missed.counts > 0)
+        self.pose = pose if parted.any() else None
+        share = missed.shares @ missed.counts / max(missed.counts.sum(), 1.0)
+        self.contradicted = bool(share > UNDECIDED[KEYPOINTS])
+        if not self.contradicted:
+            return None
+        gain, self._gain = self._gain, 0.0
+        return ByKeypoints(of_keypoints(term, pose)[0], gain)
 
 
 @dataclass(frozen=True)
 class KeypointPoses:
-    """Proposes the heaviest mode as keypoints alone would have it."""
+    """Proposes where keypoints alone would move the heaviest mode."""
 
     def propose(
         self, search: Search, _base: Minimum, sources: Hypotheses, _rng: np.random.Generator
     ) -> Hypotheses:
         """See `Proposal`."""
-        pose = pose_by_keypoints(search)
+        pose = _by_keypoints(search, None)
         return Hypotheses(
             pose, sources.log_weights[:1], sources.ancestors[:1], pose,
             np.zeros(pose.shape, dtype=np.bool_),
         )  # fmt: skip
+
+
+def _by_keypoints(search: Search, before: Array | None) -> Array:
+    """The pose x', (1, d), of an image that has keypoints."""
+    posterior = search.posterior
+    first = search.continuity.predicted[:1] if before is None else before
+    placing = posterior.placing(search.observation)
+    assert placing is not None
+    term = Sum((placing, Quadratic(first, search.precisions[:1])))
+    return posterior.minimise(term, first, posterior.settings.iterations).x
