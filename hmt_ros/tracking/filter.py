@@ -300,10 +300,10 @@ class MixtureFilter:
         found = self._misfits_of_silhouette(observation, belief)
         if observation.keypoints is not None and s.keypoints.weight > 0:
             term = self._posterior.likelihood.keypoint_term(observation, None)
-            found[KEYPOINTS], missed = of_keypoints(term, modes.poses)
-            self.misfit = max(self.misfit, missed)
+            found[KEYPOINTS] = missed = of_keypoints(term, modes.poses)
+            self.misfit = max(self.misfit, missed.share)
             if search is not None and SILHOUETTE in found:
-                alone = self._by_keypoints.follow(search, modes.poses[0], term, found[KEYPOINTS])
+                alone = self._by_keypoints.follow(search, modes.poses[0], term, missed)
         self.validity.update(found, self._dt, alone)
         self.check_depths(body, modes.poses[0], observation.depths, self._dt)
 
@@ -339,9 +339,7 @@ class MixtureFilter:
         if points is not None and (foreground.any() or observation.keypoints is not None):
             segments = len(self.body.skeleton.parents)
             found[SEGMENTS] = each = of_segments(points, 0, foreground, segments)
-            total = each.counts.sum(keepdims=True)
-            missed = (each.shares @ each.counts) / np.maximum(total, 1.0)
-            found[SILHOUETTE] = Misfit(missed, total)
+            found[SILHOUETTE] = Misfit(np.array([each.share]), each.counts.sum(keepdims=True))
         return found
 
     def likelihood(self, observation: Observation) -> Likelihood:

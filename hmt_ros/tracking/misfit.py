@@ -46,6 +46,11 @@ class Misfit(NamedTuple):
     shares: Array
     counts: Array
 
+    @property
+    def share(self) -> float:
+        """Of all measurements together; 0 where there are none."""
+        return float(self.shares @ self.counts / max(self.counts.sum(), 1.0))
+
 
 def of_segments(points: SurfacePoints, row: int, foreground: Mask, segments: int) -> Misfit:
     """Visible points of each segment that are no foreground.
@@ -99,8 +104,8 @@ def outline_costs(
     return likelihood.energies(forward(body.skeleton, poses), seen, derivatives=False).costs
 
 
-def of_keypoints(term: KeypointTerm, poses: Array) -> tuple[Misfit, float]:
-    """Keypoints that the best of poses (K, d) does not explain, by group, and of all.
+def of_keypoints(term: KeypointTerm, poses: Array) -> Misfit:
+    """Keypoints that the best of poses (K, d) does not explain, by group.
 
     Each pose is given the exchange of sides that is likeliest there.
     """
@@ -108,12 +113,12 @@ def of_keypoints(term: KeypointTerm, poses: Array) -> tuple[Misfit, float]:
     count = EXCHANGED.shape[1]
     counts = np.bincount(groups, minlength=count).astype(np.float64)
     if len(groups) == 0:
-        return Misfit(np.zeros(count), counts), 0.0
+        return Misfit(np.zeros(count), counts)
     distances = [term.distances(forward(term.skeleton, pose[None])) for pose in poses]
     missed = ~(np.stack(distances) < UNEXPLAINED)
     best = missed[missed.mean(1).argmin()]
     found = np.bincount(groups, weights=best, minlength=count)
-    return Misfit(found / np.maximum(counts, 1.0), counts), float(best.mean())
+    return Misfit(found / np.maximum(counts, 1.0), counts)
 
 
 def of_depth(body: Body, camera: Camera, poses: Array, depths: ImageMap) -> Array:

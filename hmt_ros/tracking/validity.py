@@ -15,13 +15,13 @@ clothes in the colours of the room leave holes in it, and the rest of it is wher
 A part of the body may be misplaced in a mode of a track that is right, and cover anything: the e_g
 of parts is log(w exp(e_g) + 1 - w) - log(w + (1 - w) exp(e_g)), at most log w / (1 - w) either way.
 A silhouette of something else leads the modes x to itself, which then explain it. Where they leave
-most of the keypoints, a pose x' by keypoints alone (`proposals.keypoint_poses`) stands for the
-states without the silhouette:
+more than a quarter of the keypoints, a pose x' by keypoints alone (`proposals.keypoint_poses`)
+stands for the states without the silhouette:
 
     a sum_g v_g e_g  <-  log t(x_v) + a sum_g v_g min(e_g(x_v), 0)        x_v: x' where v_s = 0  (4)
 
-What a pose explains of the cue that led it there is no evidence. t is how well it went on from the
-image before (`weighting`) when the two parted.
+The fit of a pose to the cue that it was moved to is no evidence for that cue. t is how well it went
+on from the image before (`weighting`) when the two parted.
 
 The silhouette is believed by segments, too. Segments and depths, whose misfit is that of a pose
 moved to where they place it, say nothing of the track: each has a chain of its own, which takes in
@@ -81,7 +81,7 @@ WITHOUT_SILHOUETTE = (VALID[:, AXES[SILHOUETTE]] == 0).all(1)
 
 
 class ByKeypoints(NamedTuple):
-    """A pose by keypoints alone, where modes that follow the silhouette leave most of them.
+    """A pose by keypoints alone, where modes that follow the silhouette miss too many of them.
 
     Attributes:
         keypoints: what it leaves of them.
@@ -179,7 +179,7 @@ class Validity:
         Args:
             misfits: by cue, and of the outline of the silhouette.
             dt: time since the image before, s; infinite: there is none.
-            alone: the pose by keypoints alone; None: the modes explain most of them.
+            alone: the pose by keypoints alone; None: the modes explain enough of them.
         """
         share, begun = share_of_time(dt, TAU), bool(np.isfinite(dt))
         says = {

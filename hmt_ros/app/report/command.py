@@ -35,9 +35,9 @@ _FOLDER = FolderKind('a report', PAGE, tuple(PICTURES))
 EPILOG = """\
 DIR gets report.html, a page that needs only a browser, neither network nor other files: images
 with the modes on them, all modes in a 3D view that turns with the mouse, a slider through time,
-weights, what the cues of the images are believed, free energy of trajectories and, where the truth
-is known, errors and calibration. The pictures (PNG) for documents are beside it. DIR is written
-completely or not at all.
+weights, how far each cue of the images is believed, free energy of trajectories and, where the
+truth is known, errors and calibration. Beside it are the pictures (PNG) for documents. DIR is
+written completely or not at all.
 
 The images come from --images, else from OUT itself (replay --with-images), else from its topic
 overlay/compressed, on which the heaviest modes are already drawn. The page never exceeds 20 MB:

@@ -28,7 +28,7 @@ class KeypointHistory:
 
     Attributes:
         pose: (1, d) of the last image; None: the modes explain every group of keypoints.
-        contradicted: whether the modes left most keypoints of that image.
+        contradicted: whether the modes missed more than a quarter of the keypoints of that image.
     """
 
     def __init__(self) -> None:
@@ -48,20 +48,20 @@ class KeypointHistory:
             missed: what the modes leave of them.
 
         Returns:
-            What the pose by keypoints says of the cues; None: the modes explain most keypoints.
+            What the pose by keypoints says of the cues; None: the modes explain enough keypoints.
         """
-        first = self.pose is None
+        self.contradicted = missed.share > UNDECIDED[KEYPOINTS]
+        if not (missed.shares[missed.counts > 0] > UNDECIDED[KEYPOINTS]).any():
+            self.pose = None
+            return None
         pose = _by_keypoints(search, self.pose)
-        if first:
+        if self.pose is None:
             self._gain = float(np.subtract(*search.continuity.rated(np.stack([pose[0], mode]))))
-        parted = (missed.shares > UNDECIDED[KEYPOINTS]) & (missed.counts > 0)
-        self.pose = pose if parted.any() else None
-        share = missed.shares @ missed.counts / max(missed.counts.sum(), 1.0)
-        self.contradicted = bool(share > UNDECIDED[KEYPOINTS])
+        self.pose = pose
         if not self.contradicted:
             return None
         gain, self._gain = self._gain, 0.0
-        return ByKeypoints(of_keypoints(term, pose)[0], gain)
+        return ByKeypoints(of_keypoints(term, pose), gain)
 
 
 @dataclass(frozen=True)

@@ -239,8 +239,8 @@ def test_beliefs_are_drawn_where_a_topic_has_them(page, body, poses, tmp_path):
     seen = visit(known, steps, tmp_path)
     assert ' '.join(seen['first'].split()) == (
         'person in view silhouette track depth '
-        'What the cues of the images are believed in posterior (/pose_mixture): the probability '
-        'that each shows the person; of the track, that some mode is about where the person is.'
+        'How far each cue of the images is believed in posterior (/pose_mixture): the probability '
+        'that it shows the person; of the track, that some mode is about where the person is.'
     )
     assert seen['beliefs drawn'] > 1000
     assert seen['beliefs'] != seen['later']

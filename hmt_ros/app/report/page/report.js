@@ -132,7 +132,7 @@ function choose(index) {
   element('beliefs-figure').hidden = !beliefsKnown();
   if (beliefsKnown()) {
     const text = Object.keys(chosen().layer.cues).length
-      ? `What the cues of the images are believed in ${name}: the probability that each shows the person; `
+      ? `How far each cue of the images is believed in ${name}: the probability that it shows the person; `
         + 'of the track, that some mode is about where the person is.'
       : `The probability in ${name}.`;
     element('beliefs-caption').replaceChildren(...keys(beliefCurves(chosen().layer)), made('div', text));
