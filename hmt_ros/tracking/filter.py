@@ -43,12 +43,13 @@ from hmt_ros.tracking.laplace_approximation import (
     posterior_modes,
 )
 from hmt_ros.tracking.misfit import (
+    KEYPOINTS,
+    OUTLINE,
+    SILHOUETTE,
     Misfit,
     of_depth_at_best,
     of_keypoints,
-    of_outline,
-    of_segments,
-    outline_costs,
+    of_silhouette,
 )
 from hmt_ros.tracking.motion_states import PredictedStates
 from hmt_ros.tracking.optimisation import Search
@@ -61,15 +62,7 @@ from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
 from hmt_ros.tracking.stance import stance_of
-from hmt_ros.tracking.validity import (
-    DEPTH,
-    ENOUGH,
-    KEYPOINTS,
-    OUTLINE,
-    SEGMENTS,
-    SILHOUETTE,
-    Validity,
-)
+from hmt_ros.tracking.validity import DEPTH, ENOUGH, Validity
 from hmt_ros.tracking.weighting import Continuity, at_least, normalised, pooled_origins
 
 # How often the shape is fitted to the first image.
@@ -295,9 +288,13 @@ class MixtureFilter:
         """
         body, modes, s = self.body, self.modes, self.settings.likelihood
         alone = None
-        belief = 1.0 if observation.beliefs is None else observation.beliefs.silhouette
-        self.misfit = of_outline(self._outline_costs, s.coverage, belief)
-        found = self._misfits_of_silhouette(observation, belief)
+        found = of_silhouette(
+            body, self.camera, modes.poses, observation, s.coverage,
+            self._outline_costs, self._points,
+        )  # fmt: skip
+        self.misfit = 0.0
+        if OUTLINE in found and observation.outline is not None:
+            self.misfit = found[OUTLINE].share
         if observation.keypoints is not None and s.keypoints.weight > 0:
             term = self._posterior.likelihood.keypoint_term(observation, None)
             found[KEYPOINTS] = missed = of_keypoints(term, modes.poses)
@@ -319,28 +316,6 @@ class MixtureFilter:
             share = of_depth_at_best(body, self.camera, pose, depths)
             whole = Misfit(np.array([share]), np.array([ENOUGH]))
             self.validity.update({DEPTH: whole}, dt)
-
-    def _misfits_of_silhouette(self, observation: Observation, belief: float) -> dict[str, Misfit]:
-        """By segment, of all and of the outline, which is asked even where it is left out.
-
-        An empty silhouette only says that nobody is there, unless keypoints place somebody.
-        """
-        found: dict[str, Misfit] = {}
-        foreground, coverage = observation.foreground, self.settings.likelihood.coverage
-        if foreground is None or coverage.weight == 0:
-            return found
-        costs = self._outline_costs
-        if observation.outline is None:
-            poses, belief = self.modes.poses, 1.0
-            costs = outline_costs(self.body, self.camera, poses, foreground, coverage)
-        share = of_outline(costs, coverage, belief)
-        found[OUTLINE] = Misfit(np.array([share]), np.array([costs.shape[1]]))
-        points = self._points
-        if points is not None and (foreground.any() or observation.keypoints is not None):
-            segments = len(self.body.skeleton.parents)
-            found[SEGMENTS] = each = of_segments(points, 0, foreground, segments)
-            found[SILHOUETTE] = Misfit(np.array([each.share]), each.counts.sum(keepdims=True))
-        return found
 
     def likelihood(self, observation: Observation) -> Likelihood:
         """See `likelihood_modes`."""

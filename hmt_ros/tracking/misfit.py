@@ -30,6 +30,8 @@ from hmt_ros.image.terms.keypoints import EXCHANGED, KeypointTerm
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.tracking.start_depth import moved_to_depth
 
+# Names of what is told. What is left of a silhouette's outline tells of the track alone.
+SILHOUETTE, SEGMENTS, OUTLINE, KEYPOINTS = 'silhouette', 'segments', 'outline', 'keypoints'
 # A sample of the outline or a keypoint further away than this from where it should be is
 # unexplained, in sigmas.
 UNEXPLAINED = 4.0
@@ -50,6 +52,43 @@ class Misfit(NamedTuple):
     def share(self) -> float:
         """Of all measurements together; 0 where there are none."""
         return float(self.shares @ self.counts / max(self.counts.sum(), 1.0))
+
+
+def of_silhouette(
+    body: Body,
+    camera: Camera,
+    poses: Array,
+    observation: Observation,
+    term: TermSettings,
+    costs: Array,
+    points: SurfacePoints | None,
+) -> dict[str, Misfit]:
+    """What modes leave of a silhouette, by segment, of all, and of its outline.
+
+    Nothing where there is none. An empty one only says that nobody is there, unless keypoints place
+    somebody.
+
+    Args:
+        body, camera, poses: the modes (K, d), heaviest first.
+        observation: whose outline is asked even where it is left out.
+        term: that samples of the outline cost poses by.
+        costs: (K, M) of these samples in the likelihood.
+        points: that are seen of the modes, if they are known.
+    """
+    found: dict[str, Misfit] = {}
+    foreground, beliefs = observation.foreground, observation.beliefs
+    if foreground is None or term.weight == 0:
+        return found
+    belief = 1.0 if beliefs is None else beliefs.silhouette
+    if observation.outline is None:
+        belief, costs = 1.0, outline_costs(body, camera, poses, foreground, term)
+    share = of_outline(costs, term, belief)
+    found[OUTLINE] = Misfit(np.array([share]), np.array([costs.shape[1]]))
+    if points is not None and (foreground.any() or observation.keypoints is not None):
+        segments = len(body.skeleton.parents)
+        found[SEGMENTS] = each = of_segments(points, 0, foreground, segments)
+        found[SILHOUETTE] = Misfit(np.array([each.share]), each.counts.sum(keepdims=True))
+    return found
 
 
 def of_segments(points: SurfacePoints, row: int, foreground: Mask, segments: int) -> Misfit:

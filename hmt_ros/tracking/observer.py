@@ -21,10 +21,11 @@ from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.tracking.misfit import SILHOUETTE
 from hmt_ros.tracking.person_shape import raster_step
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.silhouettes import Silhouettes, region_of
-from hmt_ros.tracking.validity import SILHOUETTE, Validity
+from hmt_ros.tracking.validity import Validity
 from hmt_ros.tracking.view import View
 
 

@@ -34,6 +34,7 @@ from hmt_ros.tracking.gravity import Gravity
 from hmt_ros.tracking.ground import Ground, GroundEstimator, KnownGround, unit_vector
 from hmt_ros.tracking.hypotheses import LIKELY, Modes
 from hmt_ros.tracking.initialisation import check_box
+from hmt_ros.tracking.misfit import SILHOUETTE
 from hmt_ros.tracking.observer import Observer
 from hmt_ros.tracking.point_estimate import PointEstimate
 from hmt_ros.tracking.prediction import expected_poses
@@ -43,7 +44,7 @@ from hmt_ros.tracking.silhouettes import Silhouettes
 from hmt_ros.tracking.start_depth import depths_of
 from hmt_ros.tracking.status import Status
 from hmt_ros.tracking.subject import Subject
-from hmt_ros.tracking.validity import SILHOUETTE, Validity
+from hmt_ros.tracking.validity import Validity
 from hmt_ros.tracking.view import View
 
 # Share of the time for which somebody stands on both feet, where contact is unknown.

@@ -45,7 +45,7 @@ from hmt_ros.image.observation import Beliefs
 from hmt_ros.image.terms.keypoints import EXCHANGED
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import share_of_time
-from hmt_ros.tracking.misfit import Misfit
+from hmt_ros.tracking.misfit import KEYPOINTS, OUTLINE, SEGMENTS, SILHOUETTE, Misfit
 
 # Rates at which a cue ceases to show the person, or a track to follow, and the rates back, 1/s.
 FAILS, RECOVERS = 0.05, 1.0
@@ -60,9 +60,7 @@ TAU = 0.1
 # What one image can say of a cue at most, nats: it may be of something that nobody has thought of.
 MOST = 3.5
 
-SILHOUETTE, SEGMENTS, KEYPOINTS, DEPTH = 'silhouette', 'segments', 'keypoints', 'depth'
-# What of a silhouette's outline is not explained tells of the track alone.
-OUTLINE = 'outline'
+DEPTH = 'depth'
 # Misfit u at which a cue is as likely to be of something else: between those of images that show
 # the person and those that do not. Clothes in the colours of the room leave holes in a silhouette.
 UNDECIDED = {SILHOUETTE: 0.4, OUTLINE: 0.4, SEGMENTS: 0.25, KEYPOINTS: 0.25, DEPTH: 0.15}

@@ -25,8 +25,9 @@ from hmt_ros.tracking import (
     Tracker,
     TrackerSettings,
 )
+from hmt_ros.tracking.misfit import KEYPOINTS
 from hmt_ros.tracking.posterior import WIDEST
-from hmt_ros.tracking.validity import KEYPOINTS, UNDECIDED
+from hmt_ros.tracking.validity import UNDECIDED
 
 ONLY_KEYPOINTS = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
 OFF = GroundSettings(0.0, 0.0, 0.0)

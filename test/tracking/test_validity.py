@@ -11,21 +11,17 @@ from scipy.linalg import expm
 
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.inference.error_model import share_of_time
-from hmt_ros.tracking.misfit import Misfit, of_segments
+from hmt_ros.tracking.misfit import KEYPOINTS, OUTLINE, SEGMENTS, SILHOUETTE, Misfit, of_segments
 from hmt_ros.tracking.validity import (
     DEPTH,
     DETECTOR,
     DETECTOR_FAILS,
     ENOUGH,
     FAILS,
-    KEYPOINTS,
     MOST,
     NATS,
-    OUTLINE,
     PLACED,
     RECOVERS,
-    SEGMENTS,
-    SILHOUETTE,
     TAU,
     UNDECIDED,
     USUAL,

@@ -18,9 +18,9 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.energy import Quadratic, Sum
 from hmt_ros.tracking.hypotheses import Hypotheses
-from hmt_ros.tracking.misfit import Misfit, of_keypoints
+from hmt_ros.tracking.misfit import KEYPOINTS, Misfit, of_keypoints
 from hmt_ros.tracking.optimisation import Search
-from hmt_ros.tracking.validity import KEYPOINTS, UNDECIDED, ByKeypoints
+from hmt_ros.tracking.validity import UNDECIDED, ByKeypoints
 
 
 class KeypointHistory:
