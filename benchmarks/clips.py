@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -51,6 +51,8 @@ class Clip:
         views: stamp -> true rotation (3, 3) and position (3,) of a camera that moves, in the world,
             m; they stand for odometry. Empty: it stands still, or the clip does not tell.
         size: against that of the images in the bag.
+        ups: stamp -> (3,) true unit vector against gravity, camera frame; empty: the clip does not
+            tell it.
     """
 
     folder: Path
@@ -62,6 +64,7 @@ class Clip:
     background: NDArray[np.uint8] | None
     size: float = 1.0
     views: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
+    ups: dict[int, NDArray[np.float64]] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -246,6 +249,7 @@ def read_clip(folder: Path, frames: int | None = None) -> Clip:
     height, width = images[0].shape[:2]
     with np.load(folder / 'truth.npz') as content:
         pixels = dict(zip(map(int, content['stamps']), np.array(content['pixels']), strict=True))
+        ups = dict(zip(pixels, _ups(content, len(pixels)), strict=False))
         views = {}
         if background is None and 'camera_quaternion' in content:
             turns = Rotation.from_quat(content['camera_quaternion']).as_matrix()
@@ -261,7 +265,16 @@ def read_clip(folder: Path, frames: int | None = None) -> Clip:
         pixels,
         None if background is None else np.asarray(background, dtype=np.uint8),
         views=views,
+        ups=ups,
     )
+
+
+def _ups(truth: Mapping[str, NDArray[np.float64]], count: int) -> NDArray[np.float64]:
+    """Unit vectors against gravity (T, 3) in so many images; (0, 3): the truth does not tell."""
+    if 'gravity' in truth:
+        down = truth['gravity']
+        return np.asarray(-down / np.linalg.norm(down, axis=1, keepdims=True))
+    return np.tile(truth['up'], (count, 1)) if 'up' in truth else np.empty((0, 3))
 
 
 @dataclass(frozen=True, eq=False)

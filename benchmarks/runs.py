@@ -69,6 +69,8 @@ IMAGES, BOTH, KEYPOINTS = 'images', 'images + keypoints', 'keypoints'
 INPUTS = (IMAGES, BOTH, KEYPOINTS)
 SUBJECT = 'subject'
 STARTS = (SUBJECT, KEYPOINTS)
+UNKNOWN, GIVEN = 'unknown', 'given'
+GRAVITIES = (UNKNOWN, GIVEN)
 KEPT = ROOT / 'build' / 'benchmarks' / 'tracking'
 # Joints of a record: the origin, then those that are scored.
 JOINTS = (ORIGIN, *EVALUATED_JOINTS)
@@ -95,6 +97,7 @@ class Run:
         size: of the images against those in the bag; other sizes go with images alone.
         start: what the track starts from, one of `STARTS`.
         rate: images a second that the tracker is given at most; 0: all images of the clip.
+        gravity: whether the tracker is given its direction with each image, one of `GRAVITIES`.
     """
 
     folder: Path
@@ -105,6 +108,7 @@ class Run:
     size: float = 1.0
     start: str = SUBJECT
     rate: float = 0.0
+    gravity: str = UNKNOWN
 
     @property
     def clip(self) -> str:
@@ -210,7 +214,7 @@ def run(one: Run) -> Record:
     if one.inputs == KEYPOINTS:
         settings = keypoints_only(settings)
     tracker = new_tracker(clip, body, settings, one.seed, with_subject=one.start == SUBJECT)
-    return follow(clip, tracker, one.seed, keypoints)
+    return follow(clip, tracker, one.seed, keypoints, gravity=one.gravity)
 
 
 def follow(
@@ -219,6 +223,8 @@ def follow(
     seed: int,
     keypoints: dict[int, Keypoints] | None = None,
     predict: Callable[[NDArray[np.uint8]], PosePrediction] | None = None,
+    *,
+    gravity: str = UNKNOWN,
 ) -> Record:
     """What a tracker says of the images of a clip.
 
@@ -228,7 +234,13 @@ def follow(
         seed: of the draws of the blind control and of the regions.
         keypoints: by stamp; None: none are used.
         predict: poses that a regression expects by an image; None: there is none.
+        gravity: one of `GRAVITIES`.
+
+    Raises:
+        ValueError: gravity is to be given, and the clip does not tell it.
     """
+    if gravity == GIVEN and not clip.ups:
+        raise ValueError(f'{clip.folder}: truth.npz has neither gravity nor up')
     bodies: list[Body] = []
     mixtures: list[GaussianMixture] = []
     points: list[NDArray[np.float64]] = []
@@ -242,6 +254,8 @@ def follow(
         if stamp in clip.views:
             rotation, position = clip.views[stamp]
             tracker.set_camera(position, rotation)
+        if gravity == GIVEN and stamp in clip.ups:
+            tracker.set_gravity(clip.ups[stamp])
         posterior, _ = tracker.step(image, stamp, seen, prediction)
         spent, cpu_spent = time.perf_counter() - start, time.process_time() - cpu_start
         statuses.append(tracker.status.value)

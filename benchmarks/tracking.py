@@ -21,10 +21,12 @@ from benchmarks.clips import find_clips, read_clip
 from benchmarks.command import benchmark_parser, show
 from benchmarks.machine import description
 from benchmarks.runs import (
+    GRAVITIES,
     IMAGES,
     INPUTS,
     STARTS,
     SUBJECT,
+    UNKNOWN,
     USUAL_RATE,
     Run,
     records_of,
@@ -41,6 +43,7 @@ from benchmarks.tracking_means import (
     entry_of,
     group_of,
     grouped,
+    key_of,
     means_of,
     medians_of,
     paired,
@@ -85,6 +88,10 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         '--start', choices=STARTS, default=SUBJECT,
         help='start from the subject file of a clip, or from its keypoints where they are an input',
+    )  # fmt: skip
+    parser.add_argument(
+        '--gravity', nargs='+', choices=GRAVITIES,
+        help='whether its direction is given with each image (all; of rules: unknown)',
     )  # fmt: skip
     parser.add_argument(
         '--seeds', type=int, nargs='+', metavar='N',
@@ -138,6 +145,7 @@ def main(argv: list[str]) -> int:
             parsed_changes(options.against), options.processes, options.frames,
             quick=options.quick, start=options.start, rates=options.rates or RATES,
             baseline=options.baseline, others=options.others, rules=options.rules,
+            gravity=options.gravity or ((UNKNOWN,) if 'rules' in parts else GRAVITIES),
             plan=Plan(options.seeds or plan.seeds, options.rates or plan.rates),
         )  # fmt: skip
     except ValueError as error:
@@ -163,6 +171,7 @@ def measure(
     rules: Sequence[str] = (),
     plan: Plan = SCREEN,
     others: bool = False,
+    gravity: Sequence[str] = (UNKNOWN,),
 ) -> dict[str, Any]:
     """Everything that was asked for.
 
@@ -182,6 +191,7 @@ def measure(
         rules: names or groups of rules that the tracker is run without; empty: all.
         plan: seeds and rates of the runs without rules.
         others: whether the clips that settings were not chosen on are run without rules, too.
+        gravity: some of `runs.GRAVITIES`; clips that do not tell it are only run without.
 
     Raises:
         ValueError: there is no such clip, or it can not be read.
@@ -200,12 +210,14 @@ def measure(
         return [
             Run(
                 folder, given, seed, limit=limit, start=SUBJECT if given == IMAGES else start,
-                rate=rate,
+                rate=rate, gravity=known,
             )
             for folder in some
             for rate in slower
             for given in inputs
             if given == IMAGES or folder.name not in lacking
+            for known in gravity
+            if known == UNKNOWN or _has_gravity(folder)
             for seed in seeds
         ]  # fmt: skip
 
@@ -219,7 +231,7 @@ def measure(
     if 'accuracy' in parts:
         entries = accuracy(runs, processes)
         entries += [
-            entry_of((folder.name, DETECTOR, rate), [detector_scores(folder, limit, rate)])
+            entry_of((folder.name, DETECTOR, rate, UNKNOWN), [detector_scores(folder, limit, rate)])
             for folder in folders
             if folder.name not in lacking
             for rate in dict.fromkeys(one.rate for one in runs)
@@ -264,11 +276,16 @@ def _has_keypoints(folder: Path) -> bool:
     return (folder / 'keypoints_mediapipe.npz').is_file()
 
 
+def _has_gravity(folder: Path) -> bool:
+    with np.load(folder / 'truth.npz') as content:
+        return 'gravity' in content or 'up' in content
+
+
 # Accuracy.
 
 
 def accuracy(runs: Sequence[Run], processes: int = 0) -> list[dict[str, Any]]:
-    """Scores of each clip, input and rate, means over the seeds."""
+    """Scores of each clip, input, rate and gravity, means over the seeds."""
     found = by_clip(runs, map(scores_of, run_all(runs, processes)))
     return [entry_of(key, [scores for _, scores in mine]) for key, mine in found.items()]
 
@@ -291,7 +308,7 @@ def comparison_with_baseline(
 ) -> dict[str, Any]:
     """Our scores minus those of the same runs of another checkout.
 
-    Clips, inputs and rates of which the other checkout lacks a seed are left out.
+    Clips, inputs, rates and gravities of which the other checkout lacks a seed are left out.
 
     Args:
         runs: to compare.
@@ -302,8 +319,8 @@ def comparison_with_baseline(
         ValueError: the folder has no record of these runs.
     """
     records = dict(zip(runs, records_of(runs, folder), strict=True))
-    lacking = {(x.clip, x.inputs, x.rate) for x, record in records.items() if record is None}
-    both = [one for one in runs if (one.clip, one.inputs, one.rate) not in lacking]
+    lacking = {key_of(x) for x, record in records.items() if record is None}
+    both = [one for one in runs if key_of(one) not in lacking]
     if not both:
         raise ValueError(f'{folder} lacks seeds of every clip and input')
     usual = [scores_of(record) for one in both if (record := records[one]) is not None]

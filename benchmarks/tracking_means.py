@@ -1,8 +1,8 @@
 """Scores of runs put together: by clip, means and medians over clips, and paired differences.
 
-An entry holds the scores of one clip, input and rate, by seed, and their means over the seeds. The
-clips fall into groups: those that settings of the tracker were chosen on, the others, and those
-that are in no mean.
+An entry holds the scores of one clip, input, rate and knowledge of gravity, by seed, and their
+means over the seeds. The clips fall into groups: those that settings of the tracker were chosen on,
+the others, and those that are in no mean.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.runs import INPUTS, Run
+from benchmarks.runs import GRAVITIES, INPUTS, Run
 from benchmarks.tracking_scores import interval, interval_over_seeds
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
 
@@ -26,8 +26,9 @@ OF_CHOSEN, OF_OTHERS, OF_APART = (
 GROUPS = (OF_CHOSEN, OF_OTHERS, OF_APART)
 DETECTOR = 'MediaPipe 3D'
 BY_JOINT = 'by_joint_90'
-# What tells entries apart.
-Key = tuple[str, str, float]
+# What tells entries apart, besides the clip.
+CONDITIONS = ('inputs', 'rate', 'gravity')
+Key = tuple[str, str, float, str]
 
 
 def group_of(clip: str) -> str:
@@ -37,21 +38,27 @@ def group_of(clip: str) -> str:
     return OF_CHOSEN if clip in CHOSEN else OF_OTHERS
 
 
+def key_of(one: Run) -> Key:
+    """Clip, input, rate and gravity of a run."""
+    return one.clip, one.inputs, one.rate, one.gravity
+
+
 def by_clip(runs: Iterable[Run], scores: Iterable[Any]) -> dict[Key, list[tuple[Run, Any]]]:
-    """Runs with their scores, by clip, input and rate."""
+    """Runs with their scores, by clip, input, rate and gravity."""
     result: dict[Key, list[tuple[Run, Any]]] = {}
     for one, found in zip(runs, scores, strict=True):
-        result.setdefault((one.clip, one.inputs, one.rate), []).append((one, found))
+        result.setdefault(key_of(one), []).append((one, found))
     return result
 
 
 def entry_of(key: Key, scores: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Scores of a clip by seed, and their means; None: unknown."""
-    clip, given, rate = key
+    clip, given, rate, gravity = key
     numbers = {
         name: [_known(one[name]) for one in scores] for name in scores[0] if name != BY_JOINT
     }
-    result: dict[str, Any] = {'clip': clip, 'inputs': given, 'rate': rate, 'by_seed': numbers}
+    result: dict[str, Any] = {'clip': clip, 'inputs': given, 'rate': rate, 'gravity': gravity}
+    result['by_seed'] = numbers
     for name, values in numbers.items():
         known = [value for value in values if value is not None]
         result[name] = float(np.mean(known)) if len(known) == len(values) else None
@@ -84,23 +91,24 @@ def grouped(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return result
 
 
-def _rank(entry: dict[str, Any]) -> tuple[float, int]:
+def _rank(entry: dict[str, Any]) -> tuple[float, int, int]:
     """All images come first, then falling rates; of a rate the inputs in their order."""
     rate = entry['rate']
-    return -(rate if rate > 0 else np.inf), (*INPUTS, DETECTOR).index(entry['inputs'])
+    given = (*INPUTS, DETECTOR).index(entry['inputs'])
+    return -(rate if rate > 0 else np.inf), given, GRAVITIES.index(entry['gravity'])
 
 
 def by_input(entries: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
-    """Entries of the same rate and input together."""
+    """Entries of the same rate, input and gravity together."""
     ranks = sorted({_rank(entry) for entry in entries})
     return [[entry for entry in entries if _rank(entry) == rank] for rank in ranks]
 
 
 def means_of(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Means over the clips by rate and input: mean, lower and upper end; see `interval`."""
+    """Means over the clips by rate, input and gravity, with both ends; see `interval`."""
     result = []
     for mine in by_input(entries):
-        means: dict[str, Any] = {'inputs': mine[0]['inputs'], 'rate': mine[0]['rate']}
+        means: dict[str, Any] = {name: mine[0][name] for name in CONDITIONS}
         for name in mine[0]['by_seed']:
             means[name] = interval(_by_seed(mine, name))
         if BY_JOINT in mine[0]:
@@ -116,10 +124,10 @@ def means_of(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def medians_of(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Medians over the clips, by rate and input, of the means over their seeds."""
+    """Medians over the clips, by rate, input and gravity, of the means over their seeds."""
     result = []
     for mine in by_input(entries):
-        medians: dict[str, Any] = {'inputs': mine[0]['inputs'], 'rate': mine[0]['rate']}
+        medians: dict[str, Any] = {name: mine[0][name] for name in CONDITIONS}
         for name in mine[0]['by_seed']:
             known = [entry[name] for entry in mine if entry[name] is not None]
             medians[name] = float(np.median(known)) if known else None
@@ -140,7 +148,7 @@ def difference_entries(
     """Entries of paired differences.
 
     Args:
-        runs: that are compared; of a clip, input and rate as many seeds as of any other.
+        runs: that are compared; of a clip, input, rate and gravity as many seeds as of any other.
         own, usual: their scores, and those that are subtracted.
         names: of the scores.
     """
@@ -154,17 +162,17 @@ def difference_entries(
 
 
 def paired(entries: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
-    """Paired differences of one score, by group, rate and input.
+    """Paired differences of one score, by group, rate, input and gravity.
 
     Args:
         entries: of differences.
         name: of the score.
 
     Returns:
-        By group, rate and input: `group`, `inputs`, `rate`, `clips` (their number), `difference`
-        (mean, lower and upper end over clips and seeds), and the clips whose own interval over the
-        seeds lies wholly `above` or `below` 0, see `interval_over_seeds`. Clips that are in no mean
-        have no difference.
+        By group, rate, input and gravity: `group`, `inputs`, `rate`, `gravity`, `clips` (their
+        number), `difference` (mean, lower and upper end over clips and seeds), and the clips whose
+        own interval over the seeds lies wholly `above` or `below` 0, see `interval_over_seeds`.
+        Clips that are in no mean have no difference.
     """
     result = []
     for title in GROUPS:
@@ -179,8 +187,7 @@ def paired(entries: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]
             result.append(
                 {
                     'group': title,
-                    'inputs': mine[0]['inputs'],
-                    'rate': mine[0]['rate'],
+                    **{name: mine[0][name] for name in CONDITIONS},
                     'clips': len(mine),
                     'difference': (None,) * 3 if title == OF_APART else interval(values),
                     'above': [clip for clip, (low, _) in ends.items() if low > 0],

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from benchmarks.clips import table
+from benchmarks.runs import GIVEN
+from benchmarks.tracking_means import DETECTOR
 from benchmarks.tracking_oracle import as_text as oracle_as_text
 from benchmarks.tracking_speed import memory_as_text, speed_as_text
 
@@ -105,8 +107,9 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         parts += _tables_of_comparison(found, what, markdown)
     if 'baseline' in result:
         found = result['baseline']
-        for clip, given, rate in found['lacking']:
-            parts.append(f'{clip}, {given}, rate {_rate(rate)}: not in {found["folder"]}.')
+        for clip, given, rate, gravity in found['lacking']:
+            which = f'{clip}, {given}, rate {_rate(rate)}, gravity {gravity}'
+            parts.append(f'{which}: not in {found["folder"]}.')
         parts += _tables_of_comparison(found, f'this code minus {found["folder"]}', markdown)
     if 'rules' in result:
         parts += _tables_of_rules(result['rules'], markdown)
@@ -146,11 +149,13 @@ def _table(
     extra = [WORST_JOINT] if worst_joint else []
     entries = [*group['clips'], *group['means']]
     rated = ['rate'] if any(entry['rate'] > 0 for entry in entries) else []
+    upright = ['gravity'] if any(entry['gravity'] == GIVEN for entry in entries) else []
 
     def head(name: str, entry: dict[str, Any]) -> list[str]:
-        return [name, entry['inputs'], *(_rate(entry['rate']) for _ in rated)]
+        conditions = [*(_rate(entry['rate']) for _ in rated), *(_gravity(entry) for _ in upright)]
+        return [name, entry['inputs'], *conditions]
 
-    rows = [['clip', 'inputs', *rated, *(column.head for column in columns), *extra]]
+    rows = [['clip', 'inputs', *rated, *upright, *(column.head for column in columns), *extra]]
     for entry in group['clips']:
         cells = [column.cell(entry.get(column.key), _sign(column, sign)) for column in columns]
         cells += [_worst_joint(entry)] if worst_joint else []
@@ -164,11 +169,16 @@ def _table(
         rows.append([*head('95 %', means), *ends, *['' for _ in extra]])
         cells = [column.cell(medians.get(column.key), _sign(column, sign)) for column in columns]
         rows.append([*head('median', medians), *cells, *['' for _ in extra]])
-    return table(rows, left=2 + len(rated), markdown=markdown)
+    return table(rows, left=2 + len(rated) + len(upright), markdown=markdown)
 
 
 def _rate(rate: float) -> str:
     return f'{rate:g}' if rate > 0 else 'all'
+
+
+def _gravity(entry: dict[str, Any]) -> str:
+    """Nothing is told to a detector."""
+    return '-' if entry['inputs'] == DETECTOR else str(entry['gravity'])
 
 
 def _tables_of_comparison(found: dict[str, Any], what: str, markdown: bool) -> list[str]:
@@ -184,17 +194,17 @@ def _tables_of_comparison(found: dict[str, Any], what: str, markdown: bool) -> l
         f'Heaviest mode: {what}, mm, mean and 95 % interval over clips and seeds; clips whose own '
         'interval over the seeds lies wholly above or below 0.'
     )
-    rows = [['group', 'inputs', 'rate', 'clips', 'difference', '95 %', 'above', 'below']]
+    rows = [['group', 'inputs', 'rate', 'gravity', 'clips', 'difference', '95 %', 'above', 'below']]
     column = COMPARED[0]
     rows += [
         [
-            each['group'], each['inputs'], _rate(each['rate']), str(each['clips']),
+            each['group'], each['inputs'], _rate(each['rate']), each['gravity'], str(each['clips']),
             column.cell(each['difference'][0], '+'), _ends(column, each['difference'], '+'),
             _number_of(each['above']), _number_of(each['below']),
         ]
         for each in found['paired']
     ]  # fmt: skip
-    parts.append(table(rows, left=3, markdown=markdown))
+    parts.append(table(rows, left=4, markdown=markdown))
     return parts
 
 
@@ -211,32 +221,38 @@ def _tables_of_rules(found: dict[str, Any], markdown: bool) -> list[str]:
     titles = [group['group'] for group in groups if group['means']]
     for title in dict.fromkeys(titles):
         parts.append(
-            f'{title}: heaviest mode without the rule, mm, more is worse; by input and rate. Last, '
-            'how often a clip has an interval over its seeds wholly above or below 0.'
+            f'{title}: heaviest mode without the rule, mm, more is worse; by input, rate and '
+            'gravity. Last, how often a clip has an interval over its seeds wholly above or below '
+            '0.'
         )
         parts.append(_summary_of_rules(found['rules'], title, markdown))
         parts.append(f'{title}: differences of all scores.')
-        head = ['group', 'rule', 'inputs', 'rate', *(column.head for column in OF_RULES)]
+        head = ['group', 'rule', 'inputs', 'rate', 'gravity', *(column.head for column in OF_RULES)]
         rows = [head]
         for rule, means in _means_of_rules(found['rules'], title):
             cells = [_with_ends(column, means[column.key]) for column in OF_RULES]
-            rows.append(
-                [rule['rule_group'], rule['rule'], means['inputs'], _rate(means['rate']), *cells]
-            )
-        parts.append(table(rows, left=4, markdown=markdown))
+            conditions = [means['inputs'], _rate(means['rate']), means['gravity']]
+            rows.append([rule['rule_group'], rule['rule'], *conditions, *cells])
+        parts.append(table(rows, left=5, markdown=markdown))
     return parts
 
 
 def _summary_of_rules(rules: Sequence[dict[str, Any]], title: str, markdown: bool) -> str:
-    """One row a rule, one column an input and rate."""
-    every = [(means['inputs'], means['rate']) for _, means in _means_of_rules(rules, title)]
+    """One row a rule, one column an input, rate and gravity."""
+    every = [
+        (means['inputs'], means['rate'], means['gravity'])
+        for _, means in _means_of_rules(rules, title)
+    ]
     columns = list(dict.fromkeys(every))
     columns.sort(key=lambda column: -column[1] if column[1] > 0 else float('-inf'))
-    heads = [f'{given}, {_rate(rate)}' for given, rate in columns]
+    heads = [
+        f'{given}, {_rate(rate)}' + (', gravity given' if gravity == GIVEN else '')
+        for given, rate, gravity in columns
+    ]
     rows = [['group', 'rule', *heads, 'above', 'below']]
     for rule in rules:
         own = {
-            (x['inputs'], x['rate']): _with_ends(OF_RULES[0], x[OF_RULES[0].key])
+            (x['inputs'], x['rate'], x['gravity']): _with_ends(OF_RULES[0], x[OF_RULES[0].key])
             for _, x in _means_of_rules([rule], title)
         }
         mine = [x for x in rule['paired'] if x['group'] == title]

@@ -14,10 +14,12 @@ from benchmarks import runs, tracking, tracking_oracle, tracking_rules, tracking
 from benchmarks.clips import LANDMARK_NAMES, at_rate, read_clip, resized, rounded, rows_at_rate
 from benchmarks.runs import (
     BOTH,
+    GIVEN,
     IMAGES,
     INPUTS,
     JOINTS,
     KEYPOINTS,
+    UNKNOWN,
     Record,
     Run,
     follow,
@@ -49,6 +51,7 @@ from benchmarks.tracking_scores import (
 from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
 from hmt_ros.tracking import TrackerSettings
+from hmt_ros.tracking.status import Status
 
 ROOT = Path(__file__).resolve().parents[1]
 REACH = ROOT / 'bags' / 'reach'
@@ -283,6 +286,46 @@ def test_a_run_at_a_lower_rate(clip):
     assert record.lagged.shape == record.weights.shape
     assert record.lagged.sum(1) == pytest.approx(1.0)
     assert np.array_equal(record.lagged[-1], record.weights[-1])
+
+
+def test_gravity_is_given_with_each_image(clip):
+    told = []
+
+    class Listener:
+        status = Status.WAITING
+
+        def set_gravity(self, up):
+            told.append(up)
+
+        def step(self, image, stamp, keypoints, prediction):
+            return None, None
+
+    ups = {stamp: np.array([0.0, -1.0, 0.1 * i]) for i, stamp in enumerate(clip.stamps)}
+    follow(replace(clip, ups=ups), Listener(), 0, gravity=GIVEN)
+    assert np.array_equal(told, [ups[stamp] for stamp in clip.stamps])
+    follow(replace(clip, ups=ups), Listener(), 0)
+    assert len(told) == len(clip.stamps)
+    with pytest.raises(ValueError, match='neither gravity nor up'):
+        follow(replace(clip, ups={}), Listener(), 0, gravity=GIVEN)
+
+
+def test_a_clip_tells_gravity_or_a_vertical_that_does_not_move(tmp_path):
+    for path in REACH.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    (tmp_path / 'truth.npz').unlink()
+    with np.load(REACH / 'truth.npz') as content:
+        known = dict(content)
+    count = len(known['stamps'])
+    down = np.tile([0.0, 4.0, 3.0], (count, 1))
+    for more, expected in (
+        ({'gravity': 2.0 * down, 'camera_height': np.ones(count)}, [0.0, -0.8, -0.6]),
+        ({'up': np.array([0.6, -0.8, 0.0])}, [0.6, -0.8, 0.0]),
+    ):
+        np.savez(tmp_path / 'truth.npz', **known, **more)
+        ups = read_clip(tmp_path, 1).ups
+        assert list(ups) == [int(stamp) for stamp in known['stamps']]
+        assert np.allclose(np.array(list(ups.values())), expected)
+    assert read_clip(REACH, 1).ups == {}
 
 
 def test_a_foot_stands_if_it_does_in_images_that_are_left_out(clip, tmp_path):
@@ -560,6 +603,7 @@ def test_records_of_another_checkout_are_found(tmp_path):
         replace(one, folder=Path('here') / 'kick'), replace(one, inputs=IMAGES),
         replace(one, seed=2), replace(one, changes=changes[:1]), replace(one, limit=None),
         replace(one, rate=3.0), replace(one, start=KEYPOINTS), replace(one, size=0.5),
+        replace(one, gravity=GIVEN),
     ]  # fmt: skip
     assert records_of(others, tmp_path) == [None] * len(others)
     # A damaged record leaves the one before it; a file of another kind is none.
@@ -621,7 +665,7 @@ def test_accuracy_over_the_bags(quick_runs, monkeypatch):
 
 def test_clips_that_settings_were_chosen_on_are_apart():
     entries = [
-        entry_of((clip, given, 0.0), [{'kept': share, 'feet': np.nan}])
+        entry_of((clip, given, 0.0, UNKNOWN), [{'kept': share, 'feet': np.nan}])
         for clip, given, share in (
             ('turns', BOTH, 0.1), ('walk', KEYPOINTS, 0.2), ('walk', IMAGES, 0.3),
             ('kick', IMAGES, 0.5),
@@ -640,7 +684,7 @@ def test_clips_that_settings_were_chosen_on_are_apart():
 
 def test_means_and_medians_leave_out_clips_that_are_apart():
     entries = [
-        entry_of((clip, given, rate), [{'kept': share}])
+        entry_of((clip, given, rate, UNKNOWN), [{'kept': share}])
         for clip, given, rate, share in (
             ('exercise', IMAGES, 0.0, 0.0), ('walk', IMAGES, 3.0, 0.2), ('walk', IMAGES, 0.0, 0.3),
             ('kick', IMAGES, 0.0, 0.4), ('shoot', IMAGES, 0.0, 0.8),
@@ -662,7 +706,7 @@ def test_means_and_medians_leave_out_clips_that_are_apart():
 
 def test_paired_differences():
     entries = [
-        entry_of((clip, IMAGES, 0.0), [{'heaviest_mm': value} for value in values])
+        entry_of((clip, IMAGES, 0.0, UNKNOWN), [{'heaviest_mm': value} for value in values])
         for clip, values in (
             ('walk', (4.0, 5.0, 6.0)), ('kick', (-5.0, 0.0, 6.0)), ('shoot', (-2.0, -2.1, -2.2)),
             ('turns', (np.nan, 1.0, 1.0)), ('exercise', (1.0, 1.1, 1.2)),
@@ -713,7 +757,7 @@ def test_a_checkout_is_compared_with_the_one_before(quick_runs, monkeypatch, tmp
     (mine,) = tracking.run_all(seen[:1])
     keep(tmp_path, 'before', seen[0], replace(mine, joints=mine.joints + 0.0, point=mine.point))
     found = tracking.measure(**given, seeds=(0,), baseline=tmp_path)['baseline']
-    assert found['lacking'] == [['reach', IMAGES, 3.0]]
+    assert found['lacking'] == [['reach', IMAGES, 3.0, UNKNOWN]]
     (entry,) = found['groups'][0]['clips']
     assert entry['heaviest_mm'] == entry['best_mm'] == 0.0
     (pair,) = found['paired']
@@ -721,8 +765,8 @@ def test_a_checkout_is_compared_with_the_one_before(quick_runs, monkeypatch, tmp
     text = tracking.as_text(
         {'clips': 'here', 'seeds': [0], 'without_keypoints': [], 'baseline': found}, markdown=True
     )
-    assert f'reach, images, rate 3: not in {tmp_path}.' in text
-    assert '| Other clips | images | all  |     1 |' in text
+    assert f'reach, images, rate 3, gravity unknown: not in {tmp_path}.' in text
+    assert '| Other clips | images | all  | unknown |     1 |' in text
     assert quick_runs[-1] == seen[0]
     with pytest.raises(ValueError, match='lacks seeds'):
         tracking.measure(**given, seeds=(1,), baseline=tmp_path)
