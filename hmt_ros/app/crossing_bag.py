@@ -1,11 +1,11 @@
 """A rendered bag of two people who walk past each other, one before the other.
 
 The bag has the topics `/image/compressed`, `/camera_info`, `/detections` (hmt_msgs/People2D: COCO
-keypoints of both, without identities) and `/humans/bodies/a/ground_truth`, `.../b/ground_truth`
-(hmt_msgs/PoseMixture). A keypoint that the other person hides is not detected, and somebody of whom
-fewer than `FEWEST` keypoints are seen is not detected at all. The order of the people in a message
-is random. Beside the bag are `background.png`, and `truth_a.npz` and `truth_b.npz` as those of
-`rendered_bag`, without masks.
+keypoints of both, without identities), `/tf_static` and `/humans/bodies/a/ground_truth`,
+`.../b/ground_truth` (hmt_msgs/PoseMixture). A keypoint that the other person hides is not detected,
+and somebody of whom fewer than `FEWEST` keypoints are seen is not detected at all. The order of the
+people in a message is random. Beside the bag are `background.png`, and `truth_a.npz` and
+`truth_b.npz` as those of `rendered_bag`, without masks.
 """
 
 from __future__ import annotations
@@ -18,7 +18,13 @@ import cv2
 import numpy as np
 
 from hmt_ros.app.progress import show_progress
-from hmt_ros.app.rendered_bag import FRAME_ID, Take, ground_truth
+from hmt_ros.app.rendered_bag import (
+    FRAME_ID,
+    Take,
+    ground_truth,
+    true_ground,
+    write_camera_place,
+)
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
@@ -88,6 +94,7 @@ def write_crossing(
         BagWriter(folder) as bag,
         show_progress(folder.name, 'images', count, quiet=not progress) as bar,
     ):
+        write_camera_place(bag, messages, scene.viewpoint, takes[0].stamp_ns(0))
         for frame in range(count):
             stamp = takes[0].stamp_ns(frame)
             poses = [take.poses[frame] for take in takes]
@@ -124,6 +131,7 @@ def write_crossing(
             source=np.array(take.source),
             dof_names=np.array(take.body.dof_names),
             poses=take.poses,
+            **true_ground(scene.viewpoint, count),
         )
 
 

@@ -3,7 +3,8 @@
 The bag has the topics `/image/compressed`, `/camera_info`, `/ground_truth` (hmt_msgs/PoseMixture)
 and `/body` (hmt_msgs/Body, latched), and `/depth` (sensor_msgs/Image, 16UC1) on request. Its folder
 also has the files that replay and evaluate need: `background.png` (the empty scene), `subject.yaml`
-(joints as clicked in the first image) and `truth.npz` (joints, pixels and silhouettes).
+(joints as clicked in the first image) and `truth.npz` (joints, pixels, silhouettes, gravity and the
+height of the camera). `/tf_static` tells where the camera is in `odom`, as a robot would.
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ import numpy as np
 
 from hmt_ros.app.progress import show_progress
 from hmt_ros.body import Body, Camera
+from hmt_ros.body.camera import Viewpoint
 from hmt_ros.inference.arrays import Array
 from hmt_ros.rendering.depth_sensor import sensed_depth
 from hmt_ros.rendering.renderer import render_frames
 from hmt_ros.rendering.scene import Scene
+from hmt_ros.sessions.transform_buffer import TRANSFORMS_TYPE
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.files.new_folder import FolderKind
 from msg_tools.messages.bodies import message_of_body
@@ -30,8 +33,11 @@ from msg_tools.messages.depth_images import depth_message
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.images import compressed_image_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+from msg_tools.messages.states import transforms_message
 
 FRAME_ID = 'camera_optical_frame'
+# The world, z up and 0 on the floor.
+WORLD = 'odom'
 START_NS = 1_700_000_000 * SECOND_NS  # stamp of the first image
 # Of two people each has an own file of the truth.
 FILES_BESIDE = ('background.png', 'subject.yaml', 'truth.npz', 'truth_a.npz', 'truth_b.npz')
@@ -101,6 +107,7 @@ def write_bag(
     ):
         bag.add_topic('body', 'hmt_msgs/msg/Body', latched=True)
         bag.write('body', START_NS, message_of_body(messages, take.body, START_NS, FRAME_ID))
+        write_camera_place(bag, messages, scene.viewpoint, START_NS)
         for frame, shown in enumerate(render_frames(take.body, take.poses, camera, scene)):
             stamp = take.stamp_ns(frame)
             image = compressed_image_message(messages, shown.image, stamp, FRAME_ID, quality)
@@ -131,7 +138,29 @@ def write_bag(
         source=np.array(take.source),
         dof_names=np.array(take.body.dof_names),
         poses=take.poses,
+        **true_ground(scene.viewpoint, len(take.poses)),
     )
+
+
+def write_camera_place(
+    bag: BagWriter, messages: RosbagsMessages, viewpoint: Viewpoint, stamp_ns: int
+) -> None:
+    """Writes where a camera stands in `WORLD`, on /tf_static."""
+    rotation, position = viewpoint.rotation.T, viewpoint.to_world(np.zeros(3))
+    place = transforms_message(
+        messages, [WORLD], [FRAME_ID], rotation[None], position[None], stamp_ns
+    )
+    bag.add_topic('/tf_static', TRANSFORMS_TYPE, latched=True)
+    bag.write('/tf_static', stamp_ns, place)
+
+
+def true_ground(viewpoint: Viewpoint, count: int) -> dict[str, Array]:
+    """`gravity` (T, 3) and `camera_height` (T,) of so many images, for a file of the truth."""
+    down = viewpoint.rotation @ np.array([0.0, 0.0, -1.0])
+    return {
+        'gravity': np.tile(down, (count, 1)),
+        'camera_height': np.full(count, viewpoint.height),
+    }
 
 
 def ground_truth(

@@ -27,12 +27,15 @@ DIR gets
   tracked/            the bag that replay writes, see replay --help
   report/report.html  the page that report writes, for a browser
 
+An unknown tilt of the camera is taken for a lean of the person: tell --level where the camera looks
+to the horizon and stands upright, or --gravity.
+
 The track starts from the keypoints that were imported, or without any from a prediction. --subject
 names a subject file instead, and --stature writes one from the keypoints of an image.
 
 examples:
   track-video walk.mp4 -o walk --fov 60 --keypoints walk.json
-  track-video walk.mp4 -o walk --fov 60 --detector mediapipe --stature 1.75
+  track-video walk.mp4 -o walk --fov 60 --detector mediapipe --stature 1.75 --level
 
 exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
 """
@@ -59,6 +62,15 @@ def _parser() -> CommandParser:
     parser.add_argument(
         '--background', type=Path, metavar='FILE', help='image of the empty scene, see replay'
     )
+    tilt = parser.add_mutually_exclusive_group()
+    tilt.add_argument(
+        '--level', action='store_true', help='the camera is level: gravity is down in the image'
+    )
+    tilt.add_argument(
+        '--gravity', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+        help='direction of gravity, of any length; x to the right of the image, y down, z forward '
+        '(default: not known)',
+    )  # fmt: skip
     parser.add_argument('--seed', type=int, metavar='N', help='seed of all random numbers')
     parser.add_argument(
         '--set', action='append', default=[], dest='settings', metavar='NAME=VALUE',
@@ -98,7 +110,7 @@ def _track(arguments: argparse.Namespace) -> int:
         subject=arguments.subject if stature is None else start,
         background=arguments.background,
         seed=arguments.seed,
-        settings=arguments.settings,
+        settings=[*_of_gravity(arguments), *arguments.settings],
     )
     replayed = replay_bag(video, folder / TRACKED, options, tell)
     say(f'{folder / TRACKED}: {replayed}')
@@ -109,6 +121,12 @@ def _track(arguments: argparse.Namespace) -> int:
     )
     say(written)
     return 0
+
+
+def _of_gravity(arguments: argparse.Namespace) -> list[str]:
+    """The setting of the tracker that tells how the camera is tilted, if it is known."""
+    gravity = [0.0, 1.0, 0.0] if arguments.level else arguments.gravity
+    return [] if gravity is None else [f'gravity={gravity}']
 
 
 def tell(text: str) -> None:

@@ -10,6 +10,7 @@ from hmt_ros.app.make_bag import main
 from hmt_ros.body import load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.rendering.renderer import render_silhouettes
+from hmt_ros.sessions.transform_buffer import TransformBuffer
 from hmt_ros.tracking.subject import read_subject
 from msg_tools import BagReader
 from msg_tools.messages.camera_info import camera_from_info
@@ -54,7 +55,8 @@ def stamp_ns(message):
 def test_topics_and_stamps(bag, content, truth):
     assert sorted(path.name for path in bag.iterdir()) == FILES
     counts = {topic: len(messages) for topic, messages in content.items()}
-    assert counts == {'body': 1, 'image/compressed': 4, 'camera_info': 4, 'ground_truth': 4}
+    each = dict.fromkeys(('image/compressed', 'camera_info', 'ground_truth'), 4)
+    assert counts == {'body': 1, 'tf_static': 1, **each}
     for topic in ('image/compressed', 'camera_info', 'ground_truth'):
         assert [stamp_ns(message) for message in content[topic]] == list(truth['stamps'])
         assert {message.header.frame_id for message in content[topic]} == {'camera_optical_frame'}
@@ -94,6 +96,18 @@ def test_camera(content, truth):
     camera = camera_from_info(content['camera_info'][0], (160, 120))
     assert np.allclose(camera.matrix, truth['K'])
     assert np.isclose(2 * np.degrees(np.arctan(80 / camera.fx)), 51.7)
+
+
+def test_the_place_of_the_camera_is_told_as_a_robot_does(content, truth):
+    """The transform, and gravity and height in the truth, say the same."""
+    buffer = TransformBuffer()
+    assert buffer.put(content['tf_static'][0], static=True) == []
+    place = buffer.lookup('odom', 'camera_optical_frame', 0)
+    view = Viewpoint()
+    np.testing.assert_allclose(place.translation, view.to_world(np.zeros(3)), atol=1e-9)
+    np.testing.assert_allclose(place.rotation, view.rotation.T, atol=1e-9)
+    np.testing.assert_allclose(truth['gravity'], [[0.0, 1.0, 0.0]] * 4, atol=1e-12)
+    assert truth['camera_height'].tolist() == [1.2] * 4
 
 
 def test_ground_truth_is_the_known_pose(content, truth):

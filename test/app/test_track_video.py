@@ -53,6 +53,27 @@ def test_a_stature_and_a_subject_file(walk_video, tmp_path, monkeypatch):
     assert [x.name for x in (tmp_path / 'given').iterdir()] == ['video']
 
 
+def test_gravity(walk_video, tmp_path, monkeypatch, capsys):
+    used = []
+
+    def replay_bag(source, target, options, tell):
+        used.append(options.settings)
+        raise ValueError('enough')
+
+    monkeypatch.setattr(track_video, 'replay_bag', replay_bag)
+    for i, options in enumerate((['--level'], ['--gravity', '0', '9', '-2.5'], [])):
+        given = [*options, '--set', 'candidates=8']
+        assert run(walk_video, '-o', str(tmp_path / str(i)), *keypoints(walk_video), *given) == 1
+    assert used == [
+        ['gravity=[0.0, 1.0, 0.0]', 'candidates=8'],
+        ['gravity=[0.0, 9.0, -2.5]', 'candidates=8'],
+        ['candidates=8'],
+    ]
+    both = ['--level', '--gravity', '0', '1', '0']
+    assert run(walk_video, '-o', str(tmp_path / 'both'), *both) == 1
+    assert 'not allowed with argument --level' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ('options', 'message'),
     [

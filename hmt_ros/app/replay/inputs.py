@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
 from hmt_ros.sessions.filter_session import DEPTH, KEYPOINTS, KEYPOINTS_3D
@@ -22,6 +23,9 @@ CAMERA_INFO_TYPE = 'sensor_msgs/msg/CameraInfo'
 # Names of topics that are preferred to all others.
 _USUAL = ('image/compressed', 'image')
 GROUND_TRUTH = 'ground_truth'
+# Frames with z up that stand still [REP 105]; messages that are searched for a way to one.
+UPRIGHT_FRAMES = ('odom', 'map', 'world')
+_SEARCHED = 2000
 # End of the name of the topic of the filter's drawings.
 OVERLAY = 'overlay/compressed'
 
@@ -41,6 +45,8 @@ class RecordedInput:
         detections: topic of several people, for the people node; None if the bag has none.
         transforms: topics of transforms by source, those that the bag has of `TRANSFORMS`; None if
             transforms are not used.
+        upright_frame: one of `UPRIGHT_FRAMES` that transforms lead to from the camera; empty: they
+            lead to none.
     """
 
     image: Topic
@@ -52,6 +58,7 @@ class RecordedInput:
     ground_truth: Topic | None
     transforms: Mapping[str, Topic] | None = None
     detections: Topic | None = None
+    upright_frame: str = ''
 
     @property
     def transport(self) -> str:
@@ -134,6 +141,40 @@ def recorded_input(
         {source: topic for source, topic in found.items() if topic is not None},
         _named(bag, DETECTIONS, tuple(SOURCES.values())),
     )
+
+
+def upright_frame(bag: BagReader, recorded: RecordedInput) -> str:
+    """The frame of `UPRIGHT_FRAMES` that is nearest above the camera; empty: there is none."""
+    names = {topic.name for topic in (recorded.transforms or {}).values()}
+    if not names:
+        return ''
+    parents: dict[str, str] = {}
+    camera = ''
+    try:
+        for stored in islice(bag.messages({*names, recorded.camera_info.name}), _SEARCHED):
+            if stored.topic in names:
+                for each in stored.message.transforms:
+                    child, parent = each.child_frame_id, each.header.frame_id
+                    parents[child.removeprefix('/')] = parent.removeprefix('/')
+            else:
+                camera = stored.message.header.frame_id.removeprefix('/')
+            found = _upright_above(camera, parents)
+            if found:
+                return found
+    except BagError:
+        # The replay itself tells of the damage, and what to do.
+        return ''
+    return ''
+
+
+def _upright_above(frame: str, parents: Mapping[str, str]) -> str:
+    seen = set()
+    while frame in parents and frame not in seen:
+        seen.add(frame)
+        frame = parents[frame]
+        if frame in UPRIGHT_FRAMES:
+            return frame
+    return ''
 
 
 def _image_topic(

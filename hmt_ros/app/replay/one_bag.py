@@ -83,6 +83,9 @@ def replay_bag(
         if subject is None and not options.quiet and not options.people:
             sources = ' or '.join(parameters.filter.sources)
             tell(f'no --subject: the track starts from {sources}{_subject_hint(source)}')
+        frame = recorded.upright_frame
+        if frame and frame == parameters.filter.gravity_frame and not options.quiet:
+            tell(f'gravity and the motion of the camera: from {frame}')
         recorded = _used(recorded, parameters)
         with BagWriter(target, overwrite=options.overwrite, namespace=options.namespace) as out:
             topics = {} if options.people else dict(track_messages.TOPICS)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from hmt_ros.app.replay.inputs import RecordedInput, recorded_input
+from hmt_ros.app.replay.inputs import RecordedInput, recorded_input, upright_frame
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.filter_parameters import FilterParameters
@@ -65,7 +65,7 @@ class ReplayOptions:
         Raises:
             BagError: there are no images, no camera_info, or several topics to choose from.
         """
-        return recorded_input(
+        found = recorded_input(
             bag,
             self.image_topic,
             self.camera_info_topic,
@@ -74,6 +74,7 @@ class ReplayOptions:
             keypoints_topic=self.keypoints_topic,
             namespace=self.namespace,
         )
+        return replace(found, upright_frame=upright_frame(bag, found))
 
     def of_bag(self, source: Path) -> ReplayOptions:
         """The options for one bag: `{bag}` in names of files becomes its folder."""
@@ -164,8 +165,16 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
     values.setdefault('use_keypoints_3d', has_depth)
     values.setdefault('use_mask', recorded.mask is not None)
     values.setdefault('use_depth', recorded.depth is not None)
+    _use_upright_frame(values, recorded)
     values['image_transport'] = recorded.transport
     return with_values(FilterParameters(), values)
+
+
+def _use_upright_frame(values: dict[str, Any], recorded: RecordedInput) -> None:
+    """What transforms of a bag tell is used where the user says nothing of it."""
+    if 'gravity' not in values:
+        values.setdefault('gravity_frame', recorded.upright_frame)
+    values.setdefault('fixed_frame', recorded.upright_frame)
 
 
 def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> PeopleParameters:
@@ -196,6 +205,7 @@ def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> Peopl
     values['source'] = sources[recorded.detections.msgtype]
     values.setdefault('use_mask', recorded.mask is not None)
     values.setdefault('use_depth', recorded.depth is not None)
+    _use_upright_frame(values, recorded)
     values['image_transport'] = recorded.transport
     return with_values(PeopleParameters(), values)
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from hmt_ros.app.replay.command import main
+from hmt_ros.app.replay.inputs import recorded_input, upright_frame
 from hmt_ros.body.camera import Viewpoint
-from msg_tools import RosbagsMessages
+from msg_tools import BagReader, RosbagsMessages
 from msg_tools.bags.contents import absolute_name
 from msg_tools.messages.ground import ground_of
 from msg_tools.messages.headers import time_ns
@@ -81,7 +82,7 @@ def test_ground_is_that_of_the_frame(replayed):
 
 def test_same_numbers_as_with_parameters_of_the_same_gravity(replayed, moving, tmp_path):
     down = [float(x) for x in -VIEW.rotation[:, 2]]
-    settings = ['--set', f'gravity={down}', '--set', 'camera_height=1.25']
+    settings = ['--set', f'gravity={down}', '--set', 'camera_height=1.25', '--set', 'fixed_frame=']
     arguments = [str(moving), '-o', str(tmp_path / 'out'), *PERSON, *SMALL, *settings]
     assert main([*arguments, '--no-smoother', '--quiet']) == 0
     other, one = read(tmp_path / 'out'), read(replayed)
@@ -94,6 +95,48 @@ def test_same_numbers_as_with_parameters_of_the_same_gravity(replayed, moving, t
             assert a.weight == pytest.approx(b.weight, abs=1e-4)
     for first, second in zip(one['/ground'], other['/ground'], strict=True):
         np.testing.assert_allclose(first.message.plane, second.message.plane, atol=1e-6)
+
+
+def test_a_frame_with_z_up_is_used_by_itself(moving, entries, tmp_path, capsys):
+    told = ['--set', 'gravity_frame=world', '--set', 'fixed_frame=world']
+    for name, settings in (('by_itself', []), ('told', told)):
+        arguments = [str(moving), '-o', str(tmp_path / name), *PERSON, *SMALL, *settings]
+        assert main([*arguments, '--no-smoother']) == 0
+    for topic in ESTIMATES:
+        assert data(tmp_path / 'by_itself', topic) == data(tmp_path / 'told', topic)
+    assert capsys.readouterr().err.count('gravity and the motion of the camera: from world') == 2
+    ground = ground_of(read(tmp_path / 'by_itself')['/ground'][0].message)
+    np.testing.assert_allclose(ground.up, VIEW.rotation[:, 2], atol=1e-9)
+    # A direction that is given comes first.
+    arguments = [str(moving), '-o', str(tmp_path / 'given'), *PERSON, *SMALL]
+    assert main([*arguments, '--set', 'gravity=[0, 1, 0]', '--no-smoother', '--quiet']) == 0
+    ground = ground_of(read(tmp_path / 'given')['/ground'][0].message)
+    np.testing.assert_allclose(ground.up, [0.0, -1.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ('links', 'found'),
+    [
+        ([('map', 'odom'), ('odom', 'base_link'), ('base_link', 'camera')], 'odom'),
+        ([('map', 'base_link'), ('/base_link', '/camera')], 'map'),
+        ([('camera', 'odom')], ''),
+        ([('torso', 'camera'), ('odom', 'wheel')], ''),
+        ([('a', 'camera'), ('b', 'a'), ('a', 'b')], ''),
+    ],
+)
+def test_the_nearest_upright_frame_above_the_camera(entries, tmp_path, links, found):
+    extra = [
+        ('/tf', 10 + i, transforms_message(
+            RosbagsMessages(), [parent], [child], np.eye(3)[None], np.zeros((1, 3)), i
+        ))
+        for i, (parent, child) in enumerate(links)
+    ]  # fmt: skip
+    for topic, _, message in entries:
+        if topic == 'camera_info':
+            message.header.frame_id = 'camera'
+    path = write(tmp_path / 'bag', sorted([*entries, *extra], key=lambda entry: entry[1]))
+    with BagReader(path) as bag:
+        assert upright_frame(bag, recorded_input(bag)) == found
 
 
 def test_new_bag_has_what_was_used(replayed, moving, tmp_path):
@@ -140,15 +183,19 @@ def test_damaged_transforms_are_told_and_left_out(entries, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ('setting', 'line'),
+    ('settings', 'line'),
     [
-        ('gravity=[0, 0, 0]', 'gravity must be three finite numbers, not all zero'),
-        ('gravity=down', "gravity must be a list of numbers, saw 'down'"),
-        ('floor_in_gravity_frame=true', 'floor_in_gravity_frame needs the name of gravity_frame'),
+        (['gravity=[0, 0, 0]'], 'gravity must be three finite numbers, not all zero'),
+        (['gravity=down'], "gravity must be a list of numbers, saw 'down'"),
+        (
+            ['floor_in_gravity_frame=true', 'gravity_frame='],
+            'floor_in_gravity_frame needs the name of gravity_frame',
+        ),
     ],
 )
-def test_bad_settings(moving, tmp_path, capsys, setting, line):
-    arguments = [str(moving), '-o', str(tmp_path / 'out'), *PERSON, '--set', setting]
+def test_bad_settings(moving, tmp_path, capsys, settings, line):
+    given = [x for setting in settings for x in ('--set', setting)]
+    arguments = [str(moving), '-o', str(tmp_path / 'out'), *PERSON, *given]
     assert main(arguments) == 1
     assert line in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
