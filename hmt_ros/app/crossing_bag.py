@@ -22,7 +22,7 @@ from hmt_ros.app.rendered_bag import (
     FRAME_ID,
     Take,
     ground_truth,
-    true_ground,
+    true_gravity,
     write_camera_place,
 )
 from hmt_ros.body import Body, Camera
@@ -131,7 +131,8 @@ def write_crossing(
             source=np.array(take.source),
             dof_names=np.array(take.body.dof_names),
             poses=take.poses,
-            **true_ground(scene.viewpoint, count),
+            gravity=np.tile(true_gravity(scene.viewpoint), (count, 1)),
+            camera_height=np.full(count, scene.viewpoint.height),
         )
 
 

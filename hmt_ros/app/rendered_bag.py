@@ -138,7 +138,8 @@ def write_bag(
         source=np.array(take.source),
         dof_names=np.array(take.body.dof_names),
         poses=take.poses,
-        **true_ground(scene.viewpoint, len(take.poses)),
+        gravity=np.tile(true_gravity(scene.viewpoint), (len(take.poses), 1)),
+        camera_height=np.full(len(take.poses), scene.viewpoint.height),
     )
 
 
@@ -154,13 +155,9 @@ def write_camera_place(
     bag.write('/tf_static', stamp_ns, place)
 
 
-def true_ground(viewpoint: Viewpoint, count: int) -> dict[str, Array]:
-    """`gravity` (T, 3) and `camera_height` (T,) of so many images, for a file of the truth."""
-    down = viewpoint.rotation @ np.array([0.0, 0.0, -1.0])
-    return {
-        'gravity': np.tile(down, (count, 1)),
-        'camera_height': np.full(count, viewpoint.height),
-    }
+def true_gravity(viewpoint: Viewpoint) -> Array:
+    """Its direction (3,) in the frame of a camera."""
+    return np.asarray(viewpoint.rotation @ np.array([0.0, 0.0, -1.0]))
 
 
 def ground_truth(
