@@ -12,10 +12,13 @@ from typing import Any, TypeVar
 from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
 from hmt_ros.app.truth import is_truth, mixture_topics
 from hmt_ros.body import Body
+from hmt_ros.evaluation.ground_scores import GravityScores, gravity_scores
 from hmt_ros.evaluation.pose_scores import MODEL_SIGMA
 from hmt_ros.evaluation.track_scores import Estimate, TrackScorer, TrackScores, Truth
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
 from msg_tools import BagMessage, BagReader, MessageError
+from msg_tools.messages.ground import GROUND, ground_of
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import (
     TRAJECTORY_MIXTURE,
@@ -67,6 +70,25 @@ def score_bag(
             if progress is not None:
                 progress(1)
         return {name: track.finish() for name, track in found.items()}
+
+
+def score_gravity(path: Path, truth: Truth) -> dict[str, GravityScores]:
+    """Scores of the verticals in a bag, by topic; those of which nothing is true are left out.
+
+    Raises:
+        ValueError: messages that can not be understood.
+    """
+    with BagReader(path) as bag:
+        ups: dict[str, dict[int, tuple[Array, float]]] = {
+            topic.name: {} for topic in bag.topics.values() if topic.msgtype == GROUND
+        }
+        if not ups or not truth.ground:
+            return {}
+        for stored in bag.messages(ups):
+            content = _content(ground_of, stored)
+            ups[stored.topic][content.stamp_ns] = content.up, content.up_sigma
+    found = {name: gravity_scores(mine, truth.ground) for name, mine in ups.items()}
+    return {name: scores for name, scores in found.items() if scores is not None}
 
 
 def message_count(path: Path, topics: Iterable[str] = ()) -> int:

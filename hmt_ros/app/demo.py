@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hmt_ros.app.bag_scores import score_gravity
 from hmt_ros.app.command_line import CommandParser, run_command
 from hmt_ros.app.evaluate import as_text
 from hmt_ros.app.replay.command import tell
@@ -19,7 +20,7 @@ from hmt_ros.app.replay.one_bag import replay_bag
 from hmt_ros.app.replay.options import ReplayOptions
 from hmt_ros.app.report.command import ReportOptions, write_report
 from hmt_ros.app.report.page import Content
-from hmt_ros.app.truth import recorded_truth
+from hmt_ros.app.truth import read_truth, recorded_truth
 from msg_tools import BagReader
 
 REPORT = 'report'
@@ -75,7 +76,9 @@ def _demonstrate(arguments: argparse.Namespace) -> int:
     )
     print(_modes(shown))
     if shown.truth is not None:
-        print(as_text(shown.scores, shown.truth, by_joint=False))
+        known = beside('truth.npz')
+        verticals = {} if known is None else score_gravity(target, read_truth(known))
+        print(as_text(shown.scores, shown.truth, verticals, by_joint=False))
         print('docs/evaluation.md explains the numbers\n')
     print(f'results\n{target}: bag with {", ".join(_topics(target))}\n{written}')
     return 0

@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hmt_ros.app.bag_scores import message_count, score_bag
+from hmt_ros.app.bag_scores import message_count, score_bag, score_gravity
 from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
 from hmt_ros.app.progress import show_progress
 from hmt_ros.app.truth import read_truth, recorded_truth
+from hmt_ros.evaluation.ground_scores import GravityScores
 from hmt_ros.evaluation.pose_scores import MODEL_SIGMA
 from hmt_ros.evaluation.track_scores import TrackScores, Truth
 
@@ -27,7 +28,8 @@ regions of a calibrated mixture cover 50 and 90 percent of the frames.
 
 Where the truth has gravity and camera_height, the feet of the heaviest component are compared with
 the floor: how deep ankles and toes lie below it, and how fast the ankles of feet that truly stand
-(contact) slide over it.
+(contact) slide over it. The vertical of a topic `ground` is compared with gravity: whether it was
+given or estimated shows in how well it is said to be known.
 
 examples:
   evaluate out --truth truth.npz             print a table
@@ -84,16 +86,19 @@ def _evaluate(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             progress=bar.update,
         )
-    print(
-        json.dumps(as_json(found, truth, model_sigma), indent=1)
-        if arguments.json
-        else as_text(found, truth)
-    )
+    verticals = score_gravity(bag, truth)
+    if arguments.json:
+        print(json.dumps(as_json(found, truth, model_sigma, verticals), indent=1))
+    else:
+        print(as_text(found, truth, verticals))
     return 0
 
 
 def as_json(
-    found: dict[str, TrackScores], truth: Truth, model_sigma: float = MODEL_SIGMA
+    found: dict[str, TrackScores],
+    truth: Truth,
+    model_sigma: float = MODEL_SIGMA,
+    verticals: Mapping[str, GravityScores] | None = None,
 ) -> dict[str, Any]:
     """The object that `--json` prints."""
     return {
@@ -111,10 +116,17 @@ def as_json(
             }
             for name, topic in found.items()
         },
+        'gravity': {name: scores.summary() for name, scores in (verticals or {}).items()},
     }
 
 
-def as_text(found: dict[str, TrackScores], truth: Truth, *, by_joint: bool = True) -> str:
+def as_text(
+    found: dict[str, TrackScores],
+    truth: Truth,
+    verticals: Mapping[str, GravityScores] | None = None,
+    *,
+    by_joint: bool = True,
+) -> str:
     """Tables for people: one row per topic, and the errors joint by joint."""
     rows: list[tuple[str, ...]] = [
         (
@@ -153,7 +165,8 @@ def as_text(found: dict[str, TrackScores], truth: Truth, *, by_joint: bool = Tru
             cells = [summary['by_joint'][joint]['best_mm'] for summary in summaries.values()]
             joints.append((joint, *(f'{cell:.0f}' for cell in cells)))
         lines += ['', *table(joints)]
-    feet = [f'{name}: {topic.ground}' for name, topic in found.items() if topic.ground is not None]
+    feet = [f'{name}: {scores}' for name, scores in (verticals or {}).items()]
+    feet += [f'{name}: {topic.ground}' for name, topic in found.items() if topic.ground is not None]
     lines += ['', *feet] if feet else []
     lines += [f'{name}: {topic.note}' for name, topic in found.items() if topic.note]
     return '\n'.join(lines)

@@ -75,6 +75,54 @@ class GroundScores:
         )
 
 
+@dataclass(frozen=True)
+class GravityScores:
+    """How well the vertical of a track is known.
+
+    Attributes:
+        error: median angle to the true one, rad.
+        said: median deviation of that angle about each horizontal axis, as the track says, rad;
+            NaN: it does not say.
+        frames: number of frames.
+    """
+
+    error: float
+    said: float
+    frames: int
+
+    def summary(self) -> dict[str, float | int | None]:
+        """The numbers by name, angles in degrees."""
+        return {
+            'error_degrees': float(np.degrees(self.error)),
+            'said_degrees': None if np.isnan(self.said) else float(np.degrees(self.said)),
+            'frames': self.frames,
+        }
+
+    def __str__(self) -> str:
+        said = 'unknown' if np.isnan(self.said) else f'{np.degrees(self.said):.1f} degrees'
+        return (
+            f'the vertical errs by {np.degrees(self.error):.1f} degrees (median), and is said to '
+            f'be known to {said}'
+        )
+
+
+def gravity_scores(
+    ups: Mapping[int, tuple[Array, float]], truth: Mapping[int, TrueGround]
+) -> GravityScores | None:
+    """Scores of a vertical; None: no frame has a truth.
+
+    Args:
+        ups: stamp in ns -> unit vector (3,) against gravity, camera frame, and its deviation, rad.
+        truth: by stamp in ns.
+    """
+    stamps = sorted(ups.keys() & truth.keys())
+    if not stamps:
+        return None
+    cosines = [float(np.clip(ups[t][0] @ truth[t].up, -1.0, 1.0)) for t in stamps]
+    said = float(np.median([ups[t][1] for t in stamps]))
+    return GravityScores(float(np.median(np.arccos(cosines))), said, len(stamps))
+
+
 def ground_scores(
     joints: Mapping[int, Array], names: Sequence[str], truth: Mapping[int, TrueGround]
 ) -> GroundScores | None:

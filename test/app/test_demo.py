@@ -70,6 +70,8 @@ def test_it_tells_what_came_out(output):
     (row,) = (line.split() for line in lines if line.startswith('/pose_mixture'))
     assert row[1] == '5'
     assert float(row[4]) >= float(row[5])  # the heaviest is no better than the best
+    (vertical,) = (line for line in lines if line.startswith('/ground: '))
+    assert 'errs by 0.0 degrees' in vertical
     for name in (*(f'report/{picture}' for picture in PICTURES), 'report/report.html', 'small'):
         assert any(line.startswith(f'{folder / name}: ') for line in lines), name
 

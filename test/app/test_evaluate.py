@@ -15,6 +15,7 @@ from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, HIPS, joint_mixture
 from hmt_ros.inference import GaussianMixture
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.bodies import message_of_body
+from msg_tools.messages.ground import GroundState, ground_message
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture, trajectory_mixture_message
 
@@ -496,3 +497,36 @@ def test_feet_against_the_floor(tmp_path, body, mixtures, truth_file, capsys):
     assert '/pose_mixture: standing ankles slide' in capsys.readouterr().out
     assert main([str(bag), '--truth', str(truth_file), '--quiet', '--json']) == 0
     assert 'feet' not in json.loads(capsys.readouterr().out)['topics']['/pose_mixture']
+
+
+def test_the_vertical_against_gravity(tmp_path, body, mixtures, truth_file, capsys):
+    with np.load(truth_file) as known:
+        content = dict(known)
+    content['gravity'] = np.tile([0.0, 9.81, 0.0], (FRAMES, 1))
+    content['camera_height'] = np.ones(FRAMES)
+    truth = tmp_path / 'truth.npz'
+    np.savez(truth, **content)
+    path = tmp_path / 'bag'
+    with BagWriter(path) as bag:
+        for stamp, mixture in zip(STAMPS, mixtures):
+            bag.write('pose_mixture', stamp, mixture_message(body, mixture, stamp))
+            up = np.array([0.0, -np.cos(0.1), np.sin(0.1)])
+            state = GroundState(stamp, FRAME_ID, up, up_sigma=0.07)
+            bag.write('ground', stamp, ground_message(MESSAGES, state))
+    assert main([str(path), '--truth', str(truth), '--quiet', '--json']) == 0
+    found = json.loads(capsys.readouterr().out)['gravity']
+    assert found == {
+        '/ground': {
+            'error_degrees': pytest.approx(np.degrees(0.1)),
+            'said_degrees': pytest.approx(np.degrees(0.07)),
+            'frames': FRAMES,
+        }
+    }
+    assert main([str(path), '--truth', str(truth), '--quiet']) == 0
+    line = (
+        '/ground: the vertical errs by 5.7 degrees (median), and is said to be known to 4.0 degrees'
+    )
+    assert line in capsys.readouterr().out.splitlines()
+    # Of a truth without gravity nothing is told.
+    assert main([str(path), '--truth', str(truth_file), '--quiet', '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['gravity'] == {}
