@@ -44,6 +44,8 @@ RATE = 30.0  # images a second
 SECONDS, QUICK_SECONDS = 16.0, 3.0
 MOTION = 'dance'
 POSTERIOR, SMOOTHED = 'pose_mixture', 'smoothed_pose_mixture'
+# Options of a replay that leaves out what the bag tells of gravity.
+UNKNOWN = ('--set', 'gravity_frame=', '--set', 'fixed_frame=')
 START_SECONDS = 120.0  # until the person is tracked: the first images compile the kernels
 PATIENCE = 3.0  # s, after the last image
 OLDEST = 1.0  # s, of a smoothed pose
@@ -73,9 +75,11 @@ CASES = {
     'queue': Case('queue_size 5', filter={'queue_size': 5}, bme={'queue_size': 5}),
     'predictions': Case('predictions from every image', bme={'tracked_interval': 0.0}),
     'compressed': Case('JPEG', transport='compressed'),
+    'gravity': Case('gravity given', filter={'gravity': (0.0, 1.0, 0.0)}),
     'usual DDS': Case('without fastdds.xml', room=False),
 }
-STAGES = ('offline', *CASES)
+OFFLINE = {'offline': 'offline, every image', 'upright': 'offline, gravity given'}
+STAGES = (*OFFLINE, *CASES)
 
 
 def main(argv: list[str]) -> int:
@@ -93,7 +97,10 @@ def measure(seconds: float = SECONDS, only: tuple[str, ...] = STAGES) -> dict[st
         folder = Path(name)
         clip = folder / 'clip'
         _run(make_bag.main, [MOTION, '-o', str(clip), '--duration', f'{seconds:g}', '--quiet'])
-        stages = {'offline': lambda: offline(clip, folder / 'offline')}
+        stages = {
+            'offline': lambda: offline(clip, folder / 'offline', *UNKNOWN),
+            'upright': lambda: offline(clip, folder / 'upright'),
+        }
         for stage, case in CASES.items():
             stages[stage] = partial(_tried, clip, folder / stage.replace(' ', '_'), case)
         return run_stages('live', stages, only)
@@ -104,9 +111,9 @@ def _run(command: Any, arguments: list[str]) -> None:
         raise ValueError(f'{" ".join(arguments)} ended with {code}')
 
 
-def offline(clip: Path, target: Path) -> dict[str, Any]:
-    """The clip in lock step: every image, by the parameters of the nodes."""
-    options = ['--background', str(clip / 'background.png'), '--quiet']
+def offline(clip: Path, target: Path, *given: str) -> dict[str, Any]:
+    """The clip in lock step: every image, by the parameters of the nodes; its bag tells gravity."""
+    options = ['--background', str(clip / 'background.png'), '--quiet', *given]
     start = time.perf_counter()
     _run(replay.main, [str(clip), '-o', str(target), *options])
     truth = read_truth(clip / 'truth.npz')
@@ -323,7 +330,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         found = result.get(stage)
         if found is None:
             continue
-        what = 'offline, every image' if stage == 'offline' else CASES[stage].what
+        what = OFFLINE.get(stage) or CASES[stage].what
         if isinstance(found, str):
             rows.append([what, found, *[''] * 10])
             continue
@@ -331,7 +338,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
             f'{found[POSTERIOR]["heaviest_mm"]:.0f} mm', f'{found[POSTERIOR]["best_mm"]:.0f} mm',
             f'{found[SMOOTHED]["heaviest_mm"]:.0f} mm',
         ]  # fmt: skip
-        if stage == 'offline':
+        if stage in OFFLINE:
             rows.append([what, str(found['images']), '0', '100 %', *[''] * 5, *errors])
             continue
         latency, age = found['latency_ms'], found['age_s']

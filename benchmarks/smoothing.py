@@ -288,5 +288,5 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         if isinstance(found, str):
             parts.append(f'clips: {found}')
         else:
-            parts.append(table(rows_of_clips(found), left=2, markdown=markdown))
+            parts.append(table(rows_of_clips(found), left=3, markdown=markdown))
     return '\n\n'.join(parts)

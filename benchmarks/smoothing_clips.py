@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from benchmarks.clips import Clip, find_clips, read_clip
-from benchmarks.runs import new_tracker
+from benchmarks.runs import GIVEN, GRAVITIES, UNKNOWN, new_tracker
 from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import (
     EVALUATED_JOINTS,
@@ -43,7 +43,7 @@ KERNELS = (1.0, 2.0, 4.0)
 
 
 def clips(quick: bool = False) -> dict[str, Any] | str:
-    """Scores of the filter and of the smoother by clip, or why there are none."""
+    """Scores of the filter and of the smoother by clip and gravity, or why there are none."""
     try:
         folders, source = find_clips(None)
     except ValueError as error:
@@ -53,14 +53,21 @@ def clips(quick: bool = False) -> dict[str, Any] | str:
         return f'skipped: {source} has none of {", ".join(NAMES)}'
     if quick:
         folders = folders[:1]
-    return {folder.name: of_clip(read_clip(folder, 12 if quick else None)) for folder in folders}
+    found: dict[str, Any] = {}
+    for folder in folders:
+        clip = read_clip(folder, 12 if quick else None)
+        known = GRAVITIES if clip.ups else (UNKNOWN,)
+        found[folder.name] = {gravity: of_clip(clip, gravity) for gravity in known}
+    return found
 
 
-def of_clip(clip: Clip) -> dict[str, Any]:
-    """Scores of one clip: filter, and smoothed likelihoods."""
+def of_clip(clip: Clip, gravity: str = UNKNOWN) -> dict[str, Any]:
+    """Scores of one clip: filter, and smoothed likelihoods; gravity is one of `GRAVITIES`."""
     tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
     posteriors, likelihoods, errors = [], [], []
     for stamp, image in zip(clip.stamps, clip.images, strict=True):
+        if gravity == GIVEN:
+            tracker.set_gravity(clip.ups[stamp])
         posterior, likelihood = tracker.step(image, stamp)
         if posterior is None or likelihood is None:
             raise ValueError(f'{clip.folder.name}: nobody at {stamp} ns')
@@ -175,17 +182,19 @@ def true_joints(clip: Clip) -> Array:
 
 def as_rows(result: dict[str, Any]) -> list[list[str]]:
     """A table for people."""
-    rows = [['clip', '', 'best of 8, mm', 'heaviest, mm', '90 %', 'joint 90 %', '-log p']]
-    for name, entry in result.items():
+    head = ['clip', 'gravity', '', 'best of 8, mm', 'heaviest, mm', '90 %', 'joint 90 %', '-log p']
+    rows = [head]
+    entries = [(name, gravity, x) for name, mine in result.items() for gravity, x in mine.items()]
+    for name, gravity, entry in entries:
         for what, label in (('filter', 'filter'), ('likelihoods', 'smoothed')):
             s = entry[what]
             rows.append(
                 [
-                    name, label, f'{s["best_mm"]:.0f}', f'{s["heaviest_mm"]:.0f}',
+                    name, gravity, label, f'{s["best_mm"]:.0f}', f'{s["heaviest_mm"]:.0f}',
                     f'{100 * s["coverage_90"]:.0f} %', f'{100 * s["joint_coverage_90"]:.0f} %',
                     f'{s["negative_log_likelihood"]:.1f}',
                 ]
             )  # fmt: skip
         averaged = f'{entry["oracle"]["averaged_mm"]:.0f}'
-        rows.append([name, 'nearest mode, averaged', averaged, '-', '-', '-', '-'])
+        rows.append([name, gravity, 'nearest mode, averaged', averaged, '-', '-', '-', '-'])
     return rows

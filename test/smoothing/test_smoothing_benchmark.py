@@ -114,4 +114,4 @@ def test_mixtures_of_a_clip_are_compared():
     # Independent errors of still poses average out.
     assert found['likelihoods']['heaviest_mm'] < found['filter']['heaviest_mm']
     assert found['likelihoods']['modes'] <= 2
-    assert len(smoothing_clips.as_rows({'still': found})) == 4
+    assert len(smoothing_clips.as_rows({'still': {'unknown': found}})) == 4
