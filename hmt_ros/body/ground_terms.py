@@ -7,7 +7,8 @@
 `lean_s` is the direction of gravity in the frame of pelvis or trunk, less that of somebody
 upright; h_p the height of a point of the sole over the floor; c the centre of mass and q the
 nearest point of its support, both seen from above. All tails are heavy: people bend, jump and lean
-on things.
+on things. A floor that is only known from the feet of the track costs nothing: feet that were taken
+for too high would hold the next ones up.
 """
 
 from __future__ import annotations
@@ -86,12 +87,15 @@ class FloorPlane:
         up_sigma: standard deviation of its angle, rad.
         height: of the camera over the floor, m; None: unknown.
         height_sigma: standard deviation of the floor's height where the person is, m.
+        measured: whether the height is known apart from the person's own feet. If not, it says where
+            they have stood, and nothing of where they are.
     """
 
     up: Array
     up_sigma: float
     height: float | None
     height_sigma: float
+    measured: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +176,7 @@ class GroundTerm:
         weights = self.settings.weights
         weights[0] *= len(upright.segments) > 0
         weights[1:] *= len(feet) > 0
-        weights[1] *= plane.height is not None
+        weights[1] *= plane.height is not None and plane.measured
         weights[2] *= mass.known
         lean = np.hypot(upright.sigma, plane.up_sigma)
         floor = float(np.hypot(FLOOR_SIGMA, plane.height_sigma))

@@ -240,11 +240,12 @@ class GroundEstimator:
             height, sigma = known.camera_height, GIVEN_HEIGHT_SIGMA
         self.estimate = Ground(up, up_sigma, height, sigma)
         # An error of the vertical lifts the floor where the person is.
-        if known.camera_height is not None:
+        measured = known.camera_height is not None
+        if measured:
             sigma = float(np.hypot(sigma, up_sigma * self._distance))
         if sigma > tracked_sigma:
-            height, sigma = tracked, tracked_sigma
-        self._plane = FloorPlane(up, up_sigma, height, sigma)
+            height, sigma, measured = tracked, tracked_sigma, False
+        self._plane = FloorPlane(up, up_sigma, height, sigma, measured)
 
     def _tracked_level(self) -> tuple[float | None, float]:
         """Height of the camera over the lowest soles of the last seconds, and its deviation, m."""

@@ -169,9 +169,10 @@ def test_feet_below_the_floor_cost_and_feet_above_it_do_not(body, standing):
     assert costs[0] == 0.0
     assert costs[1] == pytest.approx(0.0, abs=1e-6)
     assert 0.0 < costs[2] < costs[3] < costs[4] < 60.0
-    # Without a known floor nothing is below it.
-    unknown = GroundTerm(body, only('floor'), replace(plane, height=None))
-    assert unknown.energy(frames, rows).value[0] == 0.0
+    # Without a known floor nothing is below it, nor where only the feet of the track tell of it.
+    sunk = replace(plane, height=plane.height - 0.1)
+    for other in (replace(sunk, height=None), replace(sunk, measured=False)):
+        assert GroundTerm(body, only('floor'), other).energy(frames, rows).value[0] == 0.0
 
 
 def test_balance_is_the_distance_of_the_centre_of_mass_from_the_feet(body, standing):

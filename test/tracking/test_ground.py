@@ -123,6 +123,14 @@ def test_the_height_of_the_camera_is_found(name, body, request):
     assert 0.03 < found.height_sigma < 0.08
 
 
+def test_a_floor_is_measured_where_its_height_was_given(body, reaching):
+    up = up_of(PITCHED)
+    assert after(GroundEstimator(KnownGround(up, 1.4)), body, reaching[:5]).plane.measured
+    assert not after(GroundEstimator(KnownGround(up)), body, reaching[:5]).plane.measured
+    # Where the vertical is not known the height of the camera says little of the floor at the feet.
+    assert not after(GroundEstimator(KnownGround(None, 1.4)), body, reaching[:5]).plane.measured
+
+
 def test_a_jump_does_not_lift_the_floor(body, reaching):
     poses = reaching.copy()
     poses[60:75, :3] += 0.3 * up_of(PITCHED)
