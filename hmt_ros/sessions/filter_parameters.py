@@ -27,6 +27,8 @@ from hmt_ros.sessions.parameter_file import parameter_file_text
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.ground import KnownGround
 
+# Gravity points down in the image, or up by 10 degrees at most, where a camera looks down steeply.
+UPSIDE_DOWN = -0.17
 # Settings that are parameters, with their limits.
 _TRACKER = {
     'max_hypotheses': (1, 64),
@@ -127,8 +129,12 @@ class FilterParameters(CameraNodeParameters):
             )
         if self.use_keypoints_3d and not self.use_keypoints:
             raise ValueError('use_keypoints_3d needs use_keypoints, which is false')
-        if self.gravity:
-            unit_vector(self.gravity, 'gravity')
+        if self.gravity and unit_vector(self.gravity, 'gravity')[1] < UPSIDE_DOWN:
+            raise ValueError(
+                f'gravity must be the direction in which things fall, such as [0.0, 1.0, 0.0], saw '
+                f'{list(self.gravity)}, which points up in the image: an accelerometer at rest '
+                f'measures the opposite'
+            )
         if self.publish_in_fixed_frame and not self.fixed_frame:
             raise ValueError('publish_in_fixed_frame needs the name of fixed_frame, which is empty')
         if self.floor_in_gravity_frame and not self.gravity_frame:
