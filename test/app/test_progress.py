@@ -143,6 +143,6 @@ def test_commands_without_a_terminal(bag, tmp_path, capsys, monkeypatch):
     assert ' of 15 images' in streams.err
     assert recover.main([str(bag), '-o', str(tmp_path / 'saved')]) == 0
     streams = capsys.readouterr()
-    assert f'{tmp_path / "saved"}: 10 messages in 00:00' in streams.err
+    assert f'{tmp_path / "saved"}: 11 messages in 00:00' in streams.err
     assert streams.out.splitlines()[-1] == 'lost: nothing'
     assert INTERVAL >= 10

@@ -22,7 +22,7 @@ def test_what_was_saved_and_what_was_lost(tmp_path, capsys):
     assert main([str(tmp_path / 'cut.mcap'), '-o', str(tmp_path / 'out')]) == 0
     saved, lost, where = capsys.readouterr().out.splitlines()
     with BagReader(tmp_path / 'out') as bag:
-        assert saved.endswith(f'out: {bag.message_count()} messages of 4 topics saved')
+        assert saved.endswith(f'out: {bag.message_count()} messages of 5 topics saved')
         assert bag.damage is None
     assert lost == 'lost: the bag does not tell how many messages'
     assert where.startswith(f'  cut.mcap breaks off after {len(content) * 9 // 10} bytes: ')

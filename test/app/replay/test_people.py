@@ -31,7 +31,7 @@ def crossing(tmp_path_factory):
 def test_a_bag_of_two_people(crossing):
     with BagReader(crossing) as bag:
         assert set(bag.topics) == {
-            '/image/compressed', '/camera_info', '/detections',
+            '/image/compressed', '/camera_info', '/detections', '/tf_static',
             *(f'/humans/bodies/{name}/ground_truth' for name in PEOPLE),
         }  # fmt: skip
         messages = [x.message for x in bag.messages(['/detections'])]
