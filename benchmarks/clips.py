@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -247,9 +247,12 @@ def read_clip(folder: Path, frames: int | None = None) -> Clip:
     if empty.is_file() and (background := cv2.imread(str(empty))) is None:
         raise ValueError(f'{empty} is no image')
     height, width = images[0].shape[:2]
+    truth = read_truth(folder / 'truth.npz')
     with np.load(folder / 'truth.npz') as content:
         pixels = dict(zip(map(int, content['stamps']), np.array(content['pixels']), strict=True))
-        ups = dict(zip(pixels, _ups(content, len(pixels)), strict=False))
+        ups = {stamp: ground.up for stamp, ground in truth.ground.items()}
+        if 'up' in content:
+            ups = dict.fromkeys(pixels, np.array(content['up']))
         views = {}
         if background is None and 'camera_quaternion' in content:
             turns = Rotation.from_quat(content['camera_quaternion']).as_matrix()
@@ -261,20 +264,12 @@ def read_clip(folder: Path, frames: int | None = None) -> Clip:
         camera_from_info(info, (width, height)),
         stamps,
         images,
-        read_truth(folder / 'truth.npz'),
+        truth,
         pixels,
         None if background is None else np.asarray(background, dtype=np.uint8),
         views=views,
         ups=ups,
     )
-
-
-def _ups(truth: Mapping[str, NDArray[np.float64]], count: int) -> NDArray[np.float64]:
-    """Unit vectors against gravity (T, 3) in so many images; (0, 3): the truth does not tell."""
-    if 'gravity' in truth:
-        down = truth['gravity']
-        return np.asarray(-down / np.linalg.norm(down, axis=1, keepdims=True))
-    return np.tile(truth['up'], (count, 1)) if 'up' in truth else np.empty((0, 3))
 
 
 @dataclass(frozen=True, eq=False)

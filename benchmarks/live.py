@@ -44,8 +44,8 @@ RATE = 30.0  # images a second
 SECONDS, QUICK_SECONDS = 16.0, 3.0
 MOTION = 'dance'
 POSTERIOR, SMOOTHED = 'pose_mixture', 'smoothed_pose_mixture'
-# Options of a replay that leaves out what the bag tells of gravity.
-UNKNOWN = ('--set', 'gravity_frame=', '--set', 'fixed_frame=')
+# Options of a replay that leaves out the gravity of the bag.
+WITHOUT_GRAVITY = ('--set', 'gravity_frame=', '--set', 'fixed_frame=')
 START_SECONDS = 120.0  # until the person is tracked: the first images compile the kernels
 PATIENCE = 3.0  # s, after the last image
 OLDEST = 1.0  # s, of a smoothed pose
@@ -98,7 +98,7 @@ def measure(seconds: float = SECONDS, only: tuple[str, ...] = STAGES) -> dict[st
         clip = folder / 'clip'
         _run(make_bag.main, [MOTION, '-o', str(clip), '--duration', f'{seconds:g}', '--quiet'])
         stages = {
-            'offline': lambda: offline(clip, folder / 'offline', *UNKNOWN),
+            'offline': lambda: offline(clip, folder / 'offline', *WITHOUT_GRAVITY),
             'upright': lambda: offline(clip, folder / 'upright'),
         }
         for stage, case in CASES.items():

@@ -177,7 +177,7 @@ def _rate(rate: float) -> str:
 
 
 def _gravity(entry: dict[str, Any]) -> str:
-    """Nothing is told to a detector."""
+    """Whether gravity was given; a detector takes none."""
     return '-' if entry['inputs'] == DETECTOR else str(entry['gravity'])
 
 

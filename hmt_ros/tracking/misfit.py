@@ -30,7 +30,7 @@ from hmt_ros.image.terms.keypoints import EXCHANGED, KeypointTerm
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.tracking.start_depth import moved_to_depth
 
-# Names of what is told. What is left of a silhouette's outline tells of the track alone.
+# Keys of the misfits. That of the silhouette's outline is evidence about the track alone.
 SILHOUETTE, SEGMENTS, OUTLINE, KEYPOINTS = 'silhouette', 'segments', 'outline', 'keypoints'
 # A sample of the outline or a keypoint further away than this from where it should be is
 # unexplained, in sigmas.

@@ -20,8 +20,8 @@ stands for the states without the silhouette:
 
     a sum_g v_g e_g  <-  log t(x_v) + a sum_g v_g min(e_g(x_v), 0)        x_v: x' where v_s = 0  (4)
 
-The fit of a pose to the cue that it was moved to is no evidence for that cue. t is how well it went
-on from the image before (`weighting`) when the two parted.
+A pose that was moved to fit a cue is no evidence for that cue. t is how well the pose went on from
+the image before (`weighting`) when the two parted.
 
 The silhouette is believed by segments, too. Segments and depths, whose misfit is that of a pose
 moved to where they place it, say nothing of the track: each has a chain of its own, which takes in

@@ -527,6 +527,6 @@ def test_the_vertical_against_gravity(tmp_path, body, mixtures, truth_file, caps
         '/ground: the vertical errs by 5.7 degrees (median), and is said to be known to 4.0 degrees'
     )
     assert line in capsys.readouterr().out.splitlines()
-    # Of a truth without gravity nothing is told.
+    # A truth without gravity has no score.
     assert main([str(path), '--truth', str(truth_file), '--quiet', '--json']) == 0
     assert json.loads(capsys.readouterr().out)['gravity'] == {}
