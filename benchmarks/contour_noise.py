@@ -51,7 +51,7 @@ EVERY = 12  # images
 QUICK = 2  # clips
 # Of the true silhouettes, to which the flesh is fitted.
 TERM = TermSettings(30.0, 3.0, 8.0)
-SETTINGS = LikelihoodSettings.of_terms(containment=TERM, coverage=TERM)
+SETTINGS = LikelihoodSettings.of_terms(coverage=TERM)
 MOST_STEPS = 25
 # Of a step, and of a central difference, in deviations over people.
 LARGEST_STEP, DIFFERENCE = 0.8, 0.3
@@ -123,7 +123,7 @@ def posed(folder: Path, every: int = EVERY) -> Posed:
     begun = start_from_keypoints(model, clip.camera, read_subject(clip.subject, model))
     body = with_true_lengths(begun.body, clip)
     pairs = zip(clip.images[::every], silhouettes[TRUE], strict=True)
-    observations = [observe(*pair, wanted=('containment', 'coverage')) for pair in pairs]
+    observations = [observe(*pair, wanted=('coverage',)) for pair in pairs]
     poses = best_poses(body, clip, clip.stamps[::every], begun.poses[:STARTS])
     return Posed(body, clip.camera, poses, observations, silhouettes[SUBTRACTED])
 

@@ -90,7 +90,7 @@ def _terms(
     surface = project_surface(body, camera, frames)
     blur = observation.magnification * surface.noise
     seen = {k: v for k, v in observation.evidence.items() if getattr(s, k).weight > 0}
-    for name, term in (('containment', containment), ('coverage', coverage), ('edges', edges)):
+    for name, term in (('coverage', coverage), ('edges', edges)):
         if name in seen:
             own = getattr(s, name)
             result[name] = term(surface, seen[name], own, np.hypot(own.sigma, blur))
@@ -231,21 +231,6 @@ def visibility(body: Body, frames: Frames, points: Array, parts: Index) -> tuple
     through = (discriminant > 0) & (np.arange(count)[:, None] != parts)
     before = through & (mk - np.sqrt(np.maximum(discriminant, 0.0)) < (1.0 - HIDDEN) * mm)
     return through.any(1).T, before.any(1).T
-
-
-def containment(
-    surface: Surface, distance: ImageMap, term: TermSettings, sigma: Array
-) -> Residuals:
-    """Contour points outside the silhouette pay their distance to it."""
-    value, gradient = sample_distance(distance, surface.pixels)
-    out = surface.valid & (value > 0)
-    residual = np.where(out, value / sigma, 0.0)
-    each = term.weight / len(residual)
-    rho, pull, curvature = geman_mcclure(residual, term.scale, each)
-    return Residuals(
-        rho.sum(0), surface.segments, surface.points,
-        _through(gradient / sigma, surface.projection), pull, np.where(out, curvature, 0.0),
-    )  # fmt: skip
 
 
 def coverage(surface: Surface, outline: Outline, term: TermSettings, sigma: Array) -> Residuals:

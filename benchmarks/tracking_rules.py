@@ -62,9 +62,7 @@ DECIDE = Plan((0, 1, 2, 3, 4), (30.0, 8.0, 3.0))
 RULES = (
     Rule('least_weight', WEIGHTS, (('least_log_weight', -1000.0),)),
     Rule('merging', WEIGHTS, (('hypothesis_merge_distance', 0.0),)),
-    Rule('heavy_tails', WEIGHTS, (('tails', 1000.0),)),
     Rule('learned_motion', WEIGHTS, (('motion', 'random_walk'),)),
-    Rule('containment', CUES, (('likelihood.containment.weight', 0.0),), WITH_IMAGES),
     Rule('coverage', CUES, (('likelihood.coverage.weight', 0.0),), WITH_IMAGES),
     Rule('edges', CUES, (('likelihood.edges.weight', 0.0),), WITH_IMAGES),
     Rule('flow', CUES, (('flow_weight', 0.0),), WITH_IMAGES),

@@ -250,10 +250,7 @@ class ImageLikelihood:
     ) -> tuple[Any, ...]:
         """What the kernels of all terms read, for so many poses."""
         beliefs = observation.beliefs
-        if beliefs is None:
-            request = Request(poses, explained, np.ones(len(self.body.skeleton.parents)))
-        else:
-            request = Request(poses, explained, beliefs.segments)
+        request = Request(poses, explained)
         result = []
         for term in TERMS:
             s: TermSettings = getattr(self.settings, term.name)

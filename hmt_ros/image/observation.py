@@ -29,14 +29,12 @@ class Beliefs:
     """Probabilities that the cues of an image show the person: factors on their energies.
 
     Attributes:
-        silhouette: that of the silhouette's outline.
-        segments: (S,) that the silhouette shows each segment.
+        silhouette: that of the silhouette.
         keypoints: (G,) of the groups of keypoints, see `terms.keypoints`.
         depth: of the depths.
     """
 
     silhouette: float
-    segments: Array
     keypoints: Array
     depth: float
 

@@ -175,13 +175,8 @@ class Student:
         value = 0.5 * (nu + d) * np.log1p(distance / nu)
         if not derivatives:
             return Energy(value)
-        shrinkage = self.shrinkage(distance, d)
+        shrinkage = (nu + d) / (nu + distance)
         return Energy(value, shrinkage[:, None] * pulled, shrinkage[:, None, None] * precisions)
-
-    def shrinkage(self, distance: Array, dimension: int) -> Array:
-        """Curvature over that of the Gaussian with the same precision, at distances D (N,)."""
-        nu = self.degrees_of_freedom
-        return (nu + dimension) / (nu + distance)
 
 
 def _pulls(term: Quadratic | Student, x: Array, rows: Index) -> tuple[Array, Array, Array]:

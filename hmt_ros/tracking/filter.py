@@ -107,7 +107,7 @@ class MixtureFilter:
         self._modes: Modes | None = None
         self._identities = Identities()
         self.shape = ShapeEstimate(body)
-        self.validity = Validity(len(body.skeleton.parents))
+        self.validity = Validity()
         self._observed: tuple[Observation, Observation] | None = None
         self._outline_costs = np.empty((0, 0))
         self._points: SurfacePoints | None = None

@@ -1,7 +1,6 @@
 """How much of each cue of an image no mode explains, from 0 to 1.
 
     silhouette   visible points of the model outside it
-    segments     those of each segment
     outline      samples of the silhouette's outline that are further than 4 sigmas from the model's
     keypoints    those of a group that are further than 4 sigmas from their landmarks
     depth        energy of the visible surface, as a share of the largest that there is
@@ -31,7 +30,7 @@ from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.tracking.start_depth import moved_to_depth
 
 # Keys of the misfits. That of the silhouette's outline is evidence about the track alone.
-SILHOUETTE, SEGMENTS, OUTLINE, KEYPOINTS = 'silhouette', 'segments', 'outline', 'keypoints'
+SILHOUETTE, OUTLINE, KEYPOINTS = 'silhouette', 'outline', 'keypoints'
 # A sample of the outline or a keypoint further away than this from where it should be is
 # unexplained, in sigmas.
 UNEXPLAINED = 4.0
@@ -63,7 +62,7 @@ def of_silhouette(
     costs: Array,
     points: SurfacePoints | None,
 ) -> dict[str, Misfit]:
-    """What modes leave of a silhouette, by segment, of all, and of its outline.
+    """What modes leave of a silhouette and of its outline.
 
     Nothing where there is none. An empty one only says that nobody is there, unless keypoints place
     somebody.
@@ -85,30 +84,25 @@ def of_silhouette(
     share = of_outline(costs, term, belief)
     found[OUTLINE] = Misfit(np.array([share]), np.array([costs.shape[1]]))
     if points is not None and (foreground.any() or observation.keypoints is not None):
-        segments = len(body.skeleton.parents)
-        found[SEGMENTS] = each = of_segments(points, 0, foreground, segments)
-        found[SILHOUETTE] = Misfit(np.array([each.share]), each.counts.sum(keepdims=True))
+        found[SILHOUETTE] = of_points(points, 0, foreground)
     return found
 
 
-def of_segments(points: SurfacePoints, row: int, foreground: Mask, segments: int) -> Misfit:
-    """Visible points of each segment that are no foreground.
+def of_points(points: SurfacePoints, row: int, foreground: Mask) -> Misfit:
+    """Visible points of a mode that are no foreground.
 
     Args:
         points: that are seen of the modes.
         row: of the mode that is believed.
         foreground: (H, W).
-        segments: number of segments, S.
     """
     n = int(points.counts[row])
     column, line = points.pixels[row, :n].T.round().astype(np.intp)
     height, width = foreground.shape
     inside = (column >= 0) & (line >= 0) & (column < width) & (line < height)
     missed = ~foreground[line[inside], column[inside]]
-    owners = points.segments[row, :n][inside].astype(np.intp)
-    counts = np.bincount(owners, minlength=segments).astype(np.float64)
-    found = np.bincount(owners, weights=missed, minlength=segments)
-    return Misfit(found / np.maximum(counts, 1.0), counts)
+    share = float(missed.mean()) if len(missed) else 0.0
+    return Misfit(np.array([share]), np.array([float(len(missed))]))
 
 
 def of_outline(costs: Array, term: TermSettings, belief: float) -> float:

@@ -90,7 +90,7 @@ class Observer:
         s = self._settings
         silhouettes = self._silhouettes
         found, anywhere, changed = None, None, 0.0
-        if s.likelihood.containment.weight > 0 or s.likelihood.coverage.weight > 0:
+        if s.likelihood.coverage.weight > 0:
             region = None if poses is None else region_of(body, self._camera, poses, dt=dt)
             found = silhouettes.silhouette(image, mask, region, others)
         if found is not None:
@@ -118,7 +118,7 @@ class Observer:
         """
         likelihood = self._settings.likelihood
         weighed = [term for term in TERMS if getattr(likelihood, term.name).weight > 0]
-        wanted = {'containment', 'coverage'} | {term.name for term in weighed}
+        wanted = {'coverage'} | {term.name for term in weighed}
         keypoints = view.keypoints
         if keypoints is not None and not keypoints.seen.any():
             keypoints = None

@@ -5,7 +5,7 @@ x_k = argmin E(x)          bounded Newton from x_k^0, within the joint limits
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array
@@ -50,8 +50,7 @@ class Search:
         own = self.states.precisions_of(hypotheses.ancestors, hypotheses.jumped, self.precisions)
         term = posterior.given(self.observation, hypotheses, own)
         solved = posterior.minimise(term, hypotheses.poses, posterior.settings.iterations)
-        hessian = posterior.gaussian_hessians(solved, hypotheses, own)
-        return Optimised(hypotheses, replace(solved, hessian=hessian))
+        return Optimised(hypotheses, solved)
 
     def evidence(self, optimised: Optimised) -> Array:
         """What the image adds to minus the log weights (N,), nats."""

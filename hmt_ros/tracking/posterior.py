@@ -3,7 +3,7 @@
     E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_motion(x)
            + E_ground(x) + E_extra(x)
 
-E_motion is a Student prior around the expected pose: a Gaussian motion prior with heavy tails.
+E_motion is a Gaussian around the expected pose.
 E_ground is what is known of gravity, floor and feet (`body.ground_terms`), E_extra are terms that
 the user of a tracker adds.
 """
@@ -32,7 +32,6 @@ from hmt_ros.inference.energy import (
     Energy,
     EnergyTerm,
     Quadratic,
-    Student,
     Sum,
     add_energies,
 )
@@ -157,7 +156,7 @@ class Posterior:
             known = (*self.extra, ground.following(self.stance[h.ancestors]))
         exchanges = self.exchanges_of(h)
         image = self._of_image(observation, known, exchanges)
-        return Sum((image, self._motion_prior(h, precisions)))
+        return Sum((image, Quadratic(h.expected, precisions)))
 
     def exchanges_of(self, hypotheses: Hypotheses) -> Array:
         """Log probabilities (N, E) of exchanges of sides before the image, of hypotheses."""
@@ -186,19 +185,6 @@ class Posterior:
             term, poses, self.body.lower, self.body.upper, step_scale=self._step_scale,
             damping=1.0, max_iterations=iterations, tolerance=TOLERANCE,
         )  # fmt: skip
-
-    def gaussian_hessians(
-        self, solved: Minimum, hypotheses: Hypotheses, precisions: Array
-    ) -> Array:
-        """Hessians (N, d, d) at minima, with the motion prior as sharp as its covariance.
-
-        A Student density is sharper at its centre than its covariance says.
-        """
-        offset = solved.x - hypotheses.expected
-        distance = np.einsum('ni,nij,nj->n', offset, precisions, offset)
-        prior = self._motion_prior(hypotheses, precisions)
-        shrinkage = prior.shrinkage(distance, self.body.dimension)
-        return np.asarray(solved.hessian - (shrinkage - 1.0)[:, None, None] * precisions)
 
     def fit(self, poses: Array, observation: Observation) -> ImageFit:
         """How poses (K, d) explain an image."""
@@ -290,9 +276,6 @@ class Posterior:
         """Points that an image sees of the surfaces of poses (K, d)."""
         frames = forward(self.body.skeleton, poses)
         return seen_points(self.body, self.camera, frames, observation.others)
-
-    def _motion_prior(self, hypotheses: Hypotheses, precisions: Array) -> Student:
-        return Student(hypotheses.expected, precisions, self.settings.tails)
 
 
 @dataclass(frozen=True, eq=False)

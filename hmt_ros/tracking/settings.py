@@ -49,7 +49,6 @@ class TrackerSettings:
             rates of the body.
         flow_weight: Number of independent measurements that the optical flow counts for where it
             corrects predictions; 0 switches it off.
-        tails: Degrees of freedom of the Student motion prior; small numbers give heavy tails.
         least_log_weight: Smallest log weight of a mode that is kept, nats.
         estimate_shape: Whether lengths and flesh of the person are estimated while the track lasts.
         likelihood: settings of the likelihood.
@@ -69,7 +68,6 @@ class TrackerSettings:
     iterations: int = 6
     motion: str = 'learned'
     flow_weight: float = 5.0
-    tails: float = 10.0
     least_log_weight: float = -14.0
     estimate_shape: bool = True
     likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
@@ -91,7 +89,5 @@ class TrackerSettings:
         for name, bound in least.items():
             if not getattr(self, name) >= bound:
                 raise ValueError(f'{name} must be at least {bound}, saw {getattr(self, name)}')
-        if not self.tails > 0:
-            raise ValueError(f'tails must be positive, saw {self.tails}')
         if not self.flow_weight >= 0:
             raise ValueError(f'flow_weight must be at least 0, saw {self.flow_weight}')

@@ -23,9 +23,8 @@ stands for the states without the silhouette:
 A pose that was moved to fit a cue is no evidence for that cue. t is how well the pose went on from
 the image before (`weighting`) when the two parted.
 
-The silhouette is believed by segments, too. Segments and depths, whose misfit is that of a pose
-moved to where they place it, say nothing of the track: each has a chain of its own, which takes in
-log(P(v_0) exp(e_g) + 1 - P(v_0)).
+Depths, whose misfit is that of a pose moved to where they place it, say nothing of the track: they
+have a chain of their own, which takes in log(P(v_0) exp(e_g) + 1 - P(v_0)).
 
 In an image each cue counts with the energy p_g E_g, to which the energy above is equal in first
 order around E_outlier, with the p_g of (1), before the image: weights and optima hold the same sum.
@@ -45,7 +44,7 @@ from hmt_ros.image.observation import Beliefs
 from hmt_ros.image.terms.keypoints import EXCHANGED
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import share_of_time
-from hmt_ros.tracking.misfit import KEYPOINTS, OUTLINE, SEGMENTS, SILHOUETTE, Misfit
+from hmt_ros.tracking.misfit import KEYPOINTS, OUTLINE, SILHOUETTE, Misfit
 
 # Rates at which a cue ceases to show the person, or a track to follow, and the rates back, 1/s.
 FAILS, RECOVERS = 0.05, 1.0
@@ -63,10 +62,10 @@ MOST = 3.5
 DEPTH = 'depth'
 # Misfit u at which a cue is as likely to be of something else: between those of images that show
 # the person and those that do not. Clothes in the colours of the room leave holes in a silhouette.
-UNDECIDED = {SILHOUETTE: 0.4, OUTLINE: 0.4, SEGMENTS: 0.25, KEYPOINTS: 0.25, DEPTH: 0.15}
-# Cues by part of the body, and the probability w that a mode has the part where it is: limbs lag
-# behind, and hide before the trunk. Where a track begins the pose was given.
-BY_PART, PLACED = (SEGMENTS, KEYPOINTS), 0.8
+UNDECIDED = {SILHOUETTE: 0.4, OUTLINE: 0.4, KEYPOINTS: 0.25, DEPTH: 0.15}
+# Probability w that a mode has a part of the body where it is: limbs lag behind, and hide before
+# the trunk. Where a track begins the pose was given.
+PLACED = 0.8
 # Axes of the joint probability: the track, the detector of keypoints, and the cues.
 TRACK, DETECTOR = 0, 1
 AXES = {SILHOUETTE: slice(2, 3), KEYPOINTS: slice(3, 3 + EXCHANGED.shape[1])}
@@ -94,18 +93,15 @@ class ByKeypoints(NamedTuple):
 class Validity:
     """What is believed of the cues of one track, and of the track.
 
-    Args:
-        segments: number of segments of the body, S.
-
     Attributes:
         joint: (2, .., 2) probability of the track, of the detector and of the cues of `AXES`.
-        alone: by name the probabilities of the groups of the other cues.
+        depth: (1,) that of depths.
     """
 
-    def __init__(self, segments: int) -> None:
+    def __init__(self) -> None:
         usual = RECOVERS / (_fails() + RECOVERS)
         self.joint = np.where(STATES == 1, usual, 1.0 - usual).prod(1).reshape((2,) * CHAINS)
-        self.alone = {SEGMENTS: np.full(segments, USUAL), DEPTH: np.full(1, USUAL)}
+        self.depth: Array = np.full(1, USUAL)
 
     @property
     def track(self) -> float:
@@ -116,10 +112,9 @@ class Validity:
     def cues(self) -> dict[str, Array]:
         """By name the probabilities that the groups of a cue show the person.
 
-        Of the whole silhouette (1,), of the silhouette by segment (S,), of keypoints by group (3,)
-        and of depths (1,).
+        Of the silhouette (1,), of keypoints by group (3,) and of depths (1,).
         """
-        return {name: self._chains[axes] for name, axes in AXES.items()} | self.alone
+        return {name: self._chains[axes] for name, axes in AXES.items()} | {DEPTH: self.depth}
 
     def believes(self, cue: str) -> bool:
         """Whether a cue is more likely to show the person than not; who is lost asks all."""
@@ -138,16 +133,15 @@ class Validity:
         of_person = self.joint.ravel() * STATES[:, DETECTOR]
         detector = float(of_person.sum())
         groups = (of_person @ VALID[:, AXES[KEYPOINTS]]) / detector
-        return Beliefs(silhouette, cues[SEGMENTS], groups * (detector >= 0.5), depth)
+        return Beliefs(silhouette, groups * (detector >= 0.5), depth)
 
     @property
     def shown(self) -> dict[str, float]:
-        """The probabilities by name, for messages and diagnostics; of the segments the mean."""
+        """The probabilities by name, for messages and diagnostics."""
         cues = self.cues
         trunk, arms, legs = (float(p) for p in cues[KEYPOINTS])
         return {
             'silhouette': float(cues[SILHOUETTE][0]),
-            'segments': float(cues[SEGMENTS].mean()),
             'keypoints/trunk': trunk,
             'keypoints/arms': arms,
             'keypoints/legs': legs,
@@ -157,7 +151,7 @@ class Validity:
 
     def predict(self, dt: float) -> None:
         """Goes on by dt seconds, equation (1)."""
-        self.alone = {name: moved_on(p, dt) for name, p in self.alone.items()}
+        self.depth = moved_on(self.depth, dt)
         for axis, fails in enumerate(_fails()):
             valid = moved_on(np.array([0.0, 1.0]), dt, fails)
             transition = np.stack([1.0 - valid, valid])
@@ -184,8 +178,8 @@ class Validity:
             name: np.clip(share * evidence_of(name, x, begun=begun), -MOST, MOST)
             for name, x in misfits.items()
         }
-        for name in self.alone.keys() & says.keys():
-            self.alone[name] = _updated(self.alone[name], _mixed(self.track, says[name]))
+        if DEPTH in says:
+            self.depth = _updated(self.depth, _mixed(self.track, says[DEPTH]))
         of_track = np.zeros(CHAINS)
         of_track[TRACK] = says.get(OUTLINE, np.zeros(1))[0]
         for name in AXES.keys() & says.keys():
@@ -230,7 +224,7 @@ def evidence_of(cue: str, misfit: Misfit, *, begun: bool = True) -> Array:
     """
     certainty = np.minimum(misfit.counts / ENOUGH, 1.0)
     e = np.asarray(NATS * certainty * (UNDECIDED[cue] - misfit.shares))
-    return _mixed(PLACED, e) - _mixed(1.0 - PLACED, e) if cue in BY_PART and begun else e
+    return _mixed(PLACED, e) - _mixed(1.0 - PLACED, e) if cue == KEYPOINTS and begun else e
 
 
 def _fails() -> Array:

@@ -14,8 +14,8 @@ def warnings_of(process, until='[filter_node]: images from'):
 def test_unknown_names_are_told_with_the_nearest():
     from hmt_ros.nodes.node_parameters import unknown_parameters
 
-    known = ['max_hypotheses', 'likelihood.edges.weight', 'tails']
-    given = ['max_hypothesis', 'edges.weight', 'tails', 'zzz', 'absence_time']
+    known = ['max_hypotheses', 'likelihood.edges.weight', 'flow_weight']
+    given = ['max_hypothesis', 'edges.weight', 'flow_weight', 'zzz', 'absence_time']
     assert unknown_parameters(given, known) == [
         "parameter 'absence_time' was removed, it is ignored: existence is a probability with "
         'rates per second: see existence_probability',

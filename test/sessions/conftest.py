@@ -52,7 +52,7 @@ class StubTracker:
             known='known',
             watch=SimpleNamespace(moved=False, shift=0.0),
         )
-        self.validity = Validity(1)
+        self.validity = Validity()
         self.status, self.misfit, self.evaluations = Status.WAITING, 0.0, 0
         self.track_id, self.started_from = 0, None
         self.existence_probability = 0.875

@@ -125,7 +125,7 @@ def test_a_lost_track_is_told(session, outputs, small_camera, stub_tracker, monk
     one.take(IMAGE, small_camera.image(0))
     assert [content.state for content in mixtures_of(outputs)] == [TrackState.LOST]
     assert [content.existence_probability for content in mixtures_of(outputs)] == [0.875]
-    assert [len(content.cue_probabilities) for content in mixtures_of(outputs)] == [7]
+    assert [len(content.cue_probabilities) for content in mixtures_of(outputs)] == [6]
 
 
 def test_a_reset_starts_a_new_track(session, outputs, small_camera):

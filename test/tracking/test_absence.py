@@ -206,9 +206,7 @@ def test_two_persons_cross(tracked, human32, camera, closer):
         front = render(human32, passer, camera, other, i)
         seen = front.depth < frame.depth
         images.append(np.where(seen[:, :, None], front.image, frame.image))
-    # With as many hypotheses as usual, and heavy tails: with lighter ones the track may go off with
-    # the passer.
-    settings = replace(SETTINGS, candidates=16, max_hypotheses=8, tails=4.0)
+    settings = replace(SETTINGS, candidates=16, max_hypotheses=8)  # as many as usual
     statuses, tracks, components, tracker = tracked(images, settings=settings, start=near(poses[0]))
     assert Status.NOBODY not in statuses
     assert set(tracks) == {1}

@@ -51,14 +51,15 @@ def film(human32, camera):
 
 @pytest.fixture(scope='module')
 def run(film, human32, camera, keypoints_of):
-    """Function (count, change, stamps, which) -> errors of the modes; `shown`: beliefs in cues.
+    """Function (count, change, stamps, which, seed) -> errors of modes; `shown`: beliefs in cues.
 
     It follows so many images with their keypoints; change (i, inputs) may change what is given.
     """
     poses, frames, empty = film
 
-    def follow(count, change=lambda i, inputs: None, stamps=None, which=None):
-        tracker = Tracker(human32, camera, SETTINGS, BackgroundModel.from_image(empty))
+    def follow(count, change=lambda i, inputs: None, stamps=None, which=None, seed=0):
+        background = BackgroundModel.from_image(empty)
+        tracker = Tracker(human32, camera, SETTINGS, background, seed)
         tracker.reset(Subject(0, keypoints_of(human32, poses[0]), dict(human32.segment_lengths)))
         errors, shown = [], []
         for i in range(count):
@@ -305,13 +306,18 @@ def test_gaps(run, usual, gap):
 
 @pytest.fixture(scope='module')
 def slowed(run, film):
-    """Numbers of images, the rate of which falls to a third in the middle, and their errors."""
+    """Numbers of images, the rate of which falls to a third in the middle, and their errors.
+
+    Of five seeds: a track may lose a limb that moves so far between images.
+    """
     which = [*range(BAD), *range(BAD, len(film[0]), 3)]
-    return which, run(len(which), stamps=[i / RATE for i in which], which=which).heaviest
+    stamps = [i / RATE for i in which]
+    found = [run(len(which), stamps=stamps, which=which, seed=seed) for seed in range(5)]
+    return which, [one.heaviest for one in found]
 
 
 def test_a_rate_that_falls_in_the_middle(slowed, usual):
-    which, errors = slowed
+    which, (errors, *_) = slowed
     assert np.array_equal(errors[:BAD], usual.heaviest[:BAD])
     early = BAD + 4
     assert errors[BAD:early].mean() < usual.heaviest[which[BAD:early]].mean() + MORE
@@ -320,7 +326,8 @@ def test_a_rate_that_falls_in_the_middle(slowed, usual):
 def test_at_the_lower_rate_the_pose_stays_known(slowed, usual):
     """A person who dances moves far in 0.3 s."""
     which, errors = slowed
-    assert errors[-JUDGED:].mean() < usual.heaviest[which[-JUDGED:]].mean() + 1.5 * MORE
+    late = np.median([one[-JUDGED:].mean() for one in errors])
+    assert late < usual.heaviest[which[-JUDGED:]].mean() + 1.5 * MORE
 
 
 @pytest.fixture(scope='module')

@@ -35,7 +35,7 @@ from hmt_ros.tracking.shape_estimation import (
 
 VIEW = Viewpoint(distance=3.2)
 CAMERA = Camera(330.0, 330.0, 159.5, 119.5, 320, 240)
-NAMES = ('containment', 'coverage')
+NAMES = ('coverage',)
 SILHOUETTE = {name: getattr(LikelihoodSettings(), name) for name in NAMES}
 STEP = 1e-5
 
@@ -216,7 +216,6 @@ def energy_over_shape(space, pose, observation, name):
     centres, radii = places_of(body, contour.parts)
     place = (contour.local[..., 0] - centres) / radii
     sigma = np.hypot(term.sigma, observation.magnification * surface.noise)
-    energy = {'containment': oracle.containment, 'coverage': oracle.coverage}[name]
 
     def value(change):
         other = space.moved(change)
@@ -225,7 +224,7 @@ def energy_over_shape(space, pose, observation, name):
         points = moved.points(surface.segments, centres + place * radii)
         pixels, projection = CAMERA.project_with_derivative(points.transpose(1, 0, 2))
         held = replace(surface, points=points, pixels=pixels, projection=projection)
-        return energy(held, observation.evidence[name], term, sigma).value[0]
+        return oracle.coverage(held, observation.evidence[name], term, sigma).value[0]
 
     return value
 

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.inference.error_model import share_of_time
-from hmt_ros.tracking.misfit import KEYPOINTS, OUTLINE, SEGMENTS, SILHOUETTE, Misfit, of_segments
+from hmt_ros.tracking.misfit import KEYPOINTS, OUTLINE, SILHOUETTE, Misfit, of_points
 from hmt_ros.tracking.validity import (
     DEPTH,
     DETECTOR,
@@ -68,7 +68,7 @@ def test_images_are_those_of_a_hidden_markov_model():
     states = np.array(list(itertools.product((0, 1), repeat=6)))
     usual = RECOVERS / (fails + RECOVERS)
     p = np.where(states == 1, usual, 1.0 - usual).prod(1)
-    validity = Validity(2)
+    validity = Validity()
     for dt in (0.03, 0.1, 0.4, 0.03, 2.0):
         p = p @ functools.reduce(np.kron, [expm(x * dt) for x in rates])
         shares = rng.uniform(0.1, 0.6, 5)
@@ -92,7 +92,7 @@ def test_images_are_those_of_a_hidden_markov_model():
 
 
 def test_a_search_leaves_what_is_known_of_the_cues():
-    validity = Validity(1)
+    validity = Validity()
     for _ in range(9):
         validity.predict(0.1)
         validity.update({SILHOUETTE: whole(0.9), OUTLINE: whole(0.0)}, 0.1)
@@ -116,7 +116,7 @@ def test_what_measurements_say():
 
 
 def test_depths_follow_given_the_track():
-    validity = Validity(1)
+    validity = Validity()
     p, q, dt = USUAL, USUAL, 0.1
     e = share_of_time(dt, TAU) * NATS * (UNDECIDED[DEPTH] - 0.3)
     validity.update({DEPTH: whole(0.3)}, dt)
@@ -126,7 +126,7 @@ def test_depths_follow_given_the_track():
 
 
 def test_one_image_says_no_more_than_it_can():
-    validity = Validity(1)
+    validity = Validity()
     validity.update({OUTLINE: whole(0.0)}, np.inf)
     odds = validity.track / (1 - validity.track)
     assert np.log(odds) == pytest.approx(np.log(RECOVERS / FAILS) + MOST)
@@ -136,7 +136,7 @@ def test_one_image_says_no_more_than_it_can():
 def test_what_a_second_says_does_not_depend_on_the_rate(rate):
     """But for the image in which it happens."""
     for cue in (DEPTH, SILHOUETTE):
-        validity, usual = Validity(2), Validity(2)
+        validity, usual = Validity(), Validity()
         for each, r in ((validity, rate), (usual, RATE)):
             seconds(each, {cue: whole(0.0)}, lambda v: False, r, longest=2.0)
         bad = {cue: whole(0.8), KEYPOINTS: whole(0.0, 3)}
@@ -150,8 +150,8 @@ def test_what_a_second_says_does_not_depend_on_the_rate(rate):
 
 @pytest.mark.parametrize('cue', [SILHOUETTE, DEPTH, KEYPOINTS])
 def test_a_cue_is_believed_again_within_a_second(cue):
-    groups = len(Validity(1).cues[cue])
-    validity = Validity(1)
+    groups = len(Validity().cues[cue])
+    validity = Validity()
     other = KEYPOINTS if cue != KEYPOINTS else SILHOUETTE
     fine = {other: whole(0.0, len(validity.cues[other]))}
     bad = {cue: whole(1.0, groups)} | fine
@@ -163,19 +163,16 @@ def test_a_cue_is_believed_again_within_a_second(cue):
 
 
 def test_groups_fail_one_by_one():
-    """A detector whose arms are wrong, and a segment in the colours of the room."""
-    validity = Validity(3)
+    """A detector whose arms are wrong."""
+    validity = Validity()
     misfits = {
         KEYPOINTS: Misfit(np.array([0.0, 1.0, 0.0]), np.full(3, 4)),
-        SEGMENTS: Misfit(np.array([0.0, 0.0, 1.0]), np.array([9, 0, 9])),
         SILHOUETTE: whole(0.1),
     }
     seconds(validity, misfits, lambda v: False, longest=2.0)
     beliefs = validity.beliefs
     assert (beliefs.keypoints > 0.9).tolist() == [True, False, True]
     assert beliefs.keypoints[1] < 0.3
-    assert (beliefs.segments > 0.9).tolist() == [True, True, False]
-    assert beliefs.segments[2] < 0.3
     assert beliefs.silhouette > 0.9
     assert not validity.lost
 
@@ -186,7 +183,7 @@ def test_groups_fail_one_by_one():
 )
 def test_a_track_is_lost_when_no_cue_is_explained(rate, cues):
     """And then it is the track that is not believed, not the cues."""
-    validity = Validity(1)
+    validity = Validity()
     sizes = {KEYPOINTS: 3}
     fine, gone = ({name: whole(share, sizes.get(name, 1)) for name in cues} for share in (0.0, 1.0))
     seconds(validity, fine, lambda v: False, rate, longest=2.0)
@@ -201,7 +198,7 @@ def test_a_track_is_lost_when_no_cue_is_explained(rate, cues):
 
 @pytest.mark.parametrize(('right', 'wrong'), [(SILHOUETTE, KEYPOINTS), (KEYPOINTS, SILHOUETTE)])
 def test_one_cue_that_is_explained_keeps_a_track(right, wrong):
-    validity = Validity(1)
+    validity = Validity()
     sizes = {name: len(p) for name, p in validity.cues.items()}
     misfits = {right: whole(0.1, sizes[right]), wrong: whole(1.0, sizes[wrong])}
     assert np.isnan(seconds(validity, misfits, lambda v: v.lost))
@@ -212,7 +209,7 @@ def test_one_cue_that_is_explained_keeps_a_track(right, wrong):
 @pytest.mark.parametrize('rate', [30.0, 10.0, 3.0])
 def test_a_silhouette_that_keypoints_contradict_is_doubted(rate):
     """The modes have gone to it and explain it; a pose by keypoints leaves nothing of these."""
-    validity = Validity(1)
+    validity = Validity()
     fine = {SILHOUETTE: whole(0.0), OUTLINE: whole(0.0), KEYPOINTS: whole(0.0, 3)}
     seconds(validity, fine, lambda v: False, rate, longest=2.0)
     misfits = fine | {KEYPOINTS: whole(0.8, 3)}
@@ -230,7 +227,7 @@ def test_a_silhouette_that_keypoints_contradict_is_doubted(rate):
 
 def test_keypoints_that_leave_the_person_are_doubted():
     """A pose that goes with them has to go far, and the modes have not."""
-    validity = Validity(1)
+    validity = Validity()
     misfits = {SILHOUETTE: whole(0.0), OUTLINE: whole(0.0), KEYPOINTS: whole(0.8, 3)}
     alone = ByKeypoints(whole(0.0, 3), -3.0)
     for i in range(60):
@@ -244,7 +241,7 @@ def test_keypoints_that_leave_the_person_are_doubted():
 @pytest.mark.parametrize('gain', [-1.0, 0.0, 2.0])
 def test_the_pose_by_keypoints_stands_for_the_states_without_the_silhouette(gain):
     """Enumerated: silhouette and one group of keypoints, at the modes and by keypoints alone."""
-    validity, dt = Validity(1), 0.1
+    validity, dt = Validity(), 0.1
     before, share = validity.joint.copy(), share_of_time(dt, TAU)
     none = Misfit(np.zeros(3), np.array([0, 4, 0]))
     groups = Misfit(np.array([0.0, 0.9, 0.0]), np.array([0, 4, 0]))
@@ -260,33 +257,32 @@ def test_the_pose_by_keypoints_stands_for_the_states_without_the_silhouette(gain
 
 
 def test_nothing_measured_says_nothing():
-    validity = Validity(2)
+    validity = Validity()
     nothing = Misfit(np.ones(3), np.zeros(3))
     before = validity.track
     validity.update({KEYPOINTS: nothing}, 0.1)
     assert validity.track == pytest.approx(before)
-    assert validity.cues[KEYPOINTS] == pytest.approx(Validity(2).cues[KEYPOINTS])
+    assert validity.cues[KEYPOINTS] == pytest.approx(Validity().cues[KEYPOINTS])
 
 
-def seen(segments, pixels):
-    n = len(segments)
+def seen(pixels):
+    n = len(pixels)
     return SurfacePoints(
-        np.array([n]), np.array([segments]), np.zeros((1, n, 3)), np.array([pixels], float)
+        np.array([n]), np.zeros((1, n), int), np.zeros((1, n, 3)), np.array([pixels], float)
     )
 
 
-def test_points_of_a_segment_that_are_no_foreground():
-    """Ten points of segment 0 in column 1, ten of segment 2 in column 3, of which half are seen."""
+def test_points_that_are_no_foreground():
+    """Ten points in column 1, ten in column 3, of which half are seen."""
     points = [(1, i) for i in range(10)] + [(3, i) for i in range(10)]
     foreground = np.zeros((10, 5), dtype=bool)
     foreground[:, 1], foreground[:5, 3] = True, True
-    shares, counts = of_segments(seen([0] * 10 + [2] * 10, points), 0, foreground, 3)
-    assert shares.tolist() == [0.0, 0.0, 0.5]
-    assert counts.tolist() == [10.0, 0.0, 10.0]
+    shares, counts = of_points(seen(points), 0, foreground)
+    assert shares.tolist() == [0.25]
+    assert counts.tolist() == [20.0]
 
 
 def test_points_outside_the_image_say_nothing():
-    beside = seen([0, 0], [(-3, 0), (7, 0)])
-    assert of_segments(beside, 0, np.zeros((4, 4), dtype=bool), 1).counts.tolist() == [0.0]
-    nothing = seen([], np.zeros((0, 2)))
-    assert of_segments(nothing, 0, np.zeros((4, 4), dtype=bool), 1).counts.tolist() == [0.0]
+    for points in ([(-3, 0), (7, 0)], np.zeros((0, 2))):
+        shares, counts = of_points(seen(points), 0, np.zeros((4, 4), dtype=bool))
+        assert shares.tolist() == counts.tolist() == [0.0]

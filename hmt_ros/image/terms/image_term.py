@@ -147,12 +147,10 @@ class Request:
         poses: number of poses, N.
         explained: (N, M) or (1, M) what each sample of the outline costs at most, because something
             else explains it; None: nothing does.
-        beliefs: (S,) how far the silhouette is believed on each segment.
     """
 
     poses: int
     explained: Array | None = None
-    beliefs: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,10 +23,10 @@ from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.edges import EDGES
 from hmt_ros.image.terms.image_term import ImageTerm, PoseView
 from hmt_ros.image.terms.residuals import Tree, assemble_pose
-from hmt_ros.image.terms.silhouette import CONTAINMENT, COVERAGE
+from hmt_ros.image.terms.silhouette import COVERAGE
 from hmt_ros.inference.arrays import Array, Mask
 
-TERMS: tuple[ImageTerm, ...] = (CONTAINMENT, COVERAGE, EDGES, DEPTH)
+TERMS: tuple[ImageTerm, ...] = (COVERAGE, EDGES, DEPTH)
 
 
 class Model(NamedTuple):

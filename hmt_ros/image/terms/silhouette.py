@@ -1,13 +1,10 @@
-"""The silhouette, both ways (KJS 2; Sminchisescu and Triggs, IJRR 2003).
+"""The silhouette (KJS 2; Sminchisescu and Triggs, IJRR 2003).
 
-    containment   E(x) = w / C sum_i rho(max(d(u_i(x)), 0) / sigma)
     coverage      E(x) = w / M sum_m rho(|u_i(m)(x) - s_m| / sigma)
 
-d is the signed distance to the outline of the silhouette, u_i are the C points of the model's
-contour, s_m M samples of the outline, and i(m) is the contour point nearest to sample m. The model
-explains the silhouette when its contour lies inside, and when the outline of the silhouette lies on
-the contour of the model: the first alone would let the model shrink, the second alone would let
-limbs stick out.
+s_m are M samples of the outline of the silhouette, u_i points of the model's contour, and i(m) is
+the one nearest to sample m. The model explains the silhouette when its outline lies on the contour
+of the model.
 """
 
 from __future__ import annotations
@@ -18,21 +15,14 @@ import cv2
 import numpy as np
 from numba import njit
 
-from hmt_ros.image.sampling import ImageMap, sample_distance
 from hmt_ros.image.terms.image_term import (
-    NO_MAP,
     ImageTerm,
     ImageWindow,
     Request,
     TermSettings,
     Weighting,
 )
-from hmt_ros.image.terms.residuals import (
-    add_contour_residual,
-    add_residual,
-    contour_sigma,
-    geman_mcclure,
-)
+from hmt_ros.image.terms.residuals import add_residual, contour_sigma, geman_mcclure
 from hmt_ros.inference.arrays import Array
 
 # Samples on the outline.
@@ -61,20 +51,6 @@ class Outline(NamedTuple):
     beliefs: Array
 
 
-class ContainmentInputs(NamedTuple):
-    """What the kernel of the containment reads.
-
-    Attributes:
-        term: weighting.
-        distance: signed distance to the outline, px, positive outside.
-        beliefs: (S,) factor on the weight of the points of each segment.
-    """
-
-    term: Weighting
-    distance: ImageMap
-    beliefs: Array
-
-
 class CoverageInputs(NamedTuple):
     """What the kernel of the coverage reads.
 
@@ -89,20 +65,6 @@ class CoverageInputs(NamedTuple):
     outline: Outline
     explained: Array
     costs: Array
-
-
-def distance_map(window: ImageWindow) -> ImageMap | None:
-    """Signed distance to the outline of the silhouette, px, positive outside."""
-    signed, widest = window.signed_distance, window.widest_distance
-    if signed is None or widest is None:
-        return None
-    # What may be a shadow or the person forbids nothing.
-    if window.others is not None:
-        # Behind others the person may reach beyond the image.
-        signed = np.minimum(signed, widest)
-    elif widest is not signed:
-        signed = np.minimum(signed, np.maximum(widest, 0.0))
-    return window.as_map(signed[None])
 
 
 def outline(window: ImageWindow, count: int = OUTLINE_POINTS) -> Outline | None:
@@ -155,11 +117,6 @@ def outline(window: ImageWindow, count: int = OUTLINE_POINTS) -> Outline | None:
 NO_OUTLINE = Outline(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
 
 
-def _containment_inputs(term: Weighting, evidence: Any, request: Request) -> ContainmentInputs:
-    beliefs = np.zeros(0) if request.beliefs is None else request.beliefs
-    return ContainmentInputs(term, evidence or NO_MAP, beliefs)
-
-
 def _coverage_inputs(term: Weighting, evidence: Any, request: Request) -> CoverageInputs:
     found: Outline = evidence or NO_OUTLINE
     samples = len(found.pixels)
@@ -169,33 +126,6 @@ def _coverage_inputs(term: Weighting, evidence: Any, request: Request) -> Covera
     if explained is None:
         explained = np.full((1, samples), np.inf)
     return CoverageInputs(term, found, explained, np.zeros((request.poses, samples)))
-
-
-@njit(cache=True, nogil=True)
-def add_containment(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
-    """Contour points outside the silhouette pay their distance to it; see `ImageTerm.kernel`."""
-    distance, term, contour = inputs.distance, inputs.term, view.contour
-    points = view.contour_points
-    if points == 0:
-        points = len(contour.parts)
-    each = term.weight / points
-    energy = 0.0
-    for i in range(len(contour.parts)):
-        if not contour.valid[i]:
-            continue
-        value, gu, gv = sample_distance(distance, 0, contour.pixels[i, 0], contour.pixels[i, 1])
-        if value <= 0.0:
-            continue
-        segment = view.owners[contour.parts[i]]
-        believed = each * inputs.beliefs[segment]
-        sigma = contour_sigma(term, contour.noise[i])
-        rho, pull, curvature = geman_mcclure(value / sigma, term.scale, believed)
-        energy += rho
-        add_contour_residual(
-            wrenches, stiffnesses, segment, contour, i,
-            gu / sigma, gv / sigma, pull, curvature,
-        )  # fmt: skip
-    return energy
 
 
 @njit(cache=True, nogil=True)
@@ -284,15 +214,6 @@ def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untype
     return energy
 
 
-CONTAINMENT = ImageTerm(
-    'containment',
-    "Distance of the model's contour from the inside of the silhouette.",
-    TermSettings(30.0, 1.5, 8.0),
-    distance_map,
-    _containment_inputs,
-    add_containment,
-    needs_contour=True,
-)
 COVERAGE = ImageTerm(
     'coverage',
     "Distance of the silhouette's outline from the model's contour.",

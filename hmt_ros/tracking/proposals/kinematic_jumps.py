@@ -196,7 +196,7 @@ class KinematicJumps:
     def _search(self, lead: _Lead, rng: np.random.Generator) -> dict[str, Array]:
         """Configurations of some limbs that fit the image."""
         s, evidence = self.posterior.settings, lead.observation.evidence
-        shape = 'containment' in evidence or 'edges' in evidence
+        shape = 'coverage' in evidence or 'edges' in evidence
         names = list(self._searches) if shape else []
         count = min(s.searched_chains, len(names))
         if count == 0:
