@@ -35,6 +35,7 @@ PAGES = {
     'contour_noise': 'likelihood.md',
     'depth': 'likelihood.md',
     'error_model': 'tracking.md',
+    'joint_errors': 'body.md',
     'keypoint_noise': 'keypoints.md',
     'motion_prior': 'motion_prior.md',
     'people': 'people.md',

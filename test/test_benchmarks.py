@@ -15,6 +15,7 @@ from benchmarks import (
     contour_noise,
     depth,
     flips,
+    joint_errors,
     kernels,
     keypoint_noise,
     kjs,
@@ -288,8 +289,8 @@ def test_command_line(capsys, tmp_path):
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
         "benchmarks: no 'flops', wanted one of absence, bags, contour_noise, depth, error_model, "
-        'experts, flips, keypoint_noise, kernels, kjs, live, motion_prior, nodes, people, '
-        'smoothing, soak, tracking, votes'
+        'experts, flips, joint_errors, keypoint_noise, kernels, kjs, live, motion_prior, nodes, '
+        'people, smoothing, soak, tracking, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
@@ -427,3 +428,34 @@ def test_absence_tells_tracks_of_nobody_and_late_states(given):
     assert absence.as_text({'scenes': [case]}).split()[-9:] == [
         'images', '2', '1', '1', '0', '1', '1', str(1 - given), 'park',
     ]  # fmt: skip
+
+
+# joint_errors
+
+
+def said(rng, count, share, error):
+    """What modes say, of a truth that has a share of their covariances, and an error besides."""
+    result = []
+    for _ in range(count):
+        root = 0.03 * rng.standard_normal((2, 3, 3))
+        covariances = root @ root.transpose(0, 2, 1) + 1e-4 * np.eye(3)
+        own = share * covariances[0] + error**2 * np.eye(3)
+        off = rng.multivariate_normal(np.zeros(3), own)
+        means = np.stack([off, off + 0.5])
+        weights = np.array([0.9, 0.1])
+        result += [
+            joint_errors.Said('right_knee', kind, weights, means, covariances)
+            for kind in (True, False)
+        ]
+    return result
+
+
+def test_errors_of_joints_are_found_so_that_regions_hold():
+    found = joint_errors.learned(said(np.random.default_rng(0), 600, 0.5, 0.02))
+    assert found['share'] == 0.5
+    (joint,) = found['joints']
+    # The lighter of two modes, which is half a metre away, makes the regions wider.
+    assert joint['error_mm'] == pytest.approx(20.0, abs=6.0)
+    assert joint['relative'][1] == pytest.approx(0.9, abs=0.02)
+    assert joint['absolute'] == joint['relative']
+    assert 'knee' in joint_errors.as_text(found, markdown=True)

@@ -52,11 +52,10 @@ def _parser() -> CommandParser:
     parser.add_mixtures('evaluate')
     parser.add_argument(
         '--model-sigma',
-        type=number(1e-4, 1, what='a length', unit=' m'),
+        type=number(0, 1, what='a length', unit=' m'),
         default=MODEL_SIGMA,
         metavar='M',
-        help='standard deviation, in m, by which the body model errs in each coordinate of a joint '
-        'in every pose, since its lengths are not exactly those of the person; added to the '
+        help='standard deviation, in m, of each coordinate of a joint that is added to the '
         f'covariances of the mixture (default: {MODEL_SIGMA:g})',
     )
     parser.add_argument(

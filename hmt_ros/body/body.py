@@ -94,6 +94,8 @@ class Body:
             at the default lengths; it scales with them).
         default_lengths: (L,) lengths of the model file, m.
         symmetries: poses that a camera takes for each other, by map; see `body.symmetries`.
+        joint_errors: (J,) standard deviation of a coordinate of each joint, relative to the pelvis,
+            that is wrong in every pose, because people's joints are not exactly the model's, m.
         growth: (B, 5) how each part differs from the model's; see `GROWTH`.
     """
 
@@ -107,6 +109,7 @@ class Body:
     stature_extra: float
     default_lengths: Array
     symmetries: Mapping[str, Symmetry]
+    joint_errors: Array
     growth: Array = field(default_factory=lambda: np.zeros((0, len(GROWTH))))
 
     def __post_init__(self) -> None:
@@ -127,6 +130,13 @@ class Body:
             raise ValueError(
                 f'{self.name}: length_covariance must be symmetric, {(count, count)}, saw '
                 f'{covariance.shape}'
+            )
+
+        errors = self.joint_errors
+        if errors.shape != (len(self.joint_names),) or not (errors >= 0).all():
+            raise ValueError(
+                f'{self.name}: joint_errors must be {len(self.joint_names)} numbers of at least 0, '
+                f'saw {errors}'
             )
 
     @property

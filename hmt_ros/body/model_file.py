@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from functools import cache
 from importlib import resources
@@ -95,6 +96,24 @@ def usual_symmetries() -> Mapping[str, float]:
     return result
 
 
+def joint_errors_of(joint_names: Sequence[str], table: Mapping[str, float] | None = None) -> Array:
+    """Errors (J,) of joints, m: of the joints of a table, or that of human37; see `Body`.
+
+    A joint that the table does not have errs as the worst of those that it has.
+
+    Raises:
+        ValueError: a table with other entries than numbers of at least 0, of joints of the body.
+    """
+    known = _shipped('human37')['joint_errors'] if table is None else table
+    errors = {joint: float(error) for name, error in known.items() for joint, _ in _sides(name)}
+    if not errors or not all(0.0 <= error < math.inf for error in errors.values()):
+        raise ValueError(f'joint_errors: wanted numbers of at least 0 by joint, saw {known}')
+    strange = sorted(errors.keys() - set(joint_names))
+    if table is not None and strange:
+        raise ValueError(f'joint_errors names {strange}, which the body does not have')
+    return np.array([errors.get(name, max(errors.values())) for name in joint_names])
+
+
 def _whole(content: Any) -> dict[str, Any]:
     """The content of a model with that of the one it extends."""
     if not isinstance(content, dict):
@@ -142,7 +161,7 @@ def _mount(entry: dict[str, Any]) -> Array:
 
 KEYS = {
     'name', 'lengths', 'stature_spread', 'stature', 'stature_extra', 'segments', 'joints',
-    'chains', 'fixed', 'symmetries',
+    'chains', 'fixed', 'symmetries', 'joint_errors',
 }  # fmt: skip
 SEGMENT_KEYS = {
     'name', 'parent', 'offset', 'points', 'x_axis', 'length', 'diffusion', 'dofs', 'flesh',
@@ -268,6 +287,7 @@ def _build(content: dict[str, Any]) -> Body:
         stature_extra=float(content['stature_extra']),
         default_lengths=lengths,
         symmetries=symmetries_of(content.get('symmetries', usual_symmetries())),
+        joint_errors=joint_errors_of(joint_names, content.get('joint_errors')),
     )
 
 

@@ -4,11 +4,12 @@ Joint positions relative to an origin are compared, so that bodies with differen
 have comparable scores. The origin is the pelvis, or the middle of the hips where the truth has no
 pelvis. A component N(m, S) over poses becomes one over joint positions by linearisation,
 
-    N(f(m), J S J^T + s^2 I),   f: joints minus origin,   J = df/dx at m.
+    N(f(m), J S J^T + D + s^2 I),   f: joints minus origin,   J = df/dx at m.
 
-The isotropic part s stands for the error that every pose of the body has, because the lengths and
-joint centres of the model are not exactly those of the person. Without it the density would be
-confined to a surface: 13 joints have 39 coordinates, and fewer degrees of freedom move them.
+The diagonal D holds the errors that every pose of the body has, because its joints are not exactly
+those of the person (`Body.joint_errors`), as published covariances of joints do. Without it the
+density would be confined to a surface: 13 joints have 39 coordinates, and fewer degrees of freedom
+move them. s is what an evaluator adds, usually 0.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ EVALUATED_JOINTS = (
 ORIGIN = 'pelvis'
 # Their middle is the origin where the truth has no pelvis.
 HIPS = ('left_hip', 'right_hip')
-# Standard deviation of a coordinate that the body model gets wrong in every pose, m.
-MODEL_SIGMA = 0.02
+# Standard deviation of a coordinate that is added to those that are published, m.
+MODEL_SIGMA = 0.0
 # A frame is lost when the mean joint error of its best hypothesis reaches this, m.
 LOST = 0.15
 # Number of samples of a density from which a level is estimated.
@@ -141,7 +142,7 @@ def joint_mixtures(
         body: the body of the poses.
         mixtures: (T,) over poses (d,).
         names: (J,) of the joints.
-        model_sigma: standard deviation of a coordinate that the body model gets wrong, m.
+        model_sigma: standard deviation of a coordinate that is added, m.
         positions: for each mixture (K, J', 3) of all joints of the body at the means, m; None:
             computed from the means.
         origin: joints whose mean position is the origin.
@@ -151,7 +152,7 @@ def joint_mixtures(
         ValueError: a mixture over poses of another body.
     """
     which, centre = (body.skeleton.joint_index([*some]) for some in (names, origin))
-    own = model_sigma**2 * np.eye(3 * len(names))
+    own = np.diag(np.repeat(np.square(body.joint_errors[which]) + model_sigma**2, 3))
     result = []
     # Kinematics in batches: one frame alone would cost ten times as much a pose.
     for first in range(0, len(mixtures), BATCH):

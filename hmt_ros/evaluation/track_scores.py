@@ -134,7 +134,7 @@ class TrackScorer:
     Args:
         name: name of the track, for messages.
         truth: true joint positions.
-        model_sigma: standard deviation of a coordinate that the body model gets wrong, m.
+        model_sigma: standard deviation of a coordinate that is added to those published, m.
         seed: of the samples from which coverage is estimated.
 
     Attributes:

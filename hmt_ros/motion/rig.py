@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.length_prior import length_covariance
-from hmt_ros.body.model_file import load_body
+from hmt_ros.body.model_file import joint_errors_of, load_body
 from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference.arrays import Array
 from msg_tools.files.bounded_file import read_bytes
@@ -219,6 +219,7 @@ def rig_body(rig: Rig, name: str, unit_to_m: float) -> Body:
         stature_extra=SKULL_AND_HEEL * sum(lengths[k] for k in upright),
         default_lengths=values,
         symmetries=load_body('human37').symmetries,
+        joint_errors=joint_errors_of(names),
     )
 
 

@@ -88,7 +88,7 @@ class Modes(Hypotheses):
 
     Attributes:
         velocities: (N, d) per second.
-        covariances: (N, d, d) of the posterior.
+        covariances: (N, d, d) of the posterior, as certain as all images so far make them.
         filtered: (N, d, d) covariances as if errors were independent from image to image.
         log_likelihoods: (N,) of the image.
         state_covariances: (N, n, n) that are propagated, of poses and velocities. Of a random walk

@@ -1,13 +1,13 @@
 """Gaussians around optima: the modes of the posterior, and those of the likelihood alone.
 
     filtered     H^-1                                      as if errors did not last
-    covariance   (H_prior + sum_g a_g(dt) H_g)^-1 + J P J'                 g: image, keypoints
+    covariance   T (H_prior + sum_g a_g(dt) H_g)^-1 + J P J'               g: image, keypoints
     state        N(pose, velocity) conditioned on where the pose was found; see `motion_states`
 
 H is the Gauss-Newton Hessian of the energy at an optimum, H_prior that of body and ground, without
-the motion prior. Errors last, so only the share a_g of a cue is believed (`inference.error_model`),
-and what is not known of the shape is not known of the pose: J P J' (`shape_estimation`). A variable
-that rests on its limit hardly varies.
+the motion prior. Errors last, so only the share a_g of a cue is believed, and all images so far
+leave T of what one leaves by itself (`inference.error_model`). What is not known of the shape is
+not known of the pose: J P J' (`shape_estimation`). A variable on its limit hardly varies.
 
 The likelihood alone is passed on whole, with how its errors last beside it: who puts images
 together discounts them, once.
@@ -22,7 +22,7 @@ import numpy as np
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import resting
-from hmt_ros.inference.error_model import CueErrors, errors_of_cues
+from hmt_ros.inference.error_model import TOGETHER, CueErrors, errors_of_cues
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.hypotheses import Modes, Optimised
@@ -84,7 +84,7 @@ def posterior_modes(
     measured = bool(observation.evidence) or observation.keypoints is not None
     if measured:
         alone = posterior.covariances(fit, solved.free, dt)
-        covariances = alone + shape.considered(
+        covariances = TOGETHER * alone + shape.considered(
             posterior.likelihood, observation, poses, posterior.given_way(poses, observation)[1]
         )
     if states is None:
@@ -130,7 +130,7 @@ def likelihood_modes(modes: Modes, posterior: Posterior, observation: Observatio
     free = ~resting(poses, gradient, body.lower, body.upper)
     covariances = free_covariances(hessian, free)
     step = -np.einsum('kij,kj->ki', covariances, np.where(free, gradient, 0.0))
-    limit = 3.0 * np.sqrt(np.einsum('kii->ki', modes.covariances))
+    limit = 5.0 * np.sqrt(np.einsum('kii->ki', modes.covariances))
     step = np.clip(step, -limit, limit)
     means = np.clip(poses + step, body.lower, body.upper)
     weights = np.exp(at_least(normalised(-fit.energy.value), LEAST_LOG_WEIGHT))

@@ -24,7 +24,7 @@ from hmt_ros.image.background import BackgroundModel
 from hmt_ros.image.observation import Box, Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
-from hmt_ros.inference.error_model import ERRORS, seconds
+from hmt_ros.inference.error_model import ERRORS, TOGETHER, seconds
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.beginning import FROM_JOINTS, Beginning, Source, Starts, poses_to_search
 from hmt_ros.tracking.camera_motion import CameraPath, CameraPose
@@ -397,7 +397,9 @@ class Tracker:
             resting = min(self.contacts.values(), default=RESTING)
             self._ground.update(self.body, self.modes, resting, dt)
         follows = self.modes.origins.shape[1] > 0
-        self._point.update(self.body, self._track.dynamics, self.posterior, dt if follows else None)
+        # The motion takes in one image after another, and so what each leaves by itself.
+        found = replace(self.posterior, covariances=self.modes.covariances / TOGETHER)
+        self._point.update(self.body, self._track.dynamics, found, dt if follows else None)
         self._observer.last_image, self._followed = view.image, stamp
         if self._existence.seen:
             self._existence.learn(view, stamp, self.body, self.camera, self.modes.poses[0])

@@ -244,9 +244,9 @@ class PoseMixture:
             state=state,
             track_id=track_id,
             identities=identities,
-            joint_covariances=_joint_covariances(jacobians, mixture.covariances),
+            joint_covariances=_joint_covariances(body, jacobians, mixture.covariances),
             joint_covariances_relative=_joint_covariances(
-                jacobians - jacobians[:, :1], mixture.covariances
+                body, jacobians - jacobians[:, :1], mixture.covariances
             ),
             joint_velocities=joint_velocities,
             existence_probability=existence_probability,
@@ -269,12 +269,19 @@ class PoseMixture:
         return GaussianMixture(self.weights, self.means, self.covariances)
 
 
-def _joint_covariances(jacobians: Array, covariances: Array) -> Array:
-    """Covariances (K, J, 3, 3) of joints from Jacobians (K, J, 3, d) and those of the poses."""
+def _joint_covariances(body: Body, jacobians: Array, covariances: Array) -> Array:
+    """Covariances (K, J, 3, 3) of joints: of the poses, and what the body errs by in every pose.
+
+    Args:
+        body: whose joints they are.
+        jacobians: (K, J, 3, d) of the positions.
+        covariances: (K, d, d) of the poses.
+    """
     k, joints, _, d = jacobians.shape
     rows = (jacobians.reshape(k, 3 * joints, d) @ covariances).reshape(jacobians.shape)
     result = rows @ jacobians.swapaxes(2, 3)
-    return 0.5 * (result + result.swapaxes(2, 3))
+    own = np.square(body.joint_errors)[:, None, None] * np.eye(3)
+    return np.asarray(0.5 * (result + result.swapaxes(2, 3)) + own, dtype=np.float64)
 
 
 def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:

@@ -78,7 +78,8 @@ def test_linearisation_agrees_with_sampling(body, origin):
     which, centre = (body.skeleton.joint_index(names) for names in (EVALUATED_JOINTS, origin))
     relative = joints[:, which] - joints[:, centre].sum(1, keepdims=True) / len(origin)
     relative = relative.reshape(len(poses), -1)
-    seen = np.cov(relative.T) + 0.03**2 * np.eye(relative.shape[1])
+    own = np.repeat(body.joint_errors[which], 3) ** 2 + 0.03**2
+    seen = np.cov(relative.T) + np.diag(own)
     assert result.covariances.shape == (1, 39, 39)
     scale = np.sqrt(np.outer(np.diag(seen), np.diag(seen)))
     assert np.abs(result.covariances[0] - seen).max() < 0.02 * scale.max()

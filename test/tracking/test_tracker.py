@@ -16,7 +16,7 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives, Energy
-from hmt_ros.inference.error_model import ERRORS
+from hmt_ros.inference.error_model import ERRORS, TOGETHER
 from hmt_ros.tracking import (
     GroundSettings,
     PosePrediction,
@@ -357,7 +357,7 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     assert min(misfits[3:found]) > UNDECIDED[KEYPOINTS]
     assert max(misfits[found:]) < 0.1
     assert min(errors[3:found]) > 0.1
-    assert max(errors[found:]) < 0.06
+    assert max(errors[found:]) < 0.065
     # The place too, not only the posture.
     assert np.abs(posterior.means[:, :3] - other[:3]).max(1).min() < 0.2
     # Modes that are placed anew have no history, and the point estimate does not travel to them.
@@ -477,7 +477,7 @@ def test_keypoints_alone_leave_more_open_than_their_sum_says(follow):
     published, independent = (
         np.trace(x, axis1=1, axis2=2) for x in (mixtures[-1][0].covariances, modes.filtered)
     )
-    assert (published > 1.5 * independent).all()
+    assert (published > 1.5 * TOGETHER * independent).all()
 
 
 def test_who_jumps_is_found_where_the_keypoints_are(human32, started, black, motion, keypoints_of):
@@ -490,7 +490,7 @@ def test_who_jumps_is_found_where_the_keypoints_are(human32, started, black, mot
         lost.append(tracker.status is Status.LOST)
     found = lost.index(True) + 1
     assert min(errors[3:found]) > 0.1
-    assert max(errors[found:]) < 0.06
+    assert max(errors[found:]) < 0.065
 
 
 def test_one_bad_image_is_forgiven(human32, started, black, motion, keypoints_of):

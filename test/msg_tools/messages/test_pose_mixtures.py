@@ -154,7 +154,10 @@ def test_error_model(pose_mixture: PoseMixture, messages: RosbagsMessages) -> No
 
 
 def test_relative_covariances_are_those_of_samples() -> None:
-    """Of joints as seen from the pelvis, whose own place is the least certain."""
+    """Of joints as seen from the pelvis, whose own place is the least certain.
+
+    Joints of people lie elsewhere than the body's, too, whatever the pose.
+    """
     body = load_body('human37')
     sigma = np.where(body.skeleton.dof_is_rotation, 1e-3, 0.3)
     mixture = GaussianMixture([1.0], body.prior_mean[None], np.diag(sigma**2)[None])
@@ -166,10 +169,10 @@ def test_relative_covariances_are_those_of_samples() -> None:
     assert content.joint_covariances is not None
     assert not content.joint_covariances_relative[0, 0].any()
     wrist = body.joint_names.index('left_wrist')
-    wanted = np.cov(seen[:, wrist].T)
+    wanted = np.cov(seen[:, wrist].T) + body.joint_errors[wrist] ** 2 * np.eye(3)
     found = content.joint_covariances_relative[0, wrist]
     assert np.abs(found - wanted).max() < 0.1 * wanted.max()
-    assert content.joint_covariances[0, wrist].trace() > 1e3 * found.trace()
+    assert content.joint_covariances[0, wrist].trace() > 100 * found.trace()
 
 
 def test_probability_of_existence(pose_mixture: PoseMixture, messages: RosbagsMessages) -> None:

@@ -1,0 +1,218 @@
+"""joint_errors: what joints err by in every pose, and what all images leave of a covariance.
+
+Modes k of a pose say of a joint j, with the covariances C_jk that they have because of the pose,
+
+    p(x_j) = sum_k w_k N(x_j; m_jk, t C_jk + s_j^2 I)
+
+s_j is such that the 90 % regions of joint j, relative to the pelvis, hold the true joint in 90 % of
+the images of the clips that settings are chosen on, with all three inputs alike; t maximises the
+mean log density of the true joints, relative and absolute. s_j stands in `joint_errors` of
+`hmt_ros/body/models/human37.yaml`; `TOGETHER` of `hmt_ros/inference/error_model.py` is to be
+multiplied by t.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.clips import read_clip, read_detections, table, with_file
+from benchmarks.command import benchmark_parser, show, told
+from benchmarks.keypoint_noise import CLIPS, QUICK
+from benchmarks.machine import description
+from benchmarks.runs import IMAGES, INPUTS, KEYPOINTS, keypoints_only, new_tracker
+from hmt_ros.body import load_body
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN
+from hmt_ros.inference.calibration import (
+    levels_of,
+    marginal_log_densities,
+    stratified_samples,
+)
+from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.tracking import TrackerSettings
+
+Array = NDArray[np.float64]
+
+EVERY = 6  # images
+HELD = 0.9
+SAMPLES = 100
+# Values of t, and the bounds of s, m.
+SHARES = (0.35, 0.5, 0.7, 1.0, 1.4)
+LEAST, MOST = 0.001, 0.1
+HALVINGS = 6
+
+
+class Said(NamedTuple):
+    """What a track says of one joint in one image, relative to the pelvis or absolute.
+
+    Attributes:
+        joint: of the body, right for left.
+        relative: whether it is relative to the pelvis.
+        weights: (K,) of the modes.
+        means: (K, 3) less the true position, m.
+        covariances: (K, 3, 3) because of the pose, m^2.
+    """
+
+    joint: str
+    relative: bool
+    weights: Array
+    means: Array
+    covariances: Array
+
+
+def said_of(folder: Path, inputs: str) -> list[Said]:
+    """What the tracker says of the joints of a clip, with some of `runs.INPUTS`.
+
+    Raises:
+        ValueError: the clip can not be read.
+    """
+    clip, body = read_clip(folder), load_body('human37')
+    keypoints = {} if inputs == IMAGES else read_detections(folder).keypoints
+    settings = TrackerSettings()
+    tracker = new_tracker(
+        clip, body, keypoints_only(settings) if inputs == KEYPOINTS else settings, 0
+    )
+    names = [name for name in EVALUATED_JOINTS if name in clip.truth.joint_names]
+    which = body.skeleton.joint_index([ORIGIN, *names])
+    result = []
+    for i, (stamp, image) in enumerate(zip(clip.stamps, clip.images, strict=True)):
+        if stamp in clip.views:
+            rotation, position = clip.views[stamp]
+            tracker.set_camera(position, rotation)
+        posterior, _ = tracker.step(image, stamp, keypoints.get(stamp))
+        if posterior is None or i % EVERY or stamp not in clip.truth.joints:
+            continue
+        rows = [clip.truth.joint_names.index(name) for name in (ORIGIN, *names)]
+        true = clip.truth.joints[stamp][rows]
+        joints = tracker.body.joint_positions(posterior.means)[:, which]
+        jacobians = tracker.body.joint_jacobians(posterior.means)[:, which]
+        for relative in (True, False):
+            share = float(relative)
+            moved = (jacobians - share * jacobians[:, :1]) @ posterior.cholesky()[:, None]
+            covariances = moved @ moved.swapaxes(2, 3)
+            off = (joints - share * joints[:, :1]) - (true - share * true[0])
+            result += [
+                Said(_of_both(name), relative, posterior.weights, off[:, j], covariances[:, j])
+                for j, name in enumerate(names, start=1)
+            ]
+    return result
+
+
+def _of_both(joint: str) -> str:
+    return joint.replace('left_', 'right_')
+
+
+def levels_and_densities(said: Sequence[Said], share: float, error: float) -> Array:
+    """Levels and log densities (N, 2) of the true joints, with t and s."""
+    result = np.empty((len(said), 2))
+    for row, one in zip(result, said, strict=True):
+        covariances = share * one.covariances + error**2 * np.eye(3)
+        density = GaussianMixture(one.weights, one.means, covariances)
+        drawn = stratified_samples(density, SAMPLES, np.random.default_rng(0))
+        found = marginal_log_densities(density, np.concatenate([np.zeros((1, 3)), drawn]), 3)
+        row[:] = levels_of(found[:1, 0], found[1:, 0])[0], found[0, 0]
+    return result
+
+
+def error_that_holds(said: Sequence[Said], share: float) -> tuple[float, Array]:
+    """s whose regions of probability `HELD` hold as many true joints; levels and densities."""
+    low, high = LEAST, MOST
+    found = np.empty((0, 2))
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        found = levels_and_densities(said, share, middle)
+        if (found[:, 0] <= HELD).mean() < HELD:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high), found
+
+
+def learned(said: Sequence[Said]) -> dict[str, Any]:
+    """t, s_j in mm, and the shares of true joints in regions of 50 and 90 %."""
+    names = list(dict.fromkeys(one.joint for one in said))
+    relative, absolute = (
+        {name: [x for x in said if x.joint == name and x.relative == kind] for name in names}
+        for kind in (True, False)
+    )
+    best: dict[str, Any] = {'log_density': -np.inf}
+    for share in told('joint_errors', SHARES, str):
+        found = {name: error_that_holds(own, share) for name, own in relative.items()}
+        whole = {
+            name: levels_and_densities(own, share, found[name][0]) for name, own in absolute.items()
+        }
+        columns = [*(numbers for _, numbers in found.values()), *whole.values()]
+        log_density = float(np.concatenate(columns)[:, 1].mean())
+        if log_density > best['log_density']:
+            best = {
+                'share': share,
+                'log_density': log_density,
+                'joints': [
+                    {
+                        'joint': name,
+                        'error_mm': 1e3 * error,
+                        'relative': _held(numbers),
+                        'absolute': _held(whole[name]),
+                    }
+                    for name, (error, numbers) in found.items()
+                ],
+            }
+    return best
+
+
+def _held(numbers: Array) -> list[float]:
+    """Shares of levels, of `levels_and_densities`, in regions of 50 and 90 %."""
+    return [float((numbers[:, 0] <= p).mean()) for p in (0.5, 0.9)]
+
+
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+    """What is printed."""
+    rows = [['joint', 's, mm', 'relative: in 50 %', 'in 90 %', 'absolute: in 50 %', 'in 90 %']]
+    rows += [
+        [
+            one['joint'].removeprefix('right_'),
+            f'{one["error_mm"]:.0f}',
+            *(f'{held:.0%}' for held in one['relative'] + one['absolute']),
+        ]
+        for one in result['joints']
+    ]
+    text = f't = {result["share"]:g}, mean log density of a joint {result["log_density"]:.2f}'
+    return f'{text}\n\n{table(rows, markdown=markdown)}'
+
+
+def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
+    """What `learned` finds on the clips that settings are chosen on.
+
+    Raises:
+        FileNotFoundError: there are no clips.
+        ValueError: one can not be read.
+    """
+    folders = with_file(CLIPS, clips, 'truth.npz')[: QUICK if quick else None]
+    jobs = [(folder, inputs) for folder in folders for inputs in INPUTS]
+    said = [
+        one
+        for job in told('joint_errors', jobs, lambda job: f'{job[0].name}, {job[1]}')
+        for one in said_of(*job)
+    ]
+    return {'machine': description(), 'clips': [x.name for x in folders], **learned(said)}
+
+
+def main(arguments: list[str]) -> int:
+    """Runs the command; returns its exit code."""
+    parser = benchmark_parser('joint_errors', __doc__, quick=f'only {QUICK} clips')
+    parser.add_argument('--clips', type=Path, help='folder of the clips')
+    options = parser.parse_args(arguments)
+    try:
+        result = measure(options.clips, quick=options.quick)
+    except FileNotFoundError as error:
+        print(f'joint_errors: skipped, {error}', file=sys.stderr)
+        return 0
+    except ValueError as error:
+        print(f'joint_errors: {error}', file=sys.stderr)
+        return 1
+    return show(result, as_text, as_json=options.json)
