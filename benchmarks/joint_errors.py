@@ -4,11 +4,10 @@ Modes k of a pose say of a joint j, with the covariances C_jk that they have bec
 
     p(x_j) = sum_k w_k N(x_j; m_jk, t C_jk + s_j^2 I)
 
-s_j is such that the 90 % regions of joint j, relative to the pelvis, hold the true joint in 90 % of
-the images of the clips that settings are chosen on, with all three inputs alike; t maximises the
-mean log density of the true joints, relative and absolute. s_j stands in `joint_errors` of
-`hmt_ros/body/models/human37.yaml`; `TOGETHER` of `hmt_ros/inference/error_model.py` is to be
-multiplied by t.
+For some t, s_j is such that the 90 % regions of joint j, relative to the pelvis, hold the true
+joint in 90 % of the images of the clips that settings are chosen on, with all three inputs alike.
+What was made of it stands in `joint_errors` of `hmt_ros/body/models/human37.yaml`, and in
+`TOGETHER` of `hmt_ros/inference/error_model.py`, which is part of the C_jk.
 """
 
 from __future__ import annotations
@@ -133,36 +132,30 @@ def error_that_holds(said: Sequence[Said], share: float) -> tuple[float, Array]:
     return 0.5 * (low + high), found
 
 
-def learned(said: Sequence[Said]) -> dict[str, Any]:
-    """t, s_j in mm, and the shares of true joints in regions of 50 and 90 %."""
+def learned(said: Sequence[Said]) -> list[dict[str, Any]]:
+    """For each t: s_j in mm, mean log density of a joint, shares held by 50 and 90 % regions."""
     names = list(dict.fromkeys(one.joint for one in said))
     relative, absolute = (
         {name: [x for x in said if x.joint == name and x.relative == kind] for name in names}
         for kind in (True, False)
     )
-    best: dict[str, Any] = {'log_density': -np.inf}
+    result = []
     for share in told('joint_errors', SHARES, str):
         found = {name: error_that_holds(own, share) for name, own in relative.items()}
-        whole = {
-            name: levels_and_densities(own, share, found[name][0]) for name, own in absolute.items()
-        }
-        columns = [*(numbers for _, numbers in found.values()), *whole.values()]
-        log_density = float(np.concatenate(columns)[:, 1].mean())
-        if log_density > best['log_density']:
-            best = {
+        near = np.concatenate([numbers for _, numbers in found.values()])
+        whole = np.concatenate(
+            [levels_and_densities(own, share, found[name][0]) for name, own in absolute.items()]
+        )
+        result.append(
+            {
                 'share': share,
-                'log_density': log_density,
-                'joints': [
-                    {
-                        'joint': name,
-                        'error_mm': 1e3 * error,
-                        'relative': _held(numbers),
-                        'absolute': _held(whole[name]),
-                    }
-                    for name, (error, numbers) in found.items()
-                ],
+                'errors_mm': {name: 1e3 * error for name, (error, _) in found.items()},
+                'log_density': float(0.5 * (near[:, 1].mean() + whole[:, 1].mean())),
+                'relative': _held(near),
+                'absolute': _held(whole),
             }
-    return best
+        )
+    return result
 
 
 def _held(numbers: Array) -> list[float]:
@@ -172,17 +165,21 @@ def _held(numbers: Array) -> list[float]:
 
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """What is printed."""
-    rows = [['joint', 's, mm', 'relative: in 50 %', 'in 90 %', 'absolute: in 50 %', 'in 90 %']]
+    joints = list(result['shares'][0]['errors_mm'])
+    rows = [
+        ['t', *(f's of {joint.removeprefix("right_")}, mm' for joint in joints), 'log density',
+         'relative in 50 and 90 %', 'absolute in 50 and 90 %'],
+    ]  # fmt: skip
     rows += [
         [
-            one['joint'].removeprefix('right_'),
-            f'{one["error_mm"]:.0f}',
-            *(f'{held:.0%}' for held in one['relative'] + one['absolute']),
+            f'{one["share"]:g}',
+            *(f'{one["errors_mm"][joint]:.0f}' for joint in joints),
+            f'{one["log_density"]:.2f}',
+            *(f'{one[kind][0]:.0%}, {one[kind][1]:.0%}' for kind in ('relative', 'absolute')),
         ]
-        for one in result['joints']
+        for one in result['shares']
     ]
-    text = f't = {result["share"]:g}, mean log density of a joint {result["log_density"]:.2f}'
-    return f'{text}\n\n{table(rows, markdown=markdown)}'
+    return table(rows, markdown=markdown)
 
 
 def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
@@ -199,7 +196,7 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
         for job in told('joint_errors', jobs, lambda job: f'{job[0].name}, {job[1]}')
         for one in said_of(*job)
     ]
-    return {'machine': description(), 'clips': [x.name for x in folders], **learned(said)}
+    return {'machine': description(), 'clips': [x.name for x in folders], 'shares': learned(said)}
 
 
 def main(arguments: list[str]) -> int:

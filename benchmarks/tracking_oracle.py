@@ -35,7 +35,7 @@ EVERY = 10  # images
 # Poses from which the best pose of the body is fitted.
 STARTS = 8
 SHOULDERS = ('left_shoulder', 'right_shoulder')
-SHAPE_TERMS = ('containment', 'coverage', 'edges')
+SHAPE_TERMS = ('coverage', 'edges')
 BEST_POSE, TOGETHER, TRUE_KEYPOINTS = 'best pose of the body', 'together', 'true keypoints'
 OF_SUBJECT, TRUE = 'of the subject', 'true'
 SUBTRACTED = 'subtracted'

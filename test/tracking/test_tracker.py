@@ -359,7 +359,7 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     assert min(errors[3:found]) > 0.1
     assert max(errors[found:]) < 0.065
     # The place too, not only the posture.
-    assert np.abs(posterior.means[:, :3] - other[:3]).max(1).min() < 0.2
+    assert np.abs(posterior.means[:, :3] - other[:3]).max(1).min() < 0.25
     # Modes that are placed anew have no history, and the point estimate does not travel to them.
     assert begins == [i in (0, found) for i in range(len(begins))]
     assert np.abs(places[found] - other[:3]).max() < 0.3

@@ -95,7 +95,7 @@ class StandingStill:
         self.silhouettes = SimpleNamespace(
             doubted=False, known='known', watch=SimpleNamespace(moved=False, shift=0.0)
         )
-        self.validity = Validity(1)
+        self.validity = Validity()
         StandingStill.made.append(self)
 
     def reset(self, start, *, box=None):
