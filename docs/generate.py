@@ -44,6 +44,7 @@ PAGES = {
     'experts': 'experts.md',
     'absence': 'tracking.md',
     'tracking': 'tracking.md',
+    'vertical': 'ground.md',
     'votes': 'tracking.md',
 }
 

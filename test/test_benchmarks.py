@@ -21,6 +21,7 @@ from benchmarks import (
     kjs,
     live,
     nodes,
+    vertical,
     votes,
 )
 from benchmarks.__main__ import main
@@ -290,7 +291,7 @@ def test_command_line(capsys, tmp_path):
     assert capsys.readouterr().err.splitlines() == [
         "benchmarks: no 'flops', wanted one of absence, bags, contour_noise, depth, error_model, "
         'experts, flips, joint_errors, keypoint_noise, kernels, kjs, live, motion_prior, nodes, '
-        'people, smoothing, soak, tracking, votes'
+        'people, smoothing, soak, tracking, vertical, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
@@ -428,6 +429,21 @@ def test_absence_tells_tracks_of_nobody_and_late_states(given):
     assert absence.as_text({'scenes': [case]}).split()[-9:] == [
         'images', '2', '1', '1', '0', '1', '1', str(1 - given), 'park',
     ]  # fmt: skip
+
+
+# vertical
+
+
+def test_the_vertical_of_the_demonstration_is_seen(capsys):
+    result = vertical.measure(ROOT / 'bags', quick=True)
+    assert [one['clip'] for one in result['clips']] == ['reach']
+    (one,) = result['clips']
+    assert one['found'] == one['looks'] == len(one['errors'])
+    assert max(one['errors']) < 2.0
+    text = vertical.as_text(result, markdown=True)
+    assert text.splitlines()[-1].startswith('| all')
+    assert main(['vertical', '--clips', str(ROOT / 'test')]) == 1
+    assert capsys.readouterr().err.startswith('vertical: ')
 
 
 # joint_errors

@@ -69,7 +69,8 @@ class FilterParameters(CameraNodeParameters):
             there is no subject_file, and are among the hypotheses; an image then waits for the
             prediction of its stamp.
         gravity: Direction of gravity in the camera optical frame, three numbers of any length;
-            empty if unknown. A still camera that looks to the horizon has [0.0, 1.0, 0.0].
+            empty: the lines of the scene show it, if they can. A still camera that looks to the
+            horizon has [0.0, 1.0, 0.0].
         camera_height: Height of the camera above the floor, m; 0 if unknown.
         gravity_frame: Name of a frame with z up, such as odom or map; /tf and /tf_static then tell
             the direction of gravity at every image, before gravity does; empty switches it off.

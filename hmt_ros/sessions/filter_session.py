@@ -346,7 +346,6 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
                 return
             fixed = FixedFrame(p.fixed_frame, self.frames.pose, self._turn)
             self._turn = fixed.turn_of(tracker.body, posterior.means[0])
-        known = self.frames.known_ground(self.start.parameters.known_ground)
         track = TrackedImage(
             image=waiting.image,
             stamp_ns=waiting.stamp_ns,
@@ -368,7 +367,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             cue_probabilities=tracker.validity.shown,
             identities=tracker.modes.identities,
             velocities=tracker.velocities,
-            up=known.up,
+            up=tracker.vertical,
             fixed=fixed,
         )
         presentation = Presentation(

@@ -47,6 +47,7 @@ class Fault(Enum):
     NO_TRANSFORM = 'no transform'
     NO_CAMERA_POSE = 'no pose of the camera'
     CAMERA_HEIGHT = 'height of the camera'
+    GRAVITY = 'direction of gravity'
     PREDICTION = 'pose_prediction'
     NO_PREDICTION = 'no pose_prediction'
     SILHOUETTE = 'silhouette'

@@ -82,7 +82,7 @@ class TrackedImage:
         identities: (K,) of the components of the posterior.
         velocities: (K, d) of the components of the posterior, per second; None: unknown.
         up: (3,) unit vector against gravity in the camera frame; None: it is not known, at most
-            estimated.
+            guessed.
         fixed: frame that mixtures, markers and the pose of the person are published in; None: the
             frame of the camera.
     """

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_session import camera_moved_fault
 from hmt_ros.sessions.filter_state import IN_BACKGROUND
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from hmt_ros.tracking import Status, Subject, Tracker
 from hmt_ros.tracking.existence import PRESENT
+from hmt_ros.tracking.ground import CONTRARY
 from msg_tools.messages.headers import SECOND_NS
 
 # A person hardly moves meanwhile.
@@ -23,11 +26,13 @@ class TrackCondition(NamedTuple):
         status: of the tracker.
         doubted: whether the background was learned with the person in it.
         moved: whether the camera has moved since the background was taken.
+        contradicted: whether the lines of the scene contradict the gravity that is given.
     """
 
     status: Status = Status.WAITING
     doubted: bool = False
     moved: bool = False
+    contradicted: bool = False
 
     @classmethod
     def of(cls, tracker: Tracker | None) -> TrackCondition:
@@ -35,7 +40,12 @@ class TrackCondition(NamedTuple):
         if tracker is None:
             return cls()
         silhouettes = tracker.silhouettes
-        return cls(tracker.status, silhouettes.doubted, silhouettes.watch.moved)
+        return cls(
+            tracker.status,
+            silhouettes.doubted,
+            silhouettes.watch.moved,
+            tracker.gravity_contradicted,
+        )
 
 
 def report_change(
@@ -66,6 +76,16 @@ def report_change(
         remedy = 'call ~/reset; a camera that is to move needs fixed_frame or use_mask'
         text = camera_moved_fault(tracker.silhouettes.watch.shift, stamp_ns, remedy)
         log.note(Fault.CAMERA_MOVED, text, warn=True)
+    if now.contradicted and not before.contradicted:
+        up = ', '.join(f'{-x:.2f}' for x in tracker.ground.up)
+        log.note(
+            Fault.GRAVITY,
+            f'the lines of the scene contradict the gravity that is given by more than '
+            f'{np.degrees(CONTRARY):.0f} degrees at the image of {stamp_ns} ns: they show '
+            f'[{up}], which is used; check gravity, or the frame of gravity_frame and how the '
+            'camera is mounted',
+            warn=True,
+        )
     if now.status is not before.status:
         _report_status(log, before.status, tracker, initial, stamp_ns)
 

@@ -9,17 +9,19 @@ estimated from the track; see `GroundEstimator`.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.mass import masses
 from hmt_ros.body.soles import soles
-from hmt_ros.inference.arrays import Array
+from hmt_ros.image.vertical_lines import Vertical, seen_vertical
+from hmt_ros.inference.arrays import Array, Image
 from hmt_ros.tracking.camera_motion import USUAL_DISTANCE, CameraMotion
 from hmt_ros.tracking.hypotheses import Modes
 
@@ -42,6 +44,10 @@ LEVEL_TIME, LEVEL_QUANTILE = 2.0, 0.75
 LEVEL_SIGMA, FIRST_LEVEL_SIGMA = 0.04, 0.10
 # Change of a given direction of gravity that no noise of a sensor makes: the camera turns, rad.
 TURNED = 0.003
+# Time from one look at the lines of the scene to the next, s.
+LOOK_TIME = 1.0
+# Verticals that differ by more contradict each other, rad: no sensor and no lines err so far.
+CONTRARY = np.radians(10.0)
 
 
 @dataclass(frozen=True)
@@ -89,6 +95,11 @@ class Ground:
         return None if self.height is None else np.append(self.up, self.height)
 
 
+def _contradict(first: Array, second: Array) -> bool:
+    """Whether two verticals (3,) contradict each other."""
+    return bool(first @ second < np.cos(CONTRARY))
+
+
 def unit_vector(up: ArrayLike) -> Array:
     """A direction (3,) of unit length.
 
@@ -107,13 +118,18 @@ def unit_vector(up: ArrayLike) -> Array:
 
 
 class GroundEstimator:
-    """Estimates the ground from what is known of it and from a track.
+    """Estimates the ground from what is known of it, from the scene and from a track.
 
     The height of the floor follows the lowest sole: a person stands on the floor for most of the
-    time, and jumps at times, so it is a high quantile of the last seconds. The vertical is near
-    that of the image, and near the axis of a body that stands, from the middle of the feet to the
-    centre of mass. Errors of that axis last, so its images count as one per `AXIS_TIME`, and the
-    deviation never goes below `AXIS_SIGMA`.
+    time, and jumps at times, so it is a high quantile of the last seconds. The vertical is the one
+    that is given. Where none is, it is the one that the lines of the scene show
+    (`image.vertical_lines`), and where they show none, it is near that of the image, and near the
+    axis of a body that stands, from the middle of the feet to the centre of mass. Errors of that
+    axis last, so its images count as one per `AXIS_TIME`, and the deviation never goes below
+    `AXIS_SIGMA`.
+
+    A given vertical that the lines contradict at two looks is not followed, but theirs is. A
+    vertical of the lines that jumps is believed when the next look shows it too.
 
     Args:
         known: what is known; None: nothing.
@@ -121,6 +137,7 @@ class GroundEstimator:
     Attributes:
         known: what is known.
         estimate: the present one.
+        contradicted: whether the lines of the scene contradict the vertical that is given.
         still: whether the motion of the camera is known, so that what rests has a known place in
             its frame; set by who knows.
         turning: whether a newer direction of gravity has told that the camera turns otherwise than
@@ -131,6 +148,14 @@ class GroundEstimator:
         self.known = known or KnownGround()
         self.still = False
         self.turning = False
+        self.contradicted = False
+        self.forget_scene()
+
+    def forget_scene(self) -> None:
+        """Forgets what was estimated from images and from a track."""
+        self._seen: Vertical | None = None
+        self._newest: Array | None = None
+        self._looked: int | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -156,6 +181,10 @@ class GroundEstimator:
         )
         self._mean = motion.directions(self._mean)
         self._covariance = motion.rotation @ self._covariance @ motion.rotation.T
+        if self._seen is not None:
+            self._seen = replace(self._seen, up=motion.directions(self._seen.up))
+        if self._newest is not None:
+            self._newest = motion.directions(self._newest)
         self._levels = deque((time, level + rise) for time, level in self._levels)
         self._conclude()
 
@@ -167,6 +196,30 @@ class GroundEstimator:
             unit, self.known.camera_height if camera_height is None else camera_height
         )
         self._conclude()
+
+    def look(self, image: Image, camera: Camera, stamp: int) -> None:
+        """Takes in the lines of an image, if it is time to; a stamp is in ns."""
+        if self._looked is not None and 0 <= stamp - self._looked < 1e9 * LOOK_TIME:
+            return
+        self._looked = stamp
+        found = seen_vertical(image, camera)
+        if found is None:
+            return
+        before, self._newest = self._newest, found.up
+        again = before is not None and not _contradict(before, found.up)
+        if self._seen is None or again or not _contradict(self._seen.up, found.up):
+            self._seen = found
+        given = self.known.up
+        if given is None or not _contradict(given, found.up):
+            self.contradicted = False
+        elif again:
+            self.contradicted = True
+        self._conclude()
+
+    @property
+    def vertical_known(self) -> bool:
+        """Whether the vertical is given, or the lines of the scene show it; else it is guessed."""
+        return self.known.up is not None or self._seen is not None
 
     @property
     def plane(self) -> FloorPlane:
@@ -190,7 +243,7 @@ class GroundEstimator:
         weights = weights / weights.sum()
         points = frames.points(feet.segments, feet.local)
         self._time += dt
-        if self.known.up is None and mass.known:
+        if not self.vertical_known and mass.known:
             axes = mass.centre_of_mass(frames) - points.mean(0)
             axes = axes / np.linalg.norm(axes, axis=0)
             place = frames.origins[0] @ weights
@@ -229,9 +282,11 @@ class GroundEstimator:
         self._covariance = (vectors * values) @ vectors.T
 
     def _conclude(self) -> None:
-        known = self.known
-        if known.up is not None:
+        known, seen = self.known, self._seen
+        if known.up is not None and not self.contradicted:
             up, up_sigma = known.up, GIVEN_UP_SIGMA
+        elif seen is not None:
+            up, up_sigma = seen.up, seen.sigma
         else:
             up, up_sigma = self._mean, float(np.sqrt(self._covariance.trace() / 3.0))
         tracked, tracked_sigma = self._tracked_level()

@@ -144,6 +144,7 @@ class Tracker:
         self._existence, self._nobody = Existence(), False
         self._last_stamp = None
         self._camera_path = CameraPath()
+        self._ground.forget_scene()
 
     def step(
         self,
@@ -192,6 +193,8 @@ class Tracker:
             raise ValueError(f'stamps must increase, saw {stamp} after {self._last_stamp} ns')
         self.evaluations = 0
         self._move_camera(stamp)
+        if self.settings.ground.on:
+            self._ground.look(image, self.camera, stamp)
         known = self.background.frames > 0 and not self.silhouettes.doubted
         self._ground.still = self._camera_path.known or (known and not self._ground.turning)
         near, dt = None, 0.0
@@ -235,6 +238,19 @@ class Tracker:
     def ground(self) -> Ground:
         """Gravity and floor, as far as they are known or estimated."""
         return self._ground.estimate
+
+    @property
+    def vertical(self) -> Array | None:
+        """(3,) unit vector against gravity, camera frame, as given or as the scene shows it.
+
+        None: it is unknown, at most guessed from the track.
+        """
+        return self._ground.estimate.up if self._ground.vertical_known else None
+
+    @property
+    def gravity_contradicted(self) -> bool:
+        """Whether the lines of the scene contradict the gravity that is given; they hold then."""
+        return self._ground.contradicted
 
     def set_gravity(self, up: ArrayLike, camera_height: float | None = None) -> None:
         """Takes a newer direction against gravity, before the image that it belongs to.
@@ -348,7 +364,7 @@ class Tracker:
     @property
     def _gravity(self) -> Gravity | None:
         """What a start knows of gravity; None: nothing, or nothing is made of it."""
-        weight, known = self.settings.ground.upright_weight, self._ground.known.up is not None
+        weight, known = self.settings.ground.upright_weight, self._ground.vertical_known
         return Gravity(self._ground.plane, weight) if known and weight > 0 else None
 
     def _new_track(self, body: Body) -> MixtureFilter:

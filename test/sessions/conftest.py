@@ -61,6 +61,7 @@ class StubTracker:
         self.known_ground = known_ground
         up = np.array([0.0, -1.0, 0.0]) if known_ground.up is None else known_ground.up
         self.ground = Ground(up, 0.1, known_ground.camera_height, 0.02)
+        self.vertical, self.gravity_contradicted = known_ground.up, False
         self.contacts = {'left_foot': 0.75, 'right_foot': 0.0}
         self.gravities: list[Any] = []
         self.poses: list[Any] = []
@@ -78,7 +79,7 @@ class StubTracker:
     def set_gravity(self, up, camera_height=None):
         self.gravities.append(up)
         height = self.ground.height if camera_height is None else camera_height
-        self.ground = replace(self.ground, up=up, height=height)
+        self.ground, self.vertical = replace(self.ground, up=up, height=height), up
 
     def set_camera(self, position, rotation):
         self.poses.append((position, rotation))

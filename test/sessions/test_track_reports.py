@@ -89,6 +89,29 @@ def test_a_moved_camera_is_told_once(one, small_camera, stub_tracker):
     assert one.state.trouble() == CAMERA_MOVED
 
 
+def test_contradicted_gravity_is_told_once(one, small_camera, stub_tracker):
+    one.take(IMAGE, small_camera.image(0))
+    handled = []
+    for index, contradicted in enumerate((False, True, True, False, True), 1):
+        stub_tracker.made[0].gravity_contradicted = contradicted
+        step = stub_tracker.step
+
+        def seen(self, *arguments, step=step, contradicted=contradicted, **named):
+            self.gravity_contradicted = contradicted
+            return step(self, *arguments, **named)
+
+        stub_tracker.made[0].gravity_contradicted = handled != [] and bool(handled[-1][1])
+        stub_tracker.step = seen
+        taken = one.take(IMAGE, small_camera.image(index))
+        stub_tracker.step = step
+        handled.append((taken.warnings, contradicted))
+    assert [len(texts) for texts, _ in handled] == [0, 1, 0, 0, 1]
+    assert handled[1][0][0].startswith(
+        'the lines of the scene contradict the gravity that is given by more than 10 degrees at '
+        f'the image of {small_camera.stamp(2)} ns: they show ['
+    )
+
+
 def test_what_a_dropped_image_waited_for_is_known(stub_tracker, subject_file, small_camera):
     parameters = FilterParameters(
         subject_file=str(subject_file), use_keypoints=True, input_timeout=60.0

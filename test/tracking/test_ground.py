@@ -17,11 +17,13 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.motion.procedural_motion import procedural_motion
 from hmt_ros.tracking import KnownGround, Subject, Tracker, TrackerSettings
+from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.contact import FootContacts
 from hmt_ros.tracking.ground import AXIS_SIGMA, UP_SIGMA, GroundEstimator
 from hmt_ros.tracking.hypotheses import Modes, new_hypotheses
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.stance import stance_of
+from test.image.drawn_rooms import ROOM_CAMERA, drawn, room, turn
 
 RATE = 30.0
 PITCHED = Viewpoint(distance=3.5, height=1.4, pitch=np.radians(20.0))
@@ -174,6 +176,72 @@ def test_newer_directions_replace_the_known_one():
     assert estimator.turning
     with pytest.raises(ValueError, match='up must be a unit vector'):
         estimator.set_gravity([0.0, 0.0, 0.0])
+
+
+def looked(estimator: GroundEstimator, *pitches: float | None) -> GroundEstimator:
+    """The estimator after looks at rooms that are seen from these pitches, deg; None: grey."""
+    for second, pitch in enumerate(pitches):
+        grey = np.full((ROOM_CAMERA.height, ROOM_CAMERA.width, 3), 120, np.uint8)
+        image = grey if pitch is None else drawn(room(), turn(np.radians(pitch), 0.0))
+        estimator.look(image, ROOM_CAMERA, 1_000_000_000 * second)
+    return estimator
+
+
+def pitch_of(estimator: GroundEstimator) -> float:
+    return float(np.degrees(np.arcsin(-estimator.estimate.up[2])))
+
+
+def test_the_lines_of_the_scene_tell_the_vertical_and_the_track_no_more(body, reaching):
+    estimator = GroundEstimator()
+    assert not estimator.vertical_known
+    looked(estimator, 15.0, None)
+    assert estimator.vertical_known
+    assert pitch_of(estimator) == pytest.approx(15.0, abs=1.0)
+    assert np.degrees(estimator.estimate.up_sigma) < 2.0
+    before = estimator.estimate.up
+    after(estimator, body, reaching)
+    assert np.array_equal(estimator.estimate.up, before)
+    estimator.reset()  # another person, the same scene
+    assert np.array_equal(estimator.estimate.up, before)
+    estimator.forget_scene()
+    assert not estimator.vertical_known
+
+
+def test_a_vertical_that_jumps_is_believed_at_the_second_look():
+    estimator = looked(GroundEstimator(), 5.0, 30.0)
+    assert pitch_of(estimator) == pytest.approx(5.0, abs=1.0)
+    estimator.look(drawn(room(), turn(np.radians(30.0), 0.0)), ROOM_CAMERA, 1_500_000_000)
+    assert pitch_of(estimator) == pytest.approx(5.0, abs=1.0)  # too soon
+    estimator.look(drawn(room(), turn(np.radians(30.0), 0.0)), ROOM_CAMERA, 2_100_000_000)
+    assert pitch_of(estimator) == pytest.approx(30.0, abs=1.0)
+
+
+def test_a_given_vertical_is_followed_where_the_lines_agree_or_say_nothing():
+    for given, seen in ((12.0, (15.0, 15.0, 15.0)), (40.0, (None, None)), (-30.0, (0.0,))):
+        estimator = GroundEstimator(KnownGround(turn(np.radians(given), 0.0) @ [0.0, -1.0, 0.0]))
+        looked(estimator, *seen)
+        assert pitch_of(estimator) == pytest.approx(given)
+        assert not estimator.contradicted
+
+
+def test_a_given_vertical_that_is_wrong_is_noticed_and_not_followed():
+    """An inertial sensor that is mounted turned by 30 degrees."""
+    estimator = GroundEstimator(KnownGround(turn(np.radians(30.0), 0.0) @ [0.0, -1.0, 0.0], 1.4))
+    looked(estimator, 0.0, 0.0)
+    assert estimator.contradicted
+    assert pitch_of(estimator) == pytest.approx(0.0, abs=1.0)
+    assert np.degrees(estimator.estimate.up_sigma) < 2.0
+    estimator.set_gravity([0.0, -1.0, 0.0])
+    estimator.look(drawn(room(), np.eye(3)), ROOM_CAMERA, 3_000_000_000)
+    assert not estimator.contradicted
+    assert estimator.estimate.up == pytest.approx([0.0, -1.0, 0.0])
+
+
+def test_what_the_lines_showed_is_carried_with_the_camera():
+    estimator = looked(GroundEstimator(), 10.0)
+    turned = turn(np.radians(12.0), 0.0)
+    estimator.carry(CameraMotion(turned, np.zeros(3)))
+    assert pitch_of(estimator) == pytest.approx(22.0, abs=1.0)
 
 
 @pytest.mark.parametrize('rate', [10.0, 30.0, 60.0])

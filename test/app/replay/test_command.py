@@ -92,6 +92,7 @@ class StandingStill:
         self.keypoints, self.positions, self.predictions, self.masks = [], [], [], []
         self.depths = []
         self.ground, self.contacts = Ground(np.array([0.0, -1.0, 0.0]), 0.3, None, np.inf), {}
+        self.vertical, self.gravity_contradicted = None, False
         self.silhouettes = SimpleNamespace(
             doubted=False, known='known', watch=SimpleNamespace(moved=False, shift=0.0)
         )

@@ -1,0 +1,227 @@
+"""Which way is up, as the straight lines of a scene tell (Coughlan and Yuille, ICCV 1999).
+
+Edges of walls, doors and furniture run along the vertical or along two horizontal directions at
+right angles to each other. With an angle e_ik between line i in the image and the direction k of
+such a frame R, as the image would show it at the place of the line,
+
+    log p(lines | R) = sum_i log[1 - s + s / 3 sum_k r(e_ik)],   r(e) = N(e; 0, sigma) / uniform,
+
+the share s of all lines follows the frame and the rest is clutter. Summed over a raster of frames
+with a prior over how cameras are mounted, this tells how probable it is that there is such a frame
+at all, and which of its directions is the vertical. Furniture stands in all horizontal directions:
+the vertical is then refined by the lines that agree with it alone, from a wide sigma to a narrow
+one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from scipy.special import expit, logsumexp
+
+from hmt_ros.body.camera import Camera
+from hmt_ros.inference.arrays import Array, Image, Index
+
+# Images are made this large at most, px, and a line has this length at least, rad.
+LARGEST, SHORTEST = 800, 0.03
+# Lines in planes through the camera that differ by less are one line, rad.
+SAME_LINE = np.radians(0.7)
+# Share of lines that follow the frame; error of an end of a line, px.
+SHARE, END_SIGMA = 0.5, 0.5
+# How cameras are mounted, rad: pitch, down is positive, with its deviations upwards and downwards,
+# and roll; and their limits.
+PITCH, PITCH_SIGMA = np.radians(5.0), (np.radians(12.0), np.radians(20.0))
+PITCHES = np.radians(-40.0), np.radians(72.0)
+ROLL, MOST_ROLL = np.radians(6.0), np.radians(32.0)
+# Steps of the raster of frames, and deviations of the angle of a line: on the raster, and then in
+# the refinement, rad.
+STEP, COARSE = np.radians(4.0), np.radians(2.5)
+FINER = tuple(np.radians([4.0, 3.0, 2.0, 1.0, 0.5, 0.5, 0.5]))
+# Deviation of the vertical of the best frame on the raster, and of the refined one where lines are
+# many: walls lean and lenses bend, rad.
+RASTER_SIGMA, LEAST_SIGMA = np.radians(4.0), np.radians(1.0)
+# Probability that there is a frame, and that its vertical is in the surroundings of the best one,
+# rad, above which that is believed.
+BELIEVED, SURROUNDINGS = 0.95, np.radians(10.0)
+
+
+class Lines(NamedTuple):
+    """Straight lines of an image.
+
+    Attributes:
+        normals: (N, 3) unit normals of the planes through the camera and the lines, camera frame.
+        middles: (N, 3) unit rays to their middles.
+        errors: (N,) standard deviations of their directions in the image, rad.
+    """
+
+    normals: Array
+    middles: Array
+    errors: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Vertical:
+    """The vertical that an image shows.
+
+    Attributes:
+        up: (3,) unit vector against gravity, camera frame.
+        sigma: standard deviation of its angle about each horizontal axis, rad.
+    """
+
+    up: Array
+    sigma: float
+
+
+def seen_vertical(image: Image, camera: Camera) -> Vertical | None:
+    """The vertical that an image (H, W) or (H, W, 3) shows; None: its lines tell of none."""
+    lines = straight_lines(image, camera)
+    return vertical_of(lines) if len(lines.normals) else None
+
+
+def straight_lines(image: Image, camera: Camera) -> Lines:
+    """The straight lines of an image (H, W) or (H, W, 3), longest first, each once."""
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    scale = min(LARGEST / max(grey.shape), 1.0)
+    if scale < 1.0:
+        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    found: Any = cv2.createLineSegmentDetector().detect(np.ascontiguousarray(grey))[0]
+    if found is None:  # no line at all
+        return Lines(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    # The middle of the first pixel is at 0 in both sizes.
+    ends = (found.reshape(-1, 2, 2).astype(np.float64) + 0.5) / scale - 0.5
+    rays = camera.rays(ends.reshape(-1, 2)).reshape(-1, 2, 3)
+    rays = rays / np.linalg.norm(rays, axis=2, keepdims=True)
+    normals = np.cross(rays[:, 0], rays[:, 1])
+    angle = np.linalg.norm(normals, axis=1)
+    order = np.argsort(-angle, kind='stable')
+    order = order[angle[order] > SHORTEST]
+    normals = normals[order] / angle[order, None]
+    kept = _distinct(normals)
+    middles = rays[order].sum(1)[kept]
+    length = scale * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)[order][kept]
+    return Lines(
+        normals[kept],
+        middles / np.linalg.norm(middles, axis=1, keepdims=True),
+        np.sqrt(2.0) * END_SIGMA / length,
+    )
+
+
+def vertical_of(lines: Lines) -> Vertical | None:
+    """The vertical that lines tell; None: they are clutter, or fit several."""
+    raster = _raster()
+    ratios = _ratios(raster.directions, lines, COARSE)
+    vertical = SHARE / 3.0 * ratios[raster.vertical] + (1.0 - SHARE)
+    levels = [ratios[a] + ratios[b] for a, b in zip(raster.first.T, raster.second.T, strict=True)]
+    value = np.array([np.log(vertical + SHARE / 3.0 * level).sum(1) for level in levels])
+    posterior = logsumexp(value, axis=0) - np.log(len(value)) + raster.log_prior
+    evidence = float(logsumexp(posterior))
+    found = _refined(raster.ups[posterior.argmax()], lines)
+    near = raster.ups @ found.up > np.cos(SURROUNDINGS)
+    believed = expit(evidence) * np.exp(posterior[near] - evidence).sum()
+    return found if believed > BELIEVED else None
+
+
+def _refined(start: Array, lines: Lines) -> Vertical:
+    """The vertical by the lines that agree with it, near where the raster has it (3,)."""
+    up = start
+    information = np.eye(3)
+    for sigma in FINER:
+        ratios = _ratios(up[None], lines, sigma)[0]
+        agree = SHARE / 3.0 * ratios
+        weight = agree / (agree + 1.0 - SHARE / 3.0) / (sigma**2 + lines.errors**2)
+        foreshortening = 1.0 / np.sqrt(np.maximum(1.0 - (lines.middles @ up) ** 2, 1e-4))
+        slopes = foreshortening[:, None] * np.cross(up, lines.normals)
+        information = (slopes * weight[:, None]).T @ slopes + np.eye(3) / RASTER_SIGMA**2
+        pull = -(weight * foreshortening * (lines.normals @ up)) @ slopes
+        pull = pull + np.cross(up, start) / RASTER_SIGMA**2
+        turn = np.linalg.solve(information, pull)
+        up = up + np.cross(turn, up)
+        up = up / np.linalg.norm(up)
+    across = np.cross(np.eye(3), up)
+    covariance = across @ np.linalg.inv(information) @ across.T
+    return Vertical(up, float(np.sqrt(covariance.trace() / 2.0 + LEAST_SIGMA**2)))
+
+
+def _ratios(directions: Array, lines: Lines, sigma: float) -> Array:
+    """Densities (D, N) of the angles of lines if they ran along directions (D, 3), over uniform."""
+    across = np.sqrt(np.maximum(1.0 - (directions @ lines.middles.T) ** 2, 1e-4))
+    angle = np.arcsin(np.minimum(np.abs(directions @ lines.normals.T) / across, 1.0))
+    deviation = np.sqrt(sigma**2 + lines.errors**2)
+    result: Array = np.sqrt(np.pi / 2.0) / deviation * np.exp(-0.5 * (angle / deviation) ** 2)
+    return result
+
+
+def _distinct(normals: Array) -> Index:
+    """Those of unit normals (N, 3), first come, that differ from all that were kept before."""
+    same = np.abs(normals @ normals.T) > np.cos(SAME_LINE)
+    free = np.ones(len(normals), dtype=np.bool_)
+    kept = []
+    for i in range(len(normals)):
+        if free[i]:
+            kept.append(i)
+            free &= ~same[i]
+    return np.array(kept, dtype=np.intp)
+
+
+class _Raster(NamedTuple):
+    """Frames that a camera may see: F verticals, each with A pairs of horizontal directions.
+
+    Attributes:
+        ups: (F, 3) verticals.
+        log_prior: (F,) of the verticals.
+        directions: (D, 3) all directions of the frames, rounded, up to their sign.
+        vertical: (F,) index of the vertical of a frame in `directions`.
+        first, second: (F, A) indices of its horizontal directions.
+    """
+
+    ups: Array
+    log_prior: Array
+    directions: Array
+    vertical: Index
+    first: Index
+    second: Index
+
+
+@lru_cache(maxsize=1)
+def _raster() -> _Raster:
+    pitch, roll = (
+        x.ravel()
+        for x in np.meshgrid(
+            np.arange(PITCHES[0], PITCHES[1] + 1e-9, STEP),
+            np.arange(-MOST_ROLL, MOST_ROLL + 1e-9, STEP),
+            indexing='ij',
+        )
+    )
+    ups = np.stack(
+        [np.sin(roll) * np.cos(pitch), -np.cos(roll) * np.cos(pitch), -np.sin(pitch)], axis=1
+    )
+    deviation = np.where(pitch < PITCH, *PITCH_SIGMA)
+    log_prior = (
+        -0.5 * ((pitch - PITCH) / deviation) ** 2 - 0.5 * (roll / ROLL) ** 2 + np.log(np.cos(pitch))
+    )
+    turns = np.arange(0.0, np.pi / 2.0 - 1e-9, STEP)
+    across = np.cross(ups, [0.0, 0.0, 1.0])
+    across = across / np.linalg.norm(across, axis=1, keepdims=True)
+    ahead = np.cross(ups, across)
+    cosine, sine = np.cos(turns)[None, :, None], np.sin(turns)[None, :, None]
+    first = cosine * across[:, None] + sine * ahead[:, None]
+    second = cosine * ahead[:, None] - sine * across[:, None]
+    # Directions are rounded to a half of the step.
+    every = np.concatenate([ups, first.reshape(-1, 3), second.reshape(-1, 3)])
+    every = every * np.where(every[:, 2:] < 0.0, -1.0, 1.0)
+    cells = np.round(every / (0.5 * STEP)).astype(np.int64)
+    _, places, which = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    which = which.reshape(-1)
+    count, pairs = len(ups), first.shape[0] * first.shape[1]
+    return _Raster(
+        ups,
+        log_prior - logsumexp(log_prior),
+        every[places],
+        which[:count],
+        which[count : count + pairs].reshape(first.shape[:2]),
+        which[count + pairs :].reshape(first.shape[:2]),
+    )
