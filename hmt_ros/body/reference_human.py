@@ -18,6 +18,7 @@ through all joint positions; without `additions` there are none.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -59,6 +60,8 @@ NEEDED = (
 )
 # Sine of the angle below which two bones have one direction, and lengths that are none, m.
 _STRAIGHT, _NOTHING = 1e-4, 1e-3
+# Angle at which the hips lie before the line down from the pelvis joint, rad: that of our bodies.
+HIPS_AHEAD = np.arctan(0.21)
 # Weight of a change of angles from image to image against angles beyond their ranges.
 _STEADY = 0.2
 
@@ -146,21 +149,24 @@ def fit_reference_human(
     origin = (at['left_hip'] + at['right_hip']) / 2
     rotation = _body_axes(at, origin)
     in_body = {name: rotation.T @ (place - origin) for name, place in at.items()}
+    # The trunk starts over the middle of the hips, before the pelvis joint.
+    in_body['pelvis'] = in_body['pelvis'] * [0.0, 1.0, 1.0]
     angles: dict[str, float] = {}
     torso = _fit_trunk(in_body, angles, additions=additions)
     head = torso.T @ _direction(in_body, 'neck', 'head')
     angles['p_head'] = float(np.arcsin(np.clip(-head[0], -1.0, 1.0)))
     angles['r_head'] = float(np.arctan2(-head[1], head[2]))
     angles['y_head'] = 0.0
+    ahead = {side: 0.0 for side, _ in SIDES.values()}
     for letter, (side, sign) in SIDES.items():
         if additions:
-            out, up = (torso.T @ (in_body[f'{side}_shoulder'] - in_body['neck']))[1:]
+            ahead[side], out, up = torso.T @ (in_body[f'{side}_shoulder'] - in_body['neck'])
             angles[f'{letter}_clavicle'] = float(np.arctan2(up, sign * out))
         lifted = angles.get(f'{letter}_clavicle', 0.0)
         base = torso @ _turn(np.array([sign, 0.0, 0.0]), lifted)
         _fit_arm(in_body, letter, base, before, angles)
         _fit_leg(in_body, letter, before, angles)
-    joints = _joints(in_body, additions=additions)
+    joints = _joints(in_body, ahead, additions=additions)
     ordered = {j.name: angles[j.name] for j in joints if j.axis is not None}
     return ReferenceHuman(joints, ordered, rotation, origin)
 
@@ -182,6 +188,7 @@ def _body_axes(at: Mapping[str, Array], origin: Array) -> Array:
     """Columns x forward, y from the right hip to the left, z up along the pelvis."""
     y = _direction(at, 'right_hip', 'left_hip')
     up = at['pelvis'] - origin
+    up = np.cos(HIPS_AHEAD) * up + np.sin(HIPS_AHEAD) * np.cross(y, up)
     if np.linalg.norm(up - y * (y @ up)) < _NOTHING:
         up = at['neck'] - origin
     z = _unit(up - y * (y @ up), 'the line of the hips and the trunk')
@@ -284,8 +291,16 @@ def _wrapped(angle: float) -> float:
     return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
-def _joints(at: Mapping[str, Array], *, additions: bool) -> tuple[Joint, ...]:
-    """The joints of the model, at the lengths that positions in the frame of the body have."""
+def _joints(
+    at: Mapping[str, Array], ahead: Mapping[str, float], *, additions: bool
+) -> tuple[Joint, ...]:
+    """The joints of the model, at the lengths that positions in the frame of the body have.
+
+    Args:
+        at: positions of joints.
+        ahead: how far the shoulders lie before the neck, by side, m.
+        additions: see `reference_human`.
+    """
 
     def length(first: str, last: str) -> float:
         return float(np.linalg.norm(at[last] - at[first]))
@@ -309,7 +324,8 @@ def _joints(at: Mapping[str, Array], *, additions: bool) -> tuple[Joint, ...]:
         _joint('head', 'p_head', 'head', (0, 0, head), None),
     ]
     for x, (side, s) in SIDES.items():
-        shoulder = (0, s * length('neck', f'{side}_shoulder'), 0)
+        out = math.sqrt(length('neck', f'{side}_shoulder') ** 2 - ahead[side] ** 2)
+        shoulder = (ahead[side], s * out, 0)
         arm = (0, 0, -length(f'{side}_shoulder', f'{side}_elbow'))
         forearm = (0, 0, -length(f'{side}_elbow', f'{side}_wrist'))
         hip = (0, s * length('left_hip', 'right_hip') / 2, 0)

@@ -1,9 +1,10 @@
 """Flips of the torso: the pelvis and the trunk leaning or turning the other way in depth (KJS 3).
 
 The line of the hips may turn towards or away from the camera, the neck may lie before or behind the
-pelvis, and the line of the shoulders may turn either way: three binary choices, with nearly the
-same image. The torso is not a chain of links that each end in one joint, so its flips change the
-image of hips and shoulders a little; `rehang_chain` then puts the limbs back onto their rays.
+start of the trunk, and the line of the shoulders may turn either way: three binary choices, with
+nearly the same image. The torso is not a chain of links that each end in one joint, so its flips
+change the image of hips, neck and shoulders a little; `rehang_chain` then puts the limbs back onto
+their rays.
 """
 
 from __future__ import annotations
@@ -45,25 +46,30 @@ def flip_torso(body: Body, poses: ArrayLike) -> tuple[Array, Index]:
     torso = frames.points(skeleton.joint_segments[which], skeleton.joint_offsets[which])
     pelvis, neck, left_hip, right_hip, left_shoulder, right_shoulder = torso
     hips, shoulders = right_hip - left_hip, right_shoulder - left_shoulder
-    up = neck - pelvis
     # All F flips of all poses at once: a batch of N F, pose by pose.
     turn_hips, lean, turn_shoulders = np.array(_flips(len(trunk))).T
     wanted_hips = _chosen(turn_hips, _turned(hips, pelvis), hips)
-    wanted_up = _chosen(lean, _leaned(pelvis, neck), up)
     wanted_shoulders = _chosen(turn_shoulders, _turned(shoulders, neck), shoulders)
     parents = np.repeat(np.arange(len(q)), len(lean))
-    change = np.abs(wanted_hips[2] - hips[2, parents])
-    change = np.maximum(change, np.abs(wanted_up[2] - up[2, parents]))
-    change = np.maximum(change, np.abs(wanted_shoulders[2] - shoulders[2, parents]))
     result = q[parents]
-    fits = change > SIGNIFICANT
+    fits = np.ones(len(result), dtype=np.bool_)
     turned = np.flatnonzero(np.tile(turn_hips, len(q)))
     new = result[turned]
     z = frames.columns[0, 2][:, parents[turned]]
     fits[turned] &= _turn_root(skeleton, z, root, wanted_hips[:, turned], new)
     result[turned] = new
+    change = np.abs(wanted_hips[2] - hips[2, parents])
+    change = np.maximum(change, np.abs(wanted_shoulders[2] - shoulders[2, parents]))
     if len(trunk) >= 2:
-        fits &= _turn_trunk(skeleton, trunk, wanted_up, wanted_shoulders, result)
+        segment = skeleton.segment_names.index('trunk')
+        before = frames.origins[segment][:, parents]
+        start = forward(skeleton, result).origins[segment]
+        leans = np.tile(lean, len(q))
+        wanted_neck, meets = _neck(before, start, neck[:, parents], leans)
+        fits &= meets | ~leans
+        change = np.maximum(change, np.abs(wanted_neck[2] - neck[2, parents]))
+        fits &= _turn_trunk(skeleton, trunk, wanted_neck - start, wanted_shoulders, result)
+    fits &= change > SIGNIFICANT
     return result[fits], parents[fits]
 
 
@@ -100,12 +106,23 @@ def _turned(line: Array, at: Array) -> Array:
     return result
 
 
-def _leaned(start: Array, end: Array) -> Array:
-    """The other vector (3, N) from a start to the ray of an end, of the same length."""
-    distance = np.sqrt((end * end).sum(0))
-    ray = end / distance
-    result: Array = (2.0 * (ray * start).sum(0) - distance) * ray - start
-    return result
+def _neck(
+    before: Array, start: Array, neck: Array, lean: NDArray[np.bool_]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Where the neck (3, N) goes on its ray when the trunk starts elsewhere; whether it gets there.
+
+    Args:
+        before: (3, N) where the trunk started.
+        start: (3, N) where it starts now.
+        neck: (3, N) where the neck was.
+        lean: (N,) whether it goes to the other side of the trunk's start.
+    """
+    distance = np.sqrt((neck * neck).sum(0))
+    ray = neck / distance
+    middle = (ray * start).sum(0)
+    reach = ((neck - before) ** 2).sum(0) - (start * start).sum(0) + middle**2
+    side = np.where((distance < (ray * before).sum(0)) != lean, -1.0, 1.0)
+    return (middle + side * np.sqrt(np.maximum(reach, 0.0))) * ray, reach > 0.0
 
 
 def _turn_root(

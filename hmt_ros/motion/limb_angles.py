@@ -27,6 +27,8 @@ from hmt_ros.motion.rig import ARM, LEG, SIDES
 FOOT = 0.3  # a foot, for its leg
 AROUND, AROUND_TIME = 0.2, 0.2  # the frames around; standard deviation of their distance, s
 REST = 1e-3  # no twist
+HIPS = ('pelvis', 'left_hip', 'right_hip')
+TRUNK_START = 'start of the trunk'
 FLEXIBLE = 0.05  # weight of neck and shoulders for the root of a body whose trunk can bend
 
 
@@ -42,9 +44,10 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float) -> A
         ValueError: the skeleton has other limbs.
     """
     count = len(place['pelvis'])
+    aims = _aims(skeleton)
+    place = {**place, TRUNK_START: trunk_start(skeleton, place)}
     poses = np.zeros((count, skeleton.dimension))
     turns: dict[int, Array] = {}  # segment -> rotation (T, 3, 3) to the camera frame
-    aims = _aims(skeleton)
     for s, parent in enumerate(skeleton.parents):
         if parent < 0:
             turns[s] = _set_root(skeleton, place, poses)
@@ -72,6 +75,35 @@ def limb_angles(skeleton: Skeleton, place: Mapping[str, Array], fps: float) -> A
     return _within(poses, skeleton)
 
 
+def trunk_start(skeleton: Skeleton, place: Mapping[str, Array]) -> Array:
+    """Where the trunk of a person starts, (T, 3), by the pelvis and the hips.
+
+    It lies as far before the pelvis, relative to the hips below, as at rest.
+    """
+    if 'neck' not in skeleton.chains:
+        return place['pelvis']
+    trunk = skeleton.parents[skeleton.chains['neck'][0]]
+    frames = forward(skeleton, np.zeros((1, skeleton.dimension)))
+    rest = frames.joints()[skeleton.joint_index(HIPS)].transpose(0, 2, 1)
+    offset = frames.origins[trunk, :, 0] - rest[0, 0]
+    at_rest = np.einsum('tij,i->tj', _pelvis_axes(*rest), offset)[0]
+    drop = np.linalg.norm(rest[1:].mean(0) - rest[0])
+    places = [place[name] for name in HIPS]
+    drops = np.linalg.norm(0.5 * (places[1] + places[2]) - places[0], axis=1)
+    shift = np.einsum('tij,j->ti', _pelvis_axes(*places), at_rest / max(float(drop), 1e-9))
+    result: Array = places[0] + drops[:, None] * shift
+    return result
+
+
+def _pelvis_axes(pelvis: Array, left: Array, right: Array) -> Array:
+    """Axes (T, 3, 3), in columns: from the pelvis to the hips, to the right, and across both."""
+    down, across = 0.5 * (left + right) - pelvis, right - left
+    down = down / np.maximum(np.linalg.norm(down, axis=1, keepdims=True), 1e-9)
+    across = across - (across * down).sum(1, keepdims=True) * down
+    across = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-9)
+    return np.stack([down, across, np.cross(down, across)], axis=2)
+
+
 Aim = tuple[str, str, str]
 
 
@@ -93,7 +125,7 @@ def _aims(skeleton: Skeleton) -> dict[int, Aim]:
     result[head] = ('neck', 'head', '')
     trunk = skeleton.parents[head]
     if skeleton.parents[trunk] >= 0:
-        result[trunk] = ('pelvis', 'neck', '')
+        result[trunk] = (TRUNK_START, 'neck', '')
     return result
 
 

@@ -19,7 +19,7 @@ from hmt_ros.body.skeleton import Skeleton
 from hmt_ros.inference import minimise
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import EnergyFunction
-from hmt_ros.motion.limb_angles import limb_angles
+from hmt_ros.motion.limb_angles import HIPS, limb_angles, trunk_start
 from hmt_ros.motion.motion_file import Motion
 from hmt_ros.motion.rig import SIDES
 
@@ -63,7 +63,7 @@ def body_from_motion(motion: Motion, body: Body) -> Body:
     hips, shoulders = (
         (place[f'left_{joint}'], place[f'right_{joint}']) for joint in ('hip', 'shoulder')
     )
-    trunk = place['neck'] - place['pelvis']
+    trunk = place['neck'] - trunk_start(body.skeleton, place)
     drop = place['pelvis'] - 0.5 * (hips[0] + hips[1])
     rise = 0.5 * (shoulders[0] + shoulders[1]) - place['neck']
     up = trunk / np.linalg.norm(trunk, axis=1, keepdims=True)
@@ -76,7 +76,9 @@ def body_from_motion(motion: Motion, body: Body) -> Body:
         'hand': span('wrist', 'hand'),
         'hip_width': _median_norm(hips[0] - hips[1]),
         # Some skeletons have their hips above the pelvis joint.
-        'hip_drop': _median_norm(drop) * float(np.sign(np.median((drop * up).sum(1)))),
+        'hip_drop': _drop_share(body)
+        * _median_norm(drop)
+        * float(np.sign(np.median((drop * up).sum(1)))),
         'shoulder_width': _median_norm(shoulders[0] - shoulders[1]),
         'shoulder_rise': float(np.median((rise * up).sum(1))),
         'trunk': _median_norm(trunk),
@@ -90,6 +92,16 @@ def body_from_motion(motion: Motion, body: Body) -> Body:
             own = body.segment_lengths
             lengths[end] = own[end] / own[carrier] * lengths[carrier]
     return body.with_segment_lengths(lengths)
+
+
+def _drop_share(body: Body) -> float:
+    """Length `hip_drop` over the distance from the pelvis to the middle of the hips."""
+    if not set(HIPS) <= set(body.joint_names):
+        return 1.0  # who needs more than the joints says what
+    rest = body.joint_positions(np.zeros((1, body.dimension)))[0]
+    pelvis, left, right = rest[body.skeleton.joint_index(HIPS)]
+    distance = float(np.linalg.norm(0.5 * (left + right) - pelvis))
+    return abs(body.segment_lengths.get('hip_drop', 0.0)) / max(distance, 1e-9)
 
 
 def retarget(

@@ -55,10 +55,10 @@ def leaves_of(pose, kind):
 
 
 def bones(body: Body, found):
-    joints = body.joint_positions(found)
-    return np.stack(
-        [np.linalg.norm(joints[:, a] - joints[:, b], axis=1) for a, b in body.skeleton.bones]
-    )
+    """Lengths of the bones, but from the pelvis to the neck: between them the trunk turns."""
+    joints, neck = body.joint_positions(found), body.joint_names.index('neck')
+    rigid = [(a, b) for a, b in body.skeleton.bones if (body.joint_names[a], b) != ('pelvis', neck)]
+    return np.stack([np.linalg.norm(joints[:, a] - joints[:, b], axis=1) for a, b in rigid])
 
 
 def off_rays(found, pose, names=None):

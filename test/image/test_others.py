@@ -55,7 +55,7 @@ def test_nothing_changes_where_others_change(human32, camera, pose, seen):
     for fill in (0, 255):
         other = image.copy()
         # Blurs and edges reach a little over the border of what is unknown.
-        inner = cv2.erode(others.astype(np.uint8), np.ones((25, 25), np.uint8)) > 0
+        inner = cv2.erode(others.astype(np.uint8), np.ones((41, 41), np.uint8)) > 0
         other[inner] = fill
         found.append(energies(human32, camera, poses, other, mask, others).terms['edges'])
     np.testing.assert_allclose(*found, rtol=1e-6)
