@@ -2,6 +2,7 @@
 # make test   all tests                                make bench  the benchmarks
 # make setup  the workspace alone                      make soak   nodes under load and faults
 # make clean  restores the state of a clone            make mediapipe  MediaPipe in .mediapipe
+# make learn  learns everything again from DATA=...
 #
 # Each works as the first command after a clone: it installs its requirements into .venv and builds
 # the packages once. See CONTRIBUTING.md.
@@ -9,7 +10,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -e -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup mediapipe demo test lint bench soak clean lock
+.PHONY: help setup mediapipe demo test lint bench soak learn clean lock
 
 # Small matrices: a second BLAS thread costs more than it saves.
 export OMP_NUM_THREADS := 1
@@ -20,6 +21,7 @@ PYTHON_IN_VENV := .venv/bin/python
 SOURCED := source tools/environment.bash &&
 TEST_PROCESSES ?= 2
 SOAK_MINUTES ?= 10
+DATA ?= $(or $(HMT_SHARED),../shared)
 DEMO_BAG ?= $(patsubst %/metadata.yaml,%,$(firstword $(wildcard bags/*/metadata.yaml)))
 
 help:
@@ -54,6 +56,10 @@ bench:
 soak:
 	@$(WORKSPACE) ros test build
 	@$(SOURCED) python -m benchmarks soak --minutes $(SOAK_MINUTES) $(ARGS)
+
+learn:
+	@$(WORKSPACE) ros test build
+	@$(SOURCED) tools/learn.sh $(DATA) build/learned
 
 clean:
 	rm -rf .venv .mediapipe build install log .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache *.egg-info

@@ -23,6 +23,7 @@ BENCHMARKS = {
     'motion_prior': 'how well the motion prior predicts motions of other people',
     'nodes': 'images at the rate of a camera, through DDS',
     'people': 'two people cross: are they told apart afterwards?',
+    'real_video': 'real videos without truth: keypoints held out, feet, lengths; contact sheets',
     'smoothing': 'exactness, speed and peers of the smoother',
     'soak': 'nodes and files under load and fault',
     'tracking': 'accuracy, calibration and speed of the tracker on clips with known truth',

@@ -40,6 +40,7 @@ PAGES = {
     'motion_prior': 'motion_prior.md',
     'people': 'people.md',
     'kjs': 'sampling.md',
+    'real_video': 'real_video.md',
     'smoothing': 'smoothing.md',
     'experts': 'experts.md',
     'absence': 'tracking.md',

@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -21,6 +22,7 @@ from benchmarks import (
     kjs,
     live,
     nodes,
+    real_video,
     vertical,
     votes,
 )
@@ -291,7 +293,7 @@ def test_command_line(capsys, tmp_path):
     assert capsys.readouterr().err.splitlines() == [
         "benchmarks: no 'flops', wanted one of absence, bags, contour_noise, depth, error_model, "
         'experts, flips, joint_errors, keypoint_noise, kernels, kjs, live, motion_prior, nodes, '
-        'people, smoothing, soak, tracking, vertical, votes'
+        'people, real_video, smoothing, soak, tracking, vertical, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
@@ -444,6 +446,33 @@ def test_the_vertical_of_the_demonstration_is_seen(capsys):
     assert text.splitlines()[-1].startswith('| all')
     assert main(['vertical', '--clips', str(ROOT / 'test')]) == 1
     assert capsys.readouterr().err.startswith('vertical: ')
+
+
+# real_video
+
+
+def test_a_contact_sheet_shows_the_demonstration(tmp_path, capsys):
+    (path,) = real_video.draw_sheets(tmp_path, ROOT / 'bags', quick=True)
+    sheet = cv2.imread(str(path))
+    assert path.name == 'reach.png'
+    assert sheet.shape == (3 * real_video.CELL, real_video.COLUMNS * real_video.CELL, 3)
+    # The truth and the heaviest mode are drawn in every view.
+    for row in np.split(sheet, 3):
+        for colour in (real_video.TRUE, (0, 159, 230)):
+            assert (np.abs(row.astype(int) - colour).max(2) < 12).any()
+    assert main(['real_video', '--clips', str(tmp_path)]) == 0
+    assert 'skipped' in capsys.readouterr().err
+
+
+def test_scores_of_real_videos_are_told():
+    one = {
+        'clip': 'park', 'images': 3, 'held_out': 0.02, 'given': 0.01, 'feet': 0.1, 'standing': 2,
+        'lengths': 0.003, 'empty': [0, 9],
+    }  # fmt: skip
+    row = real_video.as_text({'clips': [one]}, markdown=True).splitlines()[-1]
+    assert [x.strip() for x in row.split('|')[1:-1]] == [
+        'park', '3', '2.0', '1.0', '0.10 (2 steps)', '0.3', '0 of 9',
+    ]  # fmt: skip
 
 
 # joint_errors

@@ -145,27 +145,34 @@ def joint_mixtures(
         model_sigma: standard deviation of a coordinate that is added, m.
         positions: for each mixture (K, J', 3) of all joints of the body at the means, m; None:
             computed from the means.
-        origin: joints whose mean position is the origin.
+        origin: joints whose mean position is the origin; empty: that of the camera.
 
     Raises:
         KeyError: a joint that the body does not have.
         ValueError: a mixture over poses of another body.
     """
-    which, centre = (body.skeleton.joint_index([*some]) for some in (names, origin))
+    which = body.skeleton.joint_index([*names])
+
+    def relative(positions: Array) -> Array:
+        at = positions[:, which]
+        if not origin:
+            return at
+        centre = body.skeleton.joint_index([*origin])
+        found: Array = at - positions[:, centre].mean(1, keepdims=True)
+        return found
+
     own = np.diag(np.repeat(np.square(body.joint_errors[which]) + model_sigma**2, 3))
     result = []
     # Kinematics in batches: one frame alone would cost ten times as much a pose.
     for first in range(0, len(mixtures), BATCH):
         batch = mixtures[first : first + BATCH]
         means = np.concatenate([mixture.means for mixture in batch])
-        jacobians = body.joint_jacobians(means)
-        jacobians = jacobians[:, which] - jacobians[:, centre].mean(1, keepdims=True)
-        jacobians = jacobians.reshape(len(means), -1, body.dimension)
+        jacobians = relative(body.joint_jacobians(means)).reshape(len(means), -1, body.dimension)
         if positions is None:
             joints = body.joint_positions(means)
         else:
             joints = np.concatenate(positions[first : first + BATCH])
-        joints = joints[:, which] - joints[:, centre].mean(1, keepdims=True)
+        joints = relative(joints)
         ends = np.cumsum([len(mixture) for mixture in batch])
         for mixture, end in zip(batch, ends, strict=True):
             mine = slice(int(end) - len(mixture), int(end))
@@ -189,6 +196,7 @@ class Scores:
         log_densities: (T,) log p(true joint positions), positions in m; None without covariances.
         levels: (T,) of the true positions of all joints together, see `inference.calibration`.
         joint_levels: (T, J) of the true position of each joint alone.
+        absolute_levels: (T, J) the same in the frame of the camera; None: unknown.
     """
 
     names: tuple[str, ...]
@@ -200,6 +208,7 @@ class Scores:
     log_densities: Array | None
     levels: Array | None
     joint_levels: Array | None
+    absolute_levels: Array | None = None
 
     def __len__(self) -> int:
         return len(self.heaviest)
@@ -236,7 +245,9 @@ class Scores:
         result['negative_log_likelihood'] = (
             -float(np.mean(self.log_densities)) if self.log_densities is not None else None
         )
-        for kind, levels in (('', self.levels), ('joint_', self.joint_levels)):
+        for kind, levels in (
+            ('', self.levels), ('joint_', self.joint_levels), ('absolute_', self.absolute_levels),
+        ):  # fmt: skip
             for percent in (50, 90):
                 result[f'{kind}coverage_{percent}'] = (
                     coverage(levels, percent / 100) if levels is not None else None
@@ -258,6 +269,28 @@ class Scores:
             for j, name in enumerate(self.names)
         }
         return result
+
+
+def marginal_levels(
+    mixtures: Sequence[JointMixture],
+    truth: Array,
+    *,
+    seed: int | np.random.Generator = 0,
+    samples: int = SAMPLES,
+) -> Array:
+    """Levels (T, J) of true positions (T, J, 3) of each joint alone; see `score`.
+
+    Raises:
+        ValueError: a mixture without covariances.
+    """
+    rng = np.random.default_rng(seed)
+    result = np.empty(truth.shape[:2])
+    for row, mixture, true in zip(result, mixtures, truth, strict=True):
+        density = mixture.density()
+        drawn = stratified_samples(density, samples, rng)
+        alone = marginal_log_densities(density, np.concatenate([true.reshape(1, -1), drawn]), 3)
+        row[:] = levels_of(alone[:1], alone[1:])[0]
+    return result
 
 
 def score(

@@ -7,7 +7,7 @@ Estimate and truth belong together where their stamps are equal.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from hmt_ros.evaluation.pose_scores import (
     JointMixture,
     Scores,
     joint_mixtures,
+    marginal_levels,
     origin_joints,
     relative_positions,
     score,
@@ -149,6 +150,7 @@ class TrackScorer:
     ) -> None:
         self.name, self.truth, self.kind = name, truth, ''
         self._model_sigma, self._rng = model_sigma, np.random.default_rng(seed)
+        self._rng_of_absolute = np.random.default_rng([seed, 1])
         self._origin = origin_joints(truth.joint_names, truth.source)
         self._joints = truth.evaluated_joints()
         self._note, self._without_truth = '', 0
@@ -243,21 +245,25 @@ class TrackScorer:
             found = [self._bare(one) for one in estimates]
         else:
             positions = [one.positions for one in estimates if one.positions is not None]
-            found = joint_mixtures(
-                body,
-                mixtures,
-                self._joints,
-                model_sigma=self._model_sigma,
-                positions=positions or None,
-                origin=self._origin,
+            found, absolute = (
+                joint_mixtures(
+                    body,
+                    mixtures,
+                    self._joints,
+                    model_sigma=self._model_sigma,
+                    positions=positions or None,
+                    origin=origin,
+                )
+                for origin in (self._origin, ())
             )
-        true = relative_positions(
-            np.array([self.truth.joints[one.stamp_ns] for one in estimates]),
-            self.truth.joint_names,
-            self._joints,
-            self._origin,
-        )
-        self._parts.append(score(found, true, self._joints, seed=self._rng))
+        names, every = self.truth.joint_names, [self.truth.joints[x.stamp_ns] for x in estimates]
+        true = relative_positions(np.array(every), names, self._joints, self._origin)
+        scores = score(found, true, self._joints, seed=self._rng)
+        if body is not None:
+            true = np.array(every)[:, [names.index(name) for name in self._joints]]
+            levels = marginal_levels(absolute, true, seed=self._rng_of_absolute)
+            scores = replace(scores, absolute_levels=levels)
+        self._parts.append(scores)
 
     def _bare(self, estimate: Estimate) -> JointMixture:
         """Joint positions alone."""

@@ -280,6 +280,7 @@ def _scores(content: Content) -> dict[str, Any] | None:
             else [_rounded(coverage(levels, q), 4) for q in PROBABILITIES]
             for kind, levels in (
                 ('together', topic.scores.levels), ('each', topic.scores.joint_levels),
+                ('absolute', topic.scores.absolute_levels),
             )
         }  # fmt: skip
     result['probabilities'] = PROBABILITIES.tolist()

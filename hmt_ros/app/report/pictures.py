@@ -138,16 +138,18 @@ def _draw_errors(axes: Any, track: Layer[Moment], truth: Truth, seconds: Array) 
 def _draw_calibration(path: Path, scores: dict[str, TrackScores]) -> None:
     """Coverage of the highest-density regions over their probability."""
     with mpl.rc_context(STYLE):
-        figure = Figure((7.6, 4.8), dpi=110, layout='constrained')
-        axes: Any = figure.subplots(1, 2, sharey=True)
+        figure = Figure((10.4, 4.8), dpi=110, layout='constrained')
+        axes: Any = figure.subplots(1, 3, sharey=True)
         for number, (name, topic) in enumerate(scores.items()):
-            pair = topic.scores.levels, topic.scores.joint_levels
-            for one, levels in zip(axes, pair, strict=True):
+            found = topic.scores
+            every = found.levels, found.joint_levels, found.absolute_levels
+            for one, levels in zip(axes, every, strict=True):
                 if levels is not None:
                     covered = [coverage(levels, q) for q in PROBABILITIES]
                     colour = _COLOURS[number % len(_COLOURS)]
                     one.plot(PROBABILITIES, covered, color=colour, label=name, linewidth=1.6)
-        for one, title in zip(axes, ('all joints together', 'each joint alone'), strict=True):
+        titles = 'all joints together', 'each joint alone', 'each joint, from the camera'
+        for one, title in zip(axes, titles, strict=True):
             one.plot([0, 1], [0, 1], color='#bbbbbb', linewidth=0.8, zorder=0)
             one.set(title=title, xlim=(0, 1), ylim=(0, 1), aspect='equal')
             one.set_xlabel('probability of the region')

@@ -134,7 +134,7 @@ def test_truth_errors_and_calibration(made, data, body, poses):
             told['coverage_50'], abs=1e-4
         )
     trajectories = data['scores']['topics']['/trajectory_mixture']
-    assert trajectories['calibration'] == {'together': None, 'each': None}
+    assert trajectories['calibration'] == {'together': None, 'each': None, 'absolute': None}
     assert any(note.startswith('/trajectory_mixture') for note in data['notes'])
 
 

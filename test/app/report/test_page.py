@@ -159,7 +159,7 @@ def test_layers_modes_and_play(page, tmp_path):
         for (let i = 0; i < 100 && Number(get('time').value) < 2; i += 1) await pause(50);
         get('play').click(); seen.time = Number(get('time').value);
         seen.paused = get('play').textContent;
-        ['together', 'each', 'free-energy', 'iterations'].forEach((id) => look(id, id));
+        ['together', 'each', 'absolute', 'free-energy', 'iterations'].forEach((id) => look(id, id));
         seen.scores = document.querySelectorAll('#scores tbody tr').length;
         seen.named = [...document.querySelectorAll('button, input, select, canvas')].every((x) => (
           x.textContent.trim() || x.getAttribute('aria-label') || (x.labels && x.labels.length)
@@ -179,7 +179,10 @@ def test_layers_modes_and_play(page, tmp_path):
     assert 2 <= seen['time'] < FRAMES
     assert seen['paused'] == 'Play'
     assert (
-        min(seen[f'{name} drawn'] for name in ('together', 'each', 'free-energy', 'iterations'))
+        min(
+            seen[f'{name} drawn']
+            for name in ('together', 'each', 'absolute', 'free-energy', 'iterations')
+        )
         > 500
     )
     assert seen['scores'] == 3

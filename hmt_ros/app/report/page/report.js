@@ -43,6 +43,7 @@ const charts = {
   iterations: new Chart(element('iterations'), iterationsChart),
   together: new Chart(element('together'), () => calibrationChart('together')),
   each: new Chart(element('each'), () => calibrationChart('each')),
+  absolute: new Chart(element('absolute'), () => calibrationChart('absolute')),
 };
 
 function drawAll() {
@@ -57,7 +58,7 @@ function drawAll() {
 }
 
 function drawCalibration() {
-  if (calibrated) { charts.together.draw(); charts.each.draw(); }
+  if (calibrated) { charts.together.draw(); charts.each.draw(); charts.absolute.draw(); }
 }
 
 function goTo(time) {
@@ -236,13 +237,14 @@ const COLUMNS = [
   ['-log p', (s) => fixed(s.negative_log_likelihood, 1)],
   ['all joints 50\u00a0%', (s) => percent(s.coverage_50)], ['all joints 90\u00a0%', (s) => percent(s.coverage_90)],
   ['each joint 50\u00a0%', (s) => percent(s.joint_coverage_50)], ['each joint 90\u00a0%', (s) => percent(s.joint_coverage_90)],
+  ['from the camera 90\u00a0%', (s) => percent(s.absolute_coverage_90)],
 ];
 
 function tellScores() {
   element('scores-section').hidden = !report.scores;
   if (!report.scores) return;
   element('scores-about').textContent = `Against ${report.scores.truth}, ${report.scores.truth_frames} frames. `
-    + 'Errors are mean distances of joints, pelvis on pelvis. The last four columns give the fraction of frames whose '
+    + 'Errors are mean distances of joints, pelvis on pelvis. The last five columns give the fraction of frames whose '
     + 'truth lies in the smallest region with 50 or 90 percent of the probability: 50 and 90 percent for a calibrated '
     + 'mixture, less for an overconfident one, more for a vague one.';
   const head = made('tr');
@@ -266,6 +268,7 @@ function tellScores() {
   key.append(line);
   element('together').setAttribute('aria-label', 'Calibration for all joints together; the table has the numbers');
   element('each').setAttribute('aria-label', 'Calibration for each joint alone; the table has the numbers');
+  element('absolute').setAttribute('aria-label', 'Calibration for each joint alone, in the frame of the camera');
 }
 
 // Playing: a timer waits for the time of the next image; those that come too late are skipped.

@@ -1,0 +1,36 @@
+#!/usr/bin/env bash
+# Runs everything that learns from motion capture and from clips with truth, in the order in which
+# one depends on another: priors and motion first, then what the tracker errs by, experts last.
+#
+#   tools/learn.sh DATA OUT      about an hour on two cores
+#
+# DATA holds mocap/train, mocap/train_more, mocap/dev with tables index.csv, and video. OUT gets
+# files to compare with those that ship; nothing that ships is changed. Tables of YAML files and of
+# hmt_ros/inference/error_model.py are printed to OUT/*.txt, and are put in by hand.
+set -euo pipefail
+data=${1:?the folder of mocap and video} out=${2:?the folder of the results}
+mocap=$data/mocap
+[[ -d $mocap/train && -d $data/video ]] || { echo "learn: $data lacks mocap/train or video" >&2; exit 1; }
+mkdir -p "$out"
+export HMT_SHARED=$data
+# Motions whose pelvis is mirrored in parts; their repaired copies are in train_more.
+mirrored=(cmu_13_traffic cmu_12_0x_walk cmu_signals_a1 cmu_signals_a2 cmu_run_a)
+thanks='The data used in this project was obtained from mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217.'
+source='CMU Graphics Lab Motion Capture Database, http://mocap.cs.cmu.edu: free for all uses; the data themselves may not be resold, even in converted form.'
+people=("$mocap"/index.csv "$mocap"/train_more/index.csv)
+
+learn() {  # name of the result, then the command
+  echo "learn: $1"
+  python -m "${@:2}" >"$out/$1.txt"
+}
+learn lengths hmt_ros learn-lengths "$mocap"/train "$mocap"/train_more --people "${people[@]}"
+learn prior hmt_ros learn-prior "$mocap"/train "$mocap"/train_more --people "${people[@]}" --test "$mocap"/dev \
+  --without "${mirrored[@]}" --components 8 --source "$source $thanks" -o "$out/human37_prior.npz" --overwrite
+learn motion hmt_ros learn-motion "$mocap"/train "$mocap"/train_more --without "${mirrored[@]}" \
+  --acknowledgement "$thanks" -o "$out/human37_motion.npz" --overwrite
+learn keypoint_noise benchmarks keypoint_noise
+learn contour_noise benchmarks contour_noise
+learn error_model benchmarks error_model
+learn joint_errors benchmarks joint_errors
+learn experts hmt_ros train --motions procedural --samples 1800 -o "$out/procedural.npz" --overwrite
+echo "learn: done; $out has the files and tables to compare with those that ship"
