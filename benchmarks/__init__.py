@@ -12,6 +12,7 @@ BENCHMARKS = {
     'bags': 'reading, memory, and what replay adds to the estimate',
     'contour_noise': 'how far contours of people lie from those of the model',
     'depth': 'what depth images bring to the tracker',
+    'distance': 'how far away a person is taken to be, by what is known',
     'error_model': 'how far the errors of each cue are independent, in an image and in time',
     'experts': 'conditional densities: a toy, motions of people apart, clips, speed',
     'flips': 'time per leaf of the interpretation trees',

@@ -34,6 +34,7 @@ PAGES = {
     'kernels': 'likelihood.md',
     'contour_noise': 'likelihood.md',
     'depth': 'likelihood.md',
+    'distance': 'ground.md',
     'error_model': 'tracking.md',
     'joint_errors': 'body.md',
     'keypoint_noise': 'keypoints.md',

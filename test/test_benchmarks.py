@@ -15,6 +15,7 @@ from benchmarks import (
     bags,
     contour_noise,
     depth,
+    distance,
     flips,
     joint_errors,
     kernels,
@@ -291,9 +292,9 @@ def test_command_line(capsys, tmp_path):
     assert 'tracking' in capsys.readouterr().out
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
-        "benchmarks: no 'flops', wanted one of absence, bags, contour_noise, depth, error_model, "
-        'experts, flips, joint_errors, keypoint_noise, kernels, kjs, live, motion_prior, nodes, '
-        'people, real_video, smoothing, soak, tracking, vertical, votes'
+        "benchmarks: no 'flops', wanted one of absence, bags, contour_noise, depth, distance, "
+        'error_model, experts, flips, joint_errors, keypoint_noise, kernels, kjs, live, '
+        'motion_prior, nodes, people, real_video, smoothing, soak, tracking, vertical, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
@@ -431,6 +432,18 @@ def test_absence_tells_tracks_of_nobody_and_late_states(given):
     assert absence.as_text({'scenes': [case]}).split()[-9:] == [
         'images', '2', '1', '1', '0', '1', '1', str(1 - given), 'park',
     ]  # fmt: skip
+
+
+# distance
+
+
+def test_the_distance_of_the_demonstration_needs_keypoints(capsys):
+    assert main(['distance', '--clips', str(ROOT / 'bags')]) == 1
+    assert 'keypoints' in capsys.readouterr().err
+    three = {'rms': 3 * [0.05], 'mean': 3 * [-0.01], 'said': 3 * [0.04]}
+    text = distance.as_text({'cases': [{'known': 'stature', 'clips': 3} | three]}, markdown=True)
+    row = text.splitlines()[-1].split('|')
+    assert [x.strip() for x in row[1:-1]] == ['stature', '3', *(3 * ['5.0 (-1.0; 4.0)'])]
 
 
 # vertical

@@ -434,7 +434,10 @@ class Tracker:
         # Before the first track a background may still be learned: its silhouettes are no start.
         known = masked or self._nobody
         self._existence.look(
-            view if known else view._replace(anywhere=None, silhouette=None), stamp, self.body
+            view if known else view._replace(anywhere=None, silhouette=None),
+            stamp,
+            self.body,
+            waiting=True,
         )
         somebody = self._existence.somebody and self._existence.llr > 0.0
         if self._nobody and self._starts.box is None:

@@ -447,3 +447,30 @@ def test_a_silhouette_at_the_side_of_the_image_takes_longer(film, watched):
 def test_llr_has_the_share_of_the_time(film, watched):
     _, _, watching = watched(full_views(film, 3), 10.0)
     assert watching.llr == pytest.approx(CLEAR.nats * share_of_time(0.1, CLEAR.tau))
+
+
+# What stands still.
+
+
+@pytest.mark.parametrize('waiting', [False, True])
+def test_a_detector_says_the_same_of_the_same_picture(waiting, human37, camera, keypoints_of):
+    """Before a track, keypoints on a thing that never changes count once; a person moves."""
+    rng = np.random.default_rng(0)
+    thing = rng.integers(0, 255, (camera.height, camera.width, 3), dtype=np.uint8)
+    pose = human37.prior_mean.copy()
+    pose[:3] = 0.0, 0.2, 4.0
+    seen = keypoints_of(human37, pose)
+
+    def probability(images) -> float:
+        existence = Existence()
+        for i, image in enumerate(images):
+            noisy = np.clip(image + rng.normal(0.0, 2.0, image.shape), 0, 255).astype(np.uint8)
+            existence.look(View(noisy, keypoints=seen), i * SECOND // 10, human37, waiting=waiting)
+        return existence.probability
+
+    still = probability(20 * [thing])
+    moving = probability([np.roll(thing, 3 * i, axis=1) for i in range(20)])
+    blank = probability(20 * [np.zeros_like(thing)])
+    assert moving > PRESENT
+    assert blank > PRESENT
+    assert (still > PRESENT) != waiting
