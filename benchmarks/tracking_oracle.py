@@ -26,6 +26,8 @@ from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import minimise
+from hmt_ros.motion.limb_angles import trunk_start
+from hmt_ros.motion.retarget import hip_drop_share
 from hmt_ros.tracking import read_subject
 
 Array = NDArray[np.float64]
@@ -242,9 +244,13 @@ def with_true_lengths(body: Body, clip: Clip) -> Body:
         for name, spans in SPANS.items()
         if all(set(a) | set(b) <= set(names) for a, b in spans)
     }
-    if {ORIGIN, 'neck', *SHOULDERS} <= set(names):
+    if 'hip_drop' in lengths:
+        lengths['hip_drop'] *= hip_drop_share(body)
+    if {ORIGIN, *HIPS, 'neck', *SHOULDERS} <= set(names):
+        place = {name: at((name,)) for name in (ORIGIN, *HIPS)}
+        up = at(('neck',)) - trunk_start(body.skeleton, place)
+        lengths['trunk'] = float(np.linalg.norm(up, axis=1).mean())
         # How far the shoulders are above the end of the trunk, which may be less than nothing.
-        up = at(('neck',)) - at((ORIGIN,))
         up /= np.linalg.norm(up, axis=1, keepdims=True)
         lengths['shoulder_rise'] = float(((at(SHOULDERS) - at(('neck',))) * up).sum(1).mean())
     return body.with_segment_lengths(lengths)

@@ -663,7 +663,9 @@ def test_images_of_the_camera_become_a_person_in_the_namespace(started):
     links = [link.attrib['name'] for link in robot.findall('link')]
     camera = arrived['/tf'].transforms[0].header.frame_id
     assert links[0] == camera
-    assert {t.child_frame_id for t in arrived['/tf'].transforms} == set(links[1:])
+    # The lines of the scene show which way is up.
+    frames = {*links[1:], 'body_p1/camera_upright'}
+    assert {t.child_frame_id for t in arrived['/tf'].transforms} == frames
     assert all(link.startswith('body_p1/') for link in links[1:])
     movable = {one.attrib['name'] for one in robot.findall('joint') if one.get('type') != 'fixed'}
     assert set(arrived['human_joint_states'].name) == movable

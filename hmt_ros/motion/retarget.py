@@ -76,7 +76,7 @@ def body_from_motion(motion: Motion, body: Body) -> Body:
         'hand': span('wrist', 'hand'),
         'hip_width': _median_norm(hips[0] - hips[1]),
         # Some skeletons have their hips above the pelvis joint.
-        'hip_drop': _drop_share(body)
+        'hip_drop': hip_drop_share(body)
         * _median_norm(drop)
         * float(np.sign(np.median((drop * up).sum(1)))),
         'shoulder_width': _median_norm(shoulders[0] - shoulders[1]),
@@ -94,7 +94,7 @@ def body_from_motion(motion: Motion, body: Body) -> Body:
     return body.with_segment_lengths(lengths)
 
 
-def _drop_share(body: Body) -> float:
+def hip_drop_share(body: Body) -> float:
     """Length `hip_drop` over the distance from the pelvis to the middle of the hips."""
     if not set(HIPS) <= set(body.joint_names):
         return 1.0  # who needs more than the joints says what
