@@ -33,6 +33,7 @@ from benchmarks.clips import (
     read_detections,
     read_messages,
     table,
+    with_file,
 )
 from benchmarks.command import benchmark_parser, show, told
 from benchmarks.machine import description
@@ -59,19 +60,11 @@ def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]
     Raises:
         FileNotFoundError: they are not there.
     """
-    folder = clips or development_folder()
-    found = [
-        scores_of(folder / scene.name, scene, 30 if quick else None)
-        for scene in told('real_video', SCENES, lambda scene: scene.name)
-        if _is_there(folder / scene.name)
-    ]
+    names = [scene.name for scene in SCENES]
+    folders = with_file(names, clips, 'keypoints_mediapipe.npz')
+    pairs = told('real_video', zip(folders, SCENES, strict=True), lambda pair: pair[0].name)
+    found = [scores_of(folder, scene, 30 if quick else None) for folder, scene in pairs]
     return {'machine': description(), 'clips': found}
-
-
-def _is_there(folder: Path) -> bool:
-    if not (folder / 'keypoints_mediapipe.npz').is_file():
-        raise FileNotFoundError(f'{folder} lacks keypoints_mediapipe.npz (set HMT_SHARED)')
-    return True
 
 
 @dataclass(frozen=True, eq=False)

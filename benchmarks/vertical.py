@@ -14,11 +14,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.clips import at_rate, find_clips, read_clip, table
 from benchmarks.command import benchmark_parser, show, told
 from benchmarks.machine import description
+from benchmarks.tracking_speed import opencv_work
 from hmt_ros.image.vertical_lines import seen_vertical, straight_lines
 
 RATE = 1.0  # images a second
@@ -39,7 +39,7 @@ def measured(folder: Path) -> dict[str, Any] | None:
         found = seen_vertical(image, clip.camera)
         lines.append(len(straight_lines(image, clip.camera).normals))
         seconds.append(_least(lambda image=image: seen_vertical(image, clip.camera)))
-        floor.append(_least(lambda image=image: _floor(subtractor, image)))
+        floor.append(_least(lambda image=image: opencv_work(subtractor, image)))
         if found is not None:
             errors.append(float(np.degrees(np.arccos(np.clip(found.up @ up, -1.0, 1.0)))))
             said.append(float(np.degrees(found.sigma)))
@@ -55,12 +55,6 @@ def measured(folder: Path) -> dict[str, Any] | None:
         'ms': 1e3 * float(np.mean(seconds)),
         'floor_ms': 1e3 * float(np.mean(floor)),
     }
-
-
-def _floor(subtractor: cv2.BackgroundSubtractorMOG2, image: NDArray[np.uint8]) -> None:
-    subtractor.apply(image)
-    edges = cv2.Canny(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), 60, 150)
-    cv2.distanceTransform(255 - edges, cv2.DIST_L2, 3)
 
 
 def _least(work: Callable[[], object]) -> float:

@@ -2,7 +2,7 @@
 # Runs everything that learns from motion capture and from clips with truth, in the order in which
 # one depends on another: priors and motion first, then what the tracker errs by, experts last.
 #
-#   tools/learn.sh DATA OUT      about an hour on two cores
+#   tools/learn.sh DATA OUT
 #
 # DATA holds mocap/train, mocap/train_more, mocap/dev with tables index.csv, and video. OUT gets
 # files to compare with those that ship; nothing that ships is changed. Tables of YAML files and of

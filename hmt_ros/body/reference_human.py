@@ -299,7 +299,7 @@ def _joints(
     Args:
         at: positions of joints.
         ahead: how far the shoulders lie before the neck, by side, m.
-        additions: see `reference_human`.
+        additions: see `fit_reference_human`.
     """
 
     def length(first: str, last: str) -> float:
@@ -324,7 +324,7 @@ def _joints(
         _joint('head', 'p_head', 'head', (0, 0, head), None),
     ]
     for x, (side, s) in SIDES.items():
-        out = math.sqrt(length('neck', f'{side}_shoulder') ** 2 - ahead[side] ** 2)
+        out = math.sqrt(max(length('neck', f'{side}_shoulder') ** 2 - ahead[side] ** 2, 0.0))
         shoulder = (ahead[side], s * out, 0)
         arm = (0, 0, -length(f'{side}_shoulder', f'{side}_elbow'))
         forearm = (0, 0, -length(f'{side}_elbow', f'{side}_wrist'))

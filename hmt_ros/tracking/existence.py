@@ -57,7 +57,7 @@ PART = 0.6
 
 # Blur of images that are compared, px; least change of a pixel that noise does not make, grey
 # levels; share of the pixels around keypoints that change when a person breathes or sways within
-# tenths of a second (0.003 and more on clips of people, 0 on furniture); least contrast.
+# tenths of a second (0.003 and more on ten clips of people, 0 on a table); least contrast.
 BLUR, CHANGED, MOVING, CONTRAST = 1.5, 10.0, 0.002, 4.0
 
 
@@ -152,7 +152,7 @@ class Existence:
             view: what it shows.
             stamp: of the image, ns; later than the one before.
             body: of the person.
-            waiting: whether there is no track yet.
+            waiting: whether a track has still to start.
         """
         if self._stamps is not None:
             self.probability = moved_on(self.probability, seconds(stamp - self._stamps[1]))

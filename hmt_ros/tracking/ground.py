@@ -148,7 +148,6 @@ class GroundEstimator:
         self.known = known or KnownGround()
         self.still = False
         self.turning = False
-        self.contradicted = False
         self.forget_scene()
 
     def forget_scene(self) -> None:
@@ -156,6 +155,7 @@ class GroundEstimator:
         self._seen: Vertical | None = None
         self._newest: Array | None = None
         self._looked: int | None = None
+        self.contradicted = False
         self.reset()
 
     def reset(self) -> None:

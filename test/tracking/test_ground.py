@@ -231,6 +231,10 @@ def test_a_given_vertical_that_is_wrong_is_noticed_and_not_followed():
     assert estimator.contradicted
     assert pitch_of(estimator) == pytest.approx(0.0, abs=1.0)
     assert np.degrees(estimator.estimate.up_sigma) < 2.0
+    estimator.forget_scene()  # another scene may agree with it
+    assert pitch_of(estimator) == pytest.approx(30.0)
+    looked(estimator, 0.0, 0.0)
+    assert estimator.contradicted
     estimator.set_gravity([0.0, -1.0, 0.0])
     estimator.look(drawn(room(), np.eye(3)), ROOM_CAMERA, 3_000_000_000)
     assert not estimator.contradicted
