@@ -45,6 +45,7 @@ from hmt_ros.evaluation.pose_scores import (
     EVALUATED_JOINTS,
     ORIGIN,
     joint_mixtures,
+    marginal_regions,
     origin_joints,
     score,
 )
@@ -147,6 +148,9 @@ class Record:
         statuses: (N,) what the tracker was doing in each image of the run, the value of its status;
             empty: unknown.
         lagged: (T, K) weights by what became of the modes in the next `LAG` images; empty: unknown.
+        absolute_levels: (T, J) of the true position of each scored joint in the frame of the
+            camera; empty: unknown.
+        volumes: (T, J) of the regions of 90 % there, m^3; empty: unknown.
     """
 
     stamps: NDArray[np.int64]
@@ -166,6 +170,8 @@ class Record:
     cpu_seconds: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     statuses: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, dtype='<U1'))
     lagged: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    absolute_levels: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
+    volumes: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 def keypoints_only(settings: TrackerSettings) -> TrackerSettings:
@@ -313,7 +319,7 @@ def recorded(
     point = np.empty((len(stamps), len(JOINTS), 3))
     blind = np.empty(len(stamps))
     rng = np.random.default_rng([seed, OF_BLIND_CONTROL])
-    found = []
+    found, absolute = [], []
     # The body changes only while its flesh is fitted: its kinematics is computed in batches.
     first = 0
     if not bodies:
@@ -326,6 +332,7 @@ def recorded(
         if i == len(bodies) or bodies[i] is not bodies[first]:
             body = bodies[first]
             found += joint_mixtures(body, mixtures[first:i], scored, origin=origin)
+            absolute += joint_mixtures(body, mixtures[first:i], scored, origin=())
             for t in range(first, i):
                 mixture, n = mixtures[t], len(mixtures[t])
                 heaviest = mixture[np.argsort(-mixture.weights, kind='stable')[:1]]
@@ -338,6 +345,7 @@ def recorded(
                 blind[t] = np.linalg.norm(relative - relative_truth[t], axis=2).mean(1).min()
             first = i
     scores = score(found, relative_truth, scored, seed=seed)
+    absolute_levels, volumes = marginal_regions(absolute, true[:, which], seed=seed)
     assert scores.levels is not None
     assert scores.joint_levels is not None
     assert scores.log_densities is not None
@@ -345,6 +353,7 @@ def recorded(
         np.array(stamps), joints, weights, point, blind, scores.levels, scores.joint_levels,
         scores.log_densities, np.array(evaluations), np.array(seconds),
         np.array([len(clip.images)]), true, *_feet_and_views(clip, stamps),
+        absolute_levels=absolute_levels, volumes=volumes,
     )  # fmt: skip
 
 

@@ -72,7 +72,6 @@ RULES = (
     Rule('self_intersection', CUES, (('likelihood.self_intersection_sigma', float('inf')),)),
     Rule('upright', CUES, (('ground.upright_weight', 0.0),)),
     Rule('floor', CUES, (('ground.floor_weight', 0.0),)),
-    Rule('balance', CUES, (('ground.balance_weight', 0.0),)),
     Rule('shape', CUES, (('estimate_shape', False),)),
     Rule('limb_search', PROPOSALS, (('searched_chains', 0),)),
     Rule('alternatives', PROPOSALS, (('alternatives', 1),)),

@@ -30,8 +30,9 @@ SCORES = (
     'heaviest_mm', 'lagged_mm', 'hips_mm', 'expected_mm', 'point_mm', 'best_mm', 'blind_mm',
     'aligned_mm', 'root_percent', 'depth_percent', 'path_percent', 'path_length_percent', 'kept',
     'weights', 'coverage_50', 'coverage_90', 'joint_coverage_50', 'joint_coverage_90',
-    'negative_log_likelihood', 'acceleration', 'feet', 'wrong_way', 'wrong_way_images',
-    'wrong_sign', 'nobody', 'evaluations', 'evaluations_99', 'ms', 'cpu_ms',
+    'absolute_coverage_50', 'absolute_coverage_90', 'volume', 'negative_log_likelihood',
+    'acceleration', 'feet', 'wrong_way', 'wrong_way_images', 'wrong_sign', 'nobody',
+    'evaluations', 'evaluations_99', 'ms', 'cpu_ms',
 )  # fmt: skip
 # Segments of limbs whose depth sign is scored, and the least angle to the image plane, rad.
 LIMBS = tuple(
@@ -63,9 +64,10 @@ def scores_of(record: Record) -> dict[str, Any]:
         the share of all images whose heaviest mode errs by less than 150 mm. Of the density:
         `coverage_50`, `coverage_90` of the region of all joints, `joint_coverage_50`,
         `joint_coverage_90` of those of single joints, `by_joint_90` (J,) of the evaluated joints,
-        `negative_log_likelihood`. `weights` is the mean of log(K w), w the weight of the nearest of
-        K modes: 0 if weights are uniform. Of the heaviest mode `hips_mm`, its error relative to
-        the middle of the hips; `wrong_way`, the share of images in which it faces the wrong way,
+        `absolute_coverage_50`, `absolute_coverage_90` of single joints in the frame of the camera,
+        `volume`, the mean volume of the latter, l, `negative_log_likelihood`. `weights` is the mean
+        of log(K w), w the weight of the nearest of K modes: 0 if weights are uniform. Of the
+        heaviest mode `hips_mm`, its error relative to the middle of the hips; `wrong_way`, the share of images in which it faces the wrong way,
         and `wrong_way_images`, their number; `wrong_sign`, the share of slanted limbs whose slope
         in depth has the wrong sign. `nobody` is the share of all images in which the track had
         ended. `evaluations` is the mean number in an image, `evaluations_99` the 99th percentile;
@@ -108,6 +110,7 @@ def scores_of(record: Record) -> dict[str, Any]:
         'joint_coverage_50': coverage(record.joint_levels, 0.5),
         'joint_coverage_90': coverage(record.joint_levels, 0.9),
         'by_joint_90': by_joint,
+        **absolute_scores(record),
         'negative_log_likelihood': -record.log_densities.mean(),
         'acceleration': acceleration_ratio(record.stamps, point, true),
         'feet': standing_speed(record),
@@ -118,6 +121,17 @@ def scores_of(record: Record) -> dict[str, Any]:
         'evaluations_99': np.percentile(record.evaluations, 99),
         'ms': 1e3 * np.median(record.seconds),
         'cpu_ms': 1e3 * record.cpu_seconds.mean() if len(record.cpu_seconds) else np.nan,
+    }
+
+
+def absolute_scores(record: Record) -> dict[str, float]:
+    """What regions of single joints in the frame of the camera hold, and their size; else NaN."""
+    levels, volumes = record.absolute_levels, record.volumes
+    known = levels.size > 0
+    return {
+        'absolute_coverage_50': coverage(levels, 0.5) if known else np.nan,
+        'absolute_coverage_90': coverage(levels, 0.9) if known else np.nan,
+        'volume': 1e3 * float(volumes.mean()) if known else np.nan,
     }
 
 

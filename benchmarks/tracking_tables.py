@@ -58,7 +58,9 @@ ERRORS = (
 CALIBRATION = (
     Column('50 %', 'coverage_50', factor=100.0), Column('90 %', 'coverage_90', factor=100.0),
     Column('joint 50 %', 'joint_coverage_50', factor=100.0), JOINT_90,
-    LOG_DENSITY, WEIGHTS,
+    Column('absolute 50 %', 'absolute_coverage_50', factor=100.0),
+    Column('absolute 90 %', 'absolute_coverage_90', factor=100.0),
+    Column('volume, l', 'volume', '.1f'), LOG_DENSITY, WEIGHTS,
     Column('acceleration', 'acceleration', '.1f'), Column('feet, m/s', 'feet', '.2f'),
     EVALUATIONS,
 )  # fmt: skip

@@ -15,18 +15,14 @@ from numpy.typing import NDArray
 
 from hmt_ros.inference.arrays import Array
 
-# A point of the soles supports the body up to this height over the lowest one, m.
-SUPPORT_HEIGHT = 0.10
-
 
 class Constants(NamedTuple):
     """What does not depend on the pose.
 
     Attributes:
-        parents: (S,) segment above; -1: none.
-        dof_segments, dof_is_rotation: (d,).
+        dof_is_rotation: (d,).
         moves: (S, d) whether a degree of freedom moves a segment.
-        weights: (3,) of the terms: upright, floor, balance; 0: off.
+        weights: (2,) of the terms: upright, floor; 0: off.
         up: (3,) against gravity.
         height: of the camera over the floor, m.
         upright: (U,) segments that are upright.
@@ -35,14 +31,9 @@ class Constants(NamedTuple):
         soles: (P,) segments of the points of the soles.
         local: (P, 3) their places there, m.
         per_floor: 1 / deviation of the height of the floor, 1/m.
-        shares, centres: (S,), (S, 3) masses of the segments and their places, m.
-        margin: distance from the support that costs nothing, m.
-        vertical: what the uncertain vertical adds to the deviation of the balance, m.
-        lean_tails, tails: degrees of freedom of the robust costs, of the lean and of the others.
+        lean_tails, floor_tails: degrees of freedom of the robust costs.
     """
 
-    parents: NDArray[np.int64]
-    dof_segments: NDArray[np.int64]
     dof_is_rotation: NDArray[np.bool_]
     moves: NDArray[np.bool_]
     weights: Array
@@ -54,26 +45,21 @@ class Constants(NamedTuple):
     soles: NDArray[np.int64]
     local: Array
     per_floor: float
-    shares: Array
-    centres: Array
-    margin: float
-    vertical: float
     lean_tails: float
-    tails: float
+    floor_tails: float
 
 
 @njit(cache=True, nogil=True)
 def add_ground_energies(  # type: ignore[no-untyped-def]
-    c, balance_sigma, grounded, columns, origins, axes, dof_origins, terms, gradient, hessian,
+    c, columns, origins, axes, dof_origins, terms, gradient, hessian,
 ):  # fmt: skip
     """Adds the terms of N poses.
 
     Args:
         c: the constants.
-        balance_sigma, grounded: of each pose, as in `Stance`.
         columns, origins: (N, S, 3, 3), (N, S, 3) frames of the segments.
         axes, dof_origins: (N, d, 3) of the degrees of freedom.
-        terms: (N, 3) is added to.
+        terms: (N, 2) is added to.
         gradient, hessian: (N, d), (N, d, d) are added to; of no length: not wanted.
     """
     count, d, points = len(columns), axes.shape[1], len(c.soles)
@@ -81,11 +67,10 @@ def add_ground_energies(  # type: ignore[no-untyped-def]
     place = np.zeros((points, 3))
     moved = np.zeros((points, 3, d))
     row = np.zeros(d)
-    mass, moment = np.zeros(len(c.parents)), np.zeros((len(c.parents), 3))
     for n in range(count):
         if c.weights[0] > 0:
             terms[n, 0] += _upright(c, columns[n], axes[n], row, n, wanted, gradient, hessian)
-        if c.weights[1] + c.weights[2] == 0:
+        if c.weights[1] == 0:
             continue
         for p in range(points):
             s = c.soles[p]
@@ -95,13 +80,7 @@ def add_ground_energies(  # type: ignore[no-untyped-def]
                     place[p, k] += c.local[p, i] * columns[n, s, i, k]
             if wanted:
                 _move(c.moves[s], c.dof_is_rotation, axes[n], dof_origins[n], place[p], moved[p])
-        if c.weights[1] > 0:
-            terms[n, 1] += _floor(c, place, moved, row, n, wanted, gradient, hessian)
-        if c.weights[2] > 0:
-            terms[n, 2] += _balance(
-                c, columns[n], origins[n], axes[n], dof_origins[n], place, moved, mass, moment,
-                balance_sigma[n], grounded[n], row, n, wanted, gradient, hessian,
-            )  # fmt: skip
+        terms[n, 1] += _floor(c, place, moved, row, n, wanted, gradient, hessian)
 
 
 @njit(cache=True, nogil=True)
@@ -194,108 +173,10 @@ def _floor(c, place, moved, row, n, wanted, gradient, hessian):  # type: ignore[
         r = _height(c.up, c.height, place[p]) * c.per_floor
         if r >= 0.0:
             continue
-        value, factor = _student(r * r, c.tails, 1.0)
+        value, factor = _student(r * r, c.floor_tails, 1.0)
         total += c.weights[1] * value
         if wanted:
             _project(c.up, moved[p], c.per_floor, row)
             k = c.weights[1] * factor
             _add(row, k * r, k, gradient[n], hessian[n])
     return total
-
-
-@njit(cache=True, nogil=True)
-def _balance(  # type: ignore[no-untyped-def]
-    c, columns, origins, axes, dof_origins, place, moved, mass, moment, allowed, grounded,
-    row, n, wanted, gradient, hessian,
-):  # fmt: skip
-    weight = c.weights[2] * grounded
-    if weight == 0.0:
-        return 0.0
-    # Masses and first moments of all that hangs on each segment.
-    mass[:] = 0.0
-    moment[:] = 0.0
-    for s in range(len(c.parents) - 1, -1, -1):
-        for k in range(3):
-            at = origins[s, k]
-            for i in range(3):
-                at += c.centres[s, i] * columns[s, i, k]
-            moment[s, k] += c.shares[s] * at
-        mass[s] += c.shares[s]
-        if c.parents[s] >= 0:
-            mass[c.parents[s]] += mass[s]
-            for k in range(3):
-                moment[c.parents[s], k] += moment[s, k]
-    a, b, share, distance, away = _nearest_support(c.up, place, moment[0])
-    e = distance - c.margin
-    if e <= 0.0:
-        return 0.0
-    per = 1.0 / np.sqrt(allowed * allowed + c.vertical * c.vertical)
-    r = e * per
-    value, factor = _student(r * r, c.tails, 1.0)
-    if wanted:
-        for j in range(len(row)):
-            s = c.dof_segments[j]
-            if c.dof_is_rotation[j]:
-                x = moment[s, 0] - mass[s] * dof_origins[j, 0]
-                y = moment[s, 1] - mass[s] * dof_origins[j, 1]
-                z = moment[s, 2] - mass[s] * dof_origins[j, 2]
-                total = away[0] * (axes[j, 1] * z - axes[j, 2] * y)
-                total += away[1] * (axes[j, 2] * x - axes[j, 0] * z)
-                total += away[2] * (axes[j, 0] * y - axes[j, 1] * x)
-            else:
-                total = 0.0
-                for k in range(3):
-                    total += mass[s] * away[k] * axes[j, k]
-            for k in range(3):
-                total -= away[k] * ((1.0 - share) * moved[a, k, j] + share * moved[b, k, j])
-            row[j] = total * per
-        k = weight * factor
-        _add(row, k * r, k, gradient[n], hessian[n])
-    return weight * value
-
-
-@njit(cache=True, nogil=True)
-def _nearest_support(up, place, centre):  # type: ignore[no-untyped-def]
-    """Where the support is nearest to the centre of mass, seen from above.
-
-    The support is made of the lines between any two points of the soles that are near the floor:
-    with their diagonals they come near every point of the hull.
-
-    Returns:
-        The two points and the share of the way between them; the distance and its direction (3,).
-    """
-    lowest = np.inf
-    for p in range(len(place)):
-        lowest = min(lowest, _height(up, 0.0, place[p]))
-    first, second, share, least = 0, 0, 0.0, np.inf
-    away, to, line = np.zeros(3), np.empty(3), np.empty(3)
-    for a in range(len(place)):
-        if _height(up, 0.0, place[a]) > lowest + SUPPORT_HEIGHT:
-            continue
-        for b in range(a, len(place)):
-            if _height(up, 0.0, place[b]) > lowest + SUPPORT_HEIGHT:
-                continue
-            for k in range(3):
-                to[k], line[k] = centre[k] - place[a, k], place[b, k] - place[a, k]
-            high, rise = 0.0, 0.0
-            for k in range(3):
-                high += to[k] * up[k]
-                rise += line[k] * up[k]
-            along, length = 0.0, 0.0
-            for k in range(3):
-                to[k] -= high * up[k]
-                line[k] -= rise * up[k]
-                along += to[k] * line[k]
-                length += line[k] * line[k]
-            t = 0.0 if length < 1e-12 else min(max(along / length, 0.0), 1.0)
-            square = 0.0
-            for k in range(3):
-                square += (to[k] - t * line[k]) ** 2
-            if square < least:
-                first, second, share, least = a, b, t, square
-                for k in range(3):
-                    away[k] = to[k] - t * line[k]
-    distance = np.sqrt(least)
-    if distance > 0.0:
-        away /= distance
-    return first, second, share, distance, away

@@ -271,26 +271,38 @@ class Scores:
         return result
 
 
-def marginal_levels(
+def marginal_regions(
     mixtures: Sequence[JointMixture],
     truth: Array,
     *,
     seed: int | np.random.Generator = 0,
     samples: int = SAMPLES,
-) -> Array:
-    """Levels (T, J) of true positions (T, J, 3) of each joint alone; see `score`.
+) -> tuple[Array, Array]:
+    """Regions of each joint alone: levels of the truth, and volumes.
+
+    Args:
+        mixtures: (T,) of the same joints.
+        truth: (T, J, 3) true positions from the same origin, m.
+        seed: of the samples, or their generator.
+        samples: number of samples per frame.
+
+    Returns:
+        Levels (T, J) of the true positions, see `score`; volumes (T, J) of the regions of 90 %,
+        m^3: the mean of 1 / p over samples of p, those outside the region counted as 0.
 
     Raises:
         ValueError: a mixture without covariances.
     """
     rng = np.random.default_rng(seed)
-    result = np.empty(truth.shape[:2])
-    for row, mixture, true in zip(result, mixtures, truth, strict=True):
+    levels, volumes = np.empty(truth.shape[:2]), np.empty(truth.shape[:2])
+    for t, (mixture, true) in enumerate(zip(mixtures, truth, strict=True)):
         density = mixture.density()
         drawn = stratified_samples(density, samples, rng)
         alone = marginal_log_densities(density, np.concatenate([true.reshape(1, -1), drawn]), 3)
-        row[:] = levels_of(alone[:1], alone[1:])[0]
-    return result
+        levels[t] = levels_of(alone[:1], alone[1:])[0]
+        inside = np.sort(alone[1:], axis=0)[samples - round(0.9 * samples) :]
+        volumes[t] = np.exp(-inside).sum(0) / samples
+    return levels, volumes
 
 
 def score(

@@ -20,7 +20,7 @@ from hmt_ros.evaluation.pose_scores import (
     JointMixture,
     Scores,
     joint_mixtures,
-    marginal_levels,
+    marginal_regions,
     origin_joints,
     relative_positions,
     score,
@@ -261,7 +261,7 @@ class TrackScorer:
         scores = score(found, true, self._joints, seed=self._rng)
         if body is not None:
             true = np.array(every)[:, [names.index(name) for name in self._joints]]
-            levels = marginal_levels(absolute, true, seed=self._rng_of_absolute)
+            levels, _ = marginal_regions(absolute, true, seed=self._rng_of_absolute)
             scores = replace(scores, absolute_levels=levels)
         self._parts.append(scores)
 

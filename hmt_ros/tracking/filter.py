@@ -61,7 +61,6 @@ from hmt_ros.tracking.proposals.reversals import Reversals
 from hmt_ros.tracking.selection import choose_hypotheses, distinct_hypotheses
 from hmt_ros.tracking.settings import TrackerSettings
 from hmt_ros.tracking.shape_estimation import ShapeEstimate
-from hmt_ros.tracking.stance import stance_of
 from hmt_ros.tracking.validity import DEPTH, ENOUGH, Validity
 from hmt_ros.tracking.weighting import Continuity, at_least, normalised, pooled_origins
 
@@ -218,7 +217,6 @@ class MixtureFilter:
     def _hold(self, optimised: Optimised, observation: Observation) -> None:
         """Makes modes at rest."""
         self._by_keypoints = KeypointHistory()
-        self._posterior.stance = None
         self._posterior.exchanges.forget()
         self._dt = np.inf
         optimised = _finite(optimised)
@@ -429,7 +427,6 @@ class MixtureFilter:
             self.contacts.begin(body, plane, modes)
         else:
             self.contacts.update(body, plane, modes, dt, still=ground.still)
-        self._posterior.stance = stance_of(body, plane, modes)
 
     # What is learned.
 
@@ -463,7 +460,6 @@ class MixtureFilter:
         before = self._posterior
         self._posterior = Posterior(body, self.camera, self.settings, before.extra, before.ground)
         self._posterior.evaluations = before.evaluations
-        self._posterior.stance = before.stance
         self._posterior.exchanges = before.exchanges
         self._proposal = PROPOSALS[self.settings.proposals](self._posterior)
 

@@ -28,7 +28,7 @@ class Gravity:
     def term(self, body: Body) -> GroundTerm:
         """The energy of the lean of pelvis and trunk of a body."""
         plane = replace(self.plane, height=None, height_sigma=np.inf)
-        return GroundTerm(body, GroundSettings(self.weight, 0.0, 0.0), plane)
+        return GroundTerm(body, GroundSettings(self.weight, 0.0), plane)
 
     def turned(self, body: Body, poses: Array) -> Array:
         """Poses (N, d) upright in the image, turned the shortest way to be upright in space."""

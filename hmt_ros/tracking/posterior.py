@@ -19,7 +19,7 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.ground_terms import GroundTerm, Stance, without_root_lean
+from hmt_ros.body.ground_terms import GroundTerm, without_root_lean
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.pose_terms import FrameTerm, Posed
 from hmt_ros.image.likelihood import ImageLikelihood
@@ -81,7 +81,6 @@ class Posterior:
         ground: gravity and floor; None: nothing is made of them.
 
     Attributes:
-        stance: how the modes of the image before stood; None: unknown.
         evaluations: of the likelihood, so far.
     """
 
@@ -98,7 +97,6 @@ class Posterior:
         if self.ground is not None and settings.ground.upright_weight > 0:
             body = without_root_lean(body)
         self.body, self.camera, self.settings, self.extra = body, camera, settings, extra
-        self.stance: Stance | None = None
         self.exchanges = SideExchanges()
         self._ground_term: GroundTerm | None = None
         self.evaluations = 0
@@ -112,35 +110,25 @@ class Posterior:
 
     def of_image(self, observation: Observation) -> EnergyTerm:
         """The energy without what was expected; its evaluations are counted."""
-        return self._of_image(observation, self.known, None)
+        return self._of_image(observation, None)
 
     @property
     def known(self) -> tuple[FrameTerm, ...]:
         """What is known besides image and body: terms that were added, gravity and floor."""
-        ground = self._ground
-        if ground is None:
-            return self.extra
-        stance = None if self.stance is None else self.stance[:1]
-        return (*self.extra, ground.following(stance))
-
-    @property
-    def _ground(self) -> GroundTerm | None:
-        """The term of the present plane, without a stance."""
         if self.ground is None:
-            return None
+            return self.extra
         plane = self.ground.plane
         if self._ground_term is None or self._ground_term.plane is not plane:
             self._ground_term = GroundTerm(self._person, self.settings.ground, plane)
-        return self._ground_term
+        return (*self.extra, self._ground_term)
 
     def _of_image(
         self,
         observation: Observation,
-        known: tuple[FrameTerm, ...],
         exchanges: Array | None,
     ) -> EnergyTerm:
         terms = self.likelihood.given(observation, exchanges).terms
-        return _Counted(Posed(self.body.skeleton, (*terms, *known)), self)
+        return _Counted(Posed(self.body.skeleton, (*terms, *self.known)), self)
 
     def around(self, observation: Observation, centres: Array, precisions: Array) -> EnergyTerm:
         """With a Gaussian prior of precisions (N, d, d) around centres (N, d)."""
@@ -151,11 +139,7 @@ class Posterior:
     ) -> EnergyTerm:
         """With the motion prior of N hypotheses, of precisions (N, d, d)."""
         h = hypotheses
-        known, ground = self.known, self._ground
-        if ground is not None and self.stance is not None:
-            known = (*self.extra, ground.following(self.stance[h.ancestors]))
-        exchanges = self.exchanges_of(h)
-        image = self._of_image(observation, known, exchanges)
+        image = self._of_image(observation, self.exchanges_of(h))
         return Sum((image, Quadratic(h.expected, precisions)))
 
     def exchanges_of(self, hypotheses: Hypotheses) -> Array:

@@ -1,4 +1,4 @@
-"""Gravity, floor and balance as energies of poses."""
+"""Gravity and floor as energies of poses."""
 
 from __future__ import annotations
 
@@ -10,17 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from hmt_ros.body import load_body
 from hmt_ros.body.ground_terms import (
-    BALANCE_SIGMA,
     LEAN_TAILS,
     PELVIS_SIGMA,
-    SUPPORT_MARGIN,
-    TAILS,
     TRUNK_LEAN,
     TRUNK_SIGMA,
     FloorPlane,
     GroundSettings,
     GroundTerm,
-    Stance,
     root_lean_dofs,
     without_root_lean,
 )
@@ -30,7 +26,7 @@ from hmt_ros.body.mirror import root_angles, root_rotations
 from hmt_ros.body.soles import soles
 from hmt_ros.inference.energy import Derivatives
 
-TERMS = ('upright', 'floor', 'balance')
+TERMS = ('upright', 'floor')
 UP = np.array([0.1, -0.95, -0.25]) / np.linalg.norm([0.1, -0.95, -0.25])
 PLANE = FloorPlane(UP, 0.01, 0.8, 0.02)
 LEVEL = np.array([0.0, -1.0, 0.0])
@@ -58,12 +54,6 @@ def poses(body) -> np.ndarray:
 
 
 @pytest.fixture(scope='module')
-def stance(poses) -> Stance:
-    n = len(poses)
-    return Stance(np.full(n, 0.1), np.linspace(0.5, 1.0, n))
-
-
-@pytest.fixture(scope='module')
 def standing(body) -> np.ndarray:
     """(1, d) upright, both feet on the floor below a level camera."""
     pose = np.zeros((1, body.dimension))
@@ -79,8 +69,8 @@ def level_plane(body, pose: np.ndarray) -> FloorPlane:
 
 
 @pytest.mark.parametrize('name', TERMS)
-def test_derivatives_are_those_of_finite_differences(name, body, poses, stance):
-    term, rows = GroundTerm(body, only(name), PLANE, stance), np.arange(len(poses))
+def test_derivatives_are_those_of_finite_differences(name, body, poses):
+    term, rows = GroundTerm(body, only(name), PLANE), np.arange(len(poses))
 
     def value(x: np.ndarray) -> np.ndarray:
         found = term.energy(forward(body.skeleton, x), rows, derivatives=Derivatives.NONE)
@@ -100,15 +90,15 @@ def test_derivatives_are_those_of_finite_differences(name, body, poses, stance):
 
 
 @pytest.mark.parametrize('name', TERMS)
-def test_a_camera_that_turns_with_the_vertical_changes_nothing(name, body, poses, stance):
+def test_a_camera_that_turns_with_the_vertical_changes_nothing(name, body, poses):
     turn = Rotation.from_rotvec([0.2, -0.1, 0.15]).as_matrix()
     turned = poses.copy()
     turned[:, :3] = poses[:, :3] @ turn.T
     which = body.skeleton.dof_index(('root_z', 'root_y', 'root_x'))
     turned[:, which] = root_angles(body, turn @ root_rotations(body, poses))
     rows = np.arange(len(poses))
-    before = GroundTerm(body, only(name), PLANE, stance)
-    after = GroundTerm(body, only(name), replace(PLANE, up=turn @ UP), stance)
+    before = GroundTerm(body, only(name), PLANE)
+    after = GroundTerm(body, only(name), replace(PLANE, up=turn @ UP))
     assert after.energy(forward(body.skeleton, turned), rows).value == pytest.approx(
         before.energy(forward(body.skeleton, poses), rows).value
     )
@@ -119,8 +109,7 @@ def test_who_stands_on_both_feet_costs_nothing_but_the_lean(body, standing):
     parts = term.parts(forward(body.skeleton, standing), np.zeros(1, dtype=np.intp))
     assert list(parts) == list(TERMS)
     assert parts['upright'] > 0
-    for name in TERMS[1:]:
-        assert parts[name] == pytest.approx(0.0, abs=1e-9)
+    assert parts['floor'] == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize('name', ['human32', 'human34', 'human37'])
@@ -173,31 +162,6 @@ def test_feet_below_the_floor_cost_and_feet_above_it_do_not(body, standing):
     sunk = replace(plane, height=plane.height - 0.1)
     for other in (replace(sunk, height=None), replace(sunk, measured=False)):
         assert GroundTerm(body, only('floor'), other).energy(frames, rows).value[0] == 0.0
-
-
-def test_balance_is_the_distance_of_the_centre_of_mass_from_the_feet(body, standing):
-    rows, skeleton = np.zeros(1, dtype=np.intp), body.skeleton
-    plane = level_plane(body, standing)
-    term = GroundTerm(body, only('balance'), plane)
-    x = standing.copy()
-    x[0, skeleton.dof_index(('root_x',))] = 0.4
-    frames, feet = forward(skeleton, x), soles(body)
-    centre = masses(body).centre_of_mass(frames)[:, 0]
-    points = frames.points(feet.segments, feet.local)[..., 0]
-    # Seen from above, the dense hull of the soles.
-    shares = np.random.default_rng(0).dirichlet(np.full(4, 0.3), 20000)
-    flat = np.array([1.0, 0.0, 1.0])
-    distance = np.linalg.norm((shares @ points - centre) * flat, axis=1).min()
-    excess = (distance - SUPPORT_MARGIN) / BALANCE_SIGMA
-    assert excess > 1
-    expected = 0.5 * (TAILS + 1) * np.log1p(excess**2 / TAILS)
-    cost = term.energy(frames, rows).value[0]
-    assert cost == pytest.approx(expected, rel=0.02)
-    # Who moves fast may be farther away; in the air nothing is out of balance.
-    one = Stance(np.array([0.3]), np.ones(1))
-    assert term.following(one).energy(frames, rows).value[0] < 0.4 * cost
-    aloft = replace(one, grounded=np.zeros(1))
-    assert term.following(aloft).energy(frames, rows).value[0] == 0.0
 
 
 def test_masses_are_those_of_the_table(body):

@@ -17,7 +17,7 @@ from test.tracking.test_tracker import best_error, in_bytes
 
 FRAME = 100_000_000
 # Feet rest only where the camera is known to stand still, which a background tells.
-SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, ground=GroundSettings(0.0, 0.0, 0.0))
+SETTINGS = TrackerSettings(candidates=8, max_hypotheses=4, ground=GroundSettings(0.0, 0.0))
 
 
 @pytest.fixture(scope='module')

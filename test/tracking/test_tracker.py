@@ -30,7 +30,7 @@ from hmt_ros.tracking.posterior import WIDEST
 from hmt_ros.tracking.validity import UNDECIDED
 
 ONLY_KEYPOINTS = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
-OFF = GroundSettings(0.0, 0.0, 0.0)
+OFF = GroundSettings(0.0, 0.0)
 FRAME = 100_000_000  # ns
 
 
