@@ -67,12 +67,13 @@ def scores_of(record: Record) -> dict[str, Any]:
         `absolute_coverage_50`, `absolute_coverage_90` of single joints in the frame of the camera,
         `volume`, the mean volume of the latter, l, `negative_log_likelihood`. `weights` is the mean
         of log(K w), w the weight of the nearest of K modes: 0 if weights are uniform. Of the
-        heaviest mode `hips_mm`, its error relative to the middle of the hips; `wrong_way`, the share of images in which it faces the wrong way,
-        and `wrong_way_images`, their number; `wrong_sign`, the share of slanted limbs whose slope
-        in depth has the wrong sign. `nobody` is the share of all images in which the track had
-        ended. `evaluations` is the mean number in an image, `evaluations_99` the 99th percentile;
-        `ms` the median time of a step, `cpu_ms` its mean processor time. What is unknown is NaN;
-        of a run that found nobody, only `kept` is known.
+        heaviest mode `hips_mm`, its error relative to the middle of the hips; `wrong_way`, the
+        share of images in which it faces the wrong way, and `wrong_way_images`, their number;
+        `wrong_sign`, the share of slanted limbs whose slope in depth has the wrong sign. `nobody`
+        is the share of all images in which the track had ended. `evaluations` is the mean number in
+        an image, `evaluations_99` the 99th percentile; `ms` the median time of a step, `cpu_ms` its
+        mean processor time. What is unknown is NaN; of a run that found nobody, only `kept` is
+        known.
     """
     if len(record.stamps) == 0:
         return scores_of_nobody()
