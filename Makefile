@@ -28,14 +28,14 @@ help:
 	@sed -n 's/^# \{0,1\}//p; /^$$/q' Makefile
 
 setup:
-	@$(WORKSPACE) ros test lint build
+	@$(WORKSPACE) ros test lint build kernels
 
 # An environment of its own: MediaPipe needs numpy below 2.
 mediapipe:
 	@tools/mediapipe.sh
 
 demo:
-	@$(WORKSPACE) ros build
+	@$(WORKSPACE) ros build kernels
 	@rm -rf build/demo && mkdir -p build/demo
 	@$(SOURCED) python -m hmt_ros.app.demo $(DEMO_BAG) -o build/demo --live
 

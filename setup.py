@@ -189,6 +189,7 @@ setup(
             'replay = hmt_ros.app.replay.command:main',
             'recover = hmt_ros.app.recover:main',
             'make-bag = hmt_ros.app.make_bag:main',
+            'compile = hmt_ros.app.compile_kernels:main',
             'train = hmt_ros.app.train:main',
             'learn-prior = hmt_ros.app.learn_prior:main',
             'learn-motion = hmt_ros.app.learn_motion:main',

@@ -11,7 +11,9 @@ import os
 import shutil
 import sys
 import time
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 VARIABLE = 'NUMBA_CACHE_DIR'
 _PREFIX = 'compiled-'
@@ -49,3 +51,35 @@ def folder_of(package: Path) -> Path:
         own = hashlib.sha256(str(package).encode()).hexdigest()[:12]
         parent = Path(cache) / 'hmt_ros' / own
     return parent / f'{_PREFIX}{state.hexdigest()[:16]}'
+
+
+def folder_in_use() -> str:
+    """Where code that is compiled now is kept."""
+    return os.environ.get(VARIABLE, '')
+
+
+class CompiledFunctions:
+    """Functions that numba compiles from now on; those that it loads are none of them."""
+
+    def __init__(self) -> None:
+        from numba.core import event
+
+        listener = event.RecordingListener()
+        event.register('numba:compile', listener)
+        self._events: list[tuple[float, Any]] = listener.buffer
+
+    @property
+    def count(self) -> int:
+        """How many have been compiled."""
+        return sum(found.is_end for _, found in self._events)
+
+    @property
+    def busy(self) -> bool:
+        """Whether one is being compiled."""
+        return 2 * self.count < len(self._events)
+
+
+@lru_cache(maxsize=1)
+def compiled_functions() -> CompiledFunctions:
+    """The functions that are compiled after the first call."""
+    return CompiledFunctions()

@@ -8,6 +8,7 @@
 #     test    what the tests import in addition
 #     lint    ruff, mypy, pre-commit
 #     build   both packages, in build/ and install/
+#     kernels what numba compiles, for the sources and for what is installed
 #
 # A checksum of its inputs identifies a completed stage, which is skipped. A stage that was
 # interrupted or whose inputs have changed runs again.
@@ -184,6 +185,30 @@ stage_build() {
   echo "$key" >"$stamps/build"
 }
 
+# The kernels of the sources, which commands run in this folder use, and of the installed package.
+stage_kernels() {
+  local key log
+  key=$("$venv/bin/python" -c 'from pathlib import Path; import hmt_ros.compiled_code as code
+for place in Path("."), *Path("install").glob("hmt_ros/lib/*/site-packages"):
+    print(code.folder_of((place / "hmt_ros").resolve()))')
+  done_already kernels "$key" && return
+  say 'compiling kernels, once after an update (a minute or two)'
+  log=$(mktemp)
+  (
+    set +u
+    source tools/environment.bash
+    cd / && exec python -m hmt_ros compile --quiet
+  ) >"$log" 2>&1 &
+  (
+    set +u
+    source tools/environment.bash
+    exec python -m hmt_ros compile
+  ) || fail 'the kernels could not be compiled'
+  wait $! || fail "the kernels of the installed package could not be compiled:"$'\n'"$(cat "$log")"
+  rm "$log"
+  echo "$key" >"$stamps/kernels"
+}
+
 # Runs "colcon build" quietly with .venv as the ROS installation; shows its output if it fails.
 colcon_build() {
   local build_base=$1 output
@@ -208,7 +233,7 @@ flock 9
 
 for stage in "$@"; do
   case $stage in
-    ros | test | lint | build) "stage_$stage" ;;
-    *) fail "no stage '$stage': ros, test, lint or build" ;;
+    ros | test | lint | build | kernels) "stage_$stage" ;;
+    *) fail "no stage '$stage': ros, test, lint, build or kernels" ;;
   esac
 done

@@ -25,6 +25,10 @@ COMMANDS = {
         'copy the undamaged messages of a damaged bag into a new bag',
     ),
     'make-bag': ('hmt_ros.app.make_bag', 'render a motion into a bag with ground truth'),
+    'compile': (
+        'hmt_ros.app.compile_kernels',
+        'compile all kernels, so that no first image waits for it',
+    ),
     'train': ('hmt_ros.app.train', 'learn a predictor of poses from silhouettes'),
     'learn-prior': (
         'hmt_ros.app.learn_prior',

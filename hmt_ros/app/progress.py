@@ -1,4 +1,4 @@
-"""Progress of a command on stderr: a bar on a terminal, a line every ten seconds elsewhere.
+"""Progress of a command on stderr: a bar on a terminal, a line every five seconds elsewhere.
 
 The lines come from a thread, so that a step which takes long shows that the command still works.
 stdout is left to results.
@@ -20,9 +20,11 @@ from typing import Any, TextIO, TypeAlias, TypeVar
 
 from tqdm import tqdm
 
+from hmt_ros.compiled_code import compiled_functions
+
 Item = TypeVar('Item')
 
-INTERVAL = 10.0  # s, between two lines
+INTERVAL = 5.0  # s, between two lines
 
 
 class ProgressLines:
@@ -57,6 +59,7 @@ class ProgressLines:
         self._thread = Thread(target=self._print_lines, name='progress', daemon=True)
 
     def __enter__(self) -> ProgressLines:
+        compiled_functions()
         self._thread.start()
         return self
 
@@ -75,6 +78,8 @@ class ProgressLines:
         """How much of how many is done, at what rate, and how much time is left."""
         spent = self._clock() - self._start
         so_far = f'{_duration(spent)} so far'
+        if compiled_functions().busy:
+            so_far += f', compiling kernels, once ({compiled_functions().count} done)'
         if not self._unit:
             return so_far
         count, total = self._count, self.total
