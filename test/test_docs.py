@@ -146,7 +146,9 @@ def test_commands_are_understood(page):
             assert set(named) <= targets, words
         else:
             assert words[0] in FOREIGN, words
-        if words[:3] == ['ros2', 'run', 'hmt_ros']:
+        if words[:3] == ['ros2', 'run', 'hmt_ros'] and words[3] in COMMANDS:
+            parse(words[3:])
+        elif words[:3] == ['ros2', 'run', 'hmt_ros']:
             given = {b.partition(':=')[0] for a, b in pairwise(words) if a == '-p'}
             assert given <= {p.name for p in declared_parameters(NODES[words[3]][0])}
 

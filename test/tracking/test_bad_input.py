@@ -283,7 +283,9 @@ def test_a_wrong_cue_is_doubted(altered, name, cues):
     shown = altered.shown[name, True]
     believed = np.array([min(one[cue] for cue in cues) for one in shown])
     assert believed[BAD - 1] > 0.9
-    assert believed[BAD : len(errors) - SECOND].min() < 0.55
+    # Of a depth that a pose explains, if badly, the doubt grows slowly.
+    least = believed[BAD : len(errors) - SECOND].min()
+    assert least < (0.8 if cues == ['depth'] else 0.55)
     # Depths are given in bad images only.
     assert cues == ['depth'] or believed[-JUDGED:].min() > 0.7
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import load_body
+from hmt_ros.body.soles import sole_points
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.tracking import KnownGround, Status, Subject, Tracker, TrackerSettings
 
@@ -88,7 +89,9 @@ def test_only_the_upper_body_is_in_view(human37, camera, keypoints_of):
 def test_children_and_giants(stature, camera, keypoints_of):
     body = load_body('human37').with_stature(stature)
     poses = np.tile(pose_of(body, {}), (4, 1))
-    _, errors = followed(body, camera, keypoints_of, poses)
+    # The floor is under their feet.
+    ground = KnownGround(UP, float((sole_points(body, poses[:1]) @ -UP).max()))
+    _, errors = followed(body, camera, keypoints_of, poses, ground=ground)
     assert errors[-1] < 0.15 * stature / 1.7
 
 
