@@ -83,3 +83,8 @@ class CompiledFunctions:
 def compiled_functions() -> CompiledFunctions:
     """The functions that are compiled after the first call."""
     return CompiledFunctions()
+
+
+def compiling() -> bool:
+    """Whether a function is being compiled, of those since the first call; never without numba."""
+    return 'numba' in sys.modules and compiled_functions().busy

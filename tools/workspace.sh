@@ -4,11 +4,11 @@
 #
 #     tools/workspace.sh STAGE...
 #
-#     ros     .venv with ROS 2, the build tools and what hmt_ros imports
-#     test    what the tests import in addition
-#     lint    ruff, mypy, pre-commit
-#     build   both packages, in build/ and install/
-#     kernels what numba compiles, for the sources and for what is installed
+#     ros      .venv with ROS 2, the build tools and what hmt_ros imports
+#     test     what the tests import in addition
+#     lint     ruff, mypy, pre-commit
+#     build    both packages, in build/ and install/
+#     kernels  what numba compiles, for the sources and for what is installed
 #
 # A checksum of its inputs identifies a completed stage, which is skipped. A stage that was
 # interrupted or whose inputs have changed runs again.
@@ -194,20 +194,20 @@ for place in Path("."), *Path("install").glob("hmt_ros/lib/*/site-packages"):
   done_already kernels "$key" && return
   say 'compiling kernels, once after an update (a minute or two)'
   log=$(mktemp)
-  (
-    set +u
-    source tools/environment.bash
-    cd / && exec python -m hmt_ros compile --quiet
-  ) >"$log" 2>&1 &
-  (
-    set +u
-    source tools/environment.bash
-    exec python -m hmt_ros compile
-  ) || fail 'the kernels could not be compiled'
+  compile_in / --quiet >"$log" 2>&1 &
+  compile_in . || fail 'the kernels could not be compiled'
   wait $! || fail "the kernels of the installed package could not be compiled:"$'\n'"$(cat "$log")"
   rm "$log"
   echo "$key" >"$stamps/kernels"
 }
+
+# The package that Python finds in a folder: the sources in this one, the installed one elsewhere.
+compile_in() (
+  set +u
+  source tools/environment.bash
+  cd "$1"
+  exec python -m hmt_ros compile "${@:2}"
+)
 
 # Runs "colcon build" quietly with .venv as the ROS installation; shows its output if it fails.
 colcon_build() {

@@ -72,8 +72,8 @@ def _replay() -> None:
     """Replays a bag with images and depth images through filter, smoother and experts."""
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / 'bag'
-        film = f'walk -o {bag} --duration {IMAGES / RATE} --fps {RATE} --size 240x180 --depth'
-        made = make_bag.main([*film.split(), '--distance', f'{VIEW.distance}', '--quiet'])
+        film = f'--duration {IMAGES / RATE} --fps {RATE} --distance {VIEW.distance} --size 240x180'
+        made = make_bag.main(['walk', '-o', str(bag), *film.split(), '--depth', '--quiet'])
         if made != 0:
             raise ValueError('the film that is tracked to compile could not be rendered')
         options = ReplayOptions(

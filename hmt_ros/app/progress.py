@@ -20,7 +20,7 @@ from typing import Any, TextIO, TypeAlias, TypeVar
 
 from tqdm import tqdm
 
-from hmt_ros.compiled_code import compiled_functions
+from hmt_ros.compiled_code import compiling
 
 Item = TypeVar('Item')
 
@@ -59,7 +59,7 @@ class ProgressLines:
         self._thread = Thread(target=self._print_lines, name='progress', daemon=True)
 
     def __enter__(self) -> ProgressLines:
-        compiled_functions()
+        compiling()
         self._thread.start()
         return self
 
@@ -78,8 +78,8 @@ class ProgressLines:
         """How much of how many is done, at what rate, and how much time is left."""
         spent = self._clock() - self._start
         so_far = f'{_duration(spent)} so far'
-        if compiled_functions().busy:
-            so_far += f', compiling kernels, once ({compiled_functions().count} done)'
+        if compiling():
+            so_far += ', compiling kernels, once'
         if not self._unit:
             return so_far
         count, total = self._count, self.total

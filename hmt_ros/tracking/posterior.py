@@ -108,9 +108,15 @@ class Posterior:
         """Of images."""
         return ImageLikelihood(self.body, self.camera, self.settings.likelihood)
 
-    def of_image(self, observation: Observation) -> EnergyTerm:
-        """The energy without what was expected; its evaluations are counted."""
-        return self._of_image(observation, None)
+    def of_image(self, observation: Observation, exchanges: Array | None = None) -> EnergyTerm:
+        """The energy without what was expected; its evaluations are counted.
+
+        Args:
+            observation: of the image.
+            exchanges: log probabilities (N, E) of exchanges of sides before it; None: usual ones.
+        """
+        terms = self.likelihood.given(observation, exchanges).terms
+        return _Counted(Posed(self.body.skeleton, (*terms, *self.known)), self)
 
     @property
     def known(self) -> tuple[FrameTerm, ...]:
@@ -122,14 +128,6 @@ class Posterior:
             self._ground_term = GroundTerm(self._person, self.settings.ground, plane)
         return (*self.extra, self._ground_term)
 
-    def _of_image(
-        self,
-        observation: Observation,
-        exchanges: Array | None,
-    ) -> EnergyTerm:
-        terms = self.likelihood.given(observation, exchanges).terms
-        return _Counted(Posed(self.body.skeleton, (*terms, *self.known)), self)
-
     def around(self, observation: Observation, centres: Array, precisions: Array) -> EnergyTerm:
         """With a Gaussian prior of precisions (N, d, d) around centres (N, d)."""
         return Sum((self.of_image(observation), Quadratic(centres, precisions)))
@@ -138,9 +136,8 @@ class Posterior:
         self, observation: Observation, hypotheses: Hypotheses, precisions: Array
     ) -> EnergyTerm:
         """With the motion prior of N hypotheses, of precisions (N, d, d)."""
-        h = hypotheses
-        image = self._of_image(observation, self.exchanges_of(h))
-        return Sum((image, Quadratic(h.expected, precisions)))
+        image = self.of_image(observation, self.exchanges_of(hypotheses))
+        return Sum((image, Quadratic(hypotheses.expected, precisions)))
 
     def exchanges_of(self, hypotheses: Hypotheses) -> Array:
         """Log probabilities (N, E) of exchanges of sides before the image, of hypotheses."""

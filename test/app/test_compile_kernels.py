@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 from numba import njit
 
@@ -27,15 +30,21 @@ def test_compiled_functions_are_counted():
 
 
 def test_progress_tells_that_kernels_are_compiled(monkeypatch):
-    class Compiling:
-        count, busy = 7, True
-
-    monkeypatch.setattr('hmt_ros.app.progress.compiled_functions', Compiling)
+    monkeypatch.setattr('hmt_ros.app.progress.compiling', lambda: True)
     line = ProgressLines('out', 'images', 60.0).line()
     assert line.startswith('0 of 60 images')
-    assert line.endswith('compiling kernels, once (7 done)')
-    Compiling.busy = False
+    assert line.endswith('compiling kernels, once')
+    monkeypatch.setattr('hmt_ros.app.progress.compiling', lambda: False)
     assert 'compiling' not in ProgressLines('out', 'images', 60.0).line()
+
+
+def test_commands_without_kernels_do_not_load_numba_for_their_progress():
+    code = (
+        'import sys; from hmt_ros.app.progress import ProgressLines\n'
+        "with ProgressLines('out', 'messages') as bar: bar.line()\n"
+        "sys.exit('numba' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0
 
 
 def test_a_second_call_compiles_nothing(capsys):

@@ -106,7 +106,7 @@ def test_a_camera_that_turns_with_the_vertical_changes_nothing(name, body, poses
 
 def test_who_stands_on_both_feet_costs_nothing_but_the_lean(body, standing):
     term = GroundTerm(body, GroundSettings(), level_plane(body, standing))
-    parts = term.parts(forward(body.skeleton, standing), np.zeros(1, dtype=np.intp))
+    parts = term.parts(forward(body.skeleton, standing))
     assert list(parts) == list(TERMS)
     assert parts['upright'] > 0
     assert parts['floor'] == pytest.approx(0.0, abs=1e-9)

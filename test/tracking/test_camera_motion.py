@@ -261,7 +261,7 @@ def track(body, camera, walking):
         black = np.zeros((camera.height, camera.width, 3), np.uint8)
         settings = TrackerSettings(
             max_hypotheses=1, candidates=2, likelihood=NO_IMAGE, flow_weight=0.0,
-            estimate_shape=False,            ground=GroundSettings(0.0, 0.0), iterations=12,
+            estimate_shape=False, ground=GroundSettings(0.0, 0.0), iterations=12,
         )  # fmt: skip
         term = Places(body, np.zeros((1, 3)))
         tracker = Tracker(body, camera, settings, background, extra=[term])

@@ -69,8 +69,8 @@ def test_poses_are_turned_upright(body):
 
 
 def test_only_the_lean_costs_at_the_start(body, standing):
-    frames, rows = forward(body.skeleton, standing[None]), np.zeros(1, dtype=np.intp)
-    parts = Gravity(FloorPlane(UP, 0.01, 1.0, 0.02), 0.5).term(body).parts(frames, rows)
+    frames = forward(body.skeleton, standing[None])
+    parts = Gravity(FloorPlane(UP, 0.01, 1.0, 0.02), 0.5).term(body).parts(frames)
     assert parts['upright'] > 0
     assert parts['floor'] == 0
 
