@@ -69,6 +69,12 @@ MISTAKES = (
     WRONG_WAY, Column('images', 'wrong_way_images', '.1f'), WRONG_SIGN, NOBODY,
     EVALUATIONS, Column('99 %', 'evaluations_99'), Column('ms', 'ms'), CPU,
 )  # fmt: skip
+# Where the model has joints of the trunk.
+OFFSETS = tuple(
+    Column(f'{joint}, {way}', f'{joint}_{way}_mm', '+.0f')
+    for joint in ('neck', 'shoulders', 'hips')
+    for way in ('ahead', 'up')
+)
 # Of two kinds of settings.
 COMPARED = tuple(
     column._replace(form=column.form.replace('.0f', '.1f'))
@@ -103,6 +109,12 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         parts.append(_table(group, CALIBRATION, markdown, worst_joint=True))
         parts.append(f'{group["group"]}: large mistakes, and what an image costs.')
         parts.append(_table(group, MISTAKES, markdown))
+        if group['means']:
+            parts.append(
+                f'{group["group"]}: how far joints lie ahead and above the true ones, mm, seen '
+                'from the pelvis in the frame of the trunk.'
+            )
+            parts.append(_table({**group, 'clips': []}, OFFSETS, markdown))
     if 'against' in result:
         found = result['against']
         what = f'{", ".join(found["changes"])} minus the usual settings'

@@ -47,6 +47,7 @@ from benchmarks.tracking_scores import (
     procrustes_aligned,
     scores_of,
     standing_speed,
+    trunk_offsets,
 )
 from hmt_ros.body import load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
@@ -223,6 +224,30 @@ def test_errors_relative_to_the_hips():
     found = scores_of(person_record(heaviest))
     assert found['hips_mm'] == pytest.approx(0.0, abs=1e-9)
     assert found['heaviest_mm'] == pytest.approx(1e3 * np.hypot(0.3, 0.1))
+
+
+def test_joints_that_the_model_has_elsewhere_in_the_trunk_are_told():
+    record = made_record()
+    # Somebody who faces the camera (y down, z away), and the same turned and leaning as a whole.
+    stand = {name: [0.0, 0.0, 3.0] for name in JOINTS}
+    for side, x in (('left', 0.2), ('right', -0.2)):
+        stand |= {f'{side}_shoulder': [x, -0.5, 3.0], f'{side}_hip': [x, 0.1, 2.98]}
+    stand['neck'] = [0.0, -0.5, 2.98]
+    true = np.array([stand[name] for name in JOINTS])
+    moved = true.copy()
+    hips = [JOINTS.index('left_hip'), JOINTS.index('right_hip')]
+    moved[[*hips, JOINTS.index('neck')], 2] -= 0.01
+    turn = Rotation.from_rotvec([0.3, 0.8, -0.2]).as_matrix()
+    joints = np.repeat((moved @ turn.T)[None, None], len(record.stamps), axis=0)
+    joints = np.repeat(joints, record.joints.shape[1], axis=1)
+    trues = np.repeat(true[None], len(record.stamps), axis=0)
+    found = trunk_offsets(replace(record, joints=joints, true=trues), np.ones(6, dtype=bool))
+    assert found['hips_ahead_mm'] == pytest.approx(10.0)
+    assert found['neck_ahead_mm'] == pytest.approx(10.0)
+    assert found['shoulders_ahead_mm'] == pytest.approx(0.0, abs=1e-9)
+    assert found['hips_up_mm'] == pytest.approx(0.0, abs=1e-9)
+    nobody = trunk_offsets(replace(record, joints=joints, true=trues), np.zeros(6, dtype=bool))
+    assert np.isnan(list(nobody.values())).all()
 
 
 def test_tracks_that_end_too_early_are_counted():
@@ -655,7 +680,7 @@ def test_accuracy_over_the_bags(quick_runs, monkeypatch):
     assert 'Without keypoints of a detector, images alone: reach.' in text
     assert 'Other clips: errors in mm' in text
     assert 'settings were chosen on' not in text
-    assert len([line for line in text.splitlines() if line.startswith('| clip')]) == 3
+    assert len([line for line in text.splitlines() if line.startswith('| clip')]) == 4
     assert (entry['nobody'], entry['rate']) == (0.0, 0.0)
     assert 0 < entry['cpu_ms'] < 1e5
     assert entry['evaluations'] <= entry['evaluations_99']

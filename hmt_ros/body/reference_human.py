@@ -61,7 +61,7 @@ NEEDED = (
 # Sine of the angle below which two bones have one direction, and lengths that are none, m.
 _STRAIGHT, _NOTHING = 1e-4, 1e-3
 # Angle at which the hips lie before the line down from the pelvis joint, rad: that of our bodies.
-HIPS_AHEAD = np.arctan(0.21)
+HIPS_AHEAD = np.arctan(0.33)
 # Weight of a change of angles from image to image against angles beyond their ranges.
 _STEADY = 0.2
 

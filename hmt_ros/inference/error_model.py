@@ -84,7 +84,7 @@ def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
 
 # What all images so far leave of the covariance of a pose, as a share of what the last one leaves
 # by itself, of which only its own share of the evidence is believed: `benchmarks/joint_errors.py`.
-TOGETHER = 0.36
+TOGETHER = 0.29
 
 # Chosen, not learned, at 30 and 3 images a second (docs/tracking.md). The prior of the pose is
 # counted like a cue, because the same pose is judged again in every image. `shape` is what an image

@@ -138,7 +138,7 @@ def test_the_given_pose_stays_though_it_intersects(body, pose):
     [
         DepthOrder(('left_wrist', 'left_wrist'), ('right_wrist', 'right_wrist')),
         DepthOrder(('right_elbow', 'right_elbow'), ('left_hand', 'left_hand')),
-        DepthOrder(('left_elbow', 'left_elbow'), ('pelvis', 'pelvis')),
+        DepthOrder(('right_elbow', 'right_elbow'), ('pelvis', 'pelvis')),
         DepthOrder(('pelvis', 'pelvis'), ('right_knee', 'right_knee')),
         DepthOrder(('left_elbow', 'left_elbow'), ('left_wrist', 'left_wrist')),
         DepthOrder(('left_wrist', 'left_hand'), ('pelvis', 'neck')),

