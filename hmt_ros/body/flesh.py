@@ -21,9 +21,8 @@ and e2 = 1 it has a closed form (`image.surface` solves it).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -160,8 +159,17 @@ class Flesh:
         return np.repeat(np.arange(len(self.parts)), self.ring_count)
 
     def mesh(self, stacks: int = 9, slices: int = 12) -> Mesh:
-        """Triangles of all parts: `stacks` rings of `slices` points each, and two tips a part."""
-        return _mesh(self.parts, stacks, slices)
+        """Triangles of all parts: `stacks` rings of `slices` points each, and two tips a part.
+
+        Raises:
+            ValueError: fewer than 2 stacks, or 3 slices.
+        """
+        return _mesh(self, stacks, slices)
+
+    def points_on(self, segment: int, stacks: int = 9, slices: int = 12) -> Array:
+        """Vertices (V, 3) of the same mesh that one segment carries, m."""
+        own = tuple(part for part in self.parts if part.segment == segment)
+        return Flesh(own).mesh(stacks, slices).vertices
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,12 +196,11 @@ def signed_power(x: Array, exponent: Array | float) -> Array:
     return result
 
 
-def _mesh(parts: Sequence[Superquadric], stacks: int, slices: int) -> Mesh:
+@lru_cache(maxsize=32)
+def _triangles(stacks: int, slices: int) -> Index:
+    """Triangles (F, 3) of one part."""
     if stacks < 2 or slices < 3:
         raise ValueError(f'a mesh needs 2 stacks and 3 slices at least, saw {stacks}, {slices}')
-    s = np.sin(np.linspace(-0.46, 0.46, stacks) * np.pi)
-    w = np.arange(slices) * (2 * np.pi / slices)
-    grid_s, grid_w = (x.ravel() for x in np.meshgrid(s, w, indexing='ij'))
     body = []
     for i in range(stacks - 1):
         for j in range(slices):
@@ -203,7 +210,15 @@ def _mesh(parts: Sequence[Superquadric], stacks: int, slices: int) -> Mesh:
     for j in range(slices):
         k = (j + 1) % slices
         body += [(first, j, k), (last, last - 2 - slices + 1 + k, last - 2 - slices + 1 + j)]
-    triangles = np.array(body)
+    return np.array(body, dtype=np.intp)
+
+
+@lru_cache(maxsize=16)
+def _mesh(flesh: Flesh, stacks: int, slices: int) -> Mesh:
+    parts, triangles = flesh.parts, _triangles(stacks, slices)
+    s = np.sin(np.linspace(-0.46, 0.46, stacks) * np.pi)
+    w = np.arange(slices) * (2 * np.pi / slices)
+    grid_s, grid_w = (x.ravel() for x in np.meshgrid(s, w, indexing='ij'))
     count = stacks * slices + 2
     vertices, normals = np.empty((2, len(parts), count, 3))
     for i, part in enumerate(parts):

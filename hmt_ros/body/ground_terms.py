@@ -120,12 +120,13 @@ class GroundTerm:
         gradient = np.zeros((n if derivatives else 0, d))
         hessian = np.zeros((n if derivatives else 0, d, d))
         add_ground_energies(
-            self._constants, *frames.by_pose(), *frames.dofs_by_pose(), terms, gradient, hessian,
+            self.compiled, *frames.by_pose(), *frames.dofs_by_pose(), terms, gradient, hessian,
         )  # fmt: skip
         return terms, gradient, hessian
 
     @cached_property
-    def _constants(self) -> Constants:
+    def compiled(self) -> Constants:
+        """As compiled code reads it."""
         body, plane = self.body, self.plane
         skeleton, feet = body.skeleton, soles(body)
         upright = upright_segments(body)

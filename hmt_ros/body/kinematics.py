@@ -127,9 +127,7 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
     n, s, d = len(q), len(skeleton.parents), skeleton.dimension
     columns, origins = np.empty((s, 3, 3, n)), np.empty((s, 3, n))
     axes, dof_origins = np.empty((d, 3, n)), np.zeros((d, 3, n))
-    _place_segments(
-        _plan(skeleton), skeleton.mounts, skeleton.offsets, q, columns, origins, axes, dof_origins
-    )
+    _place_segments(placing_of(skeleton), q, columns, origins, axes, dof_origins)
     return Frames(skeleton, q, columns, origins, axes, dof_origins)
 
 
@@ -160,9 +158,30 @@ def directed_derivatives(
     """
     skeleton = frames.skeleton
     axes, origins = (x[0] for x in frames.dofs_by_pose())
-    turns = np.cross(points, directions) @ axes.T - directions @ np.cross(axes, origins).T
-    result: Array = np.where(skeleton.dof_is_rotation, turns, directions @ axes.T)
-    return result * skeleton.moves[segments]
+    result = np.zeros((len(points), skeleton.dimension))
+    _directed(
+        skeleton.moves, skeleton.dof_is_rotation, axes, origins, segments, points, directions,
+        result,
+    )  # fmt: skip
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _directed(moves, is_rotation, axes, origins, segments, points, directions, result):  # type: ignore[no-untyped-def]
+    for m in range(len(points)):
+        s = segments[m]
+        p0, p1, p2 = points[m, 0], points[m, 1], points[m, 2]
+        a0, a1, a2 = directions[m, 0], directions[m, 1], directions[m, 2]
+        for j in range(len(axes)):
+            if not moves[s, j]:
+                continue
+            if is_rotation[j]:
+                # a . (axis x arm) = axis . (arm x a)
+                r0, r1, r2 = p0 - origins[j, 0], p1 - origins[j, 1], p2 - origins[j, 2]
+                turned = axes[j, 0] * (r1 * a2 - r2 * a1) + axes[j, 1] * (r2 * a0 - r0 * a2)
+                result[m, j] = turned + axes[j, 2] * (r0 * a1 - r1 * a0)
+            else:
+                result[m, j] = axes[j, 0] * a0 + axes[j, 1] * a1 + axes[j, 2] * a2
 
 
 def origin_length_jacobians(skeleton: Skeleton, frames: Frames) -> Array:
@@ -283,75 +302,105 @@ def point_energy(
     return value, gradient, hessian
 
 
-class _Plan(NamedTuple):
-    """The tree as the compiled code reads it."""
+class Placing(NamedTuple):
+    """The skeleton as compiled code places it.
+
+    Attributes:
+        parents: (S,) segment above; -1: none.
+        first_dofs: (S + 1,) the degrees of freedom of segment s start here.
+        dof_axes, dof_is_rotation: (d,).
+        mounts, offsets: (S, 3, 3), (S, 3) of the segments on their parents.
+    """
 
     parents: NDArray[np.int64]
-    first_dofs: NDArray[np.int64]  # (S + 1,) the degrees of freedom of segment s start here
+    first_dofs: NDArray[np.int64]
     dof_axes: NDArray[np.int64]
     dof_is_rotation: NDArray[np.bool_]
+    mounts: Array
+    offsets: Array
 
 
 @lru_cache(maxsize=64)
-def _plan(skeleton: Skeleton) -> _Plan:
+def placing_of(skeleton: Skeleton) -> Placing:
+    """The compiled code's view of a skeleton."""
     counts = [len(own) for own in skeleton.segment_dofs]
-    return _Plan(
+    return Placing(
         np.array(skeleton.parents, dtype=np.int64),
         np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
         np.array(skeleton.dof_axes, dtype=np.int64),
         np.array(skeleton.dof_is_rotation),
+        np.ascontiguousarray(skeleton.mounts, dtype=np.float64),
+        np.ascontiguousarray(skeleton.offsets, dtype=np.float64),
     )
 
 
 @njit(cache=True, nogil=True)
-def _place_segments(  # type: ignore[no-untyped-def]
-    plan, mounts, offsets, poses, columns, origins, axes, dof_origins
-):
-    """Fills the arrays of `Frames`, pose by pose."""
-    count = len(plan.parents)
-    frame, place = np.empty((count, 3, 3)), np.empty((count, 3))
-    for n in range(len(poses)):
-        for s in range(count):
-            parent = plan.parents[s]
+def place_pose(tree, pose, columns, origins, axes, dof_origins):  # type: ignore[no-untyped-def]
+    """Fills the frames of one pose (d,).
+
+    Args:
+        tree: of the skeleton.
+        pose: (d,).
+        columns, origins: (S, 3, 3), (S, 3) frames of the segments; columns[s, i] is axis i.
+        axes, dof_origins: (d, 3) unit vector of each degree of freedom, and a point on the axis of
+            each rotation; those of translations are left as they are.
+    """
+    mounts, offsets = tree.mounts, tree.offsets
+    for s in range(len(tree.parents)):
+        parent = tree.parents[s]
+        for k in range(3):
+            origins[s, k] = offsets[s, k]
+        if parent >= 0:
             for k in range(3):
-                place[s, k] = offsets[s, k]
-            if parent >= 0:
-                for k in range(3):
-                    place[s, k] = place[parent, k]
-                    for i in range(3):
-                        place[s, k] += offsets[s, i] * frame[parent, i, k]
-            for i in range(3):
-                for k in range(3):
-                    if parent >= 0:
-                        total = 0.0
-                        for j in range(3):
-                            total += mounts[s, j, i] * frame[parent, j, k]
-                        frame[s, i, k] = total
-                    else:
-                        frame[s, i, k] = mounts[s, k, i]
-            for d in range(plan.first_dofs[s], plan.first_dofs[s + 1]):
-                axis, value = plan.dof_axes[d], poses[n, d]
-                if plan.dof_is_rotation[d]:
-                    cos, sin = np.cos(value), np.sin(value)
-                    i, j = (axis + 1) % 3, (axis + 2) % 3
-                    for k in range(3):
-                        axes[d, k, n] = frame[s, axis, k]
-                        dof_origins[d, k, n] = place[s, k]
-                        a, b = frame[s, i, k], frame[s, j, k]
-                        frame[s, i, k] = cos * a + sin * b
-                        frame[s, j, k] = cos * b - sin * a
+                origins[s, k] = origins[parent, k]
+                for i in range(3):
+                    origins[s, k] += offsets[s, i] * columns[parent, i, k]
+        for i in range(3):
+            for k in range(3):
+                if parent >= 0:
+                    total = 0.0
+                    for j in range(3):
+                        total += mounts[s, j, i] * columns[parent, j, k]
+                    columns[s, i, k] = total
                 else:
-                    for k in range(3):
-                        along = 1.0 if k == axis else 0.0
-                        if parent >= 0:
-                            along = frame[parent, axis, k]
-                        axes[d, k, n] = along
-                        place[s, k] += along * value
-        for s in range(count):
+                    columns[s, i, k] = mounts[s, k, i]
+        for d in range(tree.first_dofs[s], tree.first_dofs[s + 1]):
+            axis, value = tree.dof_axes[d], pose[d]
+            if tree.dof_is_rotation[d]:
+                cos, sin = np.cos(value), np.sin(value)
+                i, j = (axis + 1) % 3, (axis + 2) % 3
+                for k in range(3):
+                    axes[d, k] = columns[s, axis, k]
+                    dof_origins[d, k] = origins[s, k]
+                    a, b = columns[s, i, k], columns[s, j, k]
+                    columns[s, i, k] = cos * a + sin * b
+                    columns[s, j, k] = cos * b - sin * a
+            else:
+                for k in range(3):
+                    along = 1.0 if k == axis else 0.0
+                    if parent >= 0:
+                        along = columns[parent, axis, k]
+                    axes[d, k] = along
+                    origins[s, k] += along * value
+
+
+@njit(cache=True, nogil=True)
+def _place_segments(tree, poses, columns, origins, axes, dof_origins):  # type: ignore[no-untyped-def]
+    """Fills the arrays of `Frames`, pose by pose."""
+    segments, d = len(tree.parents), poses.shape[1]
+    frame, place = np.empty((segments, 3, 3)), np.empty((segments, 3))
+    axis, on_axis = np.empty((d, 3)), np.zeros((d, 3))
+    for n in range(len(poses)):
+        place_pose(tree, poses[n], frame, place, axis, on_axis)
+        for s in range(segments):
             for k in range(3):
                 origins[s, k, n] = place[s, k]
                 for i in range(3):
                     columns[s, i, k, n] = frame[s, i, k]
+        for j in range(d):
+            for k in range(3):
+                axes[j, k, n] = axis[j, k]
+                dof_origins[j, k, n] = on_axis[j, k]
 
 
 @lru_cache(maxsize=64)

@@ -59,17 +59,18 @@ class MixturePrior:
         asked = count if derivatives else 0
         gradient, hessian = np.empty((asked, d)), np.empty((asked, d, d))
         exact = derivatives == Derivatives.EXACT
-        _evaluate(self._model, poses, exact, value, gradient, hessian)
+        evaluate_prior(self.compiled, poses, exact, value, gradient, hessian)
         return Energy(value, gradient, hessian) if derivatives else Energy(value)
 
     @cached_property
-    def _model(self) -> _Model:
+    def compiled(self) -> PriorModel:
+        """As compiled code reads it."""
         mixture, whole = self.mixture, self.mixture.whole
         n = whole.dimension
         log_det = -np.log(np.diagonal(mixture.whitening, axis1=1, axis2=2)).sum(1)
         rest = self.body.prior_sigma**-2.0
         rest[mixture.indices] = 0.0
-        return _Model(
+        return PriorModel(
             mixture.whitening,
             np.einsum('cij,cj->ci', mixture.whitening, whole.means),
             np.log(whole.weights) - log_det - 0.5 * n * np.log(2.0 * np.pi) - mixture.highest,
@@ -108,7 +109,7 @@ def pose_prior(body: Body, kind: str, weight: float) -> FrameTerm:
     return AnglePrior(body, weight) if mixture is None else MixturePrior(body, mixture, weight)
 
 
-class _Model(NamedTuple):
+class PriorModel(NamedTuple):
     """The prior as the compiled code reads it.
 
     Attributes:
@@ -131,9 +132,18 @@ class _Model(NamedTuple):
     weight: float
 
 
+def gaussian_model(body: Body, weight: float) -> PriorModel:
+    """The independent Gaussians of the model file as compiled code reads them."""
+    nothing = np.zeros((1, 0))
+    return PriorModel(
+        np.zeros((1, 0, 0)), nothing, np.zeros(1), np.zeros((1, 0, 0)), np.zeros(0, dtype=np.int64),
+        body.prior_mean, body.prior_sigma**-2.0, weight,
+    )  # fmt: skip
+
+
 @njit(cache=True, nogil=True)
-def _evaluate(
-    model: _Model, poses: Array, exact: bool, value: Array, gradient: Array, hessian: Array
+def evaluate_prior(
+    model: PriorModel, poses: Array, exact: bool, value: Array, gradient: Array, hessian: Array
 ) -> None:
     """Fills the energies (N,) of poses (N, d), and their derivatives where these have rows.
 

@@ -40,6 +40,24 @@ class _Axes(NamedTuple):
     reaches: Array
 
 
+class Overlaps(NamedTuple):
+    """Parts, the pairs (Q,) of them that may overlap, and what moves them.
+
+    Attributes:
+        parts: of the body.
+        first, second: (Q,) of the pairs.
+        dof_is_rotation, moves: (d,), (S, d) of the skeleton.
+        sigma: overlap with energy 1/2, m.
+    """
+
+    parts: _Axes
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    dof_is_rotation: NDArray[np.bool_]
+    moves: NDArray[np.bool_]
+    sigma: float
+
+
 def self_intersection_energy(
     body: Body, frames: Frames, *, sigma: float = 0.02
 ) -> tuple[Array, Array, Array]:
@@ -52,14 +70,24 @@ def self_intersection_energy(
         frames: frames of N poses.
         sigma: overlap with energy 1/2, m.
     """
-    first, second = _pairs(body)
     n, d = frames.count, body.dimension
     value, gradient, hessian = np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d))
-    _add_overlaps(
-        _axes_of(body), first, second, *frames.by_pose(), *frames.dofs_by_pose(),
-        body.skeleton.dof_is_rotation, body.skeleton.moves, sigma, value, gradient, hessian,
+    add_overlaps(
+        overlaps_of(body, sigma), *frames.by_pose(), *frames.dofs_by_pose(), value, gradient,
+        hessian,
     )  # fmt: skip
     return value, gradient, hessian
+
+
+@lru_cache(maxsize=64)
+def overlaps_of(body: Body, sigma: float) -> Overlaps:
+    """What compiled code reads of the parts of a body; sigma as for `self_intersection_energy`."""
+    first, second = _pairs(body)
+    skeleton = body.skeleton
+    return Overlaps(
+        _axes_of(body), first.astype(np.int64), second.astype(np.int64), skeleton.dof_is_rotation,
+        skeleton.moves, float(sigma),
+    )  # fmt: skip
 
 
 def deepest_overlaps(
@@ -233,11 +261,15 @@ def _far(parts, i, j, centres, middles, allowed):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
-def _add_overlaps(  # type: ignore[no-untyped-def]
-    parts, first, second, columns, origins, dof_axes, dof_origins, is_rotation, moves, sigma,
-    value, gradient, hessian,
-):  # fmt: skip
-    """Adds energy, gradient and Gauss-Newton Hessian of all pairs that overlap, pose by pose."""
+def add_overlaps(  # type: ignore[no-untyped-def]
+    overlaps, columns, origins, dof_axes, dof_origins, value, gradient, hessian
+):
+    """Adds energy, gradient and Gauss-Newton Hessian of all pairs that overlap, pose by pose.
+
+    Gradients of no pose: no derivatives are wanted.
+    """
+    parts, first, second, sigma = overlaps.parts, overlaps.first, overlaps.second, overlaps.sigma
+    is_rotation, moves = overlaps.dof_is_rotation, overlaps.moves
     d = dof_axes.shape[1]
     row = np.zeros(d)
     centres = np.empty((len(parts.segments), 3))
@@ -254,6 +286,8 @@ def _add_overlaps(  # type: ignore[no-untyped-def]
             if overlap <= 0.0:
                 continue
             value[n] += 0.5 * overlap * overlap
+            if len(gradient) == 0:
+                continue
             a, b = parts.segments[i], parts.segments[j]
             for k in range(d):
                 moved = 0.0

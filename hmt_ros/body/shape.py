@@ -17,6 +17,7 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 
 from hmt_ros.body.body import GROWTH, Body
 from hmt_ros.body.kinematics import Frames, origin_length_jacobians
@@ -83,15 +84,11 @@ class ShapeSpace:
             (M, P) a . dp / dtheta.
         """
         columns, origins = (x[0] for x in frames.by_pose())
-        part = self._part_of_segment[segments]
-        turned = np.einsum('mik,mk->mi', columns[segments], directions)
-        local = np.einsum('mik,mk->mi', columns[segments], points - origins[segments])
-        centres, radii, by_centre, by_radius = self._parts
-        place = (local - centres[part]) / radii[part]
-        result: Array = np.einsum('mi,mip->mp', turned, by_centre[part])
-        result += np.einsum('mi,mip->mp', turned * place, by_radius[part])
-        lift = self._origin_jacobians(frames)
-        result[:, : self.lengths] += np.einsum('mk,mkl->ml', directions, lift[segments])
+        result = np.zeros((len(points), self.size))
+        _move_points(
+            self._part_of_segment, *self._parts, self._origin_jacobians(frames), columns, origins,
+            segments, points, directions, result,
+        )  # fmt: skip
         return result
 
     def joint_derivatives(self, frames: Frames, joints: Index) -> Array:
@@ -134,3 +131,26 @@ class ShapeSpace:
             by_centre[b, 2, more_start], by_centre[b, 2, more_end] = 0.5, -0.5
             by_centre[b, 1, shift] = 1.0
         return centres, radii, by_centre, by_radius
+
+
+@njit(cache=True, nogil=True)
+def _move_points(  # type: ignore[no-untyped-def]
+    part_of, centres, radii, by_centre, by_radius, lift, columns, origins, segments, points,
+    directions, result,
+):  # fmt: skip
+    """Fills the result of `ShapeSpace.point_derivatives`."""
+    size, lengths = result.shape[1], lift.shape[2]
+    for m in range(len(points)):
+        s = segments[m]
+        b = part_of[s]
+        for i in range(3):
+            turned, local = 0.0, 0.0
+            for k in range(3):
+                turned += columns[s, i, k] * directions[m, k]
+                local += columns[s, i, k] * (points[m, k] - origins[s, k])
+            place = (local - centres[b, i]) / radii[b, i]
+            for p in range(size):
+                result[m, p] += turned * (by_centre[b, i, p] + place * by_radius[b, i, p])
+        for k in range(3):
+            for q in range(lengths):
+                result[m, q] += directions[m, k] * lift[s, k, q]

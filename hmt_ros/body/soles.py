@@ -52,12 +52,11 @@ def soles(body: Body) -> Soles:
         return Soles(nothing, np.zeros((0, 3)), nothing)
     joints = body.skeleton.joint_index(tuple(wanted)).reshape(2, 2)
     segments, local = [], []
-    flesh = body.flesh.mesh() if body.shapes else None
     for ankle, toe in joints:
         carrier = int(body.skeleton.joint_segments[toe])
         down, ahead = _down_and_ahead(body, ankle, toe, carrier)
-        points = None if flesh is None else flesh.vertices[flesh.segments == carrier]
-        if points is None or not len(points):
+        points = body.flesh.points_on(carrier)
+        if not len(points):
             own = body.skeleton.joint_offsets[toe]
             heel = own - ahead * float(ahead @ own)
             points = np.array([heel, own]) + ANKLE_HEIGHT * body.stature * down

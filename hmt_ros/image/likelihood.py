@@ -203,7 +203,7 @@ class ImageLikelihood:
             derivatives: whether gradient and Hessian are wanted.
         """
         n, d = frames.count, self.body.dimension
-        inputs = self._inputs(observation, n, explained)
+        inputs = self.inputs(observation, n, explained)
         running = [bool(x.term.weight > 0) for x in inputs]
         energies = np.zeros((n, len(TERMS)))
         gradient = np.zeros((n if derivatives else 0, d))
@@ -214,11 +214,11 @@ class ImageLikelihood:
 
             def work(first: int, last: int) -> None:
                 add_energies(
-                    first, last, self._model, inputs, shape, placement, energies, gradient,
+                    first, last, self.model, inputs, shape, placement, energies, gradient,
                     hessian,
                 )  # fmt: skip
 
-            _in_threads(work, n)
+            in_threads(work, n)
         result = {term.name: energies[:, i] for i, term in enumerate(TERMS) if running[i]} or {
             'nothing': np.zeros(n)
         }
@@ -233,19 +233,19 @@ class ImageLikelihood:
         Returns:
             (M, RECORDED) their points and derivatives; see `residuals.add_residual`.
         """
-        inputs = self._inputs(observation, 1, None)
+        inputs = self.inputs(observation, 1, None)
         outline = observation.outline
         samples = 0 if outline is None else len(outline.pixels)
-        most = 1 + 6 * len(self._model.flesh.ring_parts) + 2 * samples
+        most = 1 + 6 * len(self.model.flesh.ring_parts) + 2 * samples
         result = np.zeros((most, RECORDED))
         if any(x.term.weight > 0 for x in inputs):
             columns, origins = frames.by_pose()
             record_residuals(
-                self._model, inputs, columns[0], origins[0], np.zeros(len(TERMS)), result
+                self.model, inputs, columns[0], origins[0], np.zeros(len(TERMS)), result
             )  # fmt: skip
         return result[1 : 1 + int(result[0, 0])]
 
-    def _inputs(
+    def inputs(
         self, observation: Observation, poses: int, explained: Array | None
     ) -> tuple[Any, ...]:
         """What the kernels of all terms read, for so many poses."""
@@ -266,7 +266,8 @@ class ImageLikelihood:
         return tuple(result)
 
     @cached_property
-    def _model(self) -> Model:
+    def model(self) -> Model:
+        """What the kernels read of body and camera."""
         body = self.body
         flesh = flesh_table_of(body)
         count = len(flesh.part_segments)
@@ -316,9 +317,15 @@ def _thread_count() -> int:
     return min(len(os.sched_getaffinity(0)), 8)
 
 
-def _in_threads(work: Callable[[int, int], None], count: int) -> None:
-    """Shares poses among threads; each is worked on alone, so the result does not depend on it."""
-    threads = min(_thread_count(), count // 4)
+def in_threads(work: Callable[[int, int], None], count: int, least: int = 4) -> None:
+    """Shares poses among threads; each is worked on alone, so the result does not depend on it.
+
+    Args:
+        work: on the poses from one number up to another.
+        count: number of poses.
+        least: number of poses that are worth a thread.
+    """
+    threads = min(_thread_count(), count // least)
     if threads < 2:
         work(0, count)
         return

@@ -23,6 +23,8 @@ from hmt_ros.inference.energy import EnergyTerm
 from hmt_ros.inference.trust_region import Status, TrustRegion
 
 DAMPING_LIMIT = 1e12
+# A damping shrinks by at most this factor.
+LEAST_FACTOR = 1.0 / 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +90,7 @@ def minimise(
     everyone = np.arange(n)
     first = term.energy(x, everyone)
     value, gradient, hessian = (np.array(p) for p in (first.value, *first.derivatives()))
-    region = TrustRegion(n, damping, limit=DAMPING_LIMIT, least_factor=1.0 / 3.0)
+    region = TrustRegion(n, damping, limit=DAMPING_LIMIT, least_factor=LEAST_FACTOR)
     iterations = np.zeros(n, dtype=np.int32)
     status = np.full(n, Status.ITERATION_LIMIT, dtype=np.int8)
     status[~np.isfinite(value)] = Status.NOT_FINITE
@@ -149,10 +151,19 @@ def box_steps(  # type: ignore[no-untyped-def]
         n = rows[k]
         for i in range(d):
             low[i], high[i] = lower[n, i] - x[n, i], upper[n, i] - x[n, i]
-        _box_step(gradient[n], hessian[n], low, high, lam[n], metric, step[k])
-        predicted[k] = _decrease(gradient[n], hessian[n], step[k], curve)
-        if predicted[k] <= 0.0:
-            predicted[k] = _descent_step(gradient[n], hessian[n], low, high, metric, step[k], curve)
+        predicted[k] = box_step(
+            gradient[n], hessian[n], low, high, lam[n], metric, step[k], curve
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def box_step(gradient, hessian, low, high, damping, metric, step, curve):  # type: ignore[no-untyped-def]
+    """One step (d,) in a box around 0, and the decrease that is predicted; see `box_steps`."""
+    _box_step(gradient, hessian, low, high, damping, metric, step)
+    predicted = _decrease(gradient, hessian, step, curve)
+    if predicted <= 0.0:
+        predicted = _descent_step(gradient, hessian, low, high, metric, step, curve)
+    return predicted
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import cv2
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.flesh import Mesh
 from hmt_ros.body.kinematics import forward
 from hmt_ros.image.background import BackgroundSettings, one_person
 from hmt_ros.image.surface_points import coarse_mesh
@@ -93,7 +91,7 @@ def covered(body: Body, camera: Camera, pose: Array, step: int = 1) -> Mask:
 
     Each part of the flesh counts as the convex hull of its projected points.
     """
-    mesh = _mesh(body)
+    mesh = coarse_mesh(body)
     points = forward(body.skeleton, pose[None]).points(mesh.segments, mesh.vertices)[:, :, 0]
     shape = -(-camera.height // step), -(-camera.width // step)
     limit = 4.0 * max(shape)
@@ -113,8 +111,3 @@ def covered(body: Body, camera: Camera, pose: Array, step: int = 1) -> Mask:
 def counted(mask: Mask) -> int:
     """Number of the pixels of a mask."""
     return cv2.countNonZero(mask.view(np.uint8))
-
-
-@lru_cache(maxsize=8)
-def _mesh(body: Body) -> Mesh:
-    return coarse_mesh(body)

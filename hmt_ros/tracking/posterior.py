@@ -21,20 +21,14 @@ from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.ground_terms import GroundTerm, without_root_lean
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.pose_terms import FrameTerm, Posed
+from hmt_ros.body.pose_terms import FrameTerm
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.surface_points import SurfacePoints, seen_points
-from hmt_ros.inference.arrays import Array, Index, Mask
-from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
-from hmt_ros.inference.energy import (
-    Derivatives,
-    Energy,
-    EnergyTerm,
-    Quadratic,
-    Sum,
-    add_energies,
-)
+from hmt_ros.inference.arrays import Array, Mask
+from hmt_ros.inference.bounded_newton import Minimum, resting
+from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, add_energies
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking.exchanges import SideExchanges
 from hmt_ros.tracking.hypotheses import Hypotheses
@@ -108,15 +102,20 @@ class Posterior:
         """Of images."""
         return ImageLikelihood(self.body, self.camera, self.settings.likelihood)
 
-    def of_image(self, observation: Observation, exchanges: Array | None = None) -> EnergyTerm:
+    def of_image(self, observation: Observation, exchanges: Array | None = None) -> PoseEnergy:
         """The energy without what was expected; its evaluations are counted.
 
         Args:
             observation: of the image.
             exchanges: log probabilities (N, E) of exchanges of sides before it; None: usual ones.
         """
-        terms = self.likelihood.given(observation, exchanges).terms
-        return _Counted(Posed(self.body.skeleton, (*terms, *self.known)), self)
+        seen = self.likelihood.seen(observation, exchanges=exchanges)
+        return PoseEnergy(
+            self.likelihood, (*seen, *self.likelihood.priors, *self.known), counted=self._count
+        )
+
+    def _count(self, evaluations: int) -> None:
+        self.evaluations += evaluations
 
     @property
     def known(self) -> tuple[FrameTerm, ...]:
@@ -128,23 +127,23 @@ class Posterior:
             self._ground_term = GroundTerm(self._person, self.settings.ground, plane)
         return (*self.extra, self._ground_term)
 
-    def around(self, observation: Observation, centres: Array, precisions: Array) -> EnergyTerm:
+    def around(self, observation: Observation, centres: Array, precisions: Array) -> PoseEnergy:
         """With a Gaussian prior of precisions (N, d, d) around centres (N, d)."""
-        return Sum((self.of_image(observation), Quadratic(centres, precisions)))
+        return replace(self.of_image(observation), motion=Quadratic(centres, precisions))
 
     def given(
         self, observation: Observation, hypotheses: Hypotheses, precisions: Array
-    ) -> EnergyTerm:
+    ) -> PoseEnergy:
         """With the motion prior of N hypotheses, of precisions (N, d, d)."""
         image = self.of_image(observation, self.exchanges_of(hypotheses))
-        return Sum((image, Quadratic(hypotheses.expected, precisions)))
+        return replace(image, motion=Quadratic(hypotheses.expected, precisions))
 
     def exchanges_of(self, hypotheses: Hypotheses) -> Array:
         """Log probabilities (N, E) of exchanges of sides before the image, of hypotheses."""
         anew = np.asarray(hypotheses.jumped.all(1), dtype=np.bool_)
         return self.exchanges.of(hypotheses.ancestors, anew)
 
-    def placing(self, observation: Observation) -> Posed | None:
+    def placing(self, observation: Observation) -> PoseEnergy | None:
         """The prior and the squares of the distances from keypoints; None: there are none.
 
         A limb or a person far from the keypoints is not drawn to them by a robust kernel.
@@ -153,18 +152,18 @@ class Posterior:
             return None
         robust = self.likelihood.keypoint_term(observation, None)
         squares = replace(robust, settings=replace(robust.settings, scale=np.inf))
-        return Posed(self.body.skeleton, (squares, self.likelihood.pose_prior))
+        return PoseEnergy(self.likelihood, (squares, self.likelihood.pose_prior))
 
     def values(self, poses: Array, observation: Observation) -> Array:
         """Energies (N,) of poses (N, d), by image alone."""
         image = self.of_image(observation)
         return image.energy(poses, np.arange(len(poses)), derivatives=Derivatives.NONE).value
 
-    def minimise(self, term: EnergyTerm, poses: Array, iterations: int) -> Minimum:
+    def minimise(self, term: PoseEnergy, poses: Array, iterations: int) -> Minimum:
         """Minima from poses (N, d) within the limits of the body."""
-        return minimise(
-            term, poses, self.body.lower, self.body.upper, step_scale=self._step_scale,
-            damping=1.0, max_iterations=iterations, tolerance=TOLERANCE,
+        return term.minimise(
+            poses, step_scale=self._step_scale, damping=1.0, max_iterations=iterations,
+            tolerance=TOLERANCE,
         )  # fmt: skip
 
     def fit(self, poses: Array, observation: Observation) -> ImageFit:
@@ -257,20 +256,6 @@ class Posterior:
         """Points that an image sees of the surfaces of poses (K, d)."""
         frames = forward(self.body.skeleton, poses)
         return seen_points(self.body, self.camera, frames, observation.others)
-
-
-@dataclass(frozen=True, eq=False)
-class _Counted:
-    """A term whose evaluations a posterior counts."""
-
-    term: Posed
-    counter: Posterior
-
-    def energy(
-        self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
-    ) -> Energy:
-        self.counter.evaluations += len(x)
-        return self.term.energy(x, rows, derivatives=derivatives)
 
 
 def step_scale(body: Body) -> Array:

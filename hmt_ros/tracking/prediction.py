@@ -14,13 +14,13 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.motion_prior import motion_prior
-from hmt_ros.body.pose_terms import Posed
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.optical_flow import FlowTerm
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.surface import lens_of
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.energy import Quadratic, Sum
+from hmt_ros.inference.energy import Quadratic
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.hypotheses import Hypotheses, Modes, new_hypotheses
@@ -105,11 +105,10 @@ def follow_flow(
         return predicted
     lens = lens_of(posterior.camera)
     flow = FlowTerm(body.skeleton, lens, points, observation.flow, s.flow_weight)
-    term = Sum(
-        (
-            Posed(body.skeleton, (flow, posterior.likelihood.pose_prior)),
-            Quadratic(predicted.poses, precisions),
-        )
+    term = PoseEnergy(
+        posterior.likelihood,
+        (flow, posterior.likelihood.pose_prior),
+        Quadratic(predicted.poses, precisions),
     )
     moved = posterior.minimise(term, predicted.poses, s.iterations).x
     return replace(predicted, poses=moved, expected=moved)

@@ -82,9 +82,11 @@ def distinct_hypotheses(joints: Array, log_weights: Array, same: float) -> Index
 @njit(cache=True, nogil=True)
 def _choose(joints, weights, count, same, cap, first):  # type: ignore[no-untyped-def]
     n, j = joints.shape[0], joints.shape[1]
-    # One row a coordinate, so that the innermost loops run along memory.
-    rows = np.ascontiguousarray(joints.reshape(n, 3 * j).T)
-    distance = np.empty((n, n))
+    # One row a coordinate, so that the innermost loops run along memory; single precision is
+    # micrometres here.
+    rows = np.ascontiguousarray(joints.reshape(n, 3 * j).T).astype(np.float32)
+    distance = np.empty((n, n), np.float32)
+    cap, same = np.float32(cap), np.float32(same)
     for a in range(n):
         total = distance[a]
         total[:] = 0.0
@@ -96,7 +98,7 @@ def _choose(joints, weights, count, same, cap, first):  # type: ignore[no-untype
                 gap = np.sqrt(x * x + y * y + z * z)
                 total[b] += gap if gap < cap else cap
         for b in range(n):
-            total[b] = max(total[b] / j - same, 0.0)
+            total[b] = max(total[b] / np.float32(j) - same, np.float32(0.0))
     nearest = np.full(n, cap)
     gains = np.full(n, np.inf)
     chosen = np.empty(min(count, n), np.intp)

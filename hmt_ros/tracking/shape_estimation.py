@@ -43,14 +43,27 @@ class Linearised:
     """The energy of an image over shape and pose, to second order, at one pose.
 
     Attributes:
-        by_shape: (P,) gradient.
-        curvature: (P, P) Gauss-Newton Hessian.
+        pull, weights: (M,) derivative of the energy by each residual, and its curvature.
+        residuals: (M, P) derivatives of the residuals by the shape.
         mixed: (P, d) Gauss-Newton Hessian between shape and pose.
     """
 
-    by_shape: Array
-    curvature: Array
+    pull: Array
+    weights: Array
+    residuals: Array
     mixed: Array
+
+    @property
+    def by_shape(self) -> Array:
+        """The gradient (P,) by the shape."""
+        result: Array = self.residuals.T @ self.pull
+        return result
+
+    @property
+    def curvature(self) -> Array:
+        """The Gauss-Newton Hessian (P, P) by the shape."""
+        result: Array = (self.weights[:, None] * self.residuals).T @ self.residuals
+        return result
 
 
 class ShapeEstimate:
@@ -77,6 +90,8 @@ class ShapeEstimate:
         self.covariance[own, own] = body.length_covariance + np.diag(unknown)
         self._offset = np.zeros(self._space.size)
         self.images = 0
+        self._seen: Observation | None = None
+        self._known: dict[bytes, Linearised] = {}
 
     @property
     def body(self) -> Body:
@@ -133,6 +148,7 @@ class ShapeEstimate:
         limit = LARGEST * self._spread
         offset = np.clip(self._offset + move, -limit, limit)
         self._space = ShapeSpace(self._space.moved(offset - self._offset))
+        self._known = {}
         self._offset = offset
         self.images += 1
         return self._space.body
@@ -158,7 +174,20 @@ class ShapeEstimate:
     def linearised(
         self, likelihood: ImageLikelihood, observation: Observation, pose: Array
     ) -> Linearised:
-        """The energy of the contours and keypoints of an image around a pose (d,)."""
+        """The energy of the contours and keypoints of an image around a pose (d,).
+
+        Of the last image it is kept: covariances and shape ask for the same modes.
+        """
+        if self._seen is not observation:
+            self._seen, self._known = observation, {}
+        key = pose.tobytes()
+        if key not in self._known:
+            self._known[key] = self._linearise(likelihood, observation, pose)
+        return self._known[key]
+
+    def _linearise(
+        self, likelihood: ImageLikelihood, observation: Observation, pose: Array
+    ) -> Linearised:
         frames = forward(self._space.body.skeleton, pose[None])
         found = likelihood.residuals(frames, observation)
         segments, points, directions = found[:, 0].astype(np.intp), found[:, 1:4], found[:, 4:7]
@@ -173,8 +202,8 @@ class ShapeEstimate:
                 np.concatenate(pair)
                 for pair in zip((pull, curvature, by_pose, by_shape), of_joints, strict=True)
             )
-        weighted = by_shape * curvature[:, None]
-        return Linearised(by_shape.T @ pull, weighted.T @ by_shape, weighted.T @ by_pose)
+        mixed = by_shape.T @ (curvature[:, None] * by_pose)
+        return Linearised(pull, curvature, by_shape, mixed)
 
     def _limited(self, shift: Array, covariance: Array) -> Array:
         """A shift (d,) of a pose whose angles are limited.

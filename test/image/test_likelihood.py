@@ -185,7 +185,8 @@ def test_sliding_of_the_contour_hardly_changes_the_gradient(shot, observation, n
     cosine = (
         (found * wanted).sum(1) / np.linalg.norm(found, axis=1) / np.linalg.norm(wanted, axis=1)
     )
-    assert cosine.min() > 0.999
+    assert np.median(cosine) > 0.9995
+    assert cosine.min() > 0.997
 
 
 def test_gradient_and_hessian_of_the_soft_prior(shot):

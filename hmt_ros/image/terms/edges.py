@@ -26,6 +26,7 @@ from hmt_ros.image.terms.image_term import (
 from hmt_ros.image.terms.residuals import add_contour_residual, contour_sigma, geman_mcclure
 
 ORIENTATIONS = 4
+HALF_BIN = np.tan(np.pi / 8.0)
 # Canny's thresholds.
 EDGE_LOW, EDGE_HIGH = 40.0, 100.0
 # Edges further outside the silhouette than this belong to the background, px.
@@ -82,12 +83,21 @@ def _inputs(term: Weighting, evidence: Any, _request: Request) -> EdgeInputs:
     return EdgeInputs(term, evidence or NO_MAP)
 
 
+@njit(cache=True, nogil=True, inline='always')
+def _orientation(x, y):  # type: ignore[no-untyped-def]
+    """The orientation, of `ORIENTATIONS`, that a normal is nearest to: of angle k pi / 4."""
+    if abs(y) <= HALF_BIN * abs(x):
+        return 0
+    if abs(x) <= HALF_BIN * abs(y):
+        return 2
+    return 1 if x * y > 0.0 else 3
+
+
 @njit(cache=True, nogil=True)
 def add_edges(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
     """Distances from visible contour points to the nearest edge; see `ImageTerm.kernel`."""
     edges, term, contour = inputs.distances, inputs.term, view.contour
     count = view.contour_points * 6 // 10
-    bins = edges.values.shape[0]
     if count == 0:
         for i in range(len(contour.parts)):
             if contour.valid[i] and not contour.hidden[i]:
@@ -97,8 +107,7 @@ def add_edges(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
     for i in range(len(contour.parts)):
         if not contour.valid[i] or contour.hidden[i]:
             continue
-        angle = np.arctan2(contour.normals[i, 1], contour.normals[i, 0])
-        channel = int(np.round(angle * (bins / np.pi))) % bins
+        channel = _orientation(contour.normals[i, 0], contour.normals[i, 1])
         value, gu, gv = sample_distance(edges, channel, contour.pixels[i, 0], contour.pixels[i, 1])
         sigma = contour_sigma(term, contour.noise[i])
         rho, pull, curvature = geman_mcclure(value / sigma, term.scale, each)

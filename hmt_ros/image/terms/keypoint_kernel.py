@@ -13,8 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hmt_ros.image.surface import project
-from hmt_ros.image.terms.residuals import add_residual, assemble_pose, geman_mcclure
+from hmt_ros.image.surface import Lens, project
+from hmt_ros.image.terms.residuals import Tree, add_residual, assemble_pose, geman_mcclure
 from hmt_ros.inference.arrays import Array
 
 # A joint behind the camera errs by this much, in standard deviations.
@@ -59,6 +59,28 @@ class Slopes(NamedTuple):
     slopes: Array
     weights: Array
     groups: Ints
+
+
+class KeypointInputs(NamedTuple):
+    """What the energy of keypoints reads.
+
+    Attributes:
+        points, slopes: that were measured.
+        tree, lens: skeleton and camera.
+        scale: of the kernel, in standard deviations.
+        weights: (G,) factors on the energies of the groups.
+        exchanged: (E, G) 1 where an exchange exchanges a group.
+        log_priors: (R, E) of the exchanges, a row a problem or one for all.
+    """
+
+    points: Points
+    slopes: Slopes
+    tree: Tree
+    lens: Lens
+    scale: float
+    weights: Array
+    exchanged: Ints
+    log_priors: Array
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -135,10 +157,14 @@ def exchange_log_posterior(energies, weights, exchanged, log_prior, result):  # 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def add_keypoints(  # type: ignore[no-untyped-def]
-    points, slopes, tree, lens, scale, weights, exchanged, log_priors, columns, origins, axes,
-    dof_origins, value, gradient, hessian,
-):  # fmt: skip
-    """Adds energy, gradient and Hessian of poses (N,), one prior (E,) of the exchanges each."""
+    inputs, log_priors, columns, origins, axes, dof_origins, value, gradient, hessian
+):
+    """Adds energy, gradient and Hessian of poses (N,), with priors (N, E) of the exchanges.
+
+    Hessians of no pose: no derivatives are wanted.
+    """
+    points, slopes, tree, lens = inputs.points, inputs.slopes, inputs.tree, inputs.lens
+    scale, weights, exchanged = inputs.scale, inputs.weights, inputs.exchanged
     groups = exchanged.shape[1]
     energies, posterior = np.empty((groups, 2)), np.empty(len(exchanged))
     shares = np.empty((groups, 2))

@@ -32,6 +32,7 @@ from hmt_ros.image.keypoint_schemes import (
 from hmt_ros.image.surface import lens_of
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoint_kernel import (
+    KeypointInputs,
     Points,
     Slopes,
     add_keypoints,
@@ -197,16 +198,27 @@ class KeypointTerm:
         self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
     ) -> Energy:
         """See `hmt_ros.body.pose_terms.FrameTerm`."""
-        measured = self.measured
         n, d = frames.count, self.skeleton.dimension
         poses = n if derivatives else 0
         value, gradient, hessian = np.zeros(n), np.zeros((poses, d)), np.zeros((poses, d, d))
+        inputs = self.compiled
+        chosen = rows if len(inputs.log_priors) > 1 else np.zeros(n, dtype=np.intp)
         add_keypoints(
-            measured.points, measured.slopes, tree_of(self.skeleton), lens_of(self.camera),
-            float(self.settings.scale), self.weights, *self._priors(rows, n),
-            *frames.by_pose(), *frames.dofs_by_pose(), value, gradient, hessian,
+            inputs, inputs.log_priors[chosen], *frames.by_pose(), *frames.dofs_by_pose(), value,
+            gradient, hessian,
         )  # fmt: skip
         return Energy(value, gradient, hessian) if derivatives else Energy(value)
+
+    @property
+    def compiled(self) -> KeypointInputs:
+        """As compiled code reads it."""
+        exchanges = np.zeros((1, 1)) if self.exchanges is None else self.exchanges
+        measured = self.measured
+        return KeypointInputs(
+            measured.points, measured.slopes, tree_of(self.skeleton), lens_of(self.camera),
+            float(self.settings.scale), self.weights,
+            EXCHANGED[: exchanges.shape[1]], np.ascontiguousarray(exchanges, dtype=np.float64),
+        )  # fmt: skip
 
     def exchanged(self, frames: Frames, rows: Index) -> Array:
         """Log probabilities (N, E) of the exchanges at the frames of N poses."""

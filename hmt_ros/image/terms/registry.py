@@ -82,11 +82,11 @@ def _one_after_the_other(terms: tuple[ImageTerm, ...]) -> Any:
     return first_and_others
 
 
-_run_terms = _one_after_the_other(TERMS)
+run_terms = _one_after_the_other(TERMS)
 
 
 @njit(cache=True, nogil=True)
-def _view(n, model, shape, contour, columns, origins):  # type: ignore[no-untyped-def]
+def view_of(n, model, shape, contour, columns, origins):  # type: ignore[no-untyped-def]
     """A pose as kernels see it; fills the contour, if shape is asked for."""
     if shape:
         trace_contour(model.flesh, model.traced, model.lens, columns, origins, contour)
@@ -122,8 +122,8 @@ def add_energies(  # type: ignore[no-untyped-def]
         wrenches[:] = 0.0
         stiffnesses[:] = 0.0
         columns, origins = placement.columns[n], placement.origins[n]
-        view = _view(n, model, shape, contour, columns, origins)
-        _run_terms(view, inputs, 0, energies[n], wrenches, stiffnesses)
+        view = view_of(n, model, shape, contour, columns, origins)
+        run_terms(view, inputs, 0, energies[n], wrenches, stiffnesses)
         if len(hessians) > 0:
             assemble_pose(
                 model.tree, placement.axes[n], placement.dof_origins[n], wrenches, stiffnesses,
@@ -142,5 +142,5 @@ def record_residuals(model, inputs, columns, origins, energies, residuals):  # t
         residuals: (M, RECORDED) result, see `residuals.add_residual`; entry (0, 0) must be 0.
     """
     contour = empty_contour(len(model.flesh.ring_parts))
-    view = _view(0, model, True, contour, columns, origins)
-    _run_terms(view, inputs, 0, energies, residuals, np.empty((0, 6, 6)))
+    view = view_of(0, model, True, contour, columns, origins)
+    run_terms(view, inputs, 0, energies, residuals, np.empty((0, 6, 6)))

@@ -93,7 +93,10 @@ def add_residual(wrenches, stiffnesses, s, p0, p1, p2, a0, a1, a2, pull, curvatu
 
     Everything is a scalar: a small array a call would cost more than the arithmetic. Wrenches with
     the columns `RECORDED` are a list of residuals instead of sums: entry (0, 0) counts them.
+    Wrenches of no segment: no derivatives are wanted.
     """
+    if len(wrenches) == 0:
+        return
     if wrenches.shape[1] == RECORDED:
         n = int(wrenches[0, 0]) + 1
         if n < len(wrenches):

@@ -129,6 +129,34 @@ def _coverage_inputs(term: Weighting, evidence: Any, request: Request) -> Covera
 
 
 @njit(cache=True, nogil=True)
+def _nearest(pixels, normals, contour, use):  # type: ignore[no-untyped-def]
+    """For each sample the point of the contour, one of `use`, that is nearest and points its way.
+
+    All samples are compared with one point at a time: so the compiler takes many at once.
+    """
+    turn, count = np.float32(TURN), len(pixels)
+    us, vs = np.empty(count, np.float32), np.empty(count, np.float32)
+    nus, nvs = np.empty(count, np.float32), np.empty(count, np.float32)
+    least, result = np.empty(count, np.float32), np.zeros(count, np.int32)
+    for m in range(count):
+        us[m], vs[m] = pixels[m, 0], pixels[m, 1]
+        nus[m], nvs[m] = turn * np.float32(normals[m, 0]), turn * np.float32(normals[m, 1])
+        least[m] = np.inf
+    for i in use:
+        u, v = np.float32(contour.pixels[i, 0]), np.float32(contour.pixels[i, 1])
+        nu = np.float32(turn * contour.normals[i, 0])
+        nv = np.float32(turn * contour.normals[i, 1])
+        point = np.int32(i)
+        for m in range(count):
+            du, dv, dnu, dnv = u - us[m], v - vs[m], nu - nus[m], nv - nvs[m]
+            gap = du * du + dv * dv + dnu * dnu + dnv * dnv
+            closer = gap < least[m]
+            least[m] = gap if closer else least[m]
+            result[m] = point if closer else result[m]
+    return result
+
+
+@njit(cache=True, nogil=True)
 def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
     """Samples of the outline pay their distance to the nearest contour; see `ImageTerm.kernel`.
 
@@ -152,64 +180,50 @@ def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untype
             if contour.valid[i]:
                 use[used] = i
                 used += 1
-    us, vs = np.empty(used, np.float32), np.empty(used, np.float32)
-    nus, nvs = np.empty(used, np.float32), np.empty(used, np.float32)
-    turn = np.float32(TURN)
-    for k in range(used):
-        i = use[k]
-        us[k], vs[k] = contour.pixels[i, 0], contour.pixels[i, 1]
-        nus[k], nvs[k] = turn * contour.normals[i, 0], turn * contour.normals[i, 1]
-    energy = 0.0
-    gaps = np.empty(used, np.float32)
-    for m in range(len(pixels)):
-        each = share * beliefs[m]
-        if used == 0:
-            costs[m] = min(explained[m], 0.5 * each * term.scale * term.scale)
+    if used == 0:
+        energy = 0.0
+        for m in range(len(pixels)):
+            costs[m] = min(explained[m], 0.5 * share * beliefs[m] * term.scale * term.scale)
             energy += costs[m]
-            continue
-        u, v = np.float32(pixels[m, 0]), np.float32(pixels[m, 1])
-        nu, nv = turn * np.float32(normals[m, 0]), turn * np.float32(normals[m, 1])
-        for k in range(used):
-            du, dv, dnu, dnv = us[k] - u, vs[k] - v, nus[k] - nu, nvs[k] - nv
-            gaps[k] = du * du + dv * dv + dnu * dnu + dnv * dnv
-        least = gaps[0]
-        for k in range(1, used):
-            least = min(least, gaps[k])
-        nearest = 0
-        while gaps[nearest] != least:
-            nearest += 1
-        i = use[nearest]
-        sigma = contour_sigma(term, contour.noise[i])
+        return energy
+    nearest = _nearest(pixels, normals, contour, use[:used])
+    inverse = np.empty(count)
+    for i in range(count):
+        inverse[i] = 1.0 / contour_sigma(term, contour.noise[i])
+    across, beyond = np.empty(len(pixels)), np.empty(len(pixels))
+    per_scale, energy = 1.0 / (term.scale * term.scale), 0.0
+    for m in range(len(pixels)):
+        i = nearest[m]
         du, dv = contour.pixels[i, 0] - pixels[m, 0], contour.pixels[i, 1] - pixels[m, 1]
         nx, ny = normals[m, 0], normals[m, 1]
-        across = (nx * du + ny * dv) / sigma
         along = nx * dv - ny * du
-        beyond = 0.0
-        if along > SPACING:
-            beyond = (along - SPACING) / sigma
-        elif along < -SPACING:
-            beyond = (along + SPACING) / sigma
-        length = np.sqrt(across * across + beyond * beyond)
-        rho, _, curvature = geman_mcclure(length, term.scale, each)
+        across[m] = (nx * du + ny * dv) * inverse[i]
+        beyond[m] = (along - min(max(along, -SPACING), SPACING)) * inverse[i]
+        square = across[m] * across[m] + beyond[m] * beyond[m]
+        rho = 0.5 * share * beliefs[m] * square / (1.0 + square * per_scale)
+        costs[m] = min(rho, explained[m])
+        energy += costs[m]
+    if len(wrenches) == 0:
+        return energy
+    for m in range(len(pixels)):
+        square = across[m] * across[m] + beyond[m] * beyond[m]
+        rho, _, curvature = geman_mcclure(np.sqrt(square), term.scale, share * beliefs[m])
         if rho >= explained[m]:
-            costs[m] = explained[m]
-            energy += costs[m]
             continue
-        costs[m] = rho
-        energy += rho
+        i = nearest[m]
         segment = part_segments[contour.parts[i]]
         p, j = contour.points, contour.projections
-        nx, ny = nx / sigma, ny / sigma
+        nx, ny = normals[m, 0] * inverse[i], normals[m, 1] * inverse[i]
         add_residual(
             wrenches, stiffnesses, segment, p[i, 0], p[i, 1], p[i, 2],
             nx * j[i, 0, 0] + ny * j[i, 1, 0], nx * j[i, 0, 1] + ny * j[i, 1, 1],
-            nx * j[i, 0, 2] + ny * j[i, 1, 2], curvature * across, curvature,
+            nx * j[i, 0, 2] + ny * j[i, 1, 2], curvature * across[m], curvature,
         )  # fmt: skip
-        if beyond != 0.0:
+        if beyond[m] != 0.0:
             add_residual(
                 wrenches, stiffnesses, segment, p[i, 0], p[i, 1], p[i, 2],
                 nx * j[i, 1, 0] - ny * j[i, 0, 0], nx * j[i, 1, 1] - ny * j[i, 0, 1],
-                nx * j[i, 1, 2] - ny * j[i, 0, 2], curvature * beyond, curvature,
+                nx * j[i, 1, 2] - ny * j[i, 0, 2], curvature * beyond[m], curvature,
             )  # fmt: skip
     return energy
 

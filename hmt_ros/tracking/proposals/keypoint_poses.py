@@ -9,14 +9,14 @@ prediction.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hmt_ros.image.terms.keypoints import KeypointTerm
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
-from hmt_ros.inference.energy import Quadratic, Sum
+from hmt_ros.inference.energy import Quadratic
 from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.misfit import KEYPOINTS, Misfit, of_keypoints
 from hmt_ros.tracking.optimisation import Search
@@ -85,5 +85,5 @@ def _by_keypoints(search: Search, before: Array | None) -> Array:
     first = search.continuity.predicted[:1] if before is None else before
     placing = posterior.placing(search.observation)
     assert placing is not None
-    term = Sum((placing, Quadratic(first, search.precisions[:1])))
+    term = replace(placing, motion=Quadratic(first, search.precisions[:1]))
     return posterior.minimise(term, first, posterior.settings.iterations).x

@@ -9,17 +9,16 @@ rest of the body explains of the silhouette's outline costs a limb nothing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hmt_ros.body.kinematics import forward
-from hmt_ros.body.pose_terms import Posed
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.bounded_newton import minimise
-from hmt_ros.inference.energy import Derivatives, Restricted, Student, Sum
+from hmt_ros.inference.energy import Derivatives, Student
 from hmt_ros.tracking.posterior import Posterior
 
 # Degrees of freedom of the Student prior that keeps a limb near its prediction: heavy tails.
@@ -82,29 +81,28 @@ class LimbSearch:
         )
         seen = self._own.seen(observation, explained=others.costs)
         seen = (*seen, self.posterior.likelihood.pose_prior, *self.posterior.known)
-        term = Sum(
-            (
-                Restricted(Posed(body.skeleton, seen), pose, own),
-                Student(pose[own], np.asarray(np.linalg.inv(block)), TAILS),
-            )
-        )
+        motion = Student(pose[own], np.asarray(np.linalg.inv(block)), TAILS)
+        term = PoseEnergy(self._own, seen, motion, pose, own)
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
         best = samples[np.argsort(value, kind='stable')[: s.search.refined]]
         self.posterior.evaluations += len(samples) + s.search.refined * s.search.iterations
-        return minimise(
-            term, best, body.lower[own], body.upper[own],
-            step_scale=0.4, damping=1.0, max_iterations=s.search.iterations, tolerance=0.05,
-        ).x  # fmt: skip
+        return term.minimise(
+            best, step_scale=0.4, damping=1.0, max_iterations=s.search.iterations, tolerance=0.05
+        ).x
 
     def _placed(self, pose: Array, starts: Array, observation: Observation) -> Array:
         """Angles of the limb, from starts (A, chain dofs), that put it where its keypoints are."""
-        body, own, placing = self.posterior.body, self.dofs, self.posterior.placing(observation)
+        placing = self.posterior.placing(observation)
+        own = self.dofs
         if placing is None:
             return starts[:0]
-        return minimise(
-            Restricted(placing, pose, own), starts, body.lower[own], body.upper[own],
-            step_scale=0.4, damping=1.0, max_iterations=PLACING_STEPS, tolerance=0.05,
-        ).x  # fmt: skip
+        return (
+            replace(placing, point=pose, free=own)
+            .minimise(
+                starts, step_scale=0.4, damping=1.0, max_iterations=PLACING_STEPS, tolerance=0.05
+            )
+            .x
+        )
 
     def _draw(self, angles: Array, block: Array, rng: np.random.Generator) -> Array:
         """Samples from the mode, from it stretched, and from the body's prior: a third each."""
