@@ -89,7 +89,7 @@ class Toy(ShapeEstimate):
 
     def linearised(self, likelihood, observation, pose):
         a, b = self.by_shape, self.by_pose
-        return Linearised(a.T @ self.error(pose), a.T @ a, a.T @ b)
+        return Linearised(self.error(pose), np.ones(len(a)), a, a.T @ b)
 
 
 def toy(body, seed, noise=2e-3, measurements=120, pose_size=6):
