@@ -21,6 +21,7 @@ and e2 = 1 it has a closed form (`image.surface` solves it).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
@@ -59,27 +60,9 @@ class Superquadric:
 
     def surface(self, s: Array, w: Array) -> tuple[Array, Array]:
         """Points and outward unit normals (..., 3) at heights s in (-1, 1) and angles w."""
-        ring = rings(self, np.ravel(s))
-        w = np.ravel(w)
-        e2 = self.exponents[1]
-        cos, sin = np.cos(w), np.sin(w)
-        point = ring.centre + np.stack(
-            [
-                ring.radius[:, 0] * signed_power(cos, e2),
-                ring.radius[:, 1] * signed_power(sin, e2),
-                np.zeros_like(w),
-            ],
-            axis=1,
-        )
-        lateral = (
-            np.stack([signed_power(cos, 2 - e2), signed_power(sin, 2 - e2)], axis=1) / ring.radius
-        )
-        along = -(ring.slope * np.stack([cos * cos, sin * sin], axis=1)).sum(1) - (
-            lateral * ring.lean
-        ).sum(1)
-        normal = np.concatenate([lateral, along[:, None]], axis=1)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        return point.reshape(*np.shape(s), 3), normal.reshape(*np.shape(s), 3)
+        points, normals = _surfaces((self,), np.ravel(s), np.ravel(w))
+        shape = (*np.shape(s), 3)
+        return points[0].reshape(shape), normals[0].reshape(shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,22 +86,40 @@ class Rings:
 
 def rings(part: Superquadric, s: Array) -> Rings:
     """Rings of a part at heights s (R,) in (-1, 1)."""
-    e1, e2 = part.exponents
-    az = part.radii[2]
-    inside = 1.0 - np.abs(s) ** (2.0 / e1)
-    profile = inside ** (e1 / 2.0)
+    centre, radius, slope, lean = (x[0] for x in _rings((part,), s))
+    return Rings(centre, radius, slope, lean, np.full(len(s), part.exponents[1]))
+
+
+def _rings(parts: Sequence[Superquadric], s: Array) -> tuple[Array, Array, Array, Array]:
+    """Centres (P, R, 3), radii, slopes and leans (P, R, 2) of P parts at heights s (R,)."""
+    radii, taper, bend, middle = (
+        np.array([getattr(part, name) for part in parts])[:, None]
+        for name in ('radii', 'taper', 'bend', 'centre')
+    )
+    power = 2.0 / np.array([part.exponents[0] for part in parts])[:, None, None]
+    az, s = radii[..., 2:], s[:, None]
+    inside = 1.0 - np.abs(s) ** power
     # d log(profile) / ds
-    steep = -np.sign(s) * np.abs(s) ** (2.0 / e1 - 1.0) / inside
-    taper = np.array(part.taper)
-    widening = 1.0 + taper * s[:, None]
-    radius = np.array(part.radii[:2]) * profile[:, None] * widening
-    slope = -(steep[:, None] + taper / widening) / az
-    bend = np.array(part.bend)
-    centre = np.empty((len(s), 3))
-    centre[:, :2] = np.array(part.centre[:2]) + bend * (1.0 - s * s)[:, None]
-    centre[:, 2] = part.centre[2] - az * s
-    lean = 2.0 * bend * s[:, None] / az
-    return Rings(centre, radius, slope, lean, np.full(len(s), e2))
+    steep = -np.sign(s) * np.abs(s) ** (power - 1.0) / inside
+    widening = 1.0 + taper * s
+    radius = radii[..., :2] * inside ** (1.0 / power) * widening
+    slope = -(steep + taper / widening) / az
+    centre = np.concatenate([middle[..., :2] + bend * (1.0 - s * s), middle[..., 2:] - az * s], -1)
+    return centre, radius, slope, 2.0 * bend * s / az
+
+
+def _surfaces(parts: Sequence[Superquadric], s: Array, w: Array) -> tuple[Array, Array]:
+    """Points and normals (P, R, 3) of P parts at heights s (R,) and angles w (R,)."""
+    centre, radius, slope, lean = _rings(parts, s)
+    e2 = np.array([part.exponents[1] for part in parts])[:, None, None]
+    around = np.stack([np.cos(w), np.sin(w)], axis=1)
+    points = centre
+    points[..., :2] += radius * signed_power(around, e2)
+    lateral = signed_power(around, 2.0 - e2) / radius
+    along = -(slope * around**2 + lateral * lean).sum(-1)
+    normals = np.concatenate([lateral, along[..., None]], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return points, normals
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,11 +222,12 @@ def _mesh(flesh: Flesh, stacks: int, slices: int) -> Mesh:
     grid_s, grid_w = (x.ravel() for x in np.meshgrid(s, w, indexing='ij'))
     count = stacks * slices + 2
     vertices, normals = np.empty((2, len(parts), count, 3))
+    if parts:
+        vertices[:, :-2], normals[:, :-2] = _surfaces(parts, grid_s, grid_w)
+    tip = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     for i, part in enumerate(parts):
-        vertices[i, :-2], normals[i, :-2] = part.surface(grid_s, grid_w)
-        tip = np.array([0.0, 0.0, part.radii[2]])
-        vertices[i, -2:] = part.centre + tip, part.centre - tip
-        normals[i, -2:] = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
+        vertices[i, -2:] = part.centre + part.radii[2] * tip
+        normals[i, -2:] = tip
     which = np.arange(len(parts))
     return Mesh(
         vertices.reshape(-1, 3),

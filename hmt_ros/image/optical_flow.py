@@ -103,6 +103,8 @@ def _add_flow(  # type: ignore[no-untyped-def]
     segments = len(tree.parents)
     wrenches, stiffnesses = np.empty((segments, 6)), np.empty((segments, 6, 6))
     pixel, projection = np.empty((1, 2)), np.empty((1, 2, 3))
+    values, left, top = flow.values, flow.left, flow.top
+    carriers, local, pixels = points.segments, points.local, points.pixels
     for n in range(len(value)):
         wrenches[:] = 0.0
         stiffnesses[:] = 0.0
@@ -110,17 +112,17 @@ def _add_flow(  # type: ignore[no-untyped-def]
         count = points.counts[t]
         each = weight / max(count, FEWEST)
         for q in range(count):
-            s = points.segments[t, q]
-            x, y, z = points.local[t, q, 0], points.local[t, q, 1], points.local[t, q, 2]
+            s = carriers[t, q]
+            x, y, z = local[t, q, 0], local[t, q, 1], local[t, q, 2]
             axis, origin = columns[n, s], origins[n, s]
             p0 = origin[0] + axis[0, 0] * x + axis[1, 0] * y + axis[2, 0] * z
             p1 = origin[1] + axis[0, 1] * x + axis[1, 1] * y + axis[2, 1] * z
             p2 = origin[2] + axis[0, 2] * x + axis[1, 2] * y + axis[2, 2] * z
             if not project(lens, p0, p1, p2, 0, pixel, projection):
                 continue
-            u, v = points.pixels[t, q, 0], points.pixels[t, q, 1]
-            fu, _, _ = sample(flow, 0, u, v)
-            fv, _, _ = sample(flow, 1, u, v)
+            u, v = pixels[t, q, 0], pixels[t, q, 1]
+            fu, _, _ = sample(values, left, top, 0, u, v)
+            fv, _, _ = sample(values, left, top, 1, u, v)
             if np.isnan(fu):
                 # Somebody else hides it: it costs what is usual, wherever it is.
                 value[n] += geman_mcclure(1.0, SCALE, each)[0]

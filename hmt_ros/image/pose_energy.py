@@ -26,10 +26,9 @@ from hmt_ros.body.pose_terms import AnglePrior, FrameTerm, SelfIntersection
 from hmt_ros.body.self_intersection import Overlaps, add_overlaps, overlaps_of
 from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage, in_threads
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.surface import empty_contour
 from hmt_ros.image.terms.keypoint_kernel import KeypointInputs, Points, Slopes, add_keypoints
 from hmt_ros.image.terms.keypoints import KeypointTerm
-from hmt_ros.image.terms.registry import TERMS, Model, run_terms, view_of
+from hmt_ros.image.terms.registry import TERMS, Model, look, new_view, run_terms
 from hmt_ros.image.terms.residuals import assemble_pose
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import (
@@ -325,7 +324,7 @@ class Room(NamedTuple):
         pose: (1, d).
         columns, origins: (1, S, 3, 3), (1, S, 3) frames of its segments.
         axes, dof_origins: (1, d, 3) of its degrees of freedom.
-        contour: of its flesh.
+        shown: the pose as the terms of the image see it.
         wrenches, stiffnesses: (S, 6), (S, 6, 6) sums over the segments.
         energies: (terms,) of the image.
         value, ground: (1,), (1, 2).
@@ -338,7 +337,7 @@ class Room(NamedTuple):
     origins: Array
     axes: Array
     dof_origins: Array
-    contour: Any
+    shown: Any
     wrenches: Array
     stiffnesses: Array
     energies: Array
@@ -356,7 +355,7 @@ def _room(compiled, point, f):  # type: ignore[no-untyped-def]
     room = Room(
         np.empty((1, d)), np.empty((1, segments, 3, 3)), np.empty((1, segments, 3)),
         np.empty((1, d, 3)), np.zeros((1, d, 3)),
-        empty_contour(len(compiled.model.flesh.ring_parts)),
+        new_view(compiled.model),
         np.empty((segments, 6)), np.empty((segments, 6, 6)), np.empty(len(compiled.inputs)),
         np.empty(1), np.empty((1, 2)), np.empty((1, d)), np.empty((1, d, d)), np.empty(f),
         np.empty((f, f)),
@@ -365,7 +364,7 @@ def _room(compiled, point, f):  # type: ignore[no-untyped-def]
     return room
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline='always')
 def _add_terms(compiled, number, row, exact, room, gradient, hessian):  # type: ignore[no-untyped-def]
     """Energy of the pose in a room without the motion.
 
@@ -381,9 +380,9 @@ def _add_terms(compiled, number, row, exact, room, gradient, hessian):  # type: 
     place_pose(compiled.placing, room.pose[0], columns[0], origins[0], axes[0], dof_origins[0])
     evaluate_prior(compiled.prior, room.pose, exact, value, gradient, hessian)
     if compiled.image:
-        view = view_of(
-            number, compiled.model, compiled.contour, room.contour, columns[0], origins[0]
-        )
+        view = room.shown
+        view.columns[:], view.origins[:] = columns[0], origins[0]
+        look(view, number, compiled.contour)
         room.energies[:] = 0.0
         wrenches, stiffnesses = room.wrenches, room.stiffnesses
         if not wanted:
@@ -443,7 +442,7 @@ def _add_motion(compiled, row, x, slope, curve):  # type: ignore[no-untyped-def]
     return value
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline='always')
 def _energy_at(compiled, number, row, free, x, exact, room, slope, curve):  # type: ignore[no-untyped-def]
     """Energy of all terms at x (f,); slope and curve (f,), (f, f) become its derivatives.
 

@@ -23,24 +23,23 @@ class ImageMap(NamedTuple):
 
 
 @njit(cache=True, nogil=True, inline='always')
-def sample(image_map, channel, u, v):  # type: ignore[no-untyped-def]
-    """Value and its derivatives by u and v at a pixel of the whole image.
+def sample(values, left, top, channel, u, v):  # type: ignore[no-untyped-def]
+    """Value and its derivatives by u and v at a pixel of the whole image, of an `ImageMap`.
 
     Outside the window the nearest value is continued.
     """
-    values = image_map.values
     h, w = values.shape[1], values.shape[2]
-    x, y = u - image_map.left, v - image_map.top
+    x, y = u - left, v - top
     cx, cy = min(max(x, 0.0), w - 1.001), min(max(y, 0.0), h - 1.001)
     i, j = int(cy), int(cx)
     dv, du = cy - i, cx - j
     a, b = values[channel, i, j], values[channel, i, j + 1]
     p, q = values[channel, i + 1, j], values[channel, i + 1, j + 1]
-    top = a + (b - a) * du
-    bottom = p + (q - p) * du
-    value = top + (bottom - top) * dv
+    upper = a + (b - a) * du
+    lower = p + (q - p) * du
+    value = upper + (lower - upper) * dv
     slope_u = (b - a) * (1.0 - dv) + (q - p) * dv
-    slope_v = bottom - top
+    slope_v = lower - upper
     if x < 0.0 or x > w - 1.0:
         slope_u = 0.0
     if y < 0.0 or y > h - 1.0:
@@ -49,11 +48,11 @@ def sample(image_map, channel, u, v):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, inline='always')
-def sample_distance(image_map, channel, u, v):  # type: ignore[no-untyped-def]
+def sample_distance(values, left, top, channel, u, v):  # type: ignore[no-untyped-def]
     """`sample` of a map of distances, continued outside its window by the way to the window."""
-    value, slope_u, slope_v = sample(image_map, channel, u, v)
-    h, w = image_map.values.shape[1], image_map.values.shape[2]
-    x, y = u - image_map.left, v - image_map.top
+    value, slope_u, slope_v = sample(values, left, top, channel, u, v)
+    h, w = values.shape[1], values.shape[2]
+    x, y = u - left, v - top
     if x < 0.0:
         value, slope_u = value - x, -1.0
     elif x > w - 1.0:

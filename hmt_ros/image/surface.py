@@ -31,10 +31,10 @@ LENSES = {'plumb_bob': 0, 'rational_polynomial': 0, 'equidistant': 1}
 class Lens(NamedTuple):
     """A camera as compiled code reads it: fx fy cx cy, model (-1: no distortion), coefficients."""
 
-    focal: Array
-    centre: Array
+    focal: tuple[float, float]
+    centre: tuple[float, float]
     model: int
-    coefficients: Array
+    coefficients: tuple[float, float, float, float, float, float, float, float]
 
 
 class FleshTable(NamedTuple):
@@ -84,11 +84,12 @@ class Contour(NamedTuple):
 
 def lens_of(camera: Camera) -> Lens:
     """The compiled code's view of a camera."""
-    coefficients = np.zeros(8)
-    coefficients[: len(camera.distortion)] = camera.distortion
+    k1, k2, k3, k4, k5, k6, k7, k8, *_ = (*map(float, camera.distortion), *(0.0,) * 8)
     model = LENSES[camera.distortion_model] if camera.distortion else -1
-    focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    return Lens(focal, centre, model, coefficients)
+    return Lens(
+        (float(camera.fx), float(camera.fy)), (float(camera.cx), float(camera.cy)), model,
+        (k1, k2, k3, k4, k5, k6, k7, k8),
+    )  # fmt: skip
 
 
 def flesh_table_of(body: Body) -> FleshTable:
@@ -196,29 +197,39 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
         columns, origins: (S, 3, 3), (S, 3) frames of the segments; columns[s, i] is axis i.
         contour: filled.
     """
-    rings = len(flesh.ring_parts)
+    # Fields that are looked up in a loop would be counted as references there, each time.
+    part_segments, ring_parts, ring_centres = (
+        flesh.part_segments, flesh.ring_parts, flesh.ring_centres,
+    )  # fmt: skip
+    ring_radii, ring_slopes, ring_leans = flesh.ring_radii, flesh.ring_slopes, flesh.ring_leans
+    ring_exponents, ring_noise = flesh.ring_exponents, flesh.ring_noise
+    parts, points, pixels, projections = (
+        contour.parts, contour.points, contour.pixels, contour.projections,
+    )  # fmt: skip
+    normals, valid, noise = contour.normals, contour.valid, contour.noise
+    rings = len(ring_parts)
     cosines, sines = np.empty(2), np.empty(2)
     for r in range(rings):
-        part = flesh.ring_parts[r]
-        s = flesh.part_segments[part]
-        contour.parts[r] = part
-        contour.parts[r + rings] = part
-        contour.valid[r] = False
-        contour.valid[r + rings] = False
+        part = ring_parts[r]
+        s = part_segments[part]
+        parts[r] = part
+        parts[r + rings] = part
+        valid[r] = False
+        valid[r + rings] = False
         if not wanted[part]:
             continue
         x0, x1, x2 = columns[s, 0, 0], columns[s, 0, 1], columns[s, 0, 2]
         y0, y1, y2 = columns[s, 1, 0], columns[s, 1, 1], columns[s, 1, 2]
         z0, z1, z2 = columns[s, 2, 0], columns[s, 2, 1], columns[s, 2, 2]
         o0, o1, o2 = origins[s, 0], origins[s, 1], origins[s, 2]
-        cx, cy, cz = flesh.ring_centres[r, 0], flesh.ring_centres[r, 1], flesh.ring_centres[r, 2]
+        cx, cy, cz = ring_centres[r, 0], ring_centres[r, 1], ring_centres[r, 2]
         ux = x0 * o0 + x1 * o1 + x2 * o2 + cx
         uy = y0 * o0 + y1 * o1 + y2 * o2 + cy
         uz = z0 * o0 + z1 * o1 + z2 * o2 + cz
-        rx, ry = flesh.ring_radii[r, 0], flesh.ring_radii[r, 1]
-        kx, ky = flesh.ring_slopes[r, 0], flesh.ring_slopes[r, 1]
-        lx, ly = flesh.ring_leans[r, 0], flesh.ring_leans[r, 1]
-        e = flesh.ring_exponents[r]
+        rx, ry = ring_radii[r, 0], ring_radii[r, 1]
+        kx, ky = ring_slopes[r, 0], ring_slopes[r, 1]
+        lx, ly = ring_leans[r, 0], ring_leans[r, 1]
+        e = ring_exponents[r]
         bx, by = (ux - uz * lx) / rx, (uy - uz * ly) / ry
         if e == 1.0 and kx == ky:
             length = np.sqrt(bx * bx + by * by)
@@ -238,8 +249,8 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
             else:
                 outline_x, outline_y = signed_power(c, e), signed_power(sn, e)
                 lateral_x, lateral_y = signed_power(c, 2.0 - e), signed_power(sn, 2.0 - e)
-            across, ahead = c * flesh.ring_noise[r, 0], sn * flesh.ring_noise[r, 1]
-            contour.noise[r + side * rings] = np.sqrt(across * across + ahead * ahead)
+            across, ahead = c * ring_noise[r, 0], sn * ring_noise[r, 1]
+            noise[r + side * rings] = np.sqrt(across * across + ahead * ahead)
             px, py = cx + rx * outline_x, cy + ry * outline_y
             nx, ny = lateral_x / rx, lateral_y / ry
             nz = -(kx * c * c + ky * sn * sn) - (nx * lx + ny * ly)
@@ -247,16 +258,16 @@ def trace_contour(flesh, wanted, lens, columns, origins, contour):  # type: igno
             p0 = o0 + x0 * px + y0 * py + z0 * cz
             p1 = o1 + x1 * px + y1 * py + z1 * cz
             p2 = o2 + x2 * px + y2 * py + z2 * cz
-            contour.points[i, 0], contour.points[i, 1], contour.points[i, 2] = p0, p1, p2
-            if not project(lens, p0, p1, p2, i, contour.pixels, contour.projections):
+            points[i, 0], points[i, 1], points[i, 2] = p0, p1, p2
+            if not project(lens, p0, p1, p2, i, pixels, projections):
                 continue
             nu = (x0 * nx + y0 * ny + z0 * nz) / lens.focal[0]
             nv = (x1 * nx + y1 * ny + z1 * nz) / lens.focal[1]
             size = np.sqrt(nu * nu + nv * nv)
             if not size > 0.0:
                 continue
-            contour.normals[i, 0], contour.normals[i, 1] = nu / size, nv / size
-            contour.valid[i] = True
+            normals[i, 0], normals[i, 1] = nu / size, nv / size
+            valid[i] = True
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -322,20 +333,23 @@ def mark_visibility(flesh, occluders, columns, origins, parts, points, valid, co
         valid: (P,) points that matter.
         covered, hidden: (P,) results.
     """
-    count = len(flesh.part_segments)
+    part_segments, part_centres, part_radii = (
+        flesh.part_segments, flesh.part_centres, flesh.part_radii,
+    )  # fmt: skip
+    count = len(part_segments)
     shapes = np.empty((count, 3, 3))
     centres, k = np.empty((count, 3)), np.empty((count, 3))
     reach, far, outside = np.empty(count), np.empty(count), np.empty(count)
     for b in range(count):
-        s = flesh.part_segments[b]
+        s = part_segments[b]
         largest = 0.0
         for i in range(3):
             centres[b, i] = origins[s, i]
             for j in range(3):
-                centres[b, i] += columns[s, j, i] * flesh.part_centres[b, j]
+                centres[b, i] += columns[s, j, i] * part_centres[b, j]
         outside[b] = -1.0
         for i in range(3):
-            radius = COVER * flesh.part_radii[b, i]
+            radius = COVER * part_radii[b, i]
             largest = max(largest, radius)
             k[b, i] = 0.0
             for j in range(3):

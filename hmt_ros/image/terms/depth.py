@@ -77,14 +77,13 @@ def _inputs(term: Weighting, evidence: Any, _request: Request) -> DepthInputs:
 
 
 @njit(cache=True, nogil=True, inline='always')
-def sample_depth(depths, u, v):  # type: ignore[no-untyped-def]
+def sample_depth(values, left, top, u, v):  # type: ignore[no-untyped-def]
     """Depth at a pixel and its derivatives by u and v; 0 where nothing was measured.
 
     Between four depths of one surface it is bilinear, else that of the nearest pixel.
     """
-    values = depths.values
     h, w = values.shape[1], values.shape[2]
-    x, y = u - depths.left, v - depths.top
+    x, y = u - left, v - top
     if not (0.0 <= x <= w - 1.0 and 0.0 <= y <= h - 1.0):
         return 0.0, 0.0, 0.0
     i, j = min(int(y), h - 2), min(int(x), w - 2)
@@ -95,9 +94,9 @@ def sample_depth(depths, u, v):  # type: ignore[no-untyped-def]
     if least <= 0.0 or most - least > JUMP * least:
         near, far = (a, b) if dv < 0.5 else (p, q)
         return (near if du < 0.5 else far), 0.0, 0.0
-    top = a + (b - a) * du
-    bottom = p + (q - p) * du
-    return top + (bottom - top) * dv, (b - a) * (1.0 - dv) + (q - p) * dv, bottom - top
+    upper = a + (b - a) * du
+    lower = p + (q - p) * du
+    return upper + (lower - upper) * dv, (b - a) * (1.0 - dv) + (q - p) * dv, lower - upper
 
 
 @njit(cache=True, nogil=True)
@@ -111,22 +110,27 @@ def trace_front(flesh, wanted, lens, columns, origins, parts, points, cosines, n
         noise: (2R,) deviation of the flesh of people along the normal, m.
         valid: (2R,) whether the point faces the camera.
     """
-    rings = len(flesh.ring_parts)
+    part_segments, ring_parts, ring_centres = (
+        flesh.part_segments, flesh.ring_parts, flesh.ring_centres,
+    )  # fmt: skip
+    ring_radii, ring_slopes, ring_leans = flesh.ring_radii, flesh.ring_slopes, flesh.ring_leans
+    ring_exponents, ring_noise = flesh.ring_exponents, flesh.ring_noise
+    rings = len(ring_parts)
     for r in range(rings):
-        part = flesh.ring_parts[r]
-        s = flesh.part_segments[part]
+        part = ring_parts[r]
+        s = part_segments[part]
         x0, x1, x2 = columns[s, 0, 0], columns[s, 0, 1], columns[s, 0, 2]
         y0, y1, y2 = columns[s, 1, 0], columns[s, 1, 1], columns[s, 1, 2]
         z0, z1, z2 = columns[s, 2, 0], columns[s, 2, 1], columns[s, 2, 2]
         o0, o1, o2 = origins[s, 0], origins[s, 1], origins[s, 2]
-        cx, cy, cz = flesh.ring_centres[r, 0], flesh.ring_centres[r, 1], flesh.ring_centres[r, 2]
+        cx, cy, cz = ring_centres[r, 0], ring_centres[r, 1], ring_centres[r, 2]
         ux = x0 * o0 + x1 * o1 + x2 * o2 + cx
         uy = y0 * o0 + y1 * o1 + y2 * o2 + cy
         uz = z0 * o0 + z1 * o1 + z2 * o2 + cz
-        rx, ry = flesh.ring_radii[r, 0], flesh.ring_radii[r, 1]
-        kx, ky = flesh.ring_slopes[r, 0], flesh.ring_slopes[r, 1]
-        lx, ly = flesh.ring_leans[r, 0], flesh.ring_leans[r, 1]
-        e = flesh.ring_exponents[r]
+        rx, ry = ring_radii[r, 0], ring_radii[r, 1]
+        kx, ky = ring_slopes[r, 0], ring_slopes[r, 1]
+        lx, ly = ring_leans[r, 0], ring_leans[r, 1]
+        e = ring_exponents[r]
         fx, fy = -(ux - uz * lx) / rx, -(uy - uz * ly) / ry
         size = max(np.sqrt(fx * fx + fy * fy), 1e-12)
         fx, fy = fx / size, fy / size
@@ -154,7 +158,7 @@ def trace_front(flesh, wanted, lens, columns, origins, parts, points, cosines, n
             n2 = x2 * nx + y2 * ny + z2 * nz
             sizes = np.sqrt((n0 * n0 + n1 * n1 + n2 * n2) * (p0 * p0 + p1 * p1 + p2 * p2))
             cosines[i] = -(n0 * p0 + n1 * p1 + n2 * p2) / max(sizes, 1e-12)
-            across, ahead = c * flesh.ring_noise[r, 0], sn * flesh.ring_noise[r, 1]
+            across, ahead = c * ring_noise[r, 0], sn * ring_noise[r, 1]
             noise[i] = np.sqrt(across * across + ahead * ahead)
             valid[i] = cosines[i] > LEAST_COSINE
 
@@ -163,6 +167,7 @@ def trace_front(flesh, wanted, lens, columns, origins, parts, points, cosines, n
 def add_depth(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
     """Depths of visible points against those that were measured; see `ImageTerm.kernel`."""
     term, depths, flesh = inputs.term, inputs.depths, view.flesh
+    values, left, top, owners = depths.values, depths.left, depths.top, view.owners
     count = 2 * len(flesh.ring_parts)
     parts, points = np.empty(count, np.int64), np.empty((count, 3))
     cosines, noise = np.empty(count), np.empty(count)
@@ -190,7 +195,7 @@ def add_depth(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
     for i in range(count):
         if not valid[i] or hidden[i]:
             continue
-        value, gu, gv = sample_depth(depths, pixel[i, 0], pixel[i, 1])
+        value, gu, gv = sample_depth(values, left, top, pixel[i, 0], pixel[i, 1])
         if value <= 0.0:
             energy += unknown
             continue
@@ -200,7 +205,7 @@ def add_depth(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-d
         rho, pull, curvature = geman_mcclure(error, term.scale, each)
         energy += rho
         add_residual(
-            wrenches, stiffnesses, view.owners[parts[i]], points[i, 0], points[i, 1], points[i, 2],
+            wrenches, stiffnesses, owners[parts[i]], points[i, 0], points[i, 1], points[i, 2],
             (gu * j[i, 0, 0] + gv * j[i, 1, 0]) * inverse,
             (gu * j[i, 0, 1] + gv * j[i, 1, 1]) * inverse,
             (gu * j[i, 0, 2] + gv * j[i, 1, 2] - 1.0) * inverse,

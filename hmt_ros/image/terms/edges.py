@@ -97,24 +97,29 @@ def _orientation(x, y):  # type: ignore[no-untyped-def]
 def add_edges(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
     """Distances from visible contour points to the nearest edge; see `ImageTerm.kernel`."""
     edges, term, contour = inputs.distances, inputs.term, view.contour
-    count = view.contour_points * 6 // 10
+    values, left, top = edges.values, edges.left, edges.top
+    parts, points, pixels, projections = (
+        contour.parts, contour.points, contour.pixels, contour.projections,
+    )  # fmt: skip
+    normals, valid, hidden, noise = contour.normals, contour.valid, contour.hidden, contour.noise
+    owners, count = view.owners, view.contour_points * 6 // 10
     if count == 0:
-        for i in range(len(contour.parts)):
-            if contour.valid[i] and not contour.hidden[i]:
+        for i in range(len(parts)):
+            if valid[i] and not hidden[i]:
                 count += 1
     each = term.weight / max(count, FEWEST)
     energy = 0.0
-    for i in range(len(contour.parts)):
-        if not contour.valid[i] or contour.hidden[i]:
+    for i in range(len(parts)):
+        if not valid[i] or hidden[i]:
             continue
-        channel = _orientation(contour.normals[i, 0], contour.normals[i, 1])
-        value, gu, gv = sample_distance(edges, channel, contour.pixels[i, 0], contour.pixels[i, 1])
-        sigma = contour_sigma(term, contour.noise[i])
+        channel = _orientation(normals[i, 0], normals[i, 1])
+        value, gu, gv = sample_distance(values, left, top, channel, pixels[i, 0], pixels[i, 1])
+        sigma = contour_sigma(term, noise[i])
         rho, pull, curvature = geman_mcclure(value / sigma, term.scale, each)
         energy += rho
         add_contour_residual(
-            wrenches, stiffnesses, view.owners[contour.parts[i]], contour, i,
-            gu / sigma, gv / sigma, pull, curvature,
+            wrenches, stiffnesses, owners[parts[i]], points, projections, i, gu / sigma, gv / sigma,
+            pull, curvature,
         )  # fmt: skip
     return energy
 

@@ -117,7 +117,7 @@ class PoseView(NamedTuple):
     """One pose as the kernels of the terms see it.
 
     Attributes:
-        number: n, of the poses of this call.
+        number: (1,) n, of the poses of this call.
         contour: occluding contour, traced if some term asks for it.
         contour_points: number of contour points that a weight is shared among; 0: those there are.
         owners: (B,) segment of each part of the flesh.
@@ -127,7 +127,7 @@ class PoseView(NamedTuple):
         traced, occluders: (B,) parts that are compared with the image, and that can hide others.
     """
 
-    number: int
+    number: NDArray[np.int64]
     contour: Contour
     contour_points: int
     owners: NDArray[np.int64]

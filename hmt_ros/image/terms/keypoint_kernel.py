@@ -84,13 +84,15 @@ class KeypointInputs(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def point_residual(points, k, e, lens, columns, origins, pixels, projections, place):  # type: ignore[no-untyped-def]
+def point_residual(  # type: ignore[no-untyped-def]
+    segments, offsets, k, e, lens, columns, origins, pixels, projections, place
+):
     """Position of the landmark of keypoint k in exchange e into `place`; whether it has a pixel."""
-    s = points.segments[k, e]
+    s = segments[k, e]
     for i in range(3):
         place[i] = origins[s, i]
         for j in range(3):
-            place[i] += columns[s, j, i] * points.offsets[k, e, j]
+            place[i] += columns[s, j, i] * offsets[k, e, j]
     return project(lens, place[0], place[1], place[2], 0, pixels, projections)
 
 
@@ -98,20 +100,24 @@ def point_residual(points, k, e, lens, columns, origins, pixels, projections, pl
 def group_energies(points, slopes, lens, scale, columns, origins, result):  # type: ignore[no-untyped-def]
     """Energies (G, 2) of the groups at one pose, as they are called and exchanged."""
     pixels, projections, place = np.empty((1, 2)), np.empty((1, 2, 3)), np.empty(3)
+    segments, offsets, seen, whiteners, groups = points
     result[:] = 0.0
-    for k in range(len(points.groups)):
+    for k in range(len(groups)):
         for e in range(2):
-            seen = point_residual(points, k, e, lens, columns, origins, pixels, projections, place)
+            shown = point_residual(
+                segments, offsets, k, e, lens, columns, origins, pixels, projections, place
+            )
             for i in range(2):
                 residual = BEHIND
-                if seen:
-                    residual = points.whiteners[k, i, 0] * (pixels[0, 0] - points.pixels[k, 0])
-                    residual += points.whiteners[k, i, 1] * (pixels[0, 1] - points.pixels[k, 1])
-                result[points.groups[k], e] += geman_mcclure(residual, scale, 1.0)[0]
-    for k in range(len(slopes.groups)):
+                if shown:
+                    residual = whiteners[k, i, 0] * (pixels[0, 0] - seen[k, 0])
+                    residual += whiteners[k, i, 1] * (pixels[0, 1] - seen[k, 1])
+                result[groups[k], e] += geman_mcclure(residual, scale, 1.0)[0]
+    groups = slopes.groups
+    for k in range(len(groups)):
         for e in range(2):
             residual = slope_residual(slopes, k, e, columns)[0]
-            result[slopes.groups[k], e] += geman_mcclure(residual, scale, 1.0)[0]
+            result[groups[k], e] += geman_mcclure(residual, scale, 1.0)[0]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -171,6 +177,10 @@ def add_keypoints(  # type: ignore[no-untyped-def]
     wrenches = np.empty((len(tree.parents), 6))
     stiffnesses = np.empty((len(tree.parents), 6, 6))
     pixels, projections, place = np.empty((1, 2)), np.empty((1, 2, 3)), np.empty(3)
+    segments, offsets, seen, whiteners, point_groups = points
+    slope_groups, rays, slope_weights, carriers = (
+        slopes.groups, slopes.rays, slopes.weights, slopes.segments,
+    )  # fmt: skip
     for n in range(len(value)):
         group_energies(points, slopes, lens, scale, columns[n], origins[n], energies)
         value[n] += exchange_log_posterior(energies, weights, exchanged, log_priors[n], posterior)
@@ -182,38 +192,47 @@ def add_keypoints(  # type: ignore[no-untyped-def]
                 shares[g, exchanged[e, g]] += np.exp(posterior[e])
         wrenches[:] = 0.0
         stiffnesses[:] = 0.0
-        for k in range(len(points.groups)):
+        for k in range(len(point_groups)):
             for e in range(2):
-                share = weights[points.groups[k]] * shares[points.groups[k], e]
+                share = weights[point_groups[k]] * shares[point_groups[k], e]
                 if share < 1e-6 or not point_residual(
-                    points, k, e, lens, columns[n], origins[n], pixels, projections, place
+                    segments,
+                    offsets,
+                    k,
+                    e,
+                    lens,
+                    columns[n],
+                    origins[n],
+                    pixels,
+                    projections,
+                    place,
                 ):
                     continue
                 for i in range(2):
-                    w0, w1 = points.whiteners[k, i, 0], points.whiteners[k, i, 1]
-                    residual = w0 * (pixels[0, 0] - points.pixels[k, 0])
-                    residual += w1 * (pixels[0, 1] - points.pixels[k, 1])
+                    w0, w1 = whiteners[k, i, 0], whiteners[k, i, 1]
+                    residual = w0 * (pixels[0, 0] - seen[k, 0])
+                    residual += w1 * (pixels[0, 1] - seen[k, 1])
                     _, pull, curvature = geman_mcclure(residual, scale, share)
                     add_residual(
-                        wrenches, stiffnesses, points.segments[k, e], place[0], place[1], place[2],
+                        wrenches, stiffnesses, segments[k, e], place[0], place[1], place[2],
                         w0 * projections[0, 0, 0] + w1 * projections[0, 1, 0],
                         w0 * projections[0, 0, 1] + w1 * projections[0, 1, 1],
                         w0 * projections[0, 0, 2] + w1 * projections[0, 1, 2], pull, curvature,
                     )  # fmt: skip
-        for k in range(len(slopes.groups)):
+        for k in range(len(slope_groups)):
             for e in range(2):
-                share = weights[slopes.groups[k]] * shares[slopes.groups[k], e]
+                share = weights[slope_groups[k]] * shares[slope_groups[k], e]
                 if share < 1e-6:
                     continue
                 residual, d0, d1, d2 = slope_residual(slopes, k, e, columns[n])
                 _, pull, curvature = geman_mcclure(residual, scale, share)
                 # A rotation w of the segment moves the bone's direction d by w x d.
-                q0, q1, q2 = slopes.rays[k, 0], slopes.rays[k, 1], slopes.rays[k, 2]
+                q0, q1, q2 = rays[k, 0], rays[k, 1], rays[k, 2]
                 turn = np.empty(3)
-                turn[0] = slopes.weights[k] * (d1 * q2 - d2 * q1)
-                turn[1] = slopes.weights[k] * (d2 * q0 - d0 * q2)
-                turn[2] = slopes.weights[k] * (d0 * q1 - d1 * q0)
-                s = slopes.segments[k, e]
+                turn[0] = slope_weights[k] * (d1 * q2 - d2 * q1)
+                turn[1] = slope_weights[k] * (d2 * q0 - d0 * q2)
+                turn[2] = slope_weights[k] * (d0 * q1 - d1 * q0)
+                s = carriers[k, e]
                 for i in range(3):
                     wrenches[s, 3 + i] += pull * turn[i]
                     for j in range(i, 3):

@@ -64,7 +64,7 @@ def _one_after_the_other(terms: tuple[ImageTerm, ...]) -> Any:
     """
     if not terms:
 
-        @njit(nogil=True)
+        @njit(nogil=True, inline='always')
         def nothing(view, inputs, column, energies, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
             return
 
@@ -72,7 +72,7 @@ def _one_after_the_other(terms: tuple[ImageTerm, ...]) -> Any:
     kernel = terms[0].kernel
     others = _one_after_the_other(terms[1:])
 
-    @njit(nogil=True)
+    @njit(nogil=True, inline='always')
     def first_and_others(view, inputs, column, energies, wrenches, stiffnesses):  # type: ignore[no-untyped-def]
         own = inputs[0]
         if own[0].weight > 0.0:
@@ -86,18 +86,30 @@ run_terms = _one_after_the_other(TERMS)
 
 
 @njit(cache=True, nogil=True)
-def view_of(n, model, shape, contour, columns, origins):  # type: ignore[no-untyped-def]
-    """A pose as kernels see it; fills the contour, if shape is asked for."""
-    if shape:
-        trace_contour(model.flesh, model.traced, model.lens, columns, origins, contour)
-        mark_visibility(
-            model.flesh, model.occluders, columns, origins, contour.parts, contour.points,
-            contour.valid, contour.covered, contour.hidden,
-        )  # fmt: skip
+def new_view(model):  # type: ignore[no-untyped-def]
+    """Room for one pose after the other as kernels see them.
+
+    It is made once: to pass so many arrays on costs as much as a kernel.
+    """
+    segments = len(model.tree.parents)
     return PoseView(
-        n, contour, model.contour_points, model.flesh.part_segments, model.lens, columns, origins,
+        np.zeros(1, np.int64), empty_contour(len(model.flesh.ring_parts)), model.contour_points,
+        model.flesh.part_segments, model.lens, np.empty((segments, 3, 3)), np.empty((segments, 3)),
         model.flesh, model.traced, model.occluders,
     )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, inline='always')
+def look(view, number, shape):  # type: ignore[no-untyped-def]
+    """Takes in the pose, of this number, whose frames are in a view; its contour if shape is."""
+    view.number[0] = number
+    if shape:
+        contour = view.contour
+        trace_contour(view.flesh, view.traced, view.lens, view.columns, view.origins, contour)
+        mark_visibility(
+            view.flesh, view.occluders, view.columns, view.origins, contour.parts, contour.points,
+            contour.valid, contour.covered, contour.hidden,
+        )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
@@ -117,12 +129,14 @@ def add_energies(  # type: ignore[no-untyped-def]
     """
     segments = len(model.tree.parents)
     wrenches, stiffnesses = np.empty((segments, 6)), np.empty((segments, 6, 6))
-    contour = empty_contour(len(model.flesh.ring_parts))
+    if len(hessians) == 0:
+        wrenches, stiffnesses = wrenches[:0], stiffnesses[:0]
+    view = new_view(model)
     for n in range(first, last):
         wrenches[:] = 0.0
         stiffnesses[:] = 0.0
-        columns, origins = placement.columns[n], placement.origins[n]
-        view = view_of(n, model, shape, contour, columns, origins)
+        view.columns[:], view.origins[:] = placement.columns[n], placement.origins[n]
+        look(view, n, shape)
         run_terms(view, inputs, 0, energies[n], wrenches, stiffnesses)
         if len(hessians) > 0:
             assemble_pose(
@@ -141,6 +155,7 @@ def record_residuals(model, inputs, columns, origins, energies, residuals):  # t
         energies: (terms,) result.
         residuals: (M, RECORDED) result, see `residuals.add_residual`; entry (0, 0) must be 0.
     """
-    contour = empty_contour(len(model.flesh.ring_parts))
-    view = view_of(0, model, True, contour, columns, origins)
+    view = new_view(model)
+    view.columns[:], view.origins[:] = columns, origins
+    look(view, 0, True)
     run_terms(view, inputs, 0, energies, residuals, np.empty((0, 6, 6)))

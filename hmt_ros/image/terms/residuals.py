@@ -144,12 +144,14 @@ def add_residual(wrenches, stiffnesses, s, p0, p1, p2, a0, a1, a2, pull, curvatu
 
 
 @njit(cache=True, nogil=True, inline='always')
-def add_contour_residual(wrenches, stiffnesses, s, contour, i, gu, gv, pull, curvature):  # type: ignore[no-untyped-def]
+def add_contour_residual(  # type: ignore[no-untyped-def]
+    wrenches, stiffnesses, s, p, j, i, gu, gv, pull, curvature
+):
     """Adds a residual of the pixel of contour point i to segment s.
 
-    Its derivatives by column and row are gu and gv.
+    p and j are the points and projections of the contour, gu and gv the derivatives of the residual
+    by column and row.
     """
-    p, j = contour.points, contour.projections
     add_residual(
         wrenches, stiffnesses, s, p[i, 0], p[i, 1], p[i, 2],
         gu * j[i, 0, 0] + gv * j[i, 1, 0], gu * j[i, 0, 1] + gv * j[i, 1, 1],

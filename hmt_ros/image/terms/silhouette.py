@@ -129,10 +129,11 @@ def _coverage_inputs(term: Weighting, evidence: Any, request: Request) -> Covera
 
 
 @njit(cache=True, nogil=True)
-def _nearest(pixels, normals, contour, use):  # type: ignore[no-untyped-def]
+def _nearest(pixels, normals, places, directions, use):  # type: ignore[no-untyped-def]
     """For each sample the point of the contour, one of `use`, that is nearest and points its way.
 
-    All samples are compared with one point at a time: so the compiler takes many at once.
+    Places and directions are the pixels and normals of the contour. All samples are compared with
+    one point at a time: so the compiler takes many at once.
     """
     turn, count = np.float32(TURN), len(pixels)
     us, vs = np.empty(count, np.float32), np.empty(count, np.float32)
@@ -143,9 +144,9 @@ def _nearest(pixels, normals, contour, use):  # type: ignore[no-untyped-def]
         nus[m], nvs[m] = turn * np.float32(normals[m, 0]), turn * np.float32(normals[m, 1])
         least[m] = np.inf
     for i in use:
-        u, v = np.float32(contour.pixels[i, 0]), np.float32(contour.pixels[i, 1])
-        nu = np.float32(turn * contour.normals[i, 0])
-        nv = np.float32(turn * contour.normals[i, 1])
+        u, v = np.float32(places[i, 0]), np.float32(places[i, 1])
+        nu = np.float32(turn * directions[i, 0])
+        nv = np.float32(turn * directions[i, 1])
         point = np.int32(i)
         for m in range(count):
             du, dv, dnu, dnv = u - us[m], v - vs[m], nu - nus[m], nv - nvs[m]
@@ -164,20 +165,22 @@ def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untype
     """
     pixels, normals = inputs.outline.pixels, inputs.outline.normals
     term, contour, part_segments = inputs.term, view.contour, view.owners
+    parts, p, places, j = contour.parts, contour.points, contour.pixels, contour.projections
+    valid, covered, noise = contour.valid, contour.covered, contour.noise
     beliefs = inputs.outline.beliefs
     share = term.weight / len(pixels)
-    explained = inputs.explained[view.number if len(inputs.explained) > 1 else 0]
-    costs = inputs.costs[view.number]
-    count = len(contour.parts)
+    explained = inputs.explained[view.number[0] if len(inputs.explained) > 1 else 0]
+    costs = inputs.costs[view.number[0]]
+    count = len(parts)
     use = np.empty(count, np.int64)
     used = 0
     for i in range(count):
-        if contour.valid[i] and not contour.covered[i]:
+        if valid[i] and not covered[i]:
             use[used] = i
             used += 1
     if used == 0:  # a pose whose contour is covered everywhere keeps all that exists
         for i in range(count):
-            if contour.valid[i]:
+            if valid[i]:
                 use[used] = i
                 used += 1
     if used == 0:
@@ -186,15 +189,15 @@ def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untype
             costs[m] = min(explained[m], 0.5 * share * beliefs[m] * term.scale * term.scale)
             energy += costs[m]
         return energy
-    nearest = _nearest(pixels, normals, contour, use[:used])
+    nearest = _nearest(pixels, normals, places, contour.normals, use[:used])
     inverse = np.empty(count)
     for i in range(count):
-        inverse[i] = 1.0 / contour_sigma(term, contour.noise[i])
+        inverse[i] = 1.0 / contour_sigma(term, noise[i])
     across, beyond = np.empty(len(pixels)), np.empty(len(pixels))
     per_scale, energy = 1.0 / (term.scale * term.scale), 0.0
     for m in range(len(pixels)):
         i = nearest[m]
-        du, dv = contour.pixels[i, 0] - pixels[m, 0], contour.pixels[i, 1] - pixels[m, 1]
+        du, dv = places[i, 0] - pixels[m, 0], places[i, 1] - pixels[m, 1]
         nx, ny = normals[m, 0], normals[m, 1]
         along = nx * dv - ny * du
         across[m] = (nx * du + ny * dv) * inverse[i]
@@ -211,8 +214,7 @@ def add_coverage(view, inputs, wrenches, stiffnesses):  # type: ignore[no-untype
         if rho >= explained[m]:
             continue
         i = nearest[m]
-        segment = part_segments[contour.parts[i]]
-        p, j = contour.points, contour.projections
+        segment = part_segments[parts[i]]
         nx, ny = normals[m, 0] * inverse[i], normals[m, 1] * inverse[i]
         add_residual(
             wrenches, stiffnesses, segment, p[i, 0], p[i, 1], p[i, 2],

@@ -9,9 +9,8 @@ that stand for all become candidates.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
@@ -166,31 +165,27 @@ class KinematicJumps:
             alternatives: one entry a chain.
             prices: of the symmetries of the body, nats.
         """
-        changes, energy = self._rate(lead, alternatives)
+        swaps = [(pair, self._swap(lead, pair)) for pair in self.posterior.body.chain_pairs]
+        known = [(pair, swapped) for pair, swapped in swaps if swapped is not None]
+        flips = self._torso_flips(lead.pose, [a.chain for a in alternatives])
+        trunks = [(lead.pose, alternatives), *(swapped for _, swapped in known), *flips]
+        (changes, energy), *rated = self._rate(lead.observation, trunks)
         products = [_Product(modes, members, log_weights, alternatives, changes, energy)]
         weight = np.array([np.logaddexp.reduce(log_weights)])
         exchanged, flipped_over = (weight - prices[name] for name in ('exchange', 'trunk_flip'))
-        for pair in self.posterior.body.chain_pairs:
-            swapped = self._swap(lead, pair)
-            if swapped is None:
-                continue
-            other, hung = swapped
-            rated, energy = self._rate(other, hung)
+        for (pair, (other, hung)), (own, energy) in zip(known, rated[: len(known)], strict=True):
             choices, joined = [], []
             for chain, change in zip(alternatives, changes, strict=True):
                 if chain.chain in pair:
                     i = pair.index(chain.chain)
                     choices.append(hung[i])
-                    joined.append(rated[i])
+                    joined.append(own[i])
                 else:
                     choices.append(Alternatives(chain.chain, chain.angles, chain.penalties[:1]))
                     joined.append(change)
-            products.append(
-                _Product(other.pose[None], members[:1], exchanged, choices, joined, energy)
-            )
-        for flipped, hung in self._torso_flips(lead.pose, [a.chain for a in alternatives]):
-            rated, energy = self._rate(replace(lead, pose=flipped), hung)
-            products.append(_Product(flipped[None], members[:1], flipped_over, hung, rated, energy))
+            products.append(_Product(other[None], members[:1], exchanged, choices, joined, energy))
+        for (flipped, hung), (own, energy) in zip(flips, rated[len(known) :], strict=True):
+            products.append(_Product(flipped[None], members[:1], flipped_over, hung, own, energy))
         return products
 
     def _search(self, lead: _Lead, rng: np.random.Generator) -> dict[str, Array]:
@@ -258,7 +253,7 @@ class KinematicJumps:
             result.append((base, alternatives))
         return result
 
-    def _swap(self, lead: _Lead, pair: tuple[str, str]) -> tuple[_Lead, list[Alternatives]] | None:
+    def _swap(self, lead: _Lead, pair: tuple[str, str]) -> tuple[Array, list[Alternatives]] | None:
         """The pose with two limbs each on the other's image, in all ways; None if unreachable.
 
         Limbs that cross in the image are easily taken for each other, and one alone that changes
@@ -279,15 +274,28 @@ class KinematicJumps:
                 apart=DISTINCT, most=self.posterior.settings.alternatives,
             )  # fmt: skip
             alternatives.append(distinct)
-        return replace(lead, pose=base), alternatives
+        return base, alternatives
 
-    def _rate(self, lead: _Lead, alternatives: list[Alternatives]) -> tuple[list[Array], float]:
-        """Energy change that each alternative makes alone, and the energy of the pose itself."""
-        poses = [lead.pose[None]]
-        for chain in alternatives:
-            block = np.repeat(lead.pose[None], len(chain.angles), axis=0)
-            block[:, self.posterior.body.skeleton.chain_dofs[chain.chain]] = chain.angles
-            poses.append(block)
-        value = self.posterior.values(np.concatenate(poses), lead.observation)
-        ends = np.cumsum([1] + [len(c.angles) for c in alternatives])
-        return [value[a:b] - value[0] for a, b in pairwise(ends)], float(value[0])
+    def _rate(
+        self, observation: Observation, trunks: list[tuple[Array, list[Alternatives]]]
+    ) -> list[tuple[list[Array], float]]:
+        """Energy change that each alternative makes alone, and the energy of each pose itself.
+
+        Args:
+            observation: of the image.
+            trunks: poses (d,), and alternatives for chains of each.
+        """
+        poses = []
+        for pose, alternatives in trunks:
+            poses.append(pose[None])
+            for chain in alternatives:
+                block = np.repeat(pose[None], len(chain.angles), axis=0)
+                block[:, self.posterior.body.skeleton.chain_dofs[chain.chain]] = chain.angles
+                poses.append(block)
+        value = self.posterior.values(np.concatenate(poses), observation)
+        parts = iter(np.split(value, np.cumsum([len(x) for x in poses])[:-1]))
+        result = []
+        for _, alternatives in trunks:
+            energy = float(next(parts)[0])
+            result.append(([next(parts) - energy for _ in alternatives], energy))
+        return result
