@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -26,7 +26,6 @@ from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.kinematics import forward
 from hmt_ros.body.self_intersection import self_intersection_energy
 from hmt_ros.flips.interpretation_tree import enumerate_flips
-from hmt_ros.image import likelihood as likelihood_module
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import observe
 from hmt_ros.inference import gaussian_pairs
@@ -95,8 +94,8 @@ def _likelihoods(seconds: float) -> Iterator[dict[str, Any]]:
         poses[:, :3] = shown[1, :3] + 0.03 * rng.normal(size=(batch, 3))
         poses = np.clip(poses, body.lower, body.upper)
 
-        def compiled(x: Any = poses) -> Any:
-            return likelihood.energies(forward(body.skeleton, x), observation)
+        def compiled(x: Any = poses, of: ImageLikelihood = likelihood) -> Any:
+            return of.energies(forward(body.skeleton, x), observation)
 
         def vectorised(x: Any = poses) -> Any:
             return numpy_likelihood.image_energy(likelihood, x, observation)
@@ -110,8 +109,7 @@ def _likelihoods(seconds: float) -> Iterator[dict[str, Any]]:
                 (found.hessian, wanted.hessian),
             )
         )
-        with one_thread():
-            alone = best_time(compiled, seconds=seconds)
+        alone = best_time(partial(compiled, of=replace(likelihood, threads=1)), seconds=seconds)
         yield _case(
             'likelihood, gradient, Hessian', batch, best_time(vectorised, seconds=seconds), alone,
             best_time(compiled, seconds=seconds), difference,
@@ -277,13 +275,3 @@ def _case(
         'difference': difference,
     }
 
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """The likelihood on one core, as numpy's loops are."""
-    usual = likelihood_module._thread_count
-    likelihood_module._thread_count = lambda: 1  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        likelihood_module._thread_count = usual

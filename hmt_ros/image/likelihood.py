@@ -40,6 +40,7 @@ from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
 
 OFF = TermSettings(0.0, 1.0, 1.0)
+MOST_THREADS = 8
 
 # One field a term of the registry, so that a new term needs no line here.
 _ImageTerms: Any = make_dataclass(
@@ -116,6 +117,8 @@ class ImageLikelihood:
         settings: of the terms.
         parts: the parts of the flesh that are compared with the image; None: all.
         occluders: the parts that hide others; None: all.
+        threads: number of threads that share poses; 0: one a core, at most `MOST_THREADS`. Results
+            do not depend on it.
     """
 
     body: Body
@@ -123,6 +126,7 @@ class ImageLikelihood:
     settings: LikelihoodSettings = field(default_factory=LikelihoodSettings)
     parts: tuple[int, ...] | None = None
     occluders: tuple[int, ...] | None = None
+    threads: int = 0
 
     def given(
         self,
@@ -218,7 +222,7 @@ class ImageLikelihood:
                     hessian,
                 )  # fmt: skip
 
-            in_threads(work, n)
+            in_threads(work, n, threads=self.threads)
         result = {term.name: energies[:, i] for i, term in enumerate(TERMS) if running[i]} or {
             'nothing': np.zeros(n)
         }
@@ -309,23 +313,26 @@ def _selected(parts: Sequence[int] | None, count: int) -> NDArray[np.bool_]:
 
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_thread_count(), thread_name_prefix='likelihood')
+    return ThreadPoolExecutor(MOST_THREADS, thread_name_prefix='likelihood')
 
 
 @lru_cache(maxsize=1)
-def _thread_count() -> int:
-    return min(len(os.sched_getaffinity(0)), 8)
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
 
 
-def in_threads(work: Callable[[int, int], None], count: int, least: int = 4) -> None:
+def in_threads(
+    work: Callable[[int, int], None], count: int, least: int = 4, threads: int = 0
+) -> None:
     """Shares poses among threads; each is worked on alone, so the result does not depend on it.
 
     Args:
         work: on the poses from one number up to another.
         count: number of poses.
         least: number of poses that are worth a thread.
+        threads: their number at most; 0: as many as there are cores, up to `MOST_THREADS`.
     """
-    threads = min(_thread_count(), count // least)
+    threads = min(threads or _cores(), MOST_THREADS, count // least)
     if threads < 2:
         work(0, count)
         return

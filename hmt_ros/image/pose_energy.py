@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
@@ -78,6 +78,9 @@ class Compiled(NamedTuple):
     tails: float
 
 
+Term = TypeVar('Term')
+
+
 class Descent(NamedTuple):
     """What minima are found by; see `bounded_newton.minimise`.
 
@@ -113,6 +116,9 @@ class PoseEnergy:
         point: (d,) values of all variables; None: all are free.
         free: (f,) variables that may move, where there is a point.
         counted: is told how many poses have been evaluated.
+
+    Raises:
+        ValueError: two terms of one kind that has a kernel.
     """
 
     likelihood: ImageLikelihood
@@ -121,6 +127,12 @@ class PoseEnergy:
     point: Array | None = None
     free: Index | None = None
     counted: Callable[[int], None] | None = None
+
+    def __post_init__(self) -> None:
+        kinds = [type(term).__name__ for term in self.terms if isinstance(term, _KNOWN)]
+        twice = sorted({name for name in kinds if kinds.count(name) > 1})
+        if twice:
+            raise ValueError(f'a sum has one term of a kind at most, saw more: {", ".join(twice)}')
 
     def energy(
         self,
@@ -151,7 +163,7 @@ class PoseEnergy:
                 x, value, gradient, hessian, *nothing,
             )  # fmt: skip
 
-        in_threads(work, n, 8)
+        in_threads(work, n, 8, self.likelihood.threads)
         if self.counted is not None:
             self.counted(n)
         found = Energy(value, gradient, hessian) if derivatives else Energy(value)
@@ -193,7 +205,7 @@ class PoseEnergy:
                 value, gradient, hessian, status, iterations,
             )  # fmt: skip
 
-        in_threads(work, n, 4)
+        in_threads(work, n, 4, self.likelihood.threads)
         if self.counted is not None:
             self.counted(n + int(iterations.sum()))
         free = ~resting(x, gradient, lower, upper)
@@ -245,32 +257,39 @@ class PoseEnergy:
 
     def _compiled(self, count: int) -> Compiled:
         """The terms as compiled code reads them, for so many poses."""
-        of = {type(term): term for term in self.terms}
-        image = of.get(ObservedImage)
+        image = self._term(ObservedImage)
         likelihood = self.likelihood if image is None else image.likelihood
-        if image is None:
-            inputs = likelihood.inputs(NOTHING_SEEN, count, None)
-        else:
-            inputs = likelihood.inputs(image.observation, count, image.explained)
+        observation = NOTHING_SEEN if image is None else image.observation
+        inputs = likelihood.inputs(observation, count, None if image is None else image.explained)
         running = [bool(one.term.weight > 0) for one in inputs]
-        body = self.likelihood.body
-        keypoints, overlaps = of.get(KeypointTerm), of.get(SelfIntersection)
-        ground, mixture, angles = of.get(GroundTerm), of.get(MixturePrior), of.get(AnglePrior)
-        prior = gaussian_model(body, 0.0) if mixture is None else mixture.compiled
-        if angles is not None:
-            prior = gaussian_model(body, angles.weight)
+        contour = any(on and term.needs_contour for on, term in zip(running, TERMS, strict=True))
         return Compiled(
-            placing_of(body.skeleton),
-            likelihood.model,
-            inputs,
-            any(running),
-            any(on and term.needs_contour for on, term in zip(running, TERMS, strict=True)),
-            _no_keypoints(likelihood) if keypoints is None else keypoints.compiled,
-            prior,
-            overlaps_of(body, np.inf if overlaps is None else overlaps.sigma),
-            _no_ground(body.dimension) if ground is None else ground.compiled,
-            *self._expected,
+            inputs=inputs, image=any(running), contour=contour, model=likelihood.model, **self._rest
         )
+
+    @cached_property
+    def _rest(self) -> dict[str, Any]:
+        """What compiled code reads besides the terms of the image."""
+        body = self.likelihood.body
+        keypoints, overlaps = self._term(KeypointTerm), self._term(SelfIntersection)
+        ground, mixture = self._term(GroundTerm), self._term(MixturePrior)
+        angles = self._term(AnglePrior)
+        prior = gaussian_model(body, 0.0 if angles is None else angles.weight)
+        detected = _no_keypoints(self.likelihood) if keypoints is None else keypoints.compiled
+        centres, precisions, tails = self._expected
+        return {
+            'placing': placing_of(body.skeleton),
+            'keypoints': detected,
+            'prior': prior if mixture is None else mixture.compiled,
+            'overlaps': overlaps_of(body, np.inf if overlaps is None else overlaps.sigma),
+            'ground': _no_ground(body.dimension) if ground is None else ground.compiled,
+            'centres': centres,
+            'precisions': precisions,
+            'tails': tails,
+        }
+
+    def _term(self, kind: type[Term]) -> Term | None:
+        return next((term for term in self.terms if isinstance(term, kind)), None)
 
     @cached_property
     def _expected(self) -> tuple[Array, Array, float]:

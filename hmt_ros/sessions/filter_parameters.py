@@ -35,6 +35,7 @@ _TRACKER = {
     'candidates': (1, 1024),
     'searched_chains': (0, 64),
     'flow_weight': NOT_NEGATIVE,
+    'threads': (0, 64),
     **{f'likelihood.{term.name}.weight': NOT_NEGATIVE for term in TERMS},
     'likelihood.keypoints.weight': NOT_NEGATIVE,
 }

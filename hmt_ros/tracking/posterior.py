@@ -100,7 +100,8 @@ class Posterior:
     @cached_property
     def likelihood(self) -> ImageLikelihood:
         """Of images."""
-        return ImageLikelihood(self.body, self.camera, self.settings.likelihood)
+        s = self.settings
+        return ImageLikelihood(self.body, self.camera, s.likelihood, threads=s.threads)
 
     def of_image(self, observation: Observation, exchanges: Array | None = None) -> PoseEnergy:
         """The energy without what was expected; its evaluations are counted.

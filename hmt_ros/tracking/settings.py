@@ -51,6 +51,8 @@ class TrackerSettings:
             corrects predictions; 0 switches it off.
         least_log_weight: Smallest log weight of a mode that is kept, nats.
         estimate_shape: Whether lengths and flesh of the person are estimated while the track lasts.
+        threads: Number of threads that share the poses of an image; 0 takes one a core, 8 at most.
+            Results do not depend on it.
         likelihood: settings of the likelihood.
         search: settings of the search of limbs.
         ground: settings of what is known of gravity and floor.
@@ -70,6 +72,7 @@ class TrackerSettings:
     flow_weight: float = 5.0
     least_log_weight: float = -14.0
     estimate_shape: bool = True
+    threads: int = 0
     likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
     search: LimbSearchSettings = field(default_factory=LimbSearchSettings)
     ground: GroundSettings = field(default_factory=GroundSettings)
@@ -89,5 +92,7 @@ class TrackerSettings:
         for name, bound in least.items():
             if not getattr(self, name) >= bound:
                 raise ValueError(f'{name} must be at least {bound}, saw {getattr(self, name)}')
+        if self.threads < 0:
+            raise ValueError(f'threads must be at least 0, saw {self.threads}')
         if not self.flow_weight >= 0:
             raise ValueError(f'flow_weight must be at least 0, saw {self.flow_weight}')

@@ -11,7 +11,6 @@ from hmt_ros.body import Camera, load_body
 from hmt_ros.body.kinematics import directed_derivatives, forward
 from hmt_ros.body.pose_terms import AnglePrior
 from hmt_ros.body.self_intersection import self_intersection_energy
-from hmt_ros.image import likelihood as likelihood_module
 from hmt_ros.image.likelihood import OFF, ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation, observe
 from hmt_ros.image.surface import COVER, HIDDEN, flesh_table_of
@@ -353,12 +352,11 @@ def test_visibility_agrees_with_marching_along_the_rays(shot):
 # Switches.
 
 
-def test_the_number_of_threads_does_not_matter(shot, observation, monkeypatch):
+def test_the_number_of_threads_does_not_matter(shot, observation):
     poses = shot.near(23, 13)
     results = []
     for count in (1, 2, 3):
-        monkeypatch.setattr(likelihood_module, '_thread_count', lambda count=count: count)
-        likelihood = ImageLikelihood(shot.body, shot.camera)
+        likelihood = ImageLikelihood(shot.body, shot.camera, threads=count)
         found = evaluate(likelihood, poses, observation)
         results.append((found.value, found.gradient, found.hessian, found.costs))
     for other in results[1:]:

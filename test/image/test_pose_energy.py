@@ -175,6 +175,18 @@ def test_each_pose_is_worked_on_alone(terms, poses):
             assert np.array_equal(a[0], b[n])
 
 
+def test_the_number_of_threads_does_not_matter(terms, poses):
+    likelihood, some = terms['all']
+    motion = motion_of(poses, 'gaussian', 37)
+    results = []
+    for threads in (1, 2, 4):
+        own = PoseEnergy(replace(likelihood, threads=threads), some, motion)
+        found = own.minimise(poses, max_iterations=5, **SOLVER)
+        results.append((found.x, found.value, found.hessian, *own.energy(poses)))
+    for other in results[1:]:
+        assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
 def test_a_term_without_a_kernel_is_added(terms, poses, body):
     likelihood, some = terms['image']
     own = PoseEnergy(likelihood, (*some, Strange()), motion_of(poses, 'gaussian', 37))
@@ -210,3 +222,9 @@ def test_poses_that_are_none_are_refused(terms, x, message):
         PoseEnergy(likelihood, some).energy(x)
     with pytest.raises(ValueError, match=message):
         PoseEnergy(likelihood, some).minimise(x, max_iterations=1, **SOLVER)
+
+
+def test_two_terms_of_a_kind_are_refused(terms):
+    likelihood, some = terms['image']
+    with pytest.raises(ValueError, match='one term of a kind at most, saw more: ObservedImage'):
+        PoseEnergy(likelihood, (*some, *some))

@@ -201,6 +201,13 @@ def test_the_same_seed_and_images_give_identical_bytes(follow):
         assert in_bytes(first) == in_bytes(second)
 
 
+def test_the_number_of_threads_does_not_change_a_byte(follow):
+    _, first, _ = follow(4, seed=3, threads=1)
+    for threads in (2, 4):
+        _, other, _ = follow(4, seed=3, threads=threads)
+        assert in_bytes(first) == in_bytes(other)
+
+
 def test_other_body_sizes(follow, human32, camera, motion, keypoints_of):
     """A child's lengths come with the subject; the model stays."""
     child = human32.with_stature(1.3)

@@ -48,7 +48,7 @@ class LimbSearch:
         own = tuple(i for i in parts if p.body.flesh.parts[i].segment in segments)
         rest = tuple(i for i in parts if i not in own)
         for name, traced, occluders in (('_own', own, None), ('_rest', rest, rest)):
-            likelihood = ImageLikelihood(p.body, p.camera, p.settings.likelihood, traced, occluders)
+            likelihood = replace(p.likelihood, parts=traced, occluders=occluders)
             object.__setattr__(self, name, likelihood)
         object.__setattr__(self, 'dofs', p.body.skeleton.chain_dofs[self.chain])
 
