@@ -274,4 +274,3 @@ def _case(
         'compiled_threads_ms': None if threads is None else 1e3 * threads,
         'difference': difference,
     }
-

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from benchmarks.clips import Clip, table
+from benchmarks.clips import Clip, at_rate, read_clip, read_detections, table
 from benchmarks.machine import forget_peak, peak_memory, resident_memory
-from benchmarks.runs import new_tracker
+from benchmarks.runs import IMAGES, INPUTS, KEYPOINTS, keypoints_only, new_tracker
 from hmt_ros.app.progress import with_progress
 from hmt_ros.body import load_body
 from hmt_ros.tracking import TrackerSettings
 
 OPENCV = 'MOG2 + Canny + distance transform'
+# Images a second besides all of them, and images that start a track.
+LOW_RATE, STARTING = 3.0, 2
 
 
 def speed(clip: Clip) -> dict[str, Any]:
@@ -70,6 +74,73 @@ def speed(clip: Clip) -> dict[str, Any]:
         'stages_ms': dict(sorted(stages.items(), key=lambda item: -item[1])),
         'peak_memory_mb': peak_memory() / 1e6,
     }
+
+
+def costs(folder: Path, limit: int | None = None) -> list[dict[str, Any]]:
+    """Processor time of a step, over that of OpenCV's work on the same image, in the same run.
+
+    One row an input and a rate: all images, and 3 a second.
+
+    Args:
+        folder: of a clip with a background.
+        limit: number of images; None: all.
+
+    Raises:
+        ValueError: the clip can not be read.
+    """
+    whole, body = read_clip(folder, limit), load_body('human37')
+    detected = (folder / 'keypoints_mediapipe.npz').is_file()
+    known = read_detections(folder).keypoints if detected else {}
+    rows = []
+    for inputs in INPUTS if detected else (IMAGES,):
+        for rate in (0.0, LOW_RATE):
+            clip, settings = at_rate(whole, rate), TrackerSettings()
+            settings = keypoints_only(settings) if inputs == KEYPOINTS else settings
+            subtractor = cv2.createBackgroundSubtractorMOG2()
+            tracker = new_tracker(clip, body, settings, 0)
+            spent, floor, evaluations = [], [], []
+            for stamp, image in zip(clip.stamps, clip.images, strict=True):
+                start = time.process_time()
+                tracker.step(image, stamp, None if inputs == IMAGES else known.get(stamp))
+                middle = time.process_time()
+                opencv_work(subtractor, image)
+                floor.append(time.process_time() - middle)
+                spent.append(middle - start)
+                evaluations.append(tracker.evaluations)
+            if len(spent) <= STARTING:
+                continue
+            # The first images start the track, and load what is compiled.
+            steps, one = np.array(spent[STARTING:]), float(np.mean(floor[STARTING:]))
+            rows.append(
+                {
+                    'clip': clip.name,
+                    'inputs': inputs,
+                    'rate': rate,
+                    'images': len(steps),
+                    'evaluations': float(np.mean(evaluations[STARTING:])),
+                    'cpu_ms': 1e3 * float(steps.mean()),
+                    'floor_ms': 1e3 * one,
+                    'mean': float(steps.mean()) / one,
+                    'median': float(np.median(steps)) / one,
+                    'most': float(np.percentile(steps, 99)) / one,
+                }
+            )
+    return rows
+
+
+def costs_as_text(rows: Sequence[dict[str, Any]], *, markdown: bool = False) -> str:
+    """A table, with the means over the clips last."""
+    head = ['clip', 'inputs', 'rate', 'evaluations', 'CPU, ms', 'floors', 'median', '99 %']
+    names = ('evaluations', 'cpu_ms', 'mean', 'median', 'most')
+    lines = []
+    for key in dict.fromkeys((row['inputs'], row['rate']) for row in rows):
+        mine = [row for row in rows if (row['inputs'], row['rate']) == key]
+        mean = {name: float(np.mean([row[name] for row in mine])) for name in names}
+        for row in (*mine, {**mean, 'clip': 'mean', 'inputs': key[0], 'rate': key[1]}):
+            rate = f'{row["rate"]:g}' if row['rate'] else 'all'
+            numbers = [f'{row[name]:.{0 if name in names[:2] else 1}f}' for name in names]
+            lines.append([row['clip'], row['inputs'], rate, *numbers])
+    return table([head, *lines], left=2, markdown=markdown)
 
 
 def opencv_work(subtractor: Any, image: Any) -> Any:

@@ -9,7 +9,7 @@ from benchmarks.clips import table
 from benchmarks.runs import GIVEN
 from benchmarks.tracking_means import DETECTOR
 from benchmarks.tracking_oracle import as_text as oracle_as_text
-from benchmarks.tracking_speed import memory_as_text, speed_as_text
+from benchmarks.tracking_speed import OPENCV, costs_as_text, memory_as_text, speed_as_text
 
 
 class Column(NamedTuple):
@@ -146,6 +146,8 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     if 'speed' in result:
         cores = result['machine']['cores']
         parts.append(speed_as_text(result['speed'], cores, markdown=markdown))
+        parts.append(f'Processor time of a step in floors, that of {OPENCV} of the same images:')
+        parts.append(costs_as_text(result['costs'], markdown=markdown))
     if 'memory' in result:
         parts.append(memory_as_text(result['memory']))
     return '\n\n'.join(parts)

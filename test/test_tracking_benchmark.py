@@ -963,6 +963,19 @@ def test_memory_is_followed(clip):
     assert 'after 6; ' in tracking_speed.memory_as_text(found)
 
 
+def test_costs_are_told_in_floors():
+    rows = tracking_speed.costs(REACH, 20)
+    assert [(row['inputs'], row['rate']) for row in rows] == [(IMAGES, 0.0), (IMAGES, 3.0)]
+    whole, slow = rows
+    assert whole['images'] > slow['images'] > 0
+    assert len(tracking_speed.costs(REACH, 8)) == 1  # too few at the lower rate
+    assert whole['mean'] == pytest.approx(whole['cpu_ms'] / whole['floor_ms'])
+    assert 1.0 < whole['median'] <= whole['most']
+    lines = tracking_speed.costs_as_text(rows[:1], markdown=True).splitlines()
+    assert lines[0].startswith('| clip')
+    assert lines[-1].startswith('| mean  | images | all')
+
+
 def test_speed_is_told(timed):
     text = tracking_speed.speed_as_text(timed[0], 2, markdown=True)
     assert text.startswith('reach 480x360, 3 images, 2 cores: ')
