@@ -973,7 +973,7 @@ def test_costs_are_told_in_floors():
     assert 1.0 < whole['median'] <= whole['most']
     lines = tracking_speed.costs_as_text(rows[:1], markdown=True).splitlines()
     assert lines[0].startswith('| clip')
-    assert lines[-1].startswith('| mean  | images | all')
+    assert [x.strip() for x in lines[-1].split('|')[1:4]] == ['mean', 'images', 'all']
 
 
 def test_speed_is_told(timed):
