@@ -357,7 +357,7 @@ def _slopes(skeleton: Skeleton, camera: Camera, keypoints: Keypoints, sigma: flo
         lifted = _first_of(keypoints.names, keypoints.positions)
     pixels = _first_of(keypoints.names, keypoints.pixels)
     pairs, directions, rays, slopes, weights, groups = [], [], [], [], [], []
-    for bone, segments, along in _bones(skeleton):
+    for bone, segments, along in _bones(skeleton) if lifted else ():
         measured, middle = _direction(lifted, bone), _middle(pixels, bone)
         if measured is None or middle is None:
             continue
