@@ -59,7 +59,7 @@ from benchmarks.tracking_rules import (
     rules_named,
 )
 from benchmarks.tracking_scores import detector_scores, interval, scores_of
-from benchmarks.tracking_speed import costs, memory, speed
+from benchmarks.tracking_speed import PRICED, costs, memory, speed
 from benchmarks.tracking_tables import COMPARED, HEAVIEST, OF_ABLATIONS, as_text
 from hmt_ros.tracking import TrackerSettings
 
@@ -71,7 +71,6 @@ SEEDS = (0, 1, 2)
 RATES = (USUAL_RATE,)
 ABLATIONS: tuple[tuple[str, Any], ...] = (*(('max_hypotheses', k) for k in (1, 2, 4, 8, 16)),)
 TIMED = 'walk'  # if it is there
-PRICED = ('walk', 'kick', 'dab', 'turns', 'window')  # those that are there
 SIZED = 'signals'  # if it is there
 SIZES = (0.25, 0.5, 1.0)  # of the images
 QUICK = 20  # images a clip

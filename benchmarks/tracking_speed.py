@@ -21,6 +21,8 @@ from hmt_ros.tracking import TrackerSettings
 OPENCV = 'MOG2 + Canny + distance transform'
 # Images a second besides all of them, and images that start a track.
 LOW_RATE, STARTING = 3.0, 2
+# Clips whose steps are priced, where they are there.
+PRICED = ('walk', 'kick', 'dab', 'turns', 'window')
 
 
 def speed(clip: Clip) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from benchmarks import (
     depth,
     distance,
     flips,
+    gate,
     joint_errors,
     kernels,
     keypoint_noise,
@@ -293,7 +294,7 @@ def test_command_line(capsys, tmp_path):
     assert main(['flops']) == 1
     assert capsys.readouterr().err.splitlines() == [
         "benchmarks: no 'flops', wanted one of absence, bags, contour_noise, depth, distance, "
-        'error_model, experts, flips, joint_errors, keypoint_noise, kernels, kjs, live, '
+        'error_model, experts, flips, gate, joint_errors, keypoint_noise, kernels, kjs, live, '
         'motion_prior, nodes, people, real_video, smoothing, soak, tracking, vertical, votes'
     ]
     assert main(['tracking', '--clips', str(tmp_path)]) == 1
@@ -444,6 +445,29 @@ def test_the_distance_of_the_demonstration_needs_keypoints(capsys):
     text = distance.as_text({'cases': [{'known': 'stature', 'clips': 3} | three]}, markdown=True)
     row = text.splitlines()[-1].split('|')
     assert [x.strip() for x in row[1:-1]] == ['stature', '3', *(3 * ['5.0 (-1.0; 4.0)'])]
+
+
+# gate
+
+
+def test_the_gate_fails_where_a_step_costs_too_much(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(gate, 'TABLE', tmp_path / 'gate.json')
+    run = ['gate', '--quick', '--clips', str(ROOT / 'bags')]
+    assert main(run) == 1
+    assert '--write adds what is measured' in capsys.readouterr().err
+    assert main([*run, '--write']) == 0
+    assert 'met' in capsys.readouterr().out
+    known = gate.read_table(tmp_path / 'gate.json')
+    (source,) = known
+    floors = known[source]['images']['all']
+    assert floors > 1.0
+    limits = {source: {'images': {'all': floors}}}
+    for factor, over in ((1.1, False), (1.2, True)):
+        (row,) = gate.compared(source, {'images': {'all': factor * floors}}, limits)
+        assert row['over'] == over
+    text = gate.as_text({'rows': [row]})
+    assert text.splitlines()[-1].endswith('too much')
+    assert main(['gate', '--clips', str(ROOT / 'test')]) == 1
 
 
 # vertical
