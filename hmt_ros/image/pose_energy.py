@@ -57,7 +57,7 @@ class Compiled(NamedTuple):
     Attributes:
         placing: of the skeleton.
         model, inputs: of the terms of the image.
-        contour: whether one of these needs the contour; none of them is on: `image` is False.
+        image, contour: whether one of these is on, and whether one that is on needs the contour.
         keypoints, prior, overlaps, ground: of the other terms.
         centres, precisions: (R, f), (R, f, f) of the motion, a row a problem or one for all; no
             rows: there is none.
@@ -99,12 +99,6 @@ class Descent(NamedTuple):
 NO_DESCENT = Descent(0, 1.0, 0.0, np.zeros(0))
 
 
-@lru_cache(maxsize=64)
-def _limits(f: int) -> Array:
-    """Limits (2, f) that are not looked at."""
-    return np.zeros((2, f))
-
-
 @dataclass(frozen=True, eq=False)
 class PoseEnergy:
     """A sum of terms over the poses of a body; an `EnergyTerm` over all variables, or some.
@@ -129,10 +123,10 @@ class PoseEnergy:
     counted: Callable[[int], None] | None = None
 
     def __post_init__(self) -> None:
-        kinds = [type(term).__name__ for term in self.terms if isinstance(term, _KNOWN)]
-        twice = sorted({name for name in kinds if kinds.count(name) > 1})
-        if twice:
-            raise ValueError(f'a sum has one term of a kind at most, saw more: {", ".join(twice)}')
+        for kind in _KNOWN:
+            found = [type(term).__name__ for term in self.terms if isinstance(term, kind)]
+            if len(found) > 1:
+                raise ValueError(f'a sum has one term of a kind at most, saw {" and ".join(found)}')
 
     def energy(
         self,
@@ -154,12 +148,11 @@ class PoseEnergy:
         compiled, asked = self._compiled(n), n if derivatives else 0
         value, gradient, hessian = np.empty(n), np.empty((asked, f)), np.empty((asked, f, f))
         exact = derivatives == Derivatives.EXACT
-
-        nothing = np.empty(n, dtype=np.int8), np.zeros(n, dtype=np.int32)
+        limits, nothing = np.zeros((2, f)), (np.empty(n, np.int8), np.zeros(n, np.int32))
 
         def work(first: int, last: int) -> None:
             _solve(
-                first, last, compiled, self._point, self._free, rows, exact, _limits(f), NO_DESCENT,
+                first, last, compiled, self._point, self._free, rows, exact, limits, NO_DESCENT,
                 x, value, gradient, hessian, *nothing,
             )  # fmt: skip
 
@@ -236,7 +229,7 @@ class PoseEnergy:
     @cached_property
     def _strange(self) -> tuple[FrameTerm, ...]:
         """Terms without a kernel here."""
-        return tuple(term for term in self.terms if not isinstance(term, _KNOWN))
+        return tuple(x for x in self.terms if not any(isinstance(x, kind) for kind in _KNOWN))
 
     def _others(self, x: Array, rows: Index, derivatives: Derivatives) -> list[Energy]:
         """Energies of the terms without a kernel, over the free variables."""
@@ -311,7 +304,10 @@ class PoseEnergy:
         )
 
 
-_KNOWN = (ObservedImage, KeypointTerm, MixturePrior, AnglePrior, SelfIntersection, GroundTerm)
+# Kinds of terms with a kernel here.
+_KNOWN: tuple[Any, ...] = (
+    ObservedImage, KeypointTerm, (MixturePrior, AnglePrior), SelfIntersection, GroundTerm,
+)  # fmt: skip
 NOTHING_SEEN = Observation()
 
 

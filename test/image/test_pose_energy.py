@@ -226,5 +226,8 @@ def test_poses_that_are_none_are_refused(terms, x, message):
 
 def test_two_terms_of_a_kind_are_refused(terms):
     likelihood, some = terms['image']
-    with pytest.raises(ValueError, match='one term of a kind at most, saw more: ObservedImage'):
+    with pytest.raises(ValueError, match='at most, saw ObservedImage and ObservedImage'):
         PoseEnergy(likelihood, (*some, *some))
+    two = (likelihood.pose_prior, terms['independent angles'][0].pose_prior)
+    with pytest.raises(ValueError, match='at most, saw MixturePrior and AnglePrior'):
+        PoseEnergy(likelihood, two)
