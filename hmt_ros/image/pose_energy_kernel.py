@@ -1,0 +1,297 @@
+"""The compiled energies of `pose_energy`, and the descent to their minima, pose by pose."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from hmt_ros.body.ground_kernel import Constants, add_ground_energies
+from hmt_ros.body.kinematics import Placing, place_pose
+from hmt_ros.body.pose_prior import PriorModel, evaluate_prior
+from hmt_ros.body.self_intersection import Overlaps, add_overlaps
+from hmt_ros.image.terms.keypoint_kernel import KeypointInputs, add_keypoints
+from hmt_ros.image.terms.registry import Model, look, new_view, run_terms
+from hmt_ros.image.terms.residuals import assemble_pose
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.bounded_newton import DAMPING_LIMIT, LEAST_FACTOR, box_step
+from hmt_ros.inference.trust_region import LEAST_RATIO, Status
+
+# As compiled code writes them.
+_CONVERGED, _LIMIT, _STALLED, _NOT_FINITE = (
+    int(status)
+    for status in (
+        Status.CONVERGED, Status.ITERATION_LIMIT, Status.STALLED, Status.NOT_FINITE,
+    )
+)  # fmt: skip
+
+
+class Compiled(NamedTuple):
+    """The terms as compiled code reads them; what is not there counts 0.
+
+    Attributes:
+        placing: of the skeleton.
+        model, inputs: of the terms of the image.
+        image, contour: whether one of these is on, and whether one that is on needs the contour.
+        keypoints, prior, overlaps, ground: of the other terms.
+        centres, precisions: (R, f), (R, f, f) of the motion, a row a problem or one for all; no
+            rows: there is none.
+        tails: its degrees of freedom; 0: it is Gaussian.
+    """
+
+    placing: Placing
+    model: Model
+    inputs: Any
+    image: bool
+    contour: bool
+    keypoints: KeypointInputs
+    prior: PriorModel
+    overlaps: Overlaps
+    ground: Constants
+    centres: Array
+    precisions: Array
+    tails: float
+
+
+class Descent(NamedTuple):
+    """What minima are found by; see `bounded_newton.minimise`.
+
+    Attributes:
+        most: evaluations per problem after the first one.
+        damping, tolerance: first lambda, and gain of a step that ends a descent.
+        metric: (f,) diagonal of W.
+    """
+
+    most: int
+    damping: float
+    tolerance: float
+    metric: Array
+
+
+NO_DESCENT = Descent(0, 1.0, 0.0, np.zeros(0))
+
+
+class Room(NamedTuple):
+    """Where one pose is worked on.
+
+    Attributes:
+        pose: (1, d).
+        columns, origins: (1, S, 3, 3), (1, S, 3) frames of its segments.
+        axes, dof_origins: (1, d, 3) of its degrees of freedom.
+        shown: the pose as the terms of the image see it.
+        wrenches, stiffnesses: (S, 6), (S, 6, 6) sums over the segments.
+        energies: (terms,) of the image.
+        value, ground: (1,), (1, 2).
+        gradient, hessian: (1, d), (1, d, d).
+        slope, curve: (f,), (f, f) on the free variables.
+    """
+
+    pose: Array
+    columns: Array
+    origins: Array
+    axes: Array
+    dof_origins: Array
+    shown: Any
+    wrenches: Array
+    stiffnesses: Array
+    energies: Array
+    value: Array
+    ground: Array
+    gradient: Array
+    hessian: Array
+    slope: Array
+    curve: Array
+
+
+@njit(cache=True, nogil=True)
+def _room(compiled, point, f):  # type: ignore[no-untyped-def]
+    segments, d = len(compiled.placing.parents), len(point)
+    room = Room(
+        np.empty((1, d)), np.empty((1, segments, 3, 3)), np.empty((1, segments, 3)),
+        np.empty((1, d, 3)), np.zeros((1, d, 3)),
+        new_view(compiled.model),
+        np.empty((segments, 6)), np.empty((segments, 6, 6)), np.empty(len(compiled.inputs)),
+        np.empty(1), np.empty((1, 2)), np.empty((1, d)), np.empty((1, d, d)), np.empty(f),
+        np.empty((f, f)),
+    )  # fmt: skip
+    room.pose[0] = point
+    return room
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _add_terms(compiled, number, row, exact, room, gradient, hessian):  # type: ignore[no-untyped-def]
+    """Energy of the pose in a room without the motion.
+
+    Args:
+        compiled: the terms.
+        number, row: of the pose in its call, and of its problem.
+        exact: whether the Hessian of the prior is the exact one.
+        room: with the pose.
+        gradient, hessian: (1, d), (1, d, d) result; of no pose: not wanted.
+    """
+    columns, origins, axes, dof_origins = room.columns, room.origins, room.axes, room.dof_origins
+    value, wanted = room.value, len(gradient) > 0
+    place_pose(compiled.placing, room.pose[0], columns[0], origins[0], axes[0], dof_origins[0])
+    evaluate_prior(compiled.prior, room.pose, exact, value, gradient, hessian)
+    if compiled.image:
+        view = room.shown
+        view.columns[:], view.origins[:] = columns[0], origins[0]
+        look(view, number, compiled.contour)
+        room.energies[:] = 0.0
+        wrenches, stiffnesses = room.wrenches, room.stiffnesses
+        if not wanted:
+            wrenches, stiffnesses = wrenches[:0], stiffnesses[:0]
+        wrenches[:] = 0.0
+        stiffnesses[:] = 0.0
+        run_terms(view, compiled.inputs, 0, room.energies, wrenches, stiffnesses)
+        value[0] += room.energies.sum()
+        if wanted:
+            assemble_pose(
+                compiled.model.tree, axes[0], dof_origins[0], wrenches, stiffnesses, gradient[0],
+                hessian[0],
+            )  # fmt: skip
+    keypoints = compiled.keypoints
+    if len(keypoints.points.groups) + len(keypoints.slopes.groups) > 0:
+        own = row if len(keypoints.log_priors) > 1 else 0
+        add_keypoints(
+            keypoints, keypoints.log_priors[own : own + 1], columns, origins, axes, dof_origins,
+            value, gradient, hessian,
+        )  # fmt: skip
+    if compiled.overlaps.sigma < np.inf:
+        add_overlaps(
+            compiled.overlaps, columns, origins, axes, dof_origins, value, gradient, hessian
+        )
+    if compiled.ground.weights.sum() > 0.0:
+        room.ground[:] = 0.0
+        add_ground_energies(
+            compiled.ground, columns, origins, axes, dof_origins, room.ground, gradient, hessian
+        )
+        value[0] += room.ground.sum()
+    return value[0]
+
+
+@njit(cache=True, nogil=True)
+def _add_motion(compiled, row, x, slope, curve):  # type: ignore[no-untyped-def]
+    """Energy of the motion at x (f,); its derivatives are added to slopes (f,), where wanted."""
+    f = len(x)
+    own = row if len(compiled.centres) > 1 else 0
+    centre, precision, nu = compiled.centres[own], compiled.precisions[own], compiled.tails
+    pulled = np.empty(f)
+    distance = 0.0
+    for i in range(f):
+        total = 0.0
+        for j in range(f):
+            total += precision[i, j] * (x[j] - centre[j])
+        pulled[i] = total
+        distance += total * (x[i] - centre[i])
+    value, shrinkage = 0.5 * distance, 1.0
+    if nu > 0.0:
+        value = 0.5 * (nu + f) * np.log1p(distance / nu)
+        shrinkage = (nu + f) / (nu + distance)
+    if len(slope) > 0:
+        for i in range(f):
+            slope[i] += shrinkage * pulled[i]
+            for j in range(f):
+                curve[i, j] += shrinkage * precision[i, j]
+    return value
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _energy_at(compiled, number, row, free, x, exact, room, slope, curve):  # type: ignore[no-untyped-def]
+    """Energy of all terms at x (f,); slope and curve (f,), (f, f) become its derivatives.
+
+    No slopes: no derivatives are wanted.
+    """
+    f = len(free)
+    for i in range(f):
+        room.pose[0, free[i]] = x[i]
+    count = 1 if len(slope) > 0 else 0
+    gradient, hessian = room.gradient[:count], room.hessian[:count]
+    value = _add_terms(compiled, number, row, exact, room, gradient, hessian)
+    if count > 0:
+        for i in range(f):
+            slope[i] = gradient[0, free[i]]
+            for j in range(f):
+                curve[i, j] = hessian[0, free[i], free[j]]
+    if len(compiled.centres) > 0:
+        value += _add_motion(compiled, row, x, slope, curve)
+    return value
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def solve(  # type: ignore[no-untyped-def]
+    first, last, compiled, point, free, rows, exact, limits, descent, x, value, gradient, hessian,
+    status, iterations,
+):  # fmt: skip
+    """Energies at the points first to last - 1, or minima from there.
+
+    One function for both: whatever calls the kernels of all terms takes long to compile.
+
+    Args:
+        first, last: range of points.
+        compiled, point, free, rows, exact: as for `PoseEnergy.energy`.
+        limits: (2, f) lower and upper ones.
+        descent: what `bounded_newton.minimise` descends by.
+        x: (n, f) points; become minima, where iterations are asked for.
+        value, gradient, hessian: (n,), (n, f), (n, f, f) result; of no point: no derivatives are
+            wanted, and no minima.
+        status, iterations: (n,) results.
+    """
+    f = len(free)
+    room = _room(compiled, point, f)
+    slope, curve = room.slope, room.curve
+    low, high, step, trial, scratch = (
+        np.empty(f), np.empty(f), np.empty(f), np.empty(f), np.empty(f),
+    )  # fmt: skip
+    lower, upper = limits[0], limits[1]
+    wanted = len(gradient) > 0
+    for n in range(first, last):
+        found, ended = 0.0, False
+        shift, growth = descent.damping, 2.0
+        status[n] = _LIMIT
+        for turn in range(descent.most + 1):
+            if turn == 0:
+                trial[:] = x[n]
+            else:
+                for i in range(f):
+                    low[i], high[i] = lower[i] - x[n, i], upper[i] - x[n, i]
+                predicted = box_step(
+                    gradient[n], hessian[n], low, high, shift, descent.metric, step, scratch
+                )
+                if predicted < descent.tolerance:
+                    status[n] = _CONVERGED
+                    break
+                for i in range(f):
+                    # Rounding must not leave a variable a hair away from its limit.
+                    if step[i] <= low[i]:
+                        trial[i] = lower[i]
+                    elif step[i] >= high[i]:
+                        trial[i] = upper[i]
+                    else:
+                        trial[i] = min(max(x[n, i] + step[i], lower[i]), upper[i])
+            found = _energy_at(
+                compiled, n, rows[n], free, trial, exact, room, slope if wanted else slope[:0],
+                curve,
+            )  # fmt: skip
+            if turn == 0:
+                better = True
+                ended = not np.isfinite(found)
+            else:
+                iterations[n] += 1
+                ratio = (value[n] - found) / predicted if np.isfinite(found) else -np.inf
+                better = ratio > LEAST_RATIO
+                if better:
+                    shift *= max(LEAST_FACTOR, 1.0 - (2.0 * min(ratio, 2.0) - 1.0) ** 3)
+                    growth = 2.0
+                else:
+                    shift *= growth
+                    growth *= 2.0
+                    ended = shift > DAMPING_LIMIT
+            if better:
+                x[n], value[n] = trial, found
+                if wanted:
+                    gradient[n], hessian[n] = slope, curve
+            if ended:
+                status[n] = _NOT_FINITE if turn == 0 else _STALLED
+                break
