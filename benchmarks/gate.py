@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ MARGIN = 1.15
 RUNS, QUICK = 2, 20
 
 
-def measure(
+def floors_of(
     clips: Path | None = None, *, quick: bool = False
 ) -> tuple[str, dict[str, dict[str, float]]]:
     """Where the clips are from, and floors of a step by inputs and rate: the mean over the clips.
@@ -90,6 +89,30 @@ def compared(
     return rows
 
 
+def measure(
+    clips: Path | None = None, *, quick: bool = False, write: bool = False
+) -> dict[str, Any]:
+    """What a step costs, beside the table.
+
+    Args:
+        clips, quick: as for `floors_of`.
+        write: whether the table takes over what is measured.
+
+    Raises:
+        ValueError: there is nothing to measure on, or to compare with.
+    """
+    limits = read_table(TABLE)
+    source, found = floors_of(clips, quick=quick)
+    if write:
+        limits[source] = {
+            inputs: {rate: round(x, 1) for rate, x in by_rate.items()}
+            for inputs, by_rate in found.items()
+        }
+        TABLE.write_text(json.dumps(limits, indent=1, sort_keys=True) + '\n', 'utf-8')
+    rows = compared(source, found, limits)
+    return {'machine': description(), 'clips': source, 'rows': rows}
+
+
 def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     """What is printed."""
     head = ['inputs', 'rate', 'floors', 'table', '']
@@ -101,7 +124,7 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     return table([head, *rows], left=2, markdown=markdown)
 
 
-def read_table(path: Path = TABLE) -> dict[str, Any]:
+def read_table(path: Path) -> dict[str, Any]:
     """Floors by clips, inputs and images a second, as checked in; empty where there are none."""
     return dict(json.loads(path.read_text('utf-8'))) if path.is_file() else {}
 
@@ -112,19 +135,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument('--clips', type=Path, help='folder of the clips')
     parser.add_argument('--write', action='store_true', help='write the table')
     options = parser.parse_args(arguments)
-    limits = read_table()
     try:
-        source, found = measure(options.clips, quick=options.quick)
-        if options.write:
-            limits[source] = {
-                inputs: {rate: round(x, 1) for rate, x in by_rate.items()}
-                for inputs, by_rate in found.items()
-            }
-            TABLE.write_text(json.dumps(limits, indent=1, sort_keys=True) + '\n', 'utf-8')
-        rows = compared(source, found, limits)
+        result = measure(options.clips, quick=options.quick, write=options.write)
     except ValueError as error:
         print(f'gate: {error}', file=sys.stderr)
         return 1
-    result = {'machine': description(), 'clips': source, 'rows': rows}
-    show(result, partial(as_text), as_json=options.json)
-    return int(any(row['over'] for row in rows))
+    show(result, as_text, as_json=options.json)
+    return int(any(row['over'] for row in result['rows']))

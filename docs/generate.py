@@ -36,6 +36,7 @@ PAGES = {
     'depth': 'likelihood.md',
     'distance': 'ground.md',
     'error_model': 'tracking.md',
+    'gate': 'tracking.md',
     'joint_errors': 'body.md',
     'keypoint_noise': 'keypoints.md',
     'motion_prior': 'motion_prior.md',
