@@ -1,8 +1,8 @@
 """gate: fails where a step of the tracker costs more than the table in gate.json says.
 
-The processor time of a step is told in floors, OpenCV's own work on the same images in the same
-run (`tracking --parts speed`), so that machines and loads can be compared. The lower of two runs
-counts. --write puts what was measured into the table.
+Processor time is in floors, OpenCV's own work on the same images in the same run (`tracking --parts
+speed`), so that machines and loads can be compared. The lower of two runs counts. --write puts what
+was measured into the table.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def floors_of(
         quick: one run, and few images.
 
     Raises:
-        ValueError: there is no clip with a background.
+        ValueError: no clip has a background.
     """
     folders, source = find_clips(clips)
     priced = [x for x in folders if x.name in PRICED] or folders

@@ -212,8 +212,9 @@ def facing(joints: Array) -> Array:
 def trunk_offsets(record: Record, found: NDArray[np.bool_]) -> dict[str, float]:
     """How far ahead and above the true ones joints of the heaviest mode lie, mm.
 
-    Both are seen from the pelvis in the frame of the own trunk: what is left is no error of the
-    pose, but where the model has the joints. Left and right count together. NaN: no joint is known.
+    Both are seen from the pelvis, each in the frame of its own trunk: what is left comes from where
+    the model has the joints, and not from the pose. Left and right count together. NaN: no joint is
+    known.
 
     Args:
         record: of a run.

@@ -46,7 +46,7 @@ class PoseEnergy:
         motion: around where poses are expected, over the free variables; None: nothing is expected.
         point: (d,) values of all variables; None: all are free.
         free: (f,) variables that may move, where there is a point.
-        counted: is told how many poses have been evaluated.
+        counted: is called with the number of poses that were evaluated; None: nobody counts.
 
     Raises:
         ValueError: two terms of one kind that has a kernel.

@@ -124,6 +124,7 @@ def test_energies_are_those_of_the_terms(terms, poses, name, motion, derivatives
     rows = np.random.default_rng(2).permutation(COUNT)
     own = PoseEnergy(likelihood, some, expected)
     found = own.energy(poses, rows, derivatives=derivatives)
+    assert (found.hessian is None) == (derivatives == Derivatives.NONE)
     check_same(
         found, plain(likelihood, some, expected).energy(poses, rows, derivatives=derivatives)
     )
