@@ -345,43 +345,49 @@ def place_pose(tree, pose, columns, origins, axes, dof_origins):  # type: ignore
         axes, dof_origins: (d, 3) unit vector of each degree of freedom, and a point on the axis of
             each rotation; those of translations are left as they are.
     """
-    mounts, offsets = tree.mounts, tree.offsets
     for s in range(len(tree.parents)):
-        parent = tree.parents[s]
+        place_segment(tree, s, pose, columns, origins, axes, dof_origins)
+
+
+@njit(cache=True, nogil=True, inline='always')
+def place_segment(tree, s, pose, columns, origins, axes, dof_origins):  # type: ignore[no-untyped-def]
+    """Fills the frame of segment s of a pose (d,) whose parent is placed; see `place_pose`."""
+    mounts, offsets = tree.mounts, tree.offsets
+    parent = tree.parents[s]
+    for k in range(3):
+        origins[s, k] = offsets[s, k]
+    if parent >= 0:
         for k in range(3):
-            origins[s, k] = offsets[s, k]
-        if parent >= 0:
-            for k in range(3):
-                origins[s, k] = origins[parent, k]
-                for i in range(3):
-                    origins[s, k] += offsets[s, i] * columns[parent, i, k]
-        for i in range(3):
-            for k in range(3):
-                if parent >= 0:
-                    total = 0.0
-                    for j in range(3):
-                        total += mounts[s, j, i] * columns[parent, j, k]
-                    columns[s, i, k] = total
-                else:
-                    columns[s, i, k] = mounts[s, k, i]
-        for d in range(tree.first_dofs[s], tree.first_dofs[s + 1]):
-            axis, value = tree.dof_axes[d], pose[d]
-            if tree.dof_is_rotation[d]:
-                cos, sin = np.cos(value), np.sin(value)
-                i, j = (axis + 1) % 3, (axis + 2) % 3
-                for k in range(3):
-                    axes[d, k] = columns[s, axis, k]
-                    dof_origins[d, k] = origins[s, k]
-                    a, b = columns[s, i, k], columns[s, j, k]
-                    columns[s, i, k] = cos * a + sin * b
-                    columns[s, j, k] = cos * b - sin * a
+            origins[s, k] = origins[parent, k]
+            for i in range(3):
+                origins[s, k] += offsets[s, i] * columns[parent, i, k]
+    for i in range(3):
+        for k in range(3):
+            if parent >= 0:
+                total = 0.0
+                for j in range(3):
+                    total += mounts[s, j, i] * columns[parent, j, k]
+                columns[s, i, k] = total
             else:
-                for k in range(3):
-                    along = 1.0 if k == axis else 0.0
-                    if parent >= 0:
-                        along = columns[parent, axis, k]
-                    axes[d, k] = along
-                    origins[s, k] += along * value
+                columns[s, i, k] = mounts[s, k, i]
+    for d in range(tree.first_dofs[s], tree.first_dofs[s + 1]):
+        axis, value = tree.dof_axes[d], pose[d]
+        if tree.dof_is_rotation[d]:
+            cos, sin = np.cos(value), np.sin(value)
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            for k in range(3):
+                axes[d, k] = columns[s, axis, k]
+                dof_origins[d, k] = origins[s, k]
+                a, b = columns[s, i, k], columns[s, j, k]
+                columns[s, i, k] = cos * a + sin * b
+                columns[s, j, k] = cos * b - sin * a
+        else:
+            for k in range(3):
+                along = 1.0 if k == axis else 0.0
+                if parent >= 0:
+                    along = columns[parent, axis, k]
+                axes[d, k] = along
+                origins[s, k] += along * value
 
 
 @njit(cache=True, nogil=True)
