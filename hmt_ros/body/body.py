@@ -240,8 +240,7 @@ class Body:
 
     def joint_positions(self, poses: ArrayLike) -> Array:
         """Joint positions (N, J, 3) of poses (N, d), camera frame, m."""
-        joints = kinematics.forward(self.skeleton, poses).joints()
-        return np.ascontiguousarray(joints.transpose(2, 0, 1))
+        return kinematics.joint_positions(self.skeleton, poses)
 
     def joint_jacobians(self, poses: ArrayLike) -> Array:
         """Derivatives (N, J, 3, d) of the joint positions with respect to the poses (N, d)."""

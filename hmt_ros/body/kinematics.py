@@ -117,6 +117,32 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
     Raises:
         ValueError: poses that do not have d columns or are not finite.
     """
+    q = _checked(skeleton, poses)
+    n, s, d = len(q), len(skeleton.parents), skeleton.dimension
+    columns, origins = np.empty((s, 3, 3, n)), np.empty((s, 3, n))
+    axes, dof_origins = np.empty((d, 3, n)), np.zeros((d, 3, n))
+    _place_segments(placing_of(skeleton), q, columns, origins, axes, dof_origins)
+    return Frames(skeleton, q, columns, origins, axes, dof_origins)
+
+
+def joint_positions(skeleton: Skeleton, poses: ArrayLike) -> Array:
+    """Joint positions (N, J, 3) of poses (N, d), camera frame, m.
+
+    Raises:
+        ValueError: as `forward`.
+    """
+    q = _checked(skeleton, poses)
+    result = np.empty((len(q), len(skeleton.joint_segments), 3))
+    _place_joints(placing_of(skeleton), q, skeleton.joint_segments, skeleton.joint_offsets, result)
+    return result
+
+
+def _checked(skeleton: Skeleton, poses: ArrayLike) -> Array:
+    """Poses (N, d) as an array.
+
+    Raises:
+        ValueError: they do not have d columns or are not finite.
+    """
     q = np.ascontiguousarray(poses, dtype=np.float64)
     if q.ndim != 2 or q.shape[1] != skeleton.dimension:
         raise ValueError(
@@ -124,11 +150,7 @@ def forward(skeleton: Skeleton, poses: ArrayLike) -> Frames:
         )
     if not np.isfinite(q).all():
         raise ValueError(f'poses of {skeleton.name} must be finite')
-    n, s, d = len(q), len(skeleton.parents), skeleton.dimension
-    columns, origins = np.empty((s, 3, 3, n)), np.empty((s, 3, n))
-    axes, dof_origins = np.empty((d, 3, n)), np.zeros((d, 3, n))
-    _place_segments(placing_of(skeleton), q, columns, origins, axes, dof_origins)
-    return Frames(skeleton, q, columns, origins, axes, dof_origins)
+    return q
 
 
 def point_jacobians(frames: Frames, segments: Index, points: Array) -> Array:
@@ -186,16 +208,26 @@ def _directed(moves, is_rotation, axes, origins, segments, points, directions, r
 
 def origin_length_jacobians(skeleton: Skeleton, frames: Frames) -> Array:
     """Derivatives (S, 3, L, N) of the origins of the segments with respect to the lengths."""
-    n, count = frames.count, len(skeleton.length_names)
-    result = np.zeros((len(skeleton.parents), 3, count, n))
-    for s, parent in enumerate(skeleton.parents):
-        if parent >= 0:
-            result[s] = result[parent] + np.einsum(
-                'ixn,il->xln', frames.columns[parent], skeleton.offset_basis[s]
-            )
-        else:
-            result[s] = skeleton.offset_basis[s][..., None]
+    result = np.zeros((len(skeleton.parents), 3, len(skeleton.length_names), frames.count))
+    _lift_origins(placing_of(skeleton).parents, skeleton.offset_basis, frames.columns, result)
     return result
+
+
+@njit(cache=True, nogil=True)
+def _lift_origins(parents, basis, columns, result):  # type: ignore[no-untyped-def]
+    """Fills the result of `origin_length_jacobians`, segment by segment."""
+    segments, _, lengths, poses = result.shape
+    for s in range(segments):
+        parent = parents[s]
+        for x in range(3):
+            for k in range(lengths):
+                for n in range(poses):
+                    total = 0.0 if parent >= 0 else basis[s, x, k]
+                    if parent >= 0:
+                        total = result[parent, x, k, n]
+                        for i in range(3):
+                            total += columns[parent, i, x, n] * basis[s, i, k]
+                    result[s, x, k, n] = total
 
 
 def joint_length_jacobians(skeleton: Skeleton, poses: ArrayLike) -> Array:
@@ -407,6 +439,25 @@ def _place_segments(tree, poses, columns, origins, axes, dof_origins):  # type: 
             for k in range(3):
                 axes[j, k, n] = axis[j, k]
                 dof_origins[j, k, n] = on_axis[j, k]
+
+
+@njit(cache=True, nogil=True)
+def _place_joints(tree, poses, joint_segments, joint_offsets, joints):  # type: ignore[no-untyped-def]
+    """Fills the joints (N, J, 3) of poses (N, d)."""
+    segments, d = len(tree.parents), poses.shape[1]
+    columns, origins = np.empty((segments, 3, 3)), np.empty((segments, 3))
+    axes, on_axes = np.empty((d, 3)), np.empty((d, 3))
+    for n in range(len(poses)):
+        place_pose(tree, poses[n], columns, origins, axes, on_axes)
+        for j in range(len(joint_segments)):
+            s = joint_segments[j]
+            for x in range(3):
+                joints[n, j, x] = (
+                    columns[s, 0, x] * joint_offsets[j, 0]
+                    + columns[s, 1, x] * joint_offsets[j, 1]
+                    + columns[s, 2, x] * joint_offsets[j, 2]
+                    + origins[s, x]
+                )
 
 
 @lru_cache(maxsize=64)

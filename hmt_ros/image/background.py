@@ -2,8 +2,9 @@
 
 The background is either a given image of the empty scene or learned from frames in which the person
 is absent or moves. OpenCV's mixture (MOG2) or nearest-neighbour (KNN) model does the per-pixel
-work. A background that turns out to be useless can be put together anew, from the pixels of images
-where the person is not.
+work, on images made smaller to about `LINES` lines: what they cost does not depend on the camera,
+and the outline that comes back is smooth to a fraction of their pixels. A background that turns out
+to be useless can be put together anew, from the pixels of images where the person is not.
 """
 
 from __future__ import annotations
@@ -13,10 +14,14 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hmt_ros.inference.arrays import Image, Mask
 
 Box = tuple[int, int, int, int]
+
+# Number of lines that images are made smaller to, about: by a whole factor.
+LINES = 240
 
 # What OpenCV's models call a pixel that differs from the background, and one that is darker in the
 # same colour.
@@ -112,7 +117,7 @@ class BackgroundModel:
             self._shape = image.shape
         self._check(image)
         self.frames += 1
-        self._model.apply(image, learningRate=1.0 / self.frames)
+        self._model.apply(self._smaller(image), learningRate=1.0 / self.frames)
         self._nearby = self._last = None
 
     def forget(self) -> None:
@@ -144,7 +149,7 @@ class BackgroundModel:
 
     @property
     def empty(self) -> Image:
-        """The empty scene (H, W, 3), as far as it is known."""
+        """The empty scene (h, w, 3), as far as it is known, made smaller as all images are."""
         return np.asarray(self._model.getBackgroundImage(), dtype=np.uint8)
 
     def foreground(self, image: Image) -> Mask:
@@ -155,7 +160,7 @@ class BackgroundModel:
         Raises:
             ValueError: no background was learned, or the image has another size.
         """
-        return np.asarray(self._subtracted(image) == FOREGROUND)
+        return self._larger(self._subtracted(image) == FOREGROUND)
 
     def silhouette(self, image: Image, region: Box | None = None) -> Mask:
         """Foreground (H, W) of an image: the largest piece and what is near it, without shadow.
@@ -183,21 +188,23 @@ class BackgroundModel:
         """
         raw = self._subtracted(image)
         if others is not None:
-            raw = np.where(others, 0, raw).astype(np.uint8)
-        mask = raw == FOREGROUND
+            raw = np.where(self._smaller(others.view(np.uint8)) > 0, 0, raw).astype(np.uint8)
+        region = self._smaller_box(region)
+        mask, square = raw == FOREGROUND, np.ones((3, 3), np.uint8)
         part, unsure = mask[_part(region)], np.zeros(mask.shape, dtype=np.bool_)
         if part.size:
-            small, large = np.ones((3, 3), np.uint8), np.ones((5, 5), np.uint8)
             pixels = np.ascontiguousarray(part).view(np.uint8)
-            opened = cv2.morphologyEx(pixels, cv2.MORPH_OPEN, small)
-            part[:] = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, large) > 0
+            if self._factor == 1:
+                opened = cv2.morphologyEx(pixels, cv2.MORPH_OPEN, square)
+                pixels = np.asarray(opened, dtype=np.uint8)
+            part[:] = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, square) > 0
             pixels = np.ascontiguousarray(raw[_part(region)] == SHADOW).view(np.uint8)
-            unsure[_part(region)] = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, large) > 0
-        found = one_person(mask, self.settings, region)
-        return Silhouette(found, unsure & ~found)
+            unsure[_part(region)] = cv2.morphologyEx(pixels, cv2.MORPH_CLOSE, square) > 0
+        found = self._larger(one_person(mask, self.settings, region))
+        return Silhouette(found, self._larger(unsure) & ~found)
 
     def _subtracted(self, image: Image) -> Image:
-        """`FOREGROUND`, `SHADOW` or 0 (H, W)."""
+        """`FOREGROUND`, `SHADOW` or 0 (h, w), of an image made smaller."""
         if self.frames == 0:
             raise ValueError('no background has been learned: give an image or some frames first')
         self._check(image)
@@ -207,17 +214,18 @@ class BackgroundModel:
             parts.changed = False
         if parts is None and self._last is not None and self._last[0] is image:
             return self._last[1]
-        raw = np.asarray(self._model.apply(image, learningRate=FROZEN), dtype=np.uint8)
-        raw[(raw == FOREGROUND) & self._is_beside(image)] = 0
+        small = self._smaller(image)
+        raw = np.asarray(self._model.apply(small, learningRate=FROZEN), dtype=np.uint8)
+        raw[(raw == FOREGROUND) & self._is_beside(small)] = 0
         if parts is not None:
-            raw[parts.unknown] = 0
+            raw[self._smaller(parts.unknown.view(np.uint8)) > 0] = 0
         self.changed = cv2.countNonZero(raw) / raw.size
         if parts is None:
             self._last = (image, raw)
         return raw
 
     def _is_beside(self, image: Image) -> Mask:
-        """Pixels (H, W) whose colour the background has beside them: its edges, slightly moved."""
+        """Pixels (h, w) whose colour the background has beside them: its edges, slightly moved."""
         if self._nearby is None:
             empty = self.empty
             square = np.ones((3, 3), np.uint8)
@@ -229,6 +237,33 @@ class BackgroundModel:
             )
         lowest, highest = self._nearby
         return np.asarray(cv2.inRange(image, lowest, highest) > 0)
+
+    @property
+    def _factor(self) -> int:
+        """How many times smaller images are made."""
+        return max(round(self._shape[0] / LINES), 1)
+
+    def _smaller(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """An image (H, W) or (H, W, 3) made smaller; a pixel is the mean of those it stands for."""
+        if self._factor == 1:
+            return image
+        size = tuple(-(-x // self._factor) for x in image.shape[1::-1])
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+    def _larger(self, mask: Mask) -> Mask:
+        """A mask (h, w) in the size of images (H, W), its outline between the pixels smooth."""
+        if self._factor == 1:
+            return mask
+        pixels = cv2.resize(255 * mask.view(np.uint8), self._shape[1::-1])
+        return np.asarray(pixels > 127)
+
+    def _smaller_box(self, box: Box | None) -> Box | None:
+        """A region in the pixels of images made smaller, rounded outwards."""
+        if box is None:
+            return None
+        left, top, right, bottom = box
+        factor = self._factor
+        return left // factor, top // factor, -(-right // factor), -(-bottom // factor)
 
     def _learn_alone(self, background: Image) -> None:
         """Makes one image (H, W, 3) of the empty scene all that is known."""

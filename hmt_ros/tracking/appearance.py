@@ -175,7 +175,8 @@ class Appearance:
 def _coarse(view: View) -> Image:
     """The image on the raster."""
     step = raster_step(len(view.image))
-    return view.image[::step, ::step]
+    height, width = (-(-x // step) for x in view.image.shape[:2])
+    return on_raster(view.image, np.empty((height, width), np.bool_))
 
 
 def _evidence(value: float) -> float:

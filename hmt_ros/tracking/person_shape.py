@@ -57,14 +57,16 @@ def largest_person(foreground: Mask, step: int = 1) -> Piece | None:
         foreground: (h, w).
         step: px of the image between two of its pixels.
     """
-    pixels = foreground.view(np.uint8)
-    count, _, stats, _ = cv2.connectedComponentsWithStats(pixels, connectivity=8)
-    if count < 2:
+    x, y, across, down = cv2.boundingRect(foreground.view(np.uint8))
+    if across == 0:
         return None
-    whole = one_person(foreground, BackgroundSettings())
+    # Most of an image is empty.
+    inside = np.ascontiguousarray(foreground[y : y + down, x : x + across])
+    _, _, stats, _ = cv2.connectedComponentsWithStats(inside.view(np.uint8), connectivity=8)
+    whole = one_person(inside, BackgroundSettings())
     boxes = [*stats[1:].tolist(), [*cv2.boundingRect(whole.view(np.uint8)), counted(whole)]]
     alike = [
-        Piece(float(step**2 * area), left == 0 or left + width == foreground.shape[1])
+        Piece(float(step**2 * area), x + left == 0 or x + left + width == foreground.shape[1])
         for left, _, width, height, area in boxes
         if _is_person(width, height, area, step)
     ]

@@ -10,7 +10,6 @@ the user of a tracker adds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -172,28 +171,24 @@ class Posterior:
         last = self._last_fit
         if last is not None and last[0] is poses and last[1] is observation:
             return last[2]
-        frames, rows = forward(self.body.skeleton, poses), np.arange(len(poses))
-        image = self.likelihood.energies(frames, observation)
+        image = self.likelihood.energies(forward(self.body.skeleton, poses), observation)
         assert image.hessian is not None
         _, *terms = self.likelihood.seen(observation)
-        keypoints = [term.energy(frames, rows) for term in terms]
-        seen = add_energies([Energy(image.value, image.gradient, image.hessian), *keypoints])
-        of_keypoints = np.zeros_like(image.hessian)
-        for one in keypoints:
-            of_keypoints += one.derivatives()[1]
-        known = (*self.likelihood.priors, *self.known)
-        priors = [term.energy(frames, rows) for term in known]
-        energy = add_energies([seen, *priors])
+        keypoints, priors = (
+            PoseEnergy(self.likelihood, tuple(some)).energy(poses)
+            for some in (terms, (*self.likelihood.priors, *self.known))
+        )
+        seen = add_energies([Energy(image.value, image.gradient, image.hessian), keypoints])
+        of_keypoints = keypoints.derivatives()[1]
+        energy = add_energies([seen, priors])
         fit = ImageFit(energy, seen.value, image.hessian, of_keypoints, image.costs)
         self._last_fit = (poses, observation, fit)
         return fit
 
     def log_likelihoods(self, poses: Array, observation: Observation) -> Array:
         """log p(image | pose) of poses (K, d), (K,), nats up to a constant of the image."""
-        frames, rows = forward(self.body.skeleton, poses), np.arange(len(poses))
-        energies = np.zeros(len(poses))
-        for term in self.likelihood.seen(observation):
-            energies += term.energy(frames, rows, derivatives=Derivatives.NONE).value
+        seen = PoseEnergy(self.likelihood, self.likelihood.seen(observation))
+        energies = seen.energy(poses, derivatives=Derivatives.NONE).value
         return -energies
 
     def given_way(self, poses: Array, observation: Observation) -> tuple[Array, Array]:
@@ -236,21 +231,18 @@ class Posterior:
             exchanges: (N, E) log probabilities of exchanges of sides.
             dt: time since the image before, s.
         """
-        frames, rows = forward(self.body.skeleton, poses), np.arange(len(poses))
         self.evaluations += len(poses)
         share = {name: errors.share(dt) for name, errors in ERRORS.items()}
 
-        def of(terms: Sequence[FrameTerm]) -> Array:
-            value = np.zeros(len(poses))
-            for term in terms:
-                value += term.energy(frames, rows, derivatives=Derivatives.NONE).value
-            return value
+        def of(*terms: FrameTerm) -> Array:
+            energy = PoseEnergy(self.likelihood, terms)
+            return energy.energy(poses, derivatives=Derivatives.NONE).value
 
         image, *keypoints = self.likelihood.seen(observation)
-        total = share['image'] * of([image])
-        total += share['prior'] * of([*self.likelihood.priors, *self.known])
+        total = share['image'] * of(image)
+        total += share['prior'] * of(*self.likelihood.priors, *self.known)
         if keypoints:
-            total += of([self.likelihood.keypoint_term(observation, exchanges, share['keypoints'])])
+            total += of(self.likelihood.keypoint_term(observation, exchanges, share['keypoints']))
         return total
 
     def seen_points(self, poses: Array, observation: Observation) -> SurfacePoints:

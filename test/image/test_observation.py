@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.contour_noise import signed_distance
 from hmt_ros.image.observation import MARGIN, observe
 from hmt_ros.image.terms.edges import ORIENTATIONS
 from hmt_ros.image.terms.image_term import ImageWindow
@@ -32,7 +33,7 @@ def whole(image_map, channel=0, size=SIZE, fill=np.nan):
 
 def test_signed_distance_is_that_to_the_border_between_the_pixels():
     mask = disc() | disc((110, 70), 12)
-    found = ImageWindow(grey(), 0, 0, mask.astype(np.uint8), None).signed_distance
+    found = signed_distance(mask.astype(np.uint8))
     inside, outside = np.argwhere(mask), np.argwhere(~mask)
     rng = np.random.default_rng(0)
     for v, u in rng.integers(0, SIZE, (200, 2)):

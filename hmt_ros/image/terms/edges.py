@@ -31,6 +31,10 @@ HALF_BIN = np.tan(np.pi / 8.0)
 EDGE_LOW, EDGE_HIGH = 40.0, 100.0
 # Edges further outside the silhouette than this belong to the background, px.
 MARGIN = 4
+_DISC = np.array(
+    [[x * x + y * y <= (MARGIN + 0.5) ** 2 for x in range(-MARGIN, MARGIN + 1)]
+     for y in range(-MARGIN, MARGIN + 1)], dtype=np.uint8,
+)  # fmt: skip
 # Distance to an edge that is taken where somebody else hides what is there, px.
 HIDDEN = 2.0
 # Fewer visible points than this do not make each of them count more.
@@ -51,8 +55,8 @@ def edge_distances(window: ImageWindow) -> ImageMap:
     dx = cv2.Sobel(grey, cv2.CV_16S, 1, 0)
     dy = cv2.Sobel(grey, cv2.CV_16S, 0, 1)
     edges = cv2.Canny(dx, dy, EDGE_LOW, EDGE_HIGH) > 0
-    if window.widest_distance is not None:
-        edges &= window.widest_distance <= MARGIN
+    if window.widest is not None:
+        edges &= cv2.dilate(window.widest, _DISC) > 0
     if window.others is not None:
         edges &= window.others == 0
     rows, columns = np.nonzero(edges)

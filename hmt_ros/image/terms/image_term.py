@@ -8,10 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -72,32 +70,18 @@ class ImageWindow:
     others: Image | None = None
     depth: NDArray[np.floating] | None = None
 
-    @cached_property
-    def signed_distance(self) -> NDArray[np.float32] | None:
-        """Distance (h, w) to the outline of the silhouette, px, positive outside."""
-        return None if self.mask is None else _signed_distance(self.mask)
-
-    @cached_property
-    def widest_distance(self) -> NDArray[np.float32] | None:
-        """Distance (h, w) to the outline of the silhouette with all that may belong to it, px."""
-        if self.mask is None or (self.unsure is None and self.others is None):
-            return self.signed_distance
+    @property
+    def widest(self) -> Image | None:
+        """The silhouette (h, w) with all that may belong to it, 0 or 1; None: unknown."""
         widest = self.mask
-        for more in (self.unsure, self.others):
-            widest = widest if more is None else widest | more
-        return _signed_distance(widest)
+        if widest is not None:
+            for more in (self.unsure, self.others):
+                widest = widest if more is None else widest | more
+        return widest
 
     def as_map(self, channels: NDArray[np.float32]) -> ImageMap:
         """Values (C, h, w) of the window as a map of the whole image."""
         return ImageMap(channels, self.left, self.top)
-
-
-def _signed_distance(mask: Image) -> NDArray[np.float32]:
-    outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5)
-    inside = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
-    # The outline lies between the pixels: half a pixel from either side.
-    result: NDArray[np.float32] = np.where(mask > 0, 0.5 - inside, outside - 0.5)
-    return result
 
 
 class Weighting(NamedTuple):

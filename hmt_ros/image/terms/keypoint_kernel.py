@@ -162,6 +162,54 @@ def exchange_log_posterior(energies, weights, exchanged, log_prior, result):  # 
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
+def list_keypoints(  # type: ignore[no-untyped-def]
+    inputs, columns, origins, errors, which, places, directions, pulls, curvatures
+):
+    """Lists the residuals of keypoints at one pose, in the exchange that is likeliest there.
+
+    Args:
+        inputs: with a row of priors.
+        columns, origins: frames of the pose.
+        errors: (P, 2) become the whitened errors of the keypoints; NaN behind the camera.
+        which: (M, 2) becomes the keypoint of each residual, and 1 where it is exchanged.
+        places, directions: (M, 3) become the landmark and the derivative of the residual by it.
+        pulls, curvatures: (M,) become those of the energy by the residual.
+
+    Returns:
+        The number of residuals, two a landmark before the camera.
+    """
+    points, slopes, lens, scale = inputs.points, inputs.slopes, inputs.lens, inputs.scale
+    weights, exchanged = inputs.weights, inputs.exchanged
+    energies, posterior = np.empty((exchanged.shape[1], 2)), np.empty(len(exchanged))
+    pixels, projections, place = np.empty((1, 2)), np.empty((1, 2, 3)), np.empty(3)
+    segments, offsets, seen, whiteners, groups = points
+    group_energies(points, slopes, lens, scale, columns, origins, energies)
+    exchange_log_posterior(energies, weights, exchanged, inputs.log_priors[0], posterior)
+    likeliest = exchanged[np.argmax(posterior)]
+    m = 0
+    for k in range(len(groups)):
+        e = likeliest[groups[k]]
+        if not point_residual(
+            segments, offsets, k, e, lens, columns, origins, pixels, projections, place
+        ):
+            errors[k] = np.nan
+            continue
+        for i in range(2):
+            w0, w1 = whiteners[k, i, 0], whiteners[k, i, 1]
+            error = w0 * (pixels[0, 0] - seen[k, 0]) + w1 * (pixels[0, 1] - seen[k, 1])
+            errors[k, i] = error
+            shrink = 1.0 / (1.0 + error * error / (scale * scale))
+            curvatures[m] = weights[groups[k]] * shrink * shrink
+            pulls[m] = curvatures[m] * error
+            which[m, 0], which[m, 1] = k, e
+            for x in range(3):
+                places[m, x] = place[x]
+                directions[m, x] = w0 * projections[0, 0, x] + w1 * projections[0, 1, x]
+            m += 1
+    return m
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
 def add_keypoints(  # type: ignore[no-untyped-def]
     inputs, log_priors, columns, origins, axes, dof_origins, value, gradient, hessian
 ):

@@ -38,6 +38,7 @@ from hmt_ros.image.terms.keypoint_kernel import (
     add_keypoints,
     exchange_log_posterior,
     group_energies,
+    list_keypoints,
 )
 from hmt_ros.image.terms.residuals import tree_of
 from hmt_ros.inference.arrays import Array, Index
@@ -243,45 +244,30 @@ class KeypointTerm:
             residual by the position, (M,) derivative and (M,) curvature of the energy by the
             residual; two residuals a keypoint. Landmarks behind the camera have none.
         """
-        joints, places, pixels, projection = self._likeliest(frames)
-        shown = np.flatnonzero(np.isfinite(pixels).all(0))
-        points = self.measured.points
-        whiteners = points.whiteners[shown]
-        error = np.einsum('kab,kb->ka', whiteners, pixels.T[shown] - points.pixels[shown])
-        by_point = np.einsum('kab,bik->kai', whiteners, projection[..., shown])
-        s = self.settings
-        shrink = 1.0 / (1.0 + error**2 / s.scale**2)
-        curvature = self.weights[points.groups[shown]][:, None] * shrink**2
-        return (
-            np.repeat(joints[shown], 2),
-            np.repeat(places[shown], 2, axis=0),
-            by_point.reshape(-1, 3),
-            (curvature * error).reshape(-1),
-            curvature.reshape(-1),
-        )
+        _, *found = self._listed(frames)
+        which, places, directions, pulls, curvatures = found
+        joints = self.measured.joints[which[:, 0], which[:, 1]]
+        return joints, places, directions, pulls, curvatures
 
     def distances(self, frames: Frames) -> Array:
         """How far the keypoints (P,) that were seen are from the pose of frames, in deviations.
 
         The exchange of sides is the likeliest; of a landmark behind the camera it is NaN.
         """
-        pixels = self._likeliest(frames)[2]
-        points = self.measured.points
-        error = pixels.T - points.pixels
-        whitened = np.einsum('kab,kb->ka', points.whiteners, error)
-        return np.asarray(np.linalg.norm(whitened, axis=1))
+        return np.asarray(np.linalg.norm(self._listed(frames)[0], axis=1))
 
-    def _likeliest(self, frames: Frames) -> tuple[Index, Array, Array, Array]:
-        """In the likeliest exchange: joints (P,), places (P, 3), pixels (2, P), derivatives."""
-        points, everyone = self.measured.points, np.zeros(1, dtype=np.intp)
-        exchanged, _ = self._priors(everyone, 1)
-        sides = exchanged[int(np.argmax(self.exchanged(frames, everyone)[0]))][points.groups]
-        every = np.arange(len(sides))
-        segments, offsets = points.segments[every, sides], points.offsets[every, sides]
-        columns, origins = (x[0] for x in frames.by_pose())
-        places = origins[segments] + np.einsum('kji,kj->ki', columns[segments], offsets)
-        pixels, projection = self.camera.project_with_derivative(places.T)
-        return self.measured.joints[every, sides], places, pixels, projection
+    def _listed(self, frames: Frames) -> tuple[Array, Index, Array, Array, Array, Array]:
+        """Errors of the keypoints and residuals at one pose; see `list_keypoints`."""
+        count = len(self.measured.points.groups)
+        errors, which = np.empty((count, 2)), np.empty((2 * count, 2), dtype=np.intp)
+        places, directions = np.empty((2, 2 * count, 3))
+        pulls, curvatures = np.empty((2, 2 * count))
+        columns, origins = frames.by_pose()
+        n = list_keypoints(
+            self.compiled, columns[0], origins[0], errors, which, places, directions, pulls,
+            curvatures,
+        )  # fmt: skip
+        return errors, which[:n], places[:n], directions[:n], pulls[:n], curvatures[:n]
 
     def _priors(self, rows: Index, count: int) -> tuple[NDArray[np.int64], Array]:
         """Which groups each exchange exchanges (E, G), and log priors (N, E)."""
