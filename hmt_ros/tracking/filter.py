@@ -456,6 +456,8 @@ class MixtureFilter:
 
     def _use_body(self, body: Body) -> None:
         """Goes on with a body of the same degrees of freedom."""
+        if body is self.body:
+            return
         self.body = body
         before = self._posterior
         self._posterior = Posterior(body, self.camera, self.settings, before.extra, before.ground)

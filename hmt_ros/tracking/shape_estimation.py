@@ -34,6 +34,9 @@ LEAST_LENGTH_SIGMA = 0.008
 WANDERING = 0.02
 # Largest change by one image, and in all, in standard deviations over people.
 LARGEST_STEP, LARGEST = 0.5, 3.0
+# The person stays as it was until the estimate is so far from it, in standard deviations over people
+# (a length: half a millimetre): all that is made from a shape is made anew with it.
+NOTICED = 0.1
 # An angle gives way by this much at most while the shape is estimated, rad.
 LARGEST_SHIFT = 0.2
 
@@ -89,6 +92,8 @@ class ShapeEstimate:
         own = slice(0, self._space.lengths)
         self.covariance[own, own] = body.length_covariance + np.diag(unknown)
         self._offset = np.zeros(self._space.size)
+        # The offset of the person, who follows the estimate in steps.
+        self._taken = self._offset
         self.images = 0
         self._seen: Observation | None = None
         self._known: dict[bytes, Linearised] = {}
@@ -146,10 +151,11 @@ class ShapeEstimate:
         furthest = np.abs(move / self._spread).max()
         move *= min(1.0, LARGEST_STEP / max(float(furthest), 1e-12))
         limit = LARGEST * self._spread
-        offset = np.clip(self._offset + move, -limit, limit)
-        self._space = ShapeSpace(self._space.moved(offset - self._offset))
-        self._known = {}
-        self._offset = offset
+        self._offset = np.clip(self._offset + move, -limit, limit)
+        ahead = self._offset - self._taken
+        if np.abs(ahead / self._spread).max() > NOTICED:
+            self._space, self._taken = ShapeSpace(self._space.moved(ahead)), self._offset
+            self._known = {}
         self.images += 1
         return self._space.body
 
