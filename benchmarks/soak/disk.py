@@ -21,8 +21,8 @@ from msg_tools import BagReader
 
 _MODEL = ROOT / 'hmt_ros' / 'experts' / 'models' / 'procedural.npz'
 _CHEAP = (
-    '--set', 'max_hypotheses=1', '--set', 'candidates=1',
-    '--set', 'searched_chains=0', '--set', 'overlay_modes=0',
+    '--set', 'max_hypotheses=1', '--set', 'evaluation_budget=20',
+    '--set', 'overlay_modes=0',
 )  # fmt: skip
 
 

@@ -23,7 +23,7 @@ _BEGUN = 100_000
 _REPLAY = (
     sys.executable, '-m', 'hmt_ros', 'replay', str(CLIP), '--subject', str(CLIP / 'subject.yaml'),
     '--background', str(CLIP / 'background.png'), '--live', '--quiet', '--no-smoother',
-    '--set', 'max_hypotheses=2', '--set', 'candidates=4',
+    '--set', 'max_hypotheses=2', '--set', 'evaluation_budget=100',
 )  # fmt: skip
 
 

@@ -207,6 +207,19 @@ class LimbProducts:
         )
         return cls(body, modes, result, int(exchanged))
 
+    def at_most(self, poses: int) -> LimbProducts:
+        """Those without the last trunks, so that about so many poses are to be evaluated.
+
+        The trunk of the group stays in any case.
+        """
+        found = self.configurations
+        used = max(int((np.cumsum(1 + found.counts.sum(1)) <= poses).sum()), 1)
+        kept = found._replace(
+            trunks=found.trunks[:used], angles=found.angles[:used], counts=found.counts[:used]
+        )
+        exchanged = min(self.exchanged, used - 1)
+        return LimbProducts(self.body, self.modes, kept, exchanged)
+
     @property
     def alone(self) -> Array:
         """Poses (R, d) to evaluate: each trunk with its pose, then with each configuration."""

@@ -10,7 +10,7 @@ each compares points of its own.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -60,6 +60,14 @@ def optical_flow(window: ImageWindow) -> ImageMap | None:
     return window.as_map(channels)
 
 
+class FlowInputs(NamedTuple):
+    """What the energy of the flow reads; attributes as for `FlowTerm`."""
+
+    points: SurfacePoints
+    flow: ImageMap
+    weight: float
+
+
 @dataclass(frozen=True, eq=False)
 class FlowTerm:
     """The energy of poses against the flow; a `FrameTerm`.
@@ -86,20 +94,24 @@ class FlowTerm:
         value = np.zeros(n)
         gradient = np.zeros((n if derivatives else 0, d))
         hessian = np.zeros((n if derivatives else 0, d, d))
-        _add_flow(
-            tree_of(self.skeleton), self.lens, self.points, np.ascontiguousarray(rows), self.flow,
-            float(self.weight), *frames.by_pose(), *frames.dofs_by_pose(),
-            value, gradient, hessian,
+        add_flow(
+            self.compiled, tree_of(self.skeleton), self.lens, np.ascontiguousarray(rows),
+            *frames.by_pose(), *frames.dofs_by_pose(), value, gradient, hessian,
         )  # fmt: skip
         return Energy(value, gradient, hessian) if derivatives else Energy(value)
 
+    @property
+    def compiled(self) -> FlowInputs:
+        """As compiled code reads it."""
+        return FlowInputs(self.points, self.flow, float(self.weight))
+
 
 @njit(cache=True, nogil=True)
-def _add_flow(  # type: ignore[no-untyped-def]
-    tree, lens, points, rows, flow, weight, columns, origins, axes, dof_origins,
-    value, gradients, hessians,
-):  # fmt: skip
-    """Energies (N,), and unless hessians has no pose gradients (N, d), Hessians (N, d, d)."""
+def add_flow(  # type: ignore[no-untyped-def]
+    inputs, tree, lens, rows, columns, origins, axes, dof_origins, value, gradients, hessians
+):
+    """Adds energies (N,), and unless hessians has no pose gradients (N, d), Hessians (N, d, d)."""
+    points, flow, weight = inputs.points, inputs.flow, inputs.weight
     segments = len(tree.parents)
     wrenches, stiffnesses = np.empty((segments, 6)), np.empty((segments, 6, 6))
     pixel, projection = np.empty((1, 2)), np.empty((1, 2, 3))

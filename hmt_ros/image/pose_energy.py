@@ -1,6 +1,7 @@
 """Energies of poses and their minima, compiled as a whole: all terms of one image in one pass.
 
-    E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_ground(x) + E_motion(x)
+    E(x) = E_image(x) + E_keypoints(x) + E_prior(x) + E_intersection(x) + E_ground(x) + E_flow(x)
+           + E_motion(x)
 
 A pose is placed once, and the kernels of all terms that it is compared by read its frames. The
 minima are those of `inference.bounded_newton`, problem by problem instead of step by step. A term
@@ -25,10 +26,13 @@ from hmt_ros.body.pose_terms import AnglePrior, FrameTerm, SelfIntersection
 from hmt_ros.body.self_intersection import overlaps_of
 from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage, in_threads
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.optical_flow import FlowInputs, FlowTerm
 from hmt_ros.image.pose_energy_kernel import NO_DESCENT, Compiled, Descent, solve
+from hmt_ros.image.surface_points import SurfacePoints
+from hmt_ros.image.terms.image_term import NO_MAP
 from hmt_ros.image.terms.keypoint_kernel import KeypointInputs, Points, Slopes
 from hmt_ros.image.terms.keypoints import KeypointTerm
-from hmt_ros.image.terms.registry import TERMS
+from hmt_ros.image.terms.registry import TERMS, Model
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
 from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Student, add_energies
@@ -203,16 +207,20 @@ class PoseEnergy:
         body = self.likelihood.body
         keypoints, overlaps = self._term(KeypointTerm), self._term(SelfIntersection)
         ground, mixture = self._term(GroundTerm), self._term(MixturePrior)
-        angles = self._term(AnglePrior)
-        prior = gaussian_model(body, 0.0 if angles is None else angles.weight)
-        detected = _no_keypoints(self.likelihood) if keypoints is None else keypoints.compiled
+        angles, flow = self._term(AnglePrior), self._term(FlowTerm)
+        detected = _no_keypoints(self.likelihood.model) if keypoints is None else keypoints.compiled
+        if mixture is None:
+            prior = gaussian_model(body, 0.0 if angles is None else angles.weight)
+        else:
+            prior = mixture.compiled
         centres, precisions, tails = self._expected
         return {
             'placing': placing_of(body.skeleton),
             'keypoints': detected,
-            'prior': prior if mixture is None else mixture.compiled,
+            'prior': prior,
             'overlaps': overlaps_of(body, np.inf if overlaps is None else overlaps.sigma),
             'ground': _no_ground(body.dimension) if ground is None else ground.compiled,
+            'flow': _NO_FLOW if flow is None else flow.compiled,
             'centres': centres,
             'precisions': precisions,
             'tails': tails,
@@ -244,20 +252,27 @@ class PoseEnergy:
 # Kinds of terms with a kernel here.
 _KNOWN: tuple[Any, ...] = (
     ObservedImage, KeypointTerm, (MixturePrior, AnglePrior), SelfIntersection, GroundTerm,
+    FlowTerm,
 )  # fmt: skip
 NOTHING_SEEN = Observation()
+_NONE, _NO_PAIRS = np.zeros(0, dtype=np.int64), np.zeros((0, 2), dtype=np.int64)
+_NO_POINTS = Points(_NO_PAIRS, np.zeros((0, 2, 3)), np.zeros((0, 2)), np.zeros((0, 2, 2)), _NONE)
+_NO_SLOPES = Slopes(
+    _NO_PAIRS, np.zeros((0, 2, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), _NONE
+)
+_NO_FLOW = FlowInputs(
+    SurfacePoints(
+        _NONE, np.zeros((0, 0), np.int64), np.zeros((0, 0, 3)), np.zeros((0, 0, 2))
+    ), NO_MAP, 0.0,
+)  # fmt: skip
+_AS_CALLED = np.zeros((1, 1), dtype=np.int64)
+_ONE, _SURE = np.zeros(1), np.zeros((1, 1))
 
 
-def _no_keypoints(likelihood: ImageLikelihood) -> KeypointInputs:
-    none, pairs = np.zeros(0, dtype=np.int64), np.zeros((0, 2), dtype=np.int64)
+def _no_keypoints(model: Model) -> KeypointInputs:
     return KeypointInputs(
-        Points(pairs, np.zeros((0, 2, 3)), np.zeros((0, 2)), np.zeros((0, 2, 2)), none),
-        Slopes(
-            pairs, np.zeros((0, 2, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), none
-        ),
-        likelihood.model.tree, likelihood.model.lens, 1.0, np.zeros(1),
-        np.zeros((1, 1), dtype=np.int64), np.zeros((1, 1)),
-    )  # fmt: skip
+        _NO_POINTS, _NO_SLOPES, model.tree, model.lens, 1.0, _ONE, _AS_CALLED, _SURE
+    )
 
 
 @lru_cache(maxsize=16)

@@ -6,11 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from hmt_ros.body.ground_kernel import Constants, add_ground_energies
 from hmt_ros.body.kinematics import Placing, place_pose
 from hmt_ros.body.pose_prior import PriorModel, evaluate_prior
 from hmt_ros.body.self_intersection import Overlaps, add_overlaps
+from hmt_ros.image.optical_flow import FlowInputs, add_flow
 from hmt_ros.image.terms.keypoint_kernel import KeypointInputs, add_keypoints
 from hmt_ros.image.terms.registry import Model, look, new_view, run_terms
 from hmt_ros.image.terms.residuals import assemble_pose
@@ -34,7 +36,7 @@ class Compiled(NamedTuple):
         placing: of the skeleton.
         model, inputs: of the terms of the image.
         image, contour: whether one of these is on, and whether one that is on needs the contour.
-        keypoints, prior, overlaps, ground: of the other terms.
+        keypoints, prior, overlaps, ground, flow: of the other terms.
         centres, precisions: (R, f), (R, f, f) of the motion, a row a problem or one for all; no
             rows: there is none.
         tails: its degrees of freedom; 0: it is Gaussian.
@@ -49,6 +51,7 @@ class Compiled(NamedTuple):
     prior: PriorModel
     overlaps: Overlaps
     ground: Constants
+    flow: FlowInputs
     centres: Array
     precisions: Array
     tails: float
@@ -83,6 +86,7 @@ class Room(NamedTuple):
         wrenches, stiffnesses: (S, 6), (S, 6, 6) sums over the segments.
         energies: (terms,) of the image.
         value, ground: (1,), (1, 2).
+        row: (1,) of the problem.
         gradient, hessian: (1, d), (1, d, d).
         slope, curve: (f,), (f, f) on the free variables.
     """
@@ -98,6 +102,7 @@ class Room(NamedTuple):
     energies: Array
     value: Array
     ground: Array
+    row: NDArray[np.int64]
     gradient: Array
     hessian: Array
     slope: Array
@@ -112,8 +117,8 @@ def _room(compiled, point, f):  # type: ignore[no-untyped-def]
         np.empty((1, d, 3)), np.zeros((1, d, 3)),
         new_view(compiled.model),
         np.empty((segments, 6)), np.empty((segments, 6, 6)), np.empty(len(compiled.inputs)),
-        np.empty(1), np.empty((1, 2)), np.empty((1, d)), np.empty((1, d, d)), np.empty(f),
-        np.empty((f, f)),
+        np.empty(1), np.empty((1, 2)), np.zeros(1, np.int64), np.empty((1, d)),
+        np.empty((1, d, d)), np.empty(f), np.empty((f, f)),
     )  # fmt: skip
     room.pose[0] = point
     return room
@@ -168,6 +173,12 @@ def _add_terms(compiled, number, row, exact, room, gradient, hessian):  # type: 
             compiled.ground, columns, origins, axes, dof_origins, room.ground, gradient, hessian
         )
         value[0] += room.ground.sum()
+    if compiled.flow.weight > 0.0:
+        room.row[0] = row
+        add_flow(
+            compiled.flow, compiled.model.tree, compiled.model.lens, room.row, columns, origins,
+            axes, dof_origins, value, gradient, hessian,
+        )  # fmt: skip
     return value[0]
 
 

@@ -59,6 +59,8 @@ REMOVED = {
     'lost_misfit': 'a track is lost when its cues say so together: hmt_ros/tracking/validity.py',
     'lost_images': 'a track is lost when its cues say so together: hmt_ros/tracking/validity.py',
     'trust': 'how far images are believed is a table: hmt_ros/inference/error_model.py',
+    'candidates': 'how much an image is searched follows from evaluation_budget',
+    'searched_chains': 'how much an image is searched follows from evaluation_budget',
     'proposals': f'kinematic jumps; {_TRACKER}',
     'samples': f'kinematic jumps draw none; {_TRACKER}',
     'sample_scale': f'kinematic jumps draw none; {_TRACKER}',

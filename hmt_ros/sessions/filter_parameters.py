@@ -25,15 +25,15 @@ from hmt_ros.sessions.declared_parameters import (
 )
 from hmt_ros.sessions.parameter_file import parameter_file_text
 from hmt_ros.tracking import TrackerSettings
+from hmt_ros.tracking.evaluation_plan import LIVE
 from hmt_ros.tracking.ground import KnownGround
 
 # Gravity points down in the image, or up by 10 degrees at most, where a camera looks down steeply.
 UPSIDE_DOWN = -0.17
 # Settings that are parameters, with their limits.
 _TRACKER = {
+    'evaluation_budget': (1, 100_000),
     'max_hypotheses': (1, 64),
-    'candidates': (1, 1024),
-    'searched_chains': (0, 64),
     'flow_weight': NOT_NEGATIVE,
     'threads': (0, 64),
     **{f'likelihood.{term.name}.weight': NOT_NEGATIVE for term in TERMS},
@@ -113,7 +113,8 @@ class FilterParameters(CameraNodeParameters):
     publish_tf: bool = parameter_field(True, AT_ONCE)
     frame_prefix: str = parameter_field('human/', AT_ONCE)
     tracker: TrackerSettings = field(
-        default_factory=TrackerSettings, metadata=nested_parameters(NEXT_TRACK, _TRACKER)
+        default_factory=lambda: TrackerSettings(evaluation_budget=LIVE),
+        metadata=nested_parameters(NEXT_TRACK, _TRACKER),
     )
     background: BackgroundSettings = field(
         default_factory=BackgroundSettings,

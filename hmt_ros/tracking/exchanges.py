@@ -66,8 +66,10 @@ class SideExchanges:
             poses: (K, d) modes.
             prior: (K, E) of the modes, log probabilities before the image.
         """
-        self._posterior = prior
-        if observation.keypoints is not None and likelihood.settings.keypoints.weight > 0:
+        seen = observation.keypoints is not None and likelihood.settings.keypoints.weight > 0
+        if seen or self._posterior is not None:
+            self._posterior = prior
+        if seen:
             term = likelihood.keypoint_term(observation, prior)
             frames = forward(likelihood.body.skeleton, poses)
             self._posterior = term.exchanged(frames, np.arange(len(poses)))

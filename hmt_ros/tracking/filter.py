@@ -259,7 +259,7 @@ class MixtureFilter:
         continuity = Continuity(self.body, predicted.poses, modes.log_weights, dt)
         predicted = follow_flow(predicted, precisions, self._points, seen, posterior)
         base = posterior.minimise(
-            posterior.given(seen, predicted, precisions), predicted.poses, s.iterations
+            posterior.given(seen, predicted, precisions), predicted.poses, s.plan.iterations
         )
         search = Search(posterior, seen, states, precisions, continuity)
         proposals: list[Proposal] = [self._proposal]
@@ -374,7 +374,7 @@ class MixtureFilter:
         kept = choose_hypotheses(
             joints,
             log_weights,
-            s.max_hypotheses,
+            s.plan.hypotheses,
             same=s.hypothesis_merge_distance,
             first=self._best_of_the_other_way(poses, log_weights),
         )

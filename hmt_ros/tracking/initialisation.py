@@ -22,11 +22,11 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.ground_terms import without_root_lean
 from hmt_ros.body.kinematics import directed_derivatives, forward, joint_length_jacobians
 from hmt_ros.body.length_prior import held
-from hmt_ros.body.pose_terms import Posed
 from hmt_ros.flips.best_combinations import distinct_poses
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Box, Observation
+from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.depth import DEPTH
 from hmt_ros.image.terms.image_term import TermSettings
@@ -34,7 +34,7 @@ from hmt_ros.image.terms.keypoints import NOT_EXCHANGED, Keypoints, KeypointTerm
 from hmt_ros.image.terms.silhouette import Outline
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise
-from hmt_ros.inference.energy import Derivatives, EnergyFunction, EnergyTerm, Quadratic
+from hmt_ros.inference.energy import Derivatives, EnergyFunction, Quadratic
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.gravity import Gravity
 from hmt_ros.tracking.misfit import of_depth
@@ -48,6 +48,7 @@ MEASURED, STATURE_MEASURED = 0.01, 0.02
 # A stature this many standard deviations from the usual one is not believed.
 MOST_UNUSUAL = 4.0
 HEADINGS = 8
+NO_POSE = 'no pose of the body explains the keypoints: are they in the image?'
 LEAST_SQUARES = TermSettings(1.0, 1.0, np.inf)
 # Axis of the camera, along which depths are measured.
 AXIS = np.array([0.0, 0.0, 1.0])
@@ -115,31 +116,44 @@ def _start(
     fits = _fit_with_lengths(body, camera, keypoints, upright, measured)
     best = np.argsort(fits.value, kind='stable')[:3]
     if not np.isfinite(fits.value[best[0]]):
-        raise ValueError('no pose of the body explains the keypoints: are they in the image?')
+        raise ValueError(NO_POSE)
     weights = np.exp(-(fits.value[best] - fits.value[best[0]]))
     d = body.dimension
     lengths = (weights / weights.sum()) @ fits.x[best, d:]
     body = body.with_segment_lengths(dict(zip(body.skeleton.length_names, lengths, strict=True)))
     spread = np.linalg.inv(fits.hessian[best[0]])[d:, d:]
     body = replace(body, length_covariance=0.5 * (spread + spread.T))
+    solved = _with_flips(body, camera, keypoints, prior_weight, upright, depths, fits.x[:, :d])
+    return Start(body, solved.x, solved.value, solved.hessian)
 
+
+def _with_flips(
+    body: Body, camera: Camera, keypoints: Keypoints, prior_weight: float, upright: Gravity | None,
+    depths: ImageMap | None, guesses: Array,
+) -> Minimum:  # fmt: skip
+    """Distinct poses that explain joints, best first, from guesses (N, d) and all their flips.
+
+    Raises:
+        ValueError: there is none.
+    """
     least_squares = LikelihoodSettings.of_terms(keypoints=LEAST_SQUARES, depth=DEPTH.settings)
     settings = replace(least_squares, prior_weight=prior_weight)
     leaning = body if upright is None else without_root_lean(body)
     likelihood = ImageLikelihood(leaning, camera, settings)
     evidence = {} if depths is None else {DEPTH.name: depths}
     observation = Observation(keypoints=keypoints, evidence=evidence)
-    image = likelihood.given(observation, exchanges=NOT_EXCHANGED)
-    energy = image if upright is None else Posed(body.skeleton, (*image.terms, upright.term(body)))
+    terms = (*likelihood.seen(observation, exchanges=NOT_EXCHANGED), *likelihood.priors)
+    energy = PoseEnergy(likelihood, terms if upright is None else (*terms, upright.term(body)))
 
-    heads = _distinct(_solve(energy, fits.x[:, :d], body), body, 4)
+    heads = _distinct(_solve(energy, guesses, body), body, 4)
+    if len(heads.x) == 0:
+        raise ValueError(NO_POSE)
     trees = [enumerate_flips(body, heads.x, c)[0] for c in (*body.chains, *body.chain_pairs)]
     flips = np.concatenate([heads.x, *trees])
     raw = energy.energy(flips, derivatives=Derivatives.NONE).value
     keep = np.argsort(raw, kind='stable')[:192]
     solved = _distinct(_solve(energy, flips[keep], body), body, 96)
-    order = np.argsort(solved.value, kind='stable')
-    return Start(body, solved.x[order], solved.value[order], solved.hessian[order])
+    return solved[np.argsort(solved.value, kind='stable')]
 
 
 def poses_from_keypoints(
@@ -149,9 +163,25 @@ def poses_from_keypoints(
     upright: Gravity | None = None,
     depths: ImageMap | None = None,
 ) -> Array:
-    """Poses (M, d) of a body of known lengths that explain the joints of an image."""
-    subject = Subject(0, keypoints, dict(body.segment_lengths))
-    return start_from_keypoints(body, camera, subject, upright=upright, depths=depths).poses
+    """Poses (M, d) of a body of known lengths that explain the joints of an image, best first.
+
+    Depths that do not show the surface of any pose are not used.
+
+    Raises:
+        ValueError: joints from which no pose can be fitted.
+    """
+
+    def found(depths: ImageMap | None) -> Array:
+        measured = joint_depths(body, keypoints, depths)
+        guesses = _first_guesses(body, camera, keypoints, upright, measured)
+        return _with_flips(body, camera, keypoints, 1.0, upright, depths, guesses).x
+
+    if depths is not None:
+        poses = found(depths)
+        (misfit,) = of_depth(body, camera, poses[:1], depths)
+        if misfit <= UNDECIDED[DEPTH.name]:
+            return poses
+    return found(None)
 
 
 def poses_from_outline(body: Body, camera: Camera, outline: Outline) -> Array:
@@ -361,11 +391,10 @@ def _first_guesses(
     return result
 
 
-def _solve(energy: EnergyTerm, poses: Array, body: Body) -> Minimum:
-    return minimise(
-        energy, poses, body.lower, body.upper,
-        step_scale=np.where(body.skeleton.dof_is_rotation, 0.4, 0.3),
-        damping=1.0, max_iterations=40, tolerance=1e-3,
+def _solve(energy: PoseEnergy, poses: Array, body: Body) -> Minimum:
+    return energy.minimise(
+        poses, step_scale=np.where(body.skeleton.dof_is_rotation, 0.4, 0.3), damping=1.0,
+        max_iterations=40, tolerance=1e-3,
     )  # fmt: skip
 
 

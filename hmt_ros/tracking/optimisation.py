@@ -49,7 +49,7 @@ class Search:
         # Each has a precision of its own, where it jumped a lower one.
         own = self.states.precisions_of(hypotheses.ancestors, hypotheses.jumped, self.precisions)
         term = posterior.given(self.observation, hypotheses, own)
-        solved = posterior.minimise(term, hypotheses.poses, posterior.settings.iterations)
+        solved = posterior.minimise(term, hypotheses.poses, posterior.settings.plan.iterations)
         return Optimised(hypotheses, solved)
 
     def evidence(self, optimised: Optimised) -> Array:

@@ -110,5 +110,5 @@ def follow_flow(
         (flow, posterior.likelihood.pose_prior),
         Quadratic(predicted.poses, precisions),
     )
-    moved = posterior.minimise(term, predicted.poses, s.iterations).x
+    moved = posterior.minimise(term, predicted.poses, s.plan.iterations).x
     return replace(predicted, poses=moved, expected=moved)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from hmt_ros.image.likelihood import LikelihoodSettings
+from hmt_ros.tracking.evaluation_plan import ACCURATE, EvaluationPlan, plan_of
 from hmt_ros.tracking.ground import GroundSettings
 from hmt_ros.tracking.proposals import PROPOSALS
 
@@ -16,10 +18,10 @@ class LimbSearchSettings:
     """How limbs are searched.
 
     Attributes:
-        samples: Number of samples that a limb draws; a third from the mode, a third from it
+        samples: Maximum number of samples that a limb draws; a third from the mode, a third from it
             stretched, a third from the body's prior.
         stretch: Factor on the deviations of the second third.
-        refined: Number of best samples that are refined.
+        refined: Maximum number of best samples that are refined.
         iterations: Number of Newton steps of the refinement.
     """
 
@@ -34,17 +36,20 @@ class TrackerSettings:
     """How poses are tracked.
 
     Attributes:
+        evaluation_budget: Number of evaluations of poses that an image may take, about: 400 is
+            accurate, 300 is nearly so, and with fewer quality falls step by step.
         max_hypotheses: Maximum number of modes that are kept, K.
         hypothesis_merge_distance: Mean distance of the joints below which two modes are merged, m.
         proposals: Proposal distribution: 'kjs' (kinematic jumps and covariance-scaled samples),
             'css' (covariance-scaled samples alone) or 'ss' (spherical samples alone).
-        candidates: Maximum number of hypotheses that are fully optimised in an image.
-        combinations: Number of combinations of limb configurations that are rated for each trunk.
+        candidates: Maximum number of hypotheses that are fully optimised in an image; as many as
+            modes in any case.
+        combinations: Maximum number of combinations of limb configurations on each trunk.
         alternatives: Maximum number of configurations of a limb that are rated.
         samples: Number of samples drawn in an image by the proposals 'css' and 'ss'.
         sample_scale: Scale of the proposal covariance; 0 selects Cauchy tails.
-        searched_chains: Number of limbs searched in an image, chosen at random.
-        iterations: Number of Newton steps on the predictions, and on the candidates.
+        searched_chains: Maximum number of limbs searched on a trunk, chosen at random.
+        iterations: Maximum number of Newton steps on the predictions, and on the candidates.
         motion: Motion prior: 'learned', where the body ships with one, or 'random_walk' at the
             rates of the body.
         flow_weight: Number of independent measurements that the optical flow counts for where it
@@ -58,6 +63,7 @@ class TrackerSettings:
         ground: settings of what is known of gravity and floor.
     """
 
+    evaluation_budget: int = ACCURATE
     max_hypotheses: int = 8
     hypothesis_merge_distance: float = 0.02
     proposals: str = 'kjs'
@@ -82,17 +88,18 @@ class TrackerSettings:
             raise ValueError(f'proposals must be one of {tuple(PROPOSALS)}, saw {self.proposals!r}')
         if self.motion not in MOTIONS:
             raise ValueError(f'motion must be one of {MOTIONS}, saw {self.motion!r}')
-        if self.max_hypotheses < 1 or self.candidates < self.max_hypotheses:
-            raise ValueError(
-                f'wanted 1 <= max_hypotheses <= candidates, saw {self.max_hypotheses} and '
-                f'{self.candidates}'
-            )
-        least = {'samples': 1, 'iterations': 1}
-        least |= {'combinations': 1, 'alternatives': 1}
-        for name, bound in least.items():
-            if not getattr(self, name) >= bound:
-                raise ValueError(f'{name} must be at least {bound}, saw {getattr(self, name)}')
+        for name in (
+            'evaluation_budget', 'max_hypotheses', 'candidates', 'combinations', 'alternatives',
+            'samples', 'iterations',
+        ):  # fmt: skip
+            if not getattr(self, name) >= 1:
+                raise ValueError(f'{name} must be at least 1, saw {getattr(self, name)}')
         if self.threads < 0:
             raise ValueError(f'threads must be at least 0, saw {self.threads}')
         if not self.flow_weight >= 0:
             raise ValueError(f'flow_weight must be at least 0, saw {self.flow_weight}')
+
+    @cached_property
+    def plan(self) -> EvaluationPlan:
+        """What the evaluations of an image are spent on."""
+        return plan_of(self)

@@ -34,8 +34,8 @@ LEAST_LENGTH_SIGMA = 0.008
 WANDERING = 0.02
 # Largest change by one image, and in all, in standard deviations over people.
 LARGEST_STEP, LARGEST = 0.5, 3.0
-# The person stays as it was until the estimate is so far from it, in standard deviations over people
-# (a length: half a millimetre): all that is made from a shape is made anew with it.
+# The person stays as it was until the estimate is so far from it, in standard deviations over
+# people (2 mm of a length): all that is made from a shape is made anew with it.
 NOTICED = 0.1
 # An angle gives way by this much at most while the shape is estimated, rad.
 LARGEST_SHIFT = 0.2

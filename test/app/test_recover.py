@@ -68,7 +68,7 @@ def test_a_replay_that_was_killed(tmp_path, capsys):
             short.write(stored.topic, stored.log_time_ns, stored.message)
     person = ['--subject', str(REACH / 'subject.yaml')]
     person += ['--background', str(REACH / 'background.png')]
-    fast = ['--set', 'max_hypotheses=2', '--set', 'candidates=3']
+    fast = ['--set', 'max_hypotheses=2', '--set', 'evaluation_budget=100']
     command = [str(tmp_path / 'reach'), '-o', str(target), *person, *fast, '--no-smoother']
     with subprocess.Popen(
         [sys.executable, '-m', 'hmt_ros', 'replay', *command],

@@ -62,12 +62,12 @@ def test_gravity(walk_video, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(track_video, 'replay_bag', replay_bag)
     for i, options in enumerate((['--level'], ['--gravity', '0', '9', '-2.5'], [])):
-        given = [*options, '--set', 'candidates=8']
+        given = [*options, '--set', 'evaluation_budget=80']
         assert run(walk_video, '-o', str(tmp_path / str(i)), *keypoints(walk_video), *given) == 1
     assert used == [
-        ['gravity=[0.0, 1.0, 0.0]', 'candidates=8'],
-        ['gravity=[0.0, 9.0, -2.5]', 'candidates=8'],
-        ['candidates=8'],
+        ['gravity=[0.0, 1.0, 0.0]', 'evaluation_budget=80'],
+        ['gravity=[0.0, 9.0, -2.5]', 'evaluation_budget=80'],
+        ['evaluation_budget=80'],
     ]
     both = ['--level', '--gravity', '0', '1', '0']
     assert run(walk_video, '-o', str(tmp_path / 'both'), *both) == 1

@@ -10,10 +10,15 @@ import pytest
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.camera import Viewpoint
 from hmt_ros.body.ground_terms import FloorPlane, GroundSettings, GroundTerm
+from hmt_ros.body.kinematics import forward
 from hmt_ros.body.pose_terms import Posed
 from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import observe
+from hmt_ros.image.optical_flow import FlowTerm
 from hmt_ros.image.pose_energy import PoseEnergy
+from hmt_ros.image.sampling import ImageMap
+from hmt_ros.image.surface import lens_of
+from hmt_ros.image.surface_points import seen_points
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.bounded_newton import minimise
 from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Restricted, Student, Sum
@@ -64,11 +69,17 @@ def terms(body, seen):
     image, keypoints = likelihood.seen(seen[0], exchanges=exchanges)
     limb = replace(likelihood, parts=(5, 6, 7), occluders=(0, 1, 2, 5, 6, 7))
     samples = len(seen[0].outline.pixels)
+    before = seen[1] + 0.02 * rng.normal(size=(COUNT, body.dimension))
+    flow = FlowTerm(
+        body.skeleton, lens_of(CAMERA), seen_points(body, CAMERA, forward(body.skeleton, before)),
+        ImageMap(rng.normal(0.0, 3.0, (2, 240, 320)).astype(np.float32)), 5.0,
+    )  # fmt: skip
     explained = np.full((1, samples), 0.2)
     return {
         'all': (likelihood, (image, keypoints, *likelihood.priors, ground)),
         'image': (likelihood, (image,)),
         'keypoints and prior': (likelihood, (keypoints, likelihood.pose_prior)),
+        'flow and prior': (likelihood, (flow, likelihood.pose_prior)),
         'independent angles': (angles, (image, *angles.priors)),
         'limb': (limb, (*limb.seen(seen[0], explained=explained), likelihood.pose_prior)),
     }
@@ -115,7 +126,8 @@ def check_same(found, wanted):
 
 @pytest.mark.parametrize('motion', ['none', 'gaussian', 'one for all', 'diagonal', 'student'])
 @pytest.mark.parametrize(
-    'name', ['all', 'image', 'keypoints and prior', 'independent angles', 'limb']
+    'name',
+    ['all', 'image', 'keypoints and prior', 'flow and prior', 'independent angles', 'limb'],
 )
 @pytest.mark.parametrize('derivatives', [Derivatives.NONE, Derivatives.POSITIVE, Derivatives.EXACT])
 def test_energies_are_those_of_the_terms(terms, poses, name, motion, derivatives):
@@ -146,7 +158,7 @@ def test_energies_over_some_variables(terms, poses, body, motion):
     np.testing.assert_allclose(found.x, wanted.x, atol=1e-8)
 
 
-@pytest.mark.parametrize('name', ['all', 'keypoints and prior'])
+@pytest.mark.parametrize('name', ['all', 'keypoints and prior', 'flow and prior'])
 @pytest.mark.parametrize('iterations', [0, 1, 7])
 def test_minima_are_those_of_the_solver_step_by_step(terms, poses, body, name, iterations):
     likelihood, some = terms[name]

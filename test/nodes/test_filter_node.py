@@ -149,7 +149,6 @@ def test_parameters_are_those_of_the_file(running):
 def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
     running.assert_refused(
         ({'max_hypotheses': 0}, 'out of range. Min: 1, Max: 64, value: 0'),
-        ({'max_hypotheses': 20}, 'max_hypotheses <= candidates, saw 20 and 16'),
         ({'background.method': 'guess'}, "saw 'guess'"),
         ({'subject_file': str(tmp_path / 'none.yaml')}, 'none.yaml: can not be read'),
         ({'background_file': str(tmp_path / 'two\nlines')}, 'two lines: can not be read'),
@@ -159,7 +158,7 @@ def test_wrong_values_are_refused_with_a_reason(running, tmp_path):
     )
     before = FilterParameters()
     assert running.node._settings.tracker == before.tracker
-    assert running.set(max_hypotheses=20, candidates=24, queue_size=2) == (True, '')
+    assert running.set(max_hypotheses=20, evaluation_budget=800, queue_size=2) == (True, '')
     assert running.node._settings.tracker.max_hypotheses == 20
     assert running.node._session.parameters is running.node._settings
     assert running.node._thread.queue._limits['image'] == 2

@@ -181,10 +181,12 @@ def test_nodes_have_few_parameters():
     assert counts[0] <= 40
     assert sum(counts) <= 72
     names = {p.name for p in declared_parameters(FilterParameters())}
-    assert {'max_hypotheses', 'candidates', 'random_seed', 'gravity'} < names
-    parameters = with_values(FilterParameters(), {'likelihood.edges.weight': 7, 'candidates': 20})
+    assert {'max_hypotheses', 'evaluation_budget', 'random_seed', 'gravity'} < names
+    parameters = with_values(
+        FilterParameters(), {'likelihood.edges.weight': 7, 'max_hypotheses': 20}
+    )
     assert parameters.tracker.likelihood.edges.weight == 7.0
-    assert parameters.tracker.candidates == 20
+    assert parameters.tracker.max_hypotheses == 20
 
 
 @pytest.mark.parametrize(
@@ -217,7 +219,7 @@ def test_defaults_lie_between_limits(settings):
     ('values', 'message'),
     [
         ({'max_hypotheses': 0}, 'max_hypotheses must lie between 1 and 64, saw 0'),
-        ({'max_hypotheses': 50}, 'max_hypotheses <= candidates'),
+        ({'evaluation_budget': 0}, 'evaluation_budget must lie between 1 and 100000, saw 0'),
         ({'proposals': 'css'}, 'proposals was removed: kinematic jumps; programs set it'),
         ({'likelihood.edges.wieght': 2.0}, 'is likelihood.edges.weight meant'),
         ({'absence_time': 0.5}, 'absence_time was removed: existence is a probability with rates'),

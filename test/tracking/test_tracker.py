@@ -368,8 +368,10 @@ def test_a_lost_track_starts_anew_from_keypoints(human32, started, black, motion
     # The place too, not only the posture.
     assert np.abs(posterior.means[:, :3] - other[:3]).max(1).min() < 0.25
     # Modes that are placed anew have no history, and the point estimate does not travel to them.
+    # One image tells the depth to about a tenth.
     assert begins == [i in (0, found) for i in range(len(begins))]
-    assert np.abs(places[found] - other[:3]).max() < 0.3
+    assert np.abs(places[found][:2] - other[:2]).max() < 0.15
+    assert abs(places[found][2] - other[2]) < 0.4
 
 
 def predicted(body, pose) -> PosePrediction:
@@ -551,8 +553,8 @@ def test_starts_of_another_dimension_are_refused(human32, camera):
     [
         ({'proposals': 'magic'}, r"proposals must be one of .*kjs.* saw 'magic'"),
         ({'motion': 'still'}, r"motion must be one of .*learned.* saw 'still'"),
-        ({'max_hypotheses': 0}, '1 <= max_hypotheses <= candidates, saw 0 and 16'),
-        ({'candidates': 4}, '1 <= max_hypotheses <= candidates, saw 8 and 4'),
+        ({'max_hypotheses': 0}, 'max_hypotheses must be at least 1, saw 0'),
+        ({'evaluation_budget': 0}, 'evaluation_budget must be at least 1, saw 0'),
     ],
 )
 def test_settings_that_are_refused(values, said):

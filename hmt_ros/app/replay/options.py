@@ -14,6 +14,7 @@ from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.parameter_file import read_parameter_file
 from hmt_ros.sessions.people_parameters import SOURCES, PeopleParameters
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.tracking.evaluation_plan import ACCURATE
 from msg_tools import BagReader
 from msg_tools.files.error_line import error_line
 from msg_tools.files.plain_yaml import load_plain_yaml
@@ -167,6 +168,7 @@ def _filter_parameters(options: ReplayOptions, recorded: RecordedInput) -> Filte
     values.setdefault('use_depth', recorded.depth is not None)
     _use_upright_frame(values, recorded)
     values['image_transport'] = recorded.transport
+    values.setdefault('evaluation_budget', ACCURATE)
     return with_values(FilterParameters(), values)
 
 
@@ -207,6 +209,7 @@ def _people_parameters(options: ReplayOptions, recorded: RecordedInput) -> Peopl
     values.setdefault('use_depth', recorded.depth is not None)
     _use_upright_frame(values, recorded)
     values['image_transport'] = recorded.transport
+    values.setdefault('evaluation_budget', ACCURATE)
     return with_values(PeopleParameters(), values)
 
 

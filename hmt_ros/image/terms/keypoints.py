@@ -244,8 +244,7 @@ class KeypointTerm:
             residual by the position, (M,) derivative and (M,) curvature of the energy by the
             residual; two residuals a keypoint. Landmarks behind the camera have none.
         """
-        _, *found = self._listed(frames)
-        which, places, directions, pulls, curvatures = found
+        _, which, places, directions, pulls, curvatures = self._listed(frames)
         joints = self.measured.joints[which[:, 0], which[:, 1]]
         return joints, places, directions, pulls, curvatures
 

@@ -23,8 +23,6 @@ from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals.limb_search import LimbSearch
 from hmt_ros.tracking.selection import choose_hypotheses
 
-# Groups of modes with a trunk of their own whose products are rated.
-MOST_GROUPS = 3
 # Modes have the same trunk when its joints are nowhere further apart, m.
 SAME_TRUNK = 0.06
 # Configurations of a limb are distinct when some joint is further apart, m.
@@ -46,31 +44,40 @@ class KinematicJumps:
     ) -> Hypotheses:
         """See `Proposal`."""
         s, body = self.posterior.settings, self.posterior.body
+        plan, left = s.plan, s.plan.rated
         share = ERRORS['image'].share(search.dt)
         price = {name: x.price(search.dt) for name, x in body.symmetries.items()}
         everything: list[tuple[Array, Index, Array]] = []
         prior = search.rated(base.x, base.value)
-        for group in self._groups(base)[:MOST_GROUPS]:
+        groups = self._groups(base)
+        for group in groups[: plan.groups]:
             likely = prior[group].max() > prior.max() - LIKELY
             products = LimbProducts.of(
                 body, base.x[group],
                 self._search(search, base.x[group[0]], sources.ancestors[group[0]], rng)
                 if likely else {},
-                price['limb_flip'], apart=DISTINCT, most=s.alternatives,
-            )  # fmt: skip
+                price['limb_flip'], apart=DISTINCT, most=plan.alternatives,
+            ).at_most(left)  # fmt: skip
+            alone = products.alone
+            left -= len(alone)
             best = products.best(
-                self.posterior.values(products.alone, search.observation),
+                self.posterior.values(alone, search.observation),
                 sources.log_weights[group], exchange=price['exchange'], flip=price['trunk_flip'],
-                share=share, count=s.combinations,
+                share=share, count=plan.combinations,
             )  # fmt: skip
             everything.append((best.poses, group[best.parents], best.energies))
+        others = [k for group in groups[plan.groups :] for k in group]
+        if others:
+            poses = base.x[others]
+            energies = self.posterior.values(poses, search.observation)
+            everything.append((poses, np.array(others, dtype=np.intp), energies))
         poses, members, energies = (
             np.concatenate([part[i] for part in everything]) for i in range(3)
         )
         kept = choose_hypotheses(
             relative_joints(self.posterior.body, poses),
             search.rated(poses, energies),
-            s.candidates,
+            plan.candidates,
             same=s.hypothesis_merge_distance,
         ).chosen
         poses, members = poses[kept], members[kept]
@@ -113,10 +120,10 @@ class KinematicJumps:
             ancestor: of it.
             rng: source of randomness.
         """
-        s, evidence = self.posterior.settings, search.observation.evidence
+        plan, evidence = self.posterior.settings.plan, search.observation.evidence
         shape = 'coverage' in evidence or 'edges' in evidence
         names = list(self._searches) if shape else []
-        count = min(s.searched_chains, len(names))
+        count = min(plan.searched_chains, len(names))
         if count == 0:
             return {}
         chosen = rng.choice(len(names), size=count, replace=False)

@@ -71,7 +71,8 @@ class LimbSearch:
             observation: of the image.
             rng: source of randomness.
         """
-        body, own, s = self.posterior.body, self.dofs, self.posterior.settings
+        body, own = self.posterior.body, self.dofs
+        s, plan = self.posterior.settings.search, self.posterior.settings.plan
         block = covariance[np.ix_(own, own)]
         samples = self._draw(pose[own], block, rng)
         placed = self._placed(pose, samples[:: max(len(samples) // PLACED, 1)], observation)
@@ -84,10 +85,10 @@ class LimbSearch:
         motion = Student(pose[own], np.asarray(np.linalg.inv(block)), TAILS)
         term = PoseEnergy(self._own, seen, motion, pose, own)
         value = term.energy(samples, np.arange(len(samples)), derivatives=Derivatives.NONE).value
-        best = samples[np.argsort(value, kind='stable')[: s.search.refined]]
-        self.posterior.evaluations += len(samples) + s.search.refined * s.search.iterations
+        best = samples[np.argsort(value, kind='stable')[: plan.refined]]
+        self.posterior.evaluations += len(samples) + plan.refined * s.iterations
         return term.minimise(
-            best, step_scale=0.4, damping=1.0, max_iterations=s.search.iterations, tolerance=0.05
+            best, step_scale=0.4, damping=1.0, max_iterations=s.iterations, tolerance=0.05
         ).x
 
     def _placed(self, pose: Array, starts: Array, observation: Observation) -> Array:
@@ -107,7 +108,7 @@ class LimbSearch:
     def _draw(self, angles: Array, block: Array, rng: np.random.Generator) -> Array:
         """Samples from the mode, from it stretched, and from the body's prior: a third each."""
         body, own, search = self.posterior.body, self.dofs, self.posterior.settings.search
-        n = search.samples
+        n = self.posterior.settings.plan.samples
         noise = rng.standard_normal((n, len(own)))
         near = noise @ np.linalg.cholesky(block).T
         near[n // 3 :] *= search.stretch

@@ -350,16 +350,16 @@ def test_images_are_copied_on_demand(still, short, tmp_path, entries):
 def test_options_reach_the_tracker(still, short, tmp_path):
     config = tmp_path / 'config.yaml'
     config.write_text(
-        '/**:\n  ros__parameters:\n    max_hypotheses: 5\n    candidates: 10\n'
+        '/**:\n  ros__parameters:\n    max_hypotheses: 5\n    evaluation_budget: 150\n'
         '    image_transport: raw\n    autostart: false\n    use_sim_time: true\n'
         '    qos_overrides: {/image: {subscription: {depth: 3}}}\n    random_seed: 3\n'
     )
-    options = ['--config', str(config), '--set', 'candidates=12']
+    options = ['--config', str(config), '--set', 'evaluation_budget=120']
     options += ['--set', 'likelihood.edges.weight=3', '--seed', '7', '--body', 'human34', '--quiet']
     assert main([str(short), '-o', str(tmp_path / 'out'), *SUBJECT, *options]) == 0
     (tracker,) = still
     settings = tracker.settings
-    assert (settings.max_hypotheses, settings.candidates) == (5, 12)
+    assert (settings.max_hypotheses, settings.evaluation_budget) == (5, 120)
     assert settings.likelihood.edges.weight == 3.0
     assert (tracker.seed, tracker.body.name) == (7, 'human34')
 

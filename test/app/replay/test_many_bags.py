@@ -12,7 +12,7 @@ from hmt_ros.app.replay.command import main
 from msg_tools import BagReader
 
 TINY = ['--fps', '10', '--size', '240x180', '--fov', '40']
-FAST = ['--set', 'max_hypotheses=2', '--set', 'candidates=3']
+FAST = ['--set', 'max_hypotheses=2', '--set', 'evaluation_budget=100']
 FAST += ['--no-smoother']
 PERSON = ['--subject', '{bag}/subject.yaml', '--background', '{bag}/background.png', *FAST]
 

@@ -14,9 +14,8 @@ from msg_tools import BagReader
 from msg_tools.messages.detections import people_of_message
 
 SMALL = [
-    'candidates=6',
+    'evaluation_budget=150',
     'max_hypotheses=4',
-    'searched_chains=1',
 ]
 
 

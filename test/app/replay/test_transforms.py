@@ -16,7 +16,7 @@ from test.app.replay.test_command import PERSON, content, read, recorded, write
 VIEW = Viewpoint(distance=4.0, height=1.25, pitch=0.15)
 FRAME = ['--set', 'gravity_frame=world', '--set', 'floor_in_gravity_frame=true']
 ESTIMATES = ('pose_mixture', 'likelihood_mixture', 'human_joint_states', 'ground')
-SMALL = ['--set', 'max_hypotheses=2', '--set', 'candidates=3']
+SMALL = ['--set', 'max_hypotheses=2', '--set', 'evaluation_budget=100']
 
 
 def camera_place(stamp, parent, child):

@@ -1,0 +1,68 @@
+"""What the evaluations of one image are spent on: a count, so that results do not depend on speed.
+
+    budget B    predictions descend    limbs and trunks are rated    candidates descend
+    share       about B / 8            at most 2 B / 5, and searches  about B / 5
+
+What is left goes to what is made of the modes: covariances, shape, the likelihood alone. Settings
+bound each part; a budget below them takes from all parts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hmt_ros.tracking.settings import TrackerSettings
+
+# Budgets of the nodes, which have to keep up with a camera, and of everything else.
+LIVE, ACCURATE = 300, 400
+# Below this budget no limb is searched.
+LEAST_SEARCHED = 100
+
+
+@dataclass(frozen=True)
+class EvaluationPlan:
+    """How an image is searched.
+
+    Attributes:
+        hypotheses: maximum number of modes that are kept, K.
+        candidates: maximum number of hypotheses that are fully optimised.
+        iterations: number of Newton steps on the predictions, and on the candidates.
+        groups: maximum number of groups of modes with a trunk of their own that are searched.
+        rated: maximum number of poses that are rated, all groups together.
+        alternatives: maximum number of configurations of a limb.
+        combinations: maximum number of combinations on each trunk.
+        searched_chains: number of limbs searched in each group.
+        samples, refined: number of samples that a limb draws, and of the best that are refined.
+    """
+
+    hypotheses: int
+    candidates: int
+    iterations: int
+    groups: int
+    rated: int
+    alternatives: int
+    combinations: int
+    searched_chains: int
+    samples: int
+    refined: int
+
+
+def plan_of(settings: TrackerSettings) -> EvaluationPlan:
+    """The plan that keeps to the evaluation budget of some settings, and to their bounds."""
+    s, budget = settings, settings.evaluation_budget
+    hypotheses = min(s.max_hypotheses, max(budget // 25, 1))
+    searched = max(round(budget / ACCURATE), 1) if budget >= LEAST_SEARCHED else 0
+    return EvaluationPlan(
+        hypotheses=hypotheses,
+        candidates=max(min(s.candidates, budget // 40), hypotheses),
+        iterations=min(s.iterations, max(budget // 60, 1)),
+        groups=min(3, max(budget // 130, 1)),
+        rated=2 * budget // 5,
+        alternatives=min(s.alternatives, max(budget // 65, 2)),
+        combinations=min(s.combinations, max(budget // 8, 4)),
+        searched_chains=min(s.searched_chains, searched),
+        samples=min(s.search.samples, max(budget // 8, 6)),
+        refined=min(s.search.refined, max(budget // 130, 1)),
+    )
