@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 from numpy.lib.stride_tricks import as_strided
-from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs, dtrtri
+from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs, dtrtri, dtrtrs
 
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.exact_sums import dot
@@ -162,6 +162,20 @@ class BlockCholesky:
         covariances += covariances.swapaxes(1, 2).copy()
         covariances *= 0.5
         return covariances, neighbours
+
+    def inverse_block(self, t: int, d: int) -> Array:
+        """The leading part (d, d) of block t on the diagonal of P^-1: one marginal covariance.
+
+        With E the first d columns of block t, E' P^-1 E = sum_s y_s' y_s, where L y = E: y is 0
+        before t, and fades after it.
+        """
+        own, below = self.blocks
+        y = dtrtrs(own[t], np.eye(self.size, d), lower=1)[0]
+        result: Array = y.T @ y
+        for s in range(t + 1, self.times):
+            y = dtrtrs(own[s], below[s - 1] @ y, lower=1)[0]
+            result += y.T @ y
+        return np.asarray(0.5 * (result + result.T))
 
     def _windows(self, offset: int, count: int) -> Array:
         """Blocks L[t n + offset + a, t n + b] for t < count, with rubbish outside the band.

@@ -104,7 +104,7 @@ class SmootherParameters(NodeParameters):
     random_seed: int = parameter_field(0, NEXT_WINDOW, (0, 2**31 - 1))
     longest_interval: float = parameter_field(0.25, AT_ONCE, (0.0, 3600.0))
     publish_covariances: bool = parameter_field(False, AT_ONCE)
-    queue_size: int = parameter_field(50, AT_ONCE, (1, 1000))
+    queue_size: int = parameter_field(10, AT_ONCE, (1, 1000))
     through_modes: bool = False
     dynamics: SmootherDynamics = field(default_factory=SmootherDynamics)
 

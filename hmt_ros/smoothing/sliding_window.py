@@ -15,7 +15,7 @@ the newest pose by a longest time.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -164,7 +164,7 @@ class SlidingWindow:
         if self._final:
             found = replace(found, final_until_ns=self._stamps[self._final - 1])
         self._last = found
-        return WindowUpdate(found, tuple(_final_pose(found, t) for t in range(self._final)))
+        return WindowUpdate(found, _final_poses(found, range(self._final)))
 
     def _number_of_final(self) -> int:
         """How many poses of the window, the oldest, are not to be revised."""
@@ -182,11 +182,8 @@ class SlidingWindow:
         if last is None or last.stamps_ns is None:
             return ()
         until = last.final_until_ns
-        result = tuple(
-            _final_pose(last, t)
-            for t, stamp in enumerate(last.stamps_ns)
-            if until is None or stamp > until
-        )
+        stamps = enumerate(last.stamps_ns)
+        result = _final_poses(last, [t for t, stamp in stamps if until is None or stamp > until])
         self.reset()
         return result
 
@@ -261,11 +258,19 @@ def _variables(poses: Array) -> Array:
     return poses[..., None]
 
 
-def _final_pose(found: TrajectoryMixture, t: int) -> FinalPose:
-    """The pose at index t."""
-    assert found.stamps_ns is not None
-    velocities = None if found.velocities is None else found.velocities[:, t]
-    return FinalPose(found.stamps_ns[t], found.marginal(t), velocities, found.identities)
+def _final_poses(found: TrajectoryMixture, indices: Sequence[int]) -> tuple[FinalPose, ...]:
+    """The poses at some indices."""
+    stamps, velocities = found.stamps_ns, found.velocities
+    assert stamps is not None
+    return tuple(
+        FinalPose(
+            stamps[t],
+            found.marginal(t, alone=len(indices) == 1),
+            None if velocities is None else velocities[:, t],
+            found.identities,
+        )
+        for t in indices
+    )
 
 
 def first_state(mixture: GaussianMixture, dynamics: LinearGaussianDynamics) -> GaussianMixture:

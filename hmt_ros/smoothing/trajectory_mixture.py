@@ -126,9 +126,23 @@ class TrajectoryMixture:
         seconds = (np.array(self.stamps_ns) - self.stamps_ns[0]) * 1e-9
         return np.asarray(np.gradient(self.means, seconds, axis=1))
 
-    def marginal(self, t: int) -> GaussianMixture:
-        """The density of the pose at index t, a component for each trajectory."""
-        return GaussianMixture(self.weights, self.means[:, t], self.marginal_covariances[:, t])
+    def marginal(self, t: int, *, alone: bool = False) -> GaussianMixture:
+        """The density of the pose at index t, a component for each trajectory.
+
+        Args:
+            t: index.
+            alone: whether no other pose is asked for, which costs less.
+        """
+        if alone:
+            covariances = np.array(
+                [
+                    scale**2 * factor.inverse_block(t, self.dimension)
+                    for factor, scale in zip(self.factors, self.inflation, strict=True)
+                ]
+            )
+        else:
+            covariances = self.marginal_covariances[:, t]
+        return GaussianMixture(self.weights, self.means[:, t], covariances)
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draws trajectories (n, T, d), projected onto the limits."""
