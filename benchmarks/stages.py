@@ -26,7 +26,7 @@ STAGES: Stages = (
     (KinematicJumps, 'propose', 'combinations'),
     (CovarianceScaledSamples, 'propose', 'samples'),
     (LimbSearch, 'find', 'chain search'),
-    (KinematicJumps, '_rate', 'rating'),
+    (Posterior, 'values', 'rating'),
     (Posterior, 'minimise', 'candidates'),
     (MixtureFilter, '_weigh', 'keeping'),
     (MixtureFilter, '_select', 'keeping'),

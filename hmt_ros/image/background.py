@@ -188,7 +188,7 @@ class BackgroundModel:
         """
         raw = self._subtracted(image)
         if others is not None:
-            raw = np.where(self._smaller(others.view(np.uint8)) > 0, 0, raw).astype(np.uint8)
+            raw = np.where(self._any_of(others), 0, raw).astype(np.uint8)
         region = self._smaller_box(region)
         mask, square = raw == FOREGROUND, np.ones((3, 3), np.uint8)
         part, unsure = mask[_part(region)], np.zeros(mask.shape, dtype=np.bool_)
@@ -218,7 +218,7 @@ class BackgroundModel:
         raw = np.asarray(self._model.apply(small, learningRate=FROZEN), dtype=np.uint8)
         raw[(raw == FOREGROUND) & self._is_beside(small)] = 0
         if parts is not None:
-            raw[self._smaller(parts.unknown.view(np.uint8)) > 0] = 0
+            raw[self._any_of(parts.unknown)] = 0
         self.changed = cv2.countNonZero(raw) / raw.size
         if parts is None:
             self._last = (image, raw)
@@ -249,6 +249,10 @@ class BackgroundModel:
             return image
         size = tuple(-(-x // self._factor) for x in image.shape[1::-1])
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+    def _any_of(self, mask: Mask) -> Mask:
+        """Pixels (h, w) of an image made smaller of which a mask (H, W) has some part."""
+        return self._smaller(255 * mask.view(np.uint8)) > 0
 
     def _larger(self, mask: Mask) -> Mask:
         """A mask (h, w) in the size of images (H, W), its outline between the pixels smooth."""

@@ -4,7 +4,10 @@
     share       about B / 8            at most 2 B / 5, and searches  about B / 5
 
 What is left goes to what is made of the modes: covariances, shape, the likelihood alone. Settings
-bound each part; a budget below them takes from all parts.
+bound each part; a budget below them takes from all parts. An image in which the heaviest mode is
+not found where the motion prior has it, as where people move fast, gets more:
+
+    (x - f)' P (x - f) / 2 > `SURPRISING`            x: its optimum, f, P^-1: its prediction
 """
 
 from __future__ import annotations
@@ -17,6 +20,9 @@ if TYPE_CHECKING:
 
 # Budgets of the nodes, which have to keep up with a camera, and of everything else.
 LIVE, ACCURATE = 300, 400
+# Nats by which the motion of the heaviest mode is surprising, and how many times the budget such an
+# image has.
+SURPRISING, MORE = 3.0, 4
 # Below this budget no limb is searched.
 LEAST_SEARCHED = 100
 
@@ -49,9 +55,15 @@ class EvaluationPlan:
     refined: int
 
 
-def plan_of(settings: TrackerSettings) -> EvaluationPlan:
-    """The plan that keeps to the evaluation budget of some settings, and to their bounds."""
-    s, budget = settings, settings.evaluation_budget
+def plan_of(settings: TrackerSettings, *, surprising: bool = False) -> EvaluationPlan:
+    """The plan that keeps to the evaluation budget of some settings, and to their bounds.
+
+    Args:
+        settings: of the tracker.
+        surprising: whether the image is surprising.
+    """
+    s = settings
+    budget = settings.evaluation_budget * (MORE if surprising else 1)
     hypotheses = min(s.max_hypotheses, max(budget // 25, 1))
     searched = max(round(budget / ACCURATE), 1) if budget >= LEAST_SEARCHED else 0
     return EvaluationPlan(

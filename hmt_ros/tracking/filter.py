@@ -28,6 +28,7 @@ from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.classes import Facing
 from hmt_ros.tracking.contact import FootContacts
+from hmt_ros.tracking.evaluation_plan import SURPRISING
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import (
     Hypotheses,
@@ -261,7 +262,10 @@ class MixtureFilter:
         base = posterior.minimise(
             posterior.given(seen, predicted, precisions), predicted.poses, s.plan.iterations
         )
-        search = Search(posterior, seen, states, precisions, continuity)
+        moved = base.x[0] - continuity.predicted[0]
+        surprising = 0.5 * moved @ precisions[0] @ moved > SURPRISING
+        plan = s.thorough_plan if surprising else s.plan
+        search = Search(posterior, seen, states, precisions, continuity, plan)
         proposals: list[Proposal] = [self._proposal]
         if self._facing.lacks_a_way(search.rated(base.x, base.value)):
             proposals.insert(0, Reversals())

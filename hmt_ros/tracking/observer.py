@@ -28,9 +28,6 @@ from hmt_ros.tracking.silhouettes import Silhouettes, region_of
 from hmt_ros.tracking.validity import Validity
 from hmt_ros.tracking.view import View
 
-# Images closer than this tell nothing more by their flow than the motion prior does, s.
-FLOWING = 0.1
-
 
 class Observer:
     """Takes from images what the terms of a likelihood need.
@@ -101,7 +98,7 @@ class Observer:
             changed = silhouettes.background.changed if mask is None else 0.0
         foreground, unsure = (None, None) if found is None else found
         return View(
-            image, foreground, anywhere, changed, keypoints, predicted, unsure, others, depth, dt
+            image, foreground, anywhere, changed, keypoints, predicted, unsure, others, depth
         )
 
     def seen_anywhere(self, view: View, mask: Mask | None) -> View:
@@ -125,11 +122,10 @@ class Observer:
         keypoints = view.keypoints
         if keypoints is not None and not keypoints.seen.any():
             keypoints = None
-        flowing = self._settings.flow_weight > 0 and view.dt >= FLOWING
         found = observe(
             view.image, view.silhouette if validity.believes(SILHOUETTE) else None, keypoints,
-            last_image=self.last_image if flowing else None, wanted=wanted, unsure=view.unsure,
-            others=view.others, depth=view.depth,
+            last_image=self.last_image if self._settings.flow_weight > 0 else None, wanted=wanted,
+            unsure=view.unsure, others=view.others, depth=view.depth,
         )  # fmt: skip
         evidence = dict(found.evidence)
         depths = evidence.get(DEPTH.name)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import ERRORS
+from hmt_ros.tracking.evaluation_plan import EvaluationPlan
 from hmt_ros.tracking.hypotheses import Hypotheses, Optimised
 from hmt_ros.tracking.motion_states import PredictedStates
 from hmt_ros.tracking.posterior import Posterior
@@ -26,6 +27,7 @@ class Search:
         states: of the modes of the image before, predicted.
         precisions: (K, d, d) inverse covariances of their poses.
         continuity: with the modes of the image before.
+        plan: what the evaluations of the image are spent on.
     """
 
     posterior: Posterior
@@ -33,6 +35,7 @@ class Search:
     states: PredictedStates
     precisions: Array
     continuity: Continuity
+    plan: EvaluationPlan
 
     @property
     def dt(self) -> float:
@@ -49,7 +52,7 @@ class Search:
         # Each has a precision of its own, where it jumped a lower one.
         own = self.states.precisions_of(hypotheses.ancestors, hypotheses.jumped, self.precisions)
         term = posterior.given(self.observation, hypotheses, own)
-        solved = posterior.minimise(term, hypotheses.poses, posterior.settings.plan.iterations)
+        solved = posterior.minimise(term, hypotheses.poses, self.plan.iterations)
         return Optimised(hypotheses, solved)
 
     def evidence(self, optimised: Optimised) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from hmt_ros.image.likelihood import LikelihoodSettings
@@ -103,3 +103,8 @@ class TrackerSettings:
     def plan(self) -> EvaluationPlan:
         """What the evaluations of an image are spent on."""
         return plan_of(self)
+
+    @cached_property
+    def thorough_plan(self) -> EvaluationPlan:
+        """The same for a surprising image; as many modes are kept."""
+        return replace(plan_of(self, surprising=True), hypotheses=self.plan.hypotheses)

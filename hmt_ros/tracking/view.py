@@ -28,7 +28,6 @@ class View(NamedTuple):
         unsure: (H, W) what may be the person or a shadow; None: nothing.
         others: (H, W) what somebody else covers; None: nothing.
         depth: (H, W) depth along the axis of the camera, m; None: unknown.
-        dt: time since the image before in which the person was followed, s; 0: there is none.
     """
 
     image: Image
@@ -40,4 +39,3 @@ class View(NamedTuple):
     unsure: Mask | None = None
     others: Mask | None = None
     depth: NDArray[np.floating] | None = None
-    dt: float = 0.0

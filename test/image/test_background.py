@@ -217,3 +217,66 @@ def test_edges_of_the_background_that_move_by_a_pixel_are_no_foreground():
     found = background.silhouette(moved)
     assert found[20:60, 20:40].all()
     assert not found[:, 50:].any()
+
+
+@pytest.fixture(scope='module', params=[(480, 640), (481, 643), (720, 1280), (1080, 1920)], ids=str)
+def large(request):
+    """A large empty scene, somebody in it (an ellipse), where, and the shorter half axis."""
+    height, width = request.param
+    rng = np.random.default_rng(3)
+    coarse = rng.integers(60, 200, (24, 32, 3)).astype(np.uint8)
+    empty = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    somebody = np.zeros((height, width), np.uint8)
+    axes = (height // 12, height // 4)
+    cv2.ellipse(somebody, (width // 2, height // 2), axes, 20.0, 0.0, 360.0, 1, -1)
+    image = empty.copy()
+    image[somebody > 0] = (10, 240, 30)
+    return empty, noisy(image, 4), somebody > 0, axes[0]
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_large_images_are_made_smaller_and_the_outline_is_smooth(large, method):
+    empty, image, wanted, _ = large
+    background = model(empty, method)
+    assert background.empty.shape[0] < 400
+    found, unsure = background.split(image)
+    assert found.shape == unsure.shape == wanted.shape
+    # The outline lies within a pixel of the smaller image from the true one.
+    around = np.ones((3, 3), np.uint8)
+    step = round(len(image) / 240)
+    within = cv2.dilate(wanted.astype(np.uint8), around, iterations=step)
+    inside = cv2.erode(wanted.astype(np.uint8), around, iterations=step)
+    assert not (found & (within == 0)).any()
+    assert found[inside > 0].all()
+    assert found.sum() == pytest.approx(wanted.sum(), rel=0.03)
+
+
+def test_large_images_keep_to_the_region_and_to_what_others_leave(large):
+    empty, image, wanted, half = large
+    background = model(empty, 'mog2')
+    (left, right), top = np.flatnonzero(wanted.any(0))[[0, -1]], np.flatnonzero(wanted.any(1))[0]
+    assert not background.silhouette(image, (0, 0, left - 8, len(image))).any()
+    part = background.silhouette(image, (0, 0, image.shape[1], top + 2 * half))
+    assert part.any()
+    assert np.flatnonzero(part.any(1))[-1] <= top + 2 * half + 8
+    others = np.zeros(wanted.shape, np.bool_)
+    others[:, : (left + right) // 2] = True
+    open_to_view = background.split(image, others=others).foreground
+    assert not open_to_view[:, : (left + right) // 2 - 8].any()
+    assert open_to_view.sum() == pytest.approx((wanted & ~others).sum(), rel=0.05)
+
+
+def test_a_large_background_is_put_together_anew(large):
+    empty, image, wanted, _ = large
+    background = model(image, 'mog2')
+    background.forget()
+    assert background.unknown.all()
+    margin = cv2.dilate(wanted.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    for _ in range(12):
+        background.complete(image, margin)
+    assert np.array_equal(background.unknown, margin)
+    assert not background.silhouette(image)[margin].any()
+    for _ in range(12):
+        background.complete(empty, np.zeros_like(wanted))
+    assert background.unknown is None
+    assert background.silhouette(image)[wanted].mean() > 0.95

@@ -44,7 +44,7 @@ class KinematicJumps:
     ) -> Hypotheses:
         """See `Proposal`."""
         s, body = self.posterior.settings, self.posterior.body
-        plan, left = s.plan, s.plan.rated
+        plan, left = search.plan, search.plan.rated
         share = ERRORS['image'].share(search.dt)
         price = {name: x.price(search.dt) for name, x in body.symmetries.items()}
         everything: list[tuple[Array, Index, Array]] = []
@@ -120,7 +120,7 @@ class KinematicJumps:
             ancestor: of it.
             rng: source of randomness.
         """
-        plan, evidence = self.posterior.settings.plan, search.observation.evidence
+        plan, evidence = search.plan, search.observation.evidence
         shape = 'coverage' in evidence or 'edges' in evidence
         names = list(self._searches) if shape else []
         count = min(plan.searched_chains, len(names))
@@ -129,6 +129,6 @@ class KinematicJumps:
         chosen = rng.choice(len(names), size=count, replace=False)
         covariance = search.states.searched[ancestor]
         return {
-            names[i]: self._searches[names[i]].find(pose, covariance, search.observation, rng)
+            names[i]: self._searches[names[i]].find(pose, covariance, search.observation, plan, rng)
             for i in sorted(chosen)
         }

@@ -19,6 +19,7 @@ from hmt_ros.image.observation import Observation
 from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Student
+from hmt_ros.tracking.evaluation_plan import EvaluationPlan
 from hmt_ros.tracking.posterior import Posterior
 
 # Degrees of freedom of the Student prior that keeps a limb near its prediction: heavy tails.
@@ -61,6 +62,7 @@ class LimbSearch:
         pose: Array,
         covariance: Array,
         observation: Observation,
+        plan: EvaluationPlan,
         rng: np.random.Generator,
     ) -> Array:
         """Angles (A, chain dofs) of the limb that fit the image, distinct from each other or not.
@@ -69,12 +71,13 @@ class LimbSearch:
             pose: (d,) whose other limbs are kept.
             covariance: (d, d) how far the limb may have moved.
             observation: of the image.
+            plan: what its evaluations are spent on.
             rng: source of randomness.
         """
         body, own = self.posterior.body, self.dofs
-        s, plan = self.posterior.settings.search, self.posterior.settings.plan
+        s = self.posterior.settings.search
         block = covariance[np.ix_(own, own)]
-        samples = self._draw(pose[own], block, rng)
+        samples = self._draw(pose[own], block, plan.samples, rng)
         placed = self._placed(pose, samples[:: max(len(samples) // PLACED, 1)], observation)
         samples = np.concatenate([samples, placed])
         others = self._rest.energies(
@@ -105,10 +108,9 @@ class LimbSearch:
             .x
         )
 
-    def _draw(self, angles: Array, block: Array, rng: np.random.Generator) -> Array:
-        """Samples from the mode, from it stretched, and from the body's prior: a third each."""
+    def _draw(self, angles: Array, block: Array, n: int, rng: np.random.Generator) -> Array:
+        """N samples from the mode, from it stretched, and from the body's prior: a third each."""
         body, own, search = self.posterior.body, self.dofs, self.posterior.settings.search
-        n = self.posterior.settings.plan.samples
         noise = rng.standard_normal((n, len(own)))
         near = noise @ np.linalg.cholesky(block).T
         near[n // 3 :] *= search.stretch

@@ -88,7 +88,7 @@ class CovarianceScaledSamples:
         kept = choose_hypotheses(
             relative_joints(body, poses),
             search.rated(poses, energies),
-            s.plan.candidates,
+            search.plan.candidates,
             same=s.hypothesis_merge_distance,
         ).chosen
         rows = rows[kept]

@@ -28,7 +28,7 @@ def test_without_an_image_a_limb_goes_where_the_prior_wants_it_given_the_other_l
     pose = np.clip(body.prior_mean, body.lower + 0.05, body.upper - 0.05)
     pose[body.skeleton.dof_index(('root_tz', 'right_elbow', 'trunk_x'))] = (4.0, 0.5, -0.6)
     covariance = 0.3 * np.eye(37)
-    found = search.find(pose, covariance, Observation(), np.random.default_rng(0))
+    found = search.find(pose, covariance, Observation(), settings.plan, np.random.default_rng(0))
     own = search.dofs
     assert found.shape == (2, len(own))
     prior = Restricted(Posed(body.skeleton, (pose_prior(body, kind, 2.0),)), pose, own)

@@ -1,0 +1,64 @@
+"""What the evaluations of an image are spent on."""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+
+import numpy as np
+import pytest
+
+from hmt_ros.image.background import BackgroundModel
+from hmt_ros.tracking import Subject, Tracker, TrackerSettings
+from hmt_ros.tracking.evaluation_plan import ACCURATE, LEAST_SEARCHED, LIVE
+
+FRAME = 100_000_000
+
+
+def test_more_budget_is_never_less_of_anything():
+    before = astuple(TrackerSettings(evaluation_budget=1).plan)
+    for budget in range(2, 3000, 7):
+        plan = astuple(TrackerSettings(evaluation_budget=budget).plan)
+        assert all(a >= b for a, b in zip(plan, before, strict=True)), budget
+        before = plan
+
+
+def test_settings_bound_the_plan():
+    settings = TrackerSettings(
+        evaluation_budget=10_000, max_hypotheses=5, candidates=7, combinations=11, alternatives=3,
+        searched_chains=2, iterations=4,
+    )  # fmt: skip
+    plan = settings.plan
+    assert (plan.hypotheses, plan.candidates, plan.combinations) == (5, 7, 11)
+    assert (plan.alternatives, plan.searched_chains, plan.iterations) == (3, 2, 4)
+    # Every mode may have a candidate of its own.
+    assert TrackerSettings(max_hypotheses=30, candidates=7).plan.candidates >= 7
+
+
+def test_the_least_budget_still_follows_one_mode():
+    plan = TrackerSettings(evaluation_budget=1).plan
+    assert (plan.hypotheses, plan.candidates, plan.iterations, plan.searched_chains) == (1, 1, 1, 0)
+    assert TrackerSettings(evaluation_budget=LEAST_SEARCHED).plan.searched_chains == 1
+
+
+@pytest.fixture(scope='module')
+def film(filmed, camera):
+    """Poses, images and the empty scene of a person who walks."""
+    return filmed('walk', 0.8, camera)
+
+
+@pytest.mark.parametrize('budget', [40, 150, LIVE, ACCURATE])
+def test_an_image_keeps_to_its_budget(film, human32, camera, keypoints_of, budget):
+    poses, images, empty = film
+    settings = TrackerSettings(evaluation_budget=budget)
+    tracker = Tracker(human32, camera, settings, BackgroundModel.from_image(empty))
+    first = keypoints_of(human32, poses[0])
+    tracker.reset(Subject(0, first, dict(human32.segment_lengths)))
+    spent = []
+    for i, image in enumerate(images):
+        posterior, _ = tracker.step(image, i * FRAME)
+        assert posterior is not None
+        spent.append(tracker.evaluations)
+        if i > 0:
+            assert len(posterior) <= settings.plan.hypotheses
+    assert max(spent[1:]) < 1.5 * budget + 10
+    assert np.mean(spent[1:]) < 1.2 * budget
