@@ -4,7 +4,7 @@ The background is either a given image of the empty scene or learned from frames
 is absent or moves. OpenCV's mixture (MOG2) or nearest-neighbour (KNN) model does the per-pixel
 work, on images made smaller to about `LINES` lines: what they cost does not depend on the camera,
 and the outline that comes back is smooth to a fraction of their pixels. A background that turns out
-to be useless can be put together anew, from the pixels of images where the person is not.
+to be useless is rebuilt from the pixels of images where the person is not.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ WANDERING = 0.02
 # Largest change by one image, and in all, in standard deviations over people.
 LARGEST_STEP, LARGEST = 0.5, 3.0
 # The person stays as it was until the estimate is so far from it, in standard deviations over
-# people (2 mm of a length): all that is made from a shape is made anew with it.
+# people (2 mm of a length): whatever depends on a shape has to be rebuilt with it.
 NOTICED = 0.1
 # An angle gives way by this much at most while the shape is estimated, rad.
 LARGEST_SHIFT = 0.2
