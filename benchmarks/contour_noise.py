@@ -180,8 +180,8 @@ def derivatives_of(clips: Sequence[Posed], growth: Array) -> tuple[Array, Array]
         grows = slice(ShapeSpace(body).lengths, None)
         likelihood, estimate = ImageLikelihood(body, clip.camera, SETTINGS), ShapeEstimate(body)
         for pose, observation in zip(clip.poses, clip.observations, strict=True):
-            found = estimate.linearised(likelihood, observation, pose)
-            curvature += found.curvature[grows, grows]
+            found = estimate.linearised(likelihood, observation, pose[None])
+            curvature += found.curvature[0, grows, grows]
     return gradient, curvature
 
 

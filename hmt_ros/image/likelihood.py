@@ -231,23 +231,24 @@ class ImageLikelihood:
             return ImageEnergy(result, costs, None, None)
         return ImageEnergy(result, costs, gradient, hessian)
 
-    def residuals(self, frames: Frames, observation: Observation) -> Array:
-        """The residuals of the terms of contours and depths at the frames of one pose.
+    def recorded(self, frames: Frames, observation: Observation) -> Array:
+        """The residuals of the terms of contours and depths at the frames of N poses.
 
         Returns:
-            (M, RECORDED) their points and derivatives; see `residuals.add_residual`.
+            (N, 1 + M, RECORDED): rows 1 to m of a pose are their points and derivatives, see
+            `residuals.add_residual`; m is the first number of row 0.
         """
-        inputs = self.inputs(observation, 1, None)
+        n = frames.count
+        inputs = self.inputs(observation, n, None)
         outline = observation.outline
         samples = 0 if outline is None else len(outline.pixels)
         most = 1 + 6 * len(self.model.flesh.ring_parts) + 2 * samples
-        result = np.zeros((most, RECORDED))
+        result = np.zeros((n, most, RECORDED))
         if any(x.term.weight > 0 for x in inputs):
-            columns, origins = frames.by_pose()
             record_residuals(
-                self.model, inputs, columns[0], origins[0], np.zeros(len(TERMS)), result
-            )  # fmt: skip
-        return result[1 : 1 + int(result[0, 0])]
+                self.model, inputs, *frames.by_pose(), np.zeros((n, len(TERMS))), result
+            )
+        return result
 
     def inputs(
         self, observation: Observation, poses: int, explained: Array | None

@@ -41,6 +41,24 @@ Term = TypeVar('Term')
 
 
 @dataclass(frozen=True, eq=False)
+class ByCue:
+    """Energies of n poses by what they come from: image, keypoints, and all that is known else.
+
+    Attributes:
+        energy: of all together.
+        values: (n, 3).
+        gradients, hessians: (n, 3, d), (n, 3, d, d); of no pose: not asked for.
+        outline_costs: (n, M) what each sample of the silhouette's outline costs.
+    """
+
+    energy: Energy
+    values: Array
+    gradients: Array
+    hessians: Array
+    outline_costs: Array
+
+
+@dataclass(frozen=True, eq=False)
 class PoseEnergy:
     """A sum of terms over the poses of a body; an `EnergyTerm` over all variables, or some.
 
@@ -83,25 +101,51 @@ class PoseEnergy:
         Raises:
             ValueError: x has not f columns, or is not finite.
         """
+        return self._evaluated(x, rows, derivatives, apart=False)[0]
+
+    def by_cue(self, x: Array, *, derivatives: bool = True) -> ByCue:
+        """The energy at poses x (n, d), cue by cue; pose i belongs to problem i.
+
+        Raises:
+            ValueError: not all variables are free, or x is not as for `energy`.
+        """
+        if self.point is not None or self.motion is not None:
+            raise ValueError('cues are told apart where all is free and nothing is expected')
+        asked = Derivatives.POSITIVE if derivatives else Derivatives.NONE
+        energy, parts, compiled = self._evaluated(x, None, asked, apart=True)
+        costs = next((y.costs for y in compiled.inputs if hasattr(y, 'costs')), None)
+        return ByCue(energy, *parts, np.zeros((len(x), 0)) if costs is None else costs)
+
+    def _evaluated(
+        self, x: Array, rows: Index | None, derivatives: Derivatives, *, apart: bool
+    ) -> tuple[Energy, tuple[Array, Array, Array], Compiled]:
         x = self._checked(x)
         n, f = x.shape
         rows = np.arange(n) if rows is None else np.asarray(rows, dtype=np.intp)
         compiled, asked = self._compiled(n), n if derivatives else 0
         value, gradient, hessian = np.empty(n), np.empty((asked, f)), np.empty((asked, f, f))
+        parts = _empty_parts(n if apart else 0, asked if apart else 0, f)
         exact = derivatives == Derivatives.EXACT
         limits, nothing = np.zeros((2, f)), (np.empty(n, np.int8), np.zeros(n, np.int32))
 
         def work(first: int, last: int) -> None:
             solve(
                 first, last, compiled, self._point, self._free, rows, exact, limits, NO_DESCENT,
-                x, value, gradient, hessian, *nothing,
+                x, value, gradient, hessian, parts, *nothing,
             )  # fmt: skip
 
         in_threads(work, n, 8, self.likelihood.threads)
         if self.counted is not None:
             self.counted(n)
         found = Energy(value, gradient, hessian) if derivatives else Energy(value)
-        return add_energies([found, *self._others(x, rows, derivatives)])
+        others = self._others(x, rows, derivatives)
+        if apart:
+            for other in others:
+                parts[0][:, 2] += other.value
+                if derivatives:
+                    for known, own in zip(parts[1:], other.derivatives(), strict=True):
+                        known[:, 2] += own
+        return add_energies([found, *others]), parts, compiled
 
     def minimise(
         self,
@@ -132,11 +176,12 @@ class PoseEnergy:
         compiled = self._compiled(n)
         value, gradient, hessian = np.empty(n), np.empty((n, f)), np.empty((n, f, f))
         status, iterations = np.empty(n, dtype=np.int8), np.zeros(n, dtype=np.int32)
+        parts = _empty_parts(0, 0, f)
 
         def work(first: int, last: int) -> None:
             solve(
                 first, last, compiled, self._point, self._free, rows, False, limits, descent, x,
-                value, gradient, hessian, status, iterations,
+                value, gradient, hessian, parts, status, iterations,
             )  # fmt: skip
 
         in_threads(work, n, 4, self.likelihood.threads)
@@ -247,6 +292,10 @@ class PoseEnergy:
             np.array(np.broadcast_to(precisions, (rows, f, f)), dtype=np.float64),
             float(tails),
         )
+
+
+def _empty_parts(values: int, derivatives: int, d: int) -> tuple[Array, Array, Array]:
+    return np.empty((values, 3)), np.empty((derivatives, 3, d)), np.empty((derivatives, 3, d, d))
 
 
 # Kinds of terms with a kernel here.

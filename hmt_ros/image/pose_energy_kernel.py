@@ -85,9 +85,10 @@ class Room(NamedTuple):
         shown: the pose as the terms of the image see it.
         wrenches, stiffnesses: (S, 6), (S, 6, 6) sums over the segments.
         energies: (terms,) of the image.
-        value, ground: (1,), (1, 2).
+        value: (cues,) energies: of image, keypoints and what is known else, or one of them all.
+        ground: (1, 2).
         row: (1,) of the problem.
-        gradient, hessian: (1, d), (1, d, d).
+        gradient, hessian: (cues, d), (cues, d, d).
         slope, curve: (f,), (f, f) on the free variables.
     """
 
@@ -110,15 +111,15 @@ class Room(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _room(compiled, point, f):  # type: ignore[no-untyped-def]
+def _room(compiled, point, f, cues):  # type: ignore[no-untyped-def]
     segments, d = len(compiled.placing.parents), len(point)
     room = Room(
         np.empty((1, d)), np.empty((1, segments, 3, 3)), np.empty((1, segments, 3)),
         np.empty((1, d, 3)), np.zeros((1, d, 3)),
         new_view(compiled.model),
         np.empty((segments, 6)), np.empty((segments, 6, 6)), np.empty(len(compiled.inputs)),
-        np.empty(1), np.empty((1, 2)), np.zeros(1, np.int64), np.empty((1, d)),
-        np.empty((1, d, d)), np.empty(f), np.empty((f, f)),
+        np.empty(cues), np.empty((1, 2)), np.zeros(1, np.int64), np.empty((cues, d)),
+        np.empty((cues, d, d)), np.empty(f), np.empty((f, f)),
     )  # fmt: skip
     room.pose[0] = point
     return room
@@ -133,12 +134,21 @@ def _add_terms(compiled, number, row, exact, room, gradient, hessian):  # type: 
         number, row: of the pose in its call, and of its problem.
         exact: whether the Hessian of the prior is the exact one.
         room: with the pose.
-        gradient, hessian: (1, d), (1, d, d) result; of no pose: not wanted.
+        gradient, hessian: (cues, d), (cues, d, d) result; of no cue: not wanted.
     """
     columns, origins, axes, dof_origins = room.columns, room.origins, room.axes, room.dof_origins
-    value, wanted = room.value, len(gradient) > 0
+    wanted, apart = len(gradient) > 0, len(room.value) > 1
+    value, keypoint_value, known_value = room.value, room.value, room.value
+    keypoint_gradient, known_gradient = gradient, gradient
+    keypoint_hessian, known_hessian = hessian, hessian
+    if apart:
+        keypoint_value, known_value = value[1:2], value[2:]
+        keypoint_gradient, known_gradient = gradient[1:2], gradient[2:]
+        keypoint_hessian, known_hessian = hessian[1:2], hessian[2:]
+        value[:] = 0.0
+        gradient[:], hessian[:] = 0.0, 0.0
     place_pose(compiled.placing, room.pose[0], columns[0], origins[0], axes[0], dof_origins[0])
-    evaluate_prior(compiled.prior, room.pose, exact, value, gradient, hessian)
+    evaluate_prior(compiled.prior, room.pose, exact, known_value, known_gradient, known_hessian)
     if compiled.image:
         view = room.shown
         view.columns[:], view.origins[:] = columns[0], origins[0]
@@ -161,25 +171,27 @@ def _add_terms(compiled, number, row, exact, room, gradient, hessian):  # type: 
         own = row if len(keypoints.log_priors) > 1 else 0
         add_keypoints(
             keypoints, keypoints.log_priors[own : own + 1], columns, origins, axes, dof_origins,
-            value, gradient, hessian,
+            keypoint_value, keypoint_gradient, keypoint_hessian,
         )  # fmt: skip
     if compiled.overlaps.sigma < np.inf:
         add_overlaps(
-            compiled.overlaps, columns, origins, axes, dof_origins, value, gradient, hessian
-        )
+            compiled.overlaps, columns, origins, axes, dof_origins, known_value, known_gradient,
+            known_hessian,
+        )  # fmt: skip
     if compiled.ground.weights.sum() > 0.0:
         room.ground[:] = 0.0
         add_ground_energies(
-            compiled.ground, columns, origins, axes, dof_origins, room.ground, gradient, hessian
-        )
-        value[0] += room.ground.sum()
+            compiled.ground, columns, origins, axes, dof_origins, room.ground, known_gradient,
+            known_hessian,
+        )  # fmt: skip
+        known_value[0] += room.ground.sum()
     if compiled.flow.weight > 0.0:
         room.row[0] = row
         add_flow(
             compiled.flow, compiled.model.tree, compiled.model.lens, room.row, columns, origins,
-            axes, dof_origins, value, gradient, hessian,
+            axes, dof_origins, known_value, known_gradient, known_hessian,
         )  # fmt: skip
-    return value[0]
+    return value.sum()
 
 
 @njit(cache=True, nogil=True)
@@ -217,7 +229,7 @@ def _energy_at(compiled, number, row, free, x, exact, room, slope, curve):  # ty
     f = len(free)
     for i in range(f):
         room.pose[0, free[i]] = x[i]
-    count = 1 if len(slope) > 0 else 0
+    count = len(room.value) if len(slope) > 0 else 0
     gradient, hessian = room.gradient[:count], room.hessian[:count]
     value = _add_terms(compiled, number, row, exact, room, gradient, hessian)
     if count > 0:
@@ -225,6 +237,11 @@ def _energy_at(compiled, number, row, free, x, exact, room, slope, curve):  # ty
             slope[i] = gradient[0, free[i]]
             for j in range(f):
                 curve[i, j] = hessian[0, free[i], free[j]]
+        for cue in range(1, count):
+            for i in range(f):
+                slope[i] += gradient[cue, free[i]]
+                for j in range(f):
+                    curve[i, j] += hessian[cue, free[i], free[j]]
     if len(compiled.centres) > 0:
         value += _add_motion(compiled, row, x, slope, curve)
     return value
@@ -233,7 +250,7 @@ def _energy_at(compiled, number, row, free, x, exact, room, slope, curve):  # ty
 @njit(cache=True, nogil=True, error_model='numpy')
 def solve(  # type: ignore[no-untyped-def]
     first, last, compiled, point, free, rows, exact, limits, descent, x, value, gradient, hessian,
-    status, iterations,
+    by_cue, status, iterations,
 ):  # fmt: skip
     """Energies at the points first to last - 1, or minima from there.
 
@@ -247,10 +264,13 @@ def solve(  # type: ignore[no-untyped-def]
         x: (n, f) points; become minima, where iterations are asked for.
         value, gradient, hessian: (n,), (n, f), (n, f, f) result; of no point: no derivatives are
             wanted, and no minima.
+        by_cue: energies (n, 3), gradients (n, 3, d) and Hessians (n, 3, d, d) of image, keypoints
+            and what is known else, result; of no point: not wanted. They are those of the last
+            evaluation, all variables are free, and gradients only where the others are.
         status, iterations: (n,) results.
     """
-    f = len(free)
-    room = _room(compiled, point, f)
+    f, apart = len(free), len(by_cue[0]) > 0
+    room = _room(compiled, point, f, 3 if apart else 1)
     slope, curve = room.slope, room.curve
     low, high, step, trial, scratch = (
         np.empty(f), np.empty(f), np.empty(f), np.empty(f), np.empty(f),
@@ -285,6 +305,10 @@ def solve(  # type: ignore[no-untyped-def]
                 compiled, n, rows[n], free, trial, exact, room, slope if wanted else slope[:0],
                 curve,
             )  # fmt: skip
+            if apart:
+                by_cue[0][n] = room.value
+                if wanted:
+                    by_cue[1][n], by_cue[2][n] = room.gradient, room.hessian
             if turn == 0:
                 better = True
                 ended = not np.isfinite(found)

@@ -27,7 +27,7 @@ from hmt_ros.image.pose_energy import PoseEnergy
 from hmt_ros.image.surface_points import SurfacePoints, seen_points
 from hmt_ros.inference.arrays import Array, Mask
 from hmt_ros.inference.bounded_newton import Minimum, resting
-from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, add_energies
+from hmt_ros.inference.energy import Derivatives, Energy, Quadratic
 from hmt_ros.inference.error_model import ERRORS
 from hmt_ros.tracking.exchanges import SideExchanges
 from hmt_ros.tracking.hypotheses import Hypotheses
@@ -171,17 +171,13 @@ class Posterior:
         last = self._last_fit
         if last is not None and last[0] is poses and last[1] is observation:
             return last[2]
-        image = self.likelihood.energies(forward(self.body.skeleton, poses), observation)
-        assert image.hessian is not None
-        _, *terms = self.likelihood.seen(observation)
-        keypoints, priors = (
-            PoseEnergy(self.likelihood, tuple(some)).energy(poses)
-            for some in (terms, (*self.likelihood.priors, *self.known))
-        )
-        seen = add_energies([Energy(image.value, image.gradient, image.hessian), keypoints])
-        of_keypoints = keypoints.derivatives()[1]
-        energy = add_energies([seen, priors])
-        fit = ImageFit(energy, seen.value, image.hessian, of_keypoints, image.costs)
+        seen = self.likelihood.seen(observation)
+        terms = (*seen, *self.likelihood.priors, *self.known)
+        found = PoseEnergy(self.likelihood, terms).by_cue(poses)
+        fit = ImageFit(
+            found.energy, found.values[:, :2].sum(1), found.hessians[:, 0], found.hessians[:, 1],
+            found.outline_costs,
+        )  # fmt: skip
         self._last_fit = (poses, observation, fit)
         return fit
 
@@ -234,16 +230,12 @@ class Posterior:
         self.evaluations += len(poses)
         share = {name: errors.share(dt) for name, errors in ERRORS.items()}
 
-        def of(*terms: FrameTerm) -> Array:
-            energy = PoseEnergy(self.likelihood, terms)
-            return energy.energy(poses, derivatives=Derivatives.NONE).value
-
         image, *keypoints = self.likelihood.seen(observation)
-        total = share['image'] * of(image)
-        total += share['prior'] * of(*self.likelihood.priors, *self.known)
         if keypoints:
-            total += of(self.likelihood.keypoint_term(observation, exchanges, share['keypoints']))
-        return total
+            keypoints = [self.likelihood.keypoint_term(observation, exchanges, share['keypoints'])]
+        terms = (image, *keypoints, *self.likelihood.priors, *self.known)
+        values = PoseEnergy(self.likelihood, terms).by_cue(poses, derivatives=False).values
+        return np.asarray(values @ [share['image'], 1.0, share['prior']])
 
     def seen_points(self, poses: Array, observation: Observation) -> SurfacePoints:
         """Points that an image sees of the surfaces of poses (K, d)."""

@@ -14,16 +14,15 @@ is not known of the pose either: J P J' is added to the covariances of modes (a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from hmt_ros.body.body import GROWTH, Body
-from hmt_ros.body.kinematics import Frames, directed_derivatives, forward
+from hmt_ros.body.kinematics import forward
 from hmt_ros.body.shape import ShapeSpace
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
-from hmt_ros.image.terms.keypoints import KeypointTerm
 from hmt_ros.inference.arrays import Array
 
 # Standard deviations over people and clothes, by kind of growth: logarithms, m.
@@ -41,32 +40,18 @@ NOTICED = 0.1
 LARGEST_SHIFT = 0.2
 
 
-@dataclass(frozen=True, eq=False)
-class Linearised:
-    """The energy of an image over shape and pose, to second order, at one pose.
+class Linearised(NamedTuple):
+    """The energy of an image over shape and pose, to second order, at N poses.
 
     Attributes:
-        pull, weights: (M,) derivative of the energy by each residual, and its curvature.
-        residuals: (M, P) derivatives of the residuals by the shape.
-        mixed: (P, d) Gauss-Newton Hessian between shape and pose.
+        by_shape: (N, P) gradient by the shape.
+        curvature: (N, P, P) Gauss-Newton Hessian over the shape.
+        mixed: (N, P, d) the same between shape and pose.
     """
 
-    pull: Array
-    weights: Array
-    residuals: Array
+    by_shape: Array
+    curvature: Array
     mixed: Array
-
-    @property
-    def by_shape(self) -> Array:
-        """The gradient (P,) by the shape."""
-        result: Array = self.residuals.T @ self.pull
-        return result
-
-    @property
-    def curvature(self) -> Array:
-        """The Gauss-Newton Hessian (P, P) by the shape."""
-        result: Array = (self.weights[:, None] * self.residuals).T @ self.residuals
-        return result
 
 
 class ShapeEstimate:
@@ -96,7 +81,7 @@ class ShapeEstimate:
         self._taken = self._offset
         self.images = 0
         self._seen: Observation | None = None
-        self._known: dict[bytes, Linearised] = {}
+        self._known: tuple[Array, Linearised] | None = None
 
     @property
     def body(self) -> Body:
@@ -135,14 +120,14 @@ class ShapeEstimate:
         """
         size = self._space.size
         information, pull = np.zeros((size, size)), np.zeros(size)
-        for pose, weight, gradient, covariance in zip(
-            poses, weights, gradients, covariances, strict=True
+        linear = self.linearised(likelihood, observation, poses)
+        for k, (weight, gradient, covariance) in enumerate(
+            zip(weights, gradients, covariances, strict=True)
         ):
-            linear = self.linearised(likelihood, observation, pose)
-            given_way = covariance @ linear.mixed.T
+            mixed = linear.mixed[k]
             shift = self._limited(covariance @ gradient, covariance)
-            information += weight * (linear.curvature - linear.mixed @ given_way)
-            pull += weight * (linear.by_shape - linear.mixed @ shift)
+            information += weight * (linear.curvature[k] - mixed @ (covariance @ mixed.T))
+            pull += weight * (linear.by_shape[k] - mixed @ shift)
         before = self.covariance + np.diag((WANDERING * self._spread) ** 2 * dt)
         precision = np.linalg.inv(before) + trust * 0.5 * (information + information.T)
         after = np.linalg.inv(precision)
@@ -155,7 +140,7 @@ class ShapeEstimate:
         ahead = self._offset - self._taken
         if np.abs(ahead / self._spread).max() > NOTICED:
             self._space, self._taken = ShapeSpace(self._space.moved(ahead)), self._offset
-            self._known = {}
+            self._known = None
         self.images += 1
         return self._space.body
 
@@ -170,46 +155,31 @@ class ShapeEstimate:
 
         Arguments as for `update`.
         """
-        result = np.empty_like(covariances)
-        for k, (pose, covariance) in enumerate(zip(poses, covariances, strict=True)):
-            moved = covariance @ self.linearised(likelihood, observation, pose).mixed.T
-            added = moved @ self.covariance @ moved.T
-            result[k] = 0.5 * (added + added.T)
-        return result
+        moved = covariances @ self.linearised(likelihood, observation, poses).mixed.swapaxes(1, 2)
+        result = moved @ self.covariance @ moved.swapaxes(1, 2)
+        return np.asarray(0.5 * (result + result.swapaxes(1, 2)))
 
     def linearised(
-        self, likelihood: ImageLikelihood, observation: Observation, pose: Array
+        self, likelihood: ImageLikelihood, observation: Observation, poses: Array
     ) -> Linearised:
-        """The energy of the contours and keypoints of an image around a pose (d,).
+        """The energy of the contours and keypoints of an image around poses (N, d).
 
-        Of the last image it is kept: covariances and shape ask for the same modes.
+        Of the last image it is kept: covariances and shape ask for the same modes, first all and
+        then the best.
         """
-        if self._seen is not observation:
-            self._seen, self._known = observation, {}
-        key = pose.tobytes()
-        if key not in self._known:
-            self._known[key] = self._linearise(likelihood, observation, pose)
-        return self._known[key]
-
-    def _linearise(
-        self, likelihood: ImageLikelihood, observation: Observation, pose: Array
-    ) -> Linearised:
-        frames = forward(self._space.body.skeleton, pose[None])
-        found = likelihood.residuals(frames, observation)
-        segments, points, directions = found[:, 0].astype(np.intp), found[:, 1:4], found[:, 4:7]
-        pull, curvature = found[:, 7], found[:, 8]
-        by_pose = directed_derivatives(frames, segments, points, directions)
-        by_shape = self._space.point_derivatives(frames, segments, points, directions)
-        keypoints, s = observation.keypoints, likelihood.settings.keypoints
-        if keypoints is not None and s.weight > 0:
-            term = likelihood.keypoint_term(observation, None)
-            of_joints = self._of_keypoints(frames, term)
-            pull, curvature, by_pose, by_shape = (
-                np.concatenate(pair)
-                for pair in zip((pull, curvature, by_pose, by_shape), of_joints, strict=True)
-            )
-        mixed = by_shape.T @ (curvature[:, None] * by_pose)
-        return Linearised(pull, curvature, by_shape, mixed)
+        n = len(poses)
+        if self._seen is observation and self._known is not None:
+            known, found = self._known
+            if np.array_equal(known[:n], poses):
+                return Linearised(*(x[:n] for x in found))
+        frames = forward(self._space.body.skeleton, poses)
+        of_joints = np.zeros((n, 1, 9))
+        if observation.keypoints is not None and likelihood.settings.keypoints.weight > 0:
+            of_joints = likelihood.keypoint_term(observation, None).recorded(frames)
+        of_flesh = likelihood.recorded(frames, observation)
+        found = Linearised(*self._space.second_order(frames, of_flesh, of_joints))
+        self._seen, self._known = observation, (poses, found)
+        return found
 
     def _limited(self, shift: Array, covariance: Array) -> Array:
         """A shift (d,) of a pose whose angles are limited.
@@ -230,15 +200,3 @@ class ShapeEstimate:
         by_turns = np.linalg.lstsq(among, excess, rcond=1e-12)[0]
         result[~turns] -= covariance[np.ix_(~turns, turns)] @ by_turns
         return result
-
-    def _of_keypoints(
-        self, frames: Frames, term: KeypointTerm
-    ) -> tuple[Array, Array, Array, Array]:
-        """Pull, curvature (M,) and derivatives (M, d), (M, P) of the residuals of keypoints."""
-        joints, points, directions, pull, curvature = term.residuals(frames)
-        skeleton = term.skeleton
-        by_pose = directed_derivatives(frames, skeleton.joint_segments[joints], points, directions)
-        lengths = self._space.joint_derivatives(frames, joints)
-        by_shape = np.zeros((len(joints), self._space.size))
-        by_shape[:, : self._space.lengths] = np.einsum('mk,mkl->ml', directions, lengths)
-        return pull, curvature, by_pose, by_shape

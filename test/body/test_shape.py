@@ -7,7 +7,7 @@ import pytest
 
 from hmt_ros.body import load_body
 from hmt_ros.body.body import GROWTH, LEAST_HEIGHT
-from hmt_ros.body.kinematics import forward
+from hmt_ros.body.kinematics import directed_derivatives, forward
 from hmt_ros.body.shape import ShapeSpace
 
 STEP = 1e-5
@@ -104,18 +104,60 @@ def test_points_on_the_flesh_have_their_derivatives(space, body, random_poses):
         )
         return forward(other.skeleton, pose).points(segments, local)[..., 0]
 
-    found = space.point_derivatives(frames, segments, points(body), directions)
+    rows = residuals(segments, points(body), directions)
     moved = central_difference(space, points)
-    assert np.allclose(found, np.einsum('mk,mkp->mp', directions, moved), atol=1e-8)
+    wanted = np.einsum('mk,mkp->mp', directions, moved)
+    by_pose = directed_derivatives(frames, segments, points(body), directions)
+    found = space.second_order(frames, rows[None], NO_RESIDUALS)
+    check_sums(found, wanted, by_pose, rows[1:, 7], rows[1:, 8])
 
 
 def test_joints_have_their_derivatives(space, body, random_poses):
     pose = random_poses(body, 1, 5)
     joints = np.array([0, 3, 3, len(body.joint_names) - 1])
-    found = space.joint_derivatives(forward(body.skeleton, pose), joints)
-    wanted = central_difference(space, lambda other: other.joint_positions(pose)[0][joints])
-    assert np.allclose(found, wanted[..., : space.lengths], atol=1e-8)
-    assert not wanted[..., space.lengths :].any()
+    directions = np.random.default_rng(6).normal(size=(len(joints), 3))
+    frames, places = forward(body.skeleton, pose), body.joint_positions(pose)[0][joints]
+    moved = central_difference(space, lambda other: other.joint_positions(pose)[0][joints])
+    segments = body.skeleton.joint_segments[joints]
+    by_pose = directed_derivatives(frames, segments, places, directions)
+    rows = residuals(joints, places, directions)
+    found = space.second_order(frames, NO_RESIDUALS, rows[None])
+    wanted = np.einsum('mk,mkp->mp', directions, moved)
+    check_sums(found, wanted, by_pose, rows[1:, 7], rows[1:, 8])
+    assert not found[0][:, space.lengths :].any()
+
+
+def test_sums_over_residuals_are_those_of_each_pose(space, body, random_poses):
+    poses = random_poses(body, 3, 7)
+    rng = np.random.default_rng(8)
+    segments = np.array([shape.segment for shape in body.shapes])
+    rows = np.stack([residuals(segments, *rng.normal(size=(2, len(segments), 3))) for _ in poses])
+    rows[1, 0, 0] = 5  # what follows is not read
+    none = np.zeros((3, 1, 9))
+    together = space.second_order(forward(body.skeleton, poses), rows, none)
+    for n in range(3):
+        frames = forward(body.skeleton, poses[n : n + 1])
+        alone = space.second_order(frames, rows[n : n + 1], NO_RESIDUALS)
+        assert all(np.array_equal(x[n], y[0]) for x, y in zip(together, alone))
+
+
+NO_RESIDUALS = np.zeros((1, 1, 9))
+
+
+def residuals(owners, points, directions):
+    """Rows of one pose for `ShapeSpace.second_order`."""
+    rng = np.random.default_rng(9)
+    rows = np.column_stack([owners, points, directions, rng.normal(size=(len(points), 2))])
+    rows[:, 8] = np.abs(rows[:, 8])
+    return np.concatenate([np.array([[len(rows), *8 * [0.0]]]), rows])
+
+
+def check_sums(found, by_shape, by_pose, pull, curvature):
+    """Against the rows (M, P), (M, d) of each residual."""
+    gradient, hessian, mixed = found
+    assert np.allclose(gradient[0], pull @ by_shape, atol=1e-7)
+    assert np.allclose(hessian[0], (curvature[:, None] * by_shape).T @ by_shape, atol=1e-7)
+    assert np.allclose(mixed[0], (curvature[:, None] * by_shape).T @ by_pose, atol=1e-7)
 
 
 # Growth of a body.

@@ -231,6 +231,12 @@ def test_self_intersection_falls_against_its_gradient(shot):
 # Lists of residuals.
 
 
+def residuals(likelihood, frames, observation):
+    """Those of one pose, (M, 9)."""
+    (found,) = likelihood.recorded(frames, observation)
+    return found[1 : 1 + int(found[0, 0])]
+
+
 def summed(frames, segments, points, directions, pull, curvature):
     """Gradient (d,) and Hessian (d, d) over the pose of residuals at points of the skin."""
     by_pose = directed_derivatives(frames, segments, points, directions)
@@ -242,7 +248,7 @@ def test_listed_residuals_sum_to_gradient_and_hessian(shot, observation, names):
     likelihood = only(ImageLikelihood(shot.body, shot.camera), *names)
     for pose in shot.near(4, 22, spread=0.3):
         frames = forward(shot.body.skeleton, pose[None])
-        listed = likelihood.residuals(frames, observation)
+        listed = residuals(likelihood, frames, observation)
         assert len(listed) > 10
         gradient, hessian = summed(
             frames, listed[:, 0].astype(int), listed[:, 1:4], listed[:, 4:7],
@@ -256,9 +262,9 @@ def test_listed_residuals_sum_to_gradient_and_hessian(shot, observation, names):
 def test_without_evidence_no_residuals_are_listed(shot, observation):
     frames = forward(shot.body.skeleton, shot.poses[:1])
     likelihood = ImageLikelihood(shot.body, shot.camera)
-    assert likelihood.residuals(frames, Observation()).shape == (0, 9)
+    assert residuals(likelihood, frames, Observation()).shape == (0, 9)
     switched_off = replace(likelihood, settings=LikelihoodSettings.of_terms())
-    assert switched_off.residuals(frames, observation).shape == (0, 9)
+    assert residuals(switched_off, frames, observation).shape == (0, 9)
 
 
 def test_listed_residuals_of_keypoints_sum_to_gradient_and_hessian(shot):
@@ -271,10 +277,14 @@ def test_listed_residuals_of_keypoints_sum_to_gradient_and_hessian(shot):
     term = KeypointTerm(shot.body.skeleton, shot.camera, keypoints, TermSettings(2.0, 1.5, 5.0))
     for pose in poses:
         frames = forward(shot.body.skeleton, pose[None])
-        joints, *residuals = term.residuals(frames)
+        joints, *found = term.residuals(frames)
         assert not {3, 5} & set(joints)
+        (recorded,) = term.recorded(frames)
+        assert recorded[0, 0] == len(joints)
+        rows = np.column_stack([joints, *found])
+        assert np.array_equal(recorded[1 : 1 + len(rows)], rows)
         segments = shot.body.skeleton.joint_segments[joints]
-        gradient, hessian = summed(frames, segments, *residuals)
+        gradient, hessian = summed(frames, segments, *found)
         wanted = term.energy(frames, np.arange(1))
         assert np.allclose(gradient, wanted.gradient[0], rtol=1e-9, atol=1e-7)
         assert np.allclose(hessian, wanted.hessian[0], rtol=1e-9, atol=1e-7)
@@ -309,7 +319,7 @@ def test_the_nearer_a_person_the_less_a_pixel_says(shot, observation, name):
     likelihood = only(ImageLikelihood(shot.body, shot.camera), name)
     frames = forward(shot.body.skeleton, shot.near(1, 24))
     curvatures = [
-        likelihood.residuals(frames, replace(observation, magnification=pixels))[:, 4:]
+        residuals(likelihood, frames, replace(observation, magnification=pixels))[:, 4:]
         for pixels in (0.0, 100.0, 400.0)
     ]
     sharpness = [

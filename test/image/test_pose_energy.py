@@ -142,6 +142,37 @@ def test_energies_are_those_of_the_terms(terms, poses, name, motion, derivatives
     )
 
 
+@pytest.mark.parametrize('strange', [False, True])
+def test_energies_by_cue_are_those_of_the_terms(terms, poses, strange):
+    likelihood, (image, keypoints, *known) = terms['all']
+    known = [*known, Strange()] if strange else known
+    own = PoseEnergy(likelihood, (image, keypoints, *known))
+    found = own.by_cue(poses)
+    for cue, some in enumerate(([image], [keypoints], known)):
+        wanted = plain(likelihood, tuple(some), None).energy(poses, np.arange(COUNT))
+        cues = (found.values[:, cue], found.gradients[:, cue], found.hessians[:, cue])
+        check_same(cues, wanted)
+    check_same(found.energy, own.energy(poses))
+    costs = likelihood.energies(
+        forward(likelihood.body.skeleton, poses), image.observation, derivatives=False
+    ).costs
+    assert np.array_equal(found.outline_costs, costs)
+    values = own.by_cue(poses, derivatives=False)
+    np.testing.assert_allclose(values.values, found.values, rtol=1e-12)
+    assert values.energy.hessian is None
+
+
+def test_what_is_not_there_has_no_energy_of_its_own(terms, poses):
+    likelihood, (image, _, *known) = terms['all']
+    found = PoseEnergy(likelihood, tuple(known)).by_cue(poses)
+    assert found.values[:, 2].all()
+    assert not found.values[:, :2].any()
+    assert not found.hessians[:, :2].any()
+    assert found.outline_costs.shape == (COUNT, 0)
+    with pytest.raises(ValueError, match='cues are told apart where all is free'):
+        PoseEnergy(likelihood, (image,), motion_of(poses, 'gaussian', 37)).by_cue(poses)
+
+
 @pytest.mark.parametrize('motion', ['none', 'student'])
 def test_energies_over_some_variables(terms, poses, body, motion):
     likelihood, some = terms['limb']

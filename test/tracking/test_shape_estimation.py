@@ -87,9 +87,11 @@ class Toy(ShapeEstimate):
     def error(self, pose):
         return self.by_shape @ self.theta() + self.by_pose @ pose - self.measured
 
-    def linearised(self, likelihood, observation, pose):
+    def linearised(self, likelihood, observation, poses):
         a, b = self.by_shape, self.by_pose
-        return Linearised(self.error(pose), np.ones(len(a)), a, a.T @ b)
+        n = len(poses)
+        gradients = np.array([a.T @ self.error(pose) for pose in poses])
+        return Linearised(gradients, np.tile(a.T @ a, (n, 1, 1)), np.tile(a.T @ b, (n, 1, 1)))
 
 
 def toy(body, seed, noise=2e-3, measurements=120, pose_size=6):
@@ -239,7 +241,7 @@ def test_gradients_over_the_shape_at_material_points(human37, poses, observation
     for pose in poses[0] + 0.05 * rng.normal(size=(2, human37.dimension)):
         pose = np.clip(pose, human37.lower, human37.upper)
         value = energy_over_shape(space, pose, observation, name)
-        found = estimate.linearised(likelihood, observation, pose).by_shape
+        (found,) = estimate.linearised(likelihood, observation, pose[None]).by_shape
         wanted = np.array([(value(x) - value(-x)) / 2e-6 for x in 1e-6 * np.eye(space.size)])
         errors = np.abs(found - wanted) / np.abs(wanted).max()
         assert np.quantile(errors, 0.95) < 1e-6
@@ -257,10 +259,10 @@ def test_curvatures_of_keypoints_are_derivatives_of_their_gradients(human37, pos
         body = space.moved(change)
         other = ShapeEstimate(body)
         likelihood = ImageLikelihood(body, CAMERA, settings)
-        return other.linearised(likelihood, observation, pose).by_shape
+        return other.linearised(likelihood, observation, pose[None]).by_shape[0]
 
     likelihood = ImageLikelihood(human37, CAMERA, settings)
-    found = estimate.linearised(likelihood, observation, pose)
+    found = Linearised(*(x[0] for x in estimate.linearised(likelihood, observation, pose[None])))
     assert np.allclose(found.by_shape, 0.0, atol=1e-6)
     still = np.zeros(space.size)
     for steps, wanted in (
@@ -380,8 +382,9 @@ def test_what_is_considered_is_that_of_the_uncertain_shape(human37, poses, obser
     estimate = ShapeEstimate(human37)
     _, covariances = posterior.given_way(poses[:2], observation)
     found = estimate.considered(posterior.likelihood, observation, poses[:2], covariances)
-    for k, pose in enumerate(poses[:2]):
-        mixed = estimate.linearised(posterior.likelihood, observation, pose).mixed
+    for k in range(2):
+        pose = poses[k : k + 1]
+        (mixed,) = estimate.linearised(posterior.likelihood, observation, pose).mixed
         moved = -covariances[k] @ mixed.T
         assert np.allclose(found[k], moved @ estimate.covariance @ moved.T)
         assert np.linalg.eigvalsh(found[k])[0] > -1e-12
@@ -404,7 +407,8 @@ def test_keypoints_tell_nothing_of_the_size(human37, poses):
     observation = Observation(keypoints=seen)
     (gradient,), (covariance,) = posterior.given_way(poses[:1], observation)
     estimate = ShapeEstimate(human37)
-    linear = estimate.linearised(posterior.likelihood, observation, poses[0])
+    found = estimate.linearised(posterior.likelihood, observation, poses[:1])
+    linear = Linearised(*(x[0] for x in found))
     whole = covariance @ gradient
     turns = human37.skeleton.dof_is_rotation
     shift = estimate._limited(whole, covariance)

@@ -209,6 +209,34 @@ def list_keypoints(  # type: ignore[no-untyped-def]
     return m
 
 
+@njit(cache=True, nogil=True)
+def record_keypoints(inputs, joints, columns, origins, residuals):  # type: ignore[no-untyped-def]
+    """Lists the residuals of keypoints at N poses as `registry.record_residuals` does.
+
+    The first number of a residual is its joint of the skeleton instead of a segment.
+
+    Args:
+        inputs: as for `list_keypoints`.
+        joints: (P, 2) of the skeleton that the keypoints show, as called and exchanged.
+        columns, origins: (N, S, 3, 3), (N, S, 3) frames of the segments.
+        residuals: (N, 1 + 2 P, 9) result.
+    """
+    count = len(joints)
+    errors, which = np.empty((count, 2)), np.empty((2 * count, 2), np.intp)
+    places, directions = np.empty((2 * count, 3)), np.empty((2 * count, 3))
+    pulls, curvatures = np.empty(2 * count), np.empty(2 * count)
+    for n in range(len(columns)):
+        m = list_keypoints(
+            inputs, columns[n], origins[n], errors, which, places, directions, pulls, curvatures
+        )
+        residuals[n, 0, 0] = m
+        for i in range(m):
+            row = residuals[n, 1 + i]
+            row[0] = joints[which[i, 0], which[i, 1]]
+            row[1:4], row[4:7] = places[i], directions[i]
+            row[7], row[8] = pulls[i], curvatures[i]
+
+
 @njit(cache=True, nogil=True, error_model='numpy')
 def add_keypoints(  # type: ignore[no-untyped-def]
     inputs, log_priors, columns, origins, axes, dof_origins, value, gradient, hessian

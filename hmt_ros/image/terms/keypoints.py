@@ -39,6 +39,7 @@ from hmt_ros.image.terms.keypoint_kernel import (
     exchange_log_posterior,
     group_energies,
     list_keypoints,
+    record_keypoints,
 )
 from hmt_ros.image.terms.residuals import tree_of
 from hmt_ros.inference.arrays import Array, Index
@@ -247,6 +248,18 @@ class KeypointTerm:
         _, which, places, directions, pulls, curvatures = self._listed(frames)
         joints = self.measured.joints[which[:, 0], which[:, 1]]
         return joints, places, directions, pulls, curvatures
+
+    def recorded(self, frames: Frames) -> Array:
+        """The residuals at the frames of N poses, as `residuals` of one; see `record_keypoints`.
+
+        Returns:
+            (N, 1 + M, 9): rows 1 to m of a pose are joint, position, derivative of the residual by
+            it, derivative and curvature of the energy; m is the first number of row 0.
+        """
+        measured = self.measured
+        result = np.zeros((frames.count, 1 + 2 * len(measured.joints), 9))
+        record_keypoints(self.compiled, measured.joints, *frames.by_pose(), result)
+        return result
 
     def distances(self, frames: Frames) -> Array:
         """How far the keypoints (P,) that were seen are from the pose of frames, in deviations.

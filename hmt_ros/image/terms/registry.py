@@ -147,15 +147,17 @@ def add_energies(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def record_residuals(model, inputs, columns, origins, energies, residuals):  # type: ignore[no-untyped-def]
-    """Lists the residuals of one pose, instead of summing them.
+    """Lists the residuals of N poses, instead of summing them.
 
     Args:
         model, inputs: as for `add_energies`; the contour is traced.
-        columns, origins: (S, 3, 3), (S, 3) frames of the segments.
-        energies: (terms,) result.
-        residuals: (M, RECORDED) result, see `residuals.add_residual`; entry (0, 0) must be 0.
+        columns, origins: (N, S, 3, 3), (N, S, 3) frames of the segments.
+        energies: (N, terms) result.
+        residuals: (N, M, RECORDED) result, see `residuals.add_residual`; entries (n, 0, 0) must be
+            0 and become the number of residuals of pose n.
     """
-    view = new_view(model)
-    view.columns[:], view.origins[:] = columns, origins
-    look(view, 0, True)
-    run_terms(view, inputs, 0, energies, residuals, np.empty((0, 6, 6)))
+    view, nothing = new_view(model), np.empty((0, 6, 6))
+    for n in range(len(columns)):
+        view.columns[:], view.origins[:] = columns[n], origins[n]
+        look(view, n, True)
+        run_terms(view, inputs, 0, energies[n], residuals[n], nothing)
