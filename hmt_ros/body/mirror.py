@@ -107,13 +107,21 @@ def left_directions(body: Body, poses: Array) -> Array:
     Raises:
         ValueError: a body without shoulders and hips.
     """
+    return _left_of(body, body.joint_positions(poses))
+
+
+def _left_of(body: Body, joints: Array) -> Array:
+    """Unit vectors (N, 3) to the left of persons with joints (N, J, 3)."""
     if not body.trunk_pairs:
         raise ValueError(f'body {body.name} has neither shoulders nor hips: it faces nowhere')
-    joints = body.joint_positions(poses)
     ends = [body.skeleton.joint_index(side) for side in zip(*body.trunk_pairs, strict=True)]
-    left = joints[:, ends[0]].sum(1) - joints[:, ends[1]].sum(1)
-    result: Array = left / np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-12)
-    return result
+    return _units(joints[:, ends[0]].sum(1) - joints[:, ends[1]].sum(1))
+
+
+def _units(vectors: Array) -> Array:
+    """Vectors (N, 3) divided by their lengths."""
+    lengths = np.sqrt((vectors * vectors).sum(1, keepdims=True))
+    return np.asarray(vectors / np.maximum(lengths, 1e-12))
 
 
 def faces_back(body: Body, poses: Array, reference: Array) -> Mask:
@@ -125,12 +133,10 @@ def faces_back(body: Body, poses: Array, reference: Array) -> Mask:
     Raises:
         ValueError: a body without shoulders and hips.
     """
-    both = np.concatenate([reference[None], poses])
-    left = left_directions(body, both)
-    joints = body.joint_positions(both)
-    up = joints[:, body.skeleton.joint_index(['neck'])[0]] - joints[:, 0]
-    up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-12)
-    ray = joints[:, 0] / np.linalg.norm(joints[:, 0], axis=1, keepdims=True)
-    away = (np.cross(left, up) * ray).sum(1)
+    joints = body.joint_positions(np.concatenate([reference[None], poses]))
+    left, pelvis = _left_of(body, joints), joints[:, 0]
+    up = _units(joints[:, body.skeleton.joint_index(['neck'])[0]] - pelvis)
+    # How far the front, left x up, points away from the camera.
+    away = np.linalg.det(np.stack([left, up, _units(pelvis)], axis=1))
     apart = (away[1:] * away[0] < 0) & (np.abs(away[1:] - away[0]) > 2 * SIDEWAYS)
     return np.asarray((left[1:] @ left[0] < 0) | apart, dtype=np.bool_)

@@ -99,7 +99,13 @@ class Colours:
         if not model.any() or not around.any():
             return
         bins = binned(image)
-        on, off, scene = shares(bins, model), shares(bins, around), shares(bins)
+        # One pass: beside both, on the model, around it.
+        counts = np.bincount(
+            (bins + BINS**3 * (model + 2 * around.view(np.uint8)).astype(np.uint16)).ravel(),
+            minlength=3 * BINS**3,
+        ).reshape(3, -1)
+        on, off = (x / max(x.sum(), 1) for x in counts[1:])
+        scene = counts.sum(0) / bins.size
         first = self._inside is None
         gain = 1.0 if first else -math.expm1(-dt / MEMORY)
         self._inside = on if self._inside is None else self._inside + gain * (on - self._inside)
@@ -143,10 +149,9 @@ def binned(image: Image) -> NDArray[np.uint16]:
     return result
 
 
-def shares(bins: NDArray[np.uint16], where: Mask | None = None) -> Array:
-    """Share (BINS^3,) of each colour among the pixels of a mask; all zero where it is empty."""
-    chosen = bins.ravel() if where is None else bins[where]
-    return np.bincount(chosen, minlength=BINS**3) / max(chosen.size, 1)
+def shares(bins: NDArray[np.uint16]) -> Array:
+    """Share (BINS^3,) of each colour among pixels."""
+    return np.bincount(bins.ravel(), minlength=BINS**3) / bins.size
 
 
 def surroundings(model: Mask) -> Mask:

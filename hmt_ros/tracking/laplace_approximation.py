@@ -21,7 +21,6 @@ import numpy as np
 
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.bounded_newton import resting
 from hmt_ros.inference.error_model import TOGETHER, CueErrors, errors_of_cues
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
@@ -126,10 +125,9 @@ def likelihood_modes(modes: Modes, posterior: Posterior, observation: Observatio
     """
     body, poses = posterior.body, modes.poses
     fit = posterior.fit(poses, observation)
-    gradient, hessian = fit.energy.derivatives()
-    free = ~resting(poses, gradient, body.lower, body.upper)
-    covariances = free_covariances(hessian, free)
-    step = -np.einsum('kij,kj->ki', covariances, np.where(free, gradient, 0.0))
+    covariances = fit.covariances
+    gradient = np.where(fit.free, fit.energy.derivatives()[0], 0.0)
+    step = -np.einsum('kij,kj->ki', covariances, gradient)
     limit = 5.0 * np.sqrt(np.einsum('kii->ki', modes.covariances))
     step = np.clip(step, -limit, limit)
     means = np.clip(poses + step, body.lower, body.upper)

@@ -55,6 +55,8 @@ class ImageFit:
         image_hessian: (K, d, d) of the image terms alone, keypoints apart.
         keypoint_hessian: (K, d, d) of the keypoints alone.
         outline_costs: (K, M) of the samples of the silhouette's outline.
+        free: (K, d) variables that do not rest on a limit, where only the image moves them.
+        covariances: (K, d, d) inverse Hessians of the energy on these; see `free_covariances`.
     """
 
     energy: Energy
@@ -62,6 +64,8 @@ class ImageFit:
     image_hessian: Array
     keypoint_hessian: Array
     outline_costs: Array
+    free: Mask
+    covariances: Array
 
 
 class Posterior:
@@ -174,9 +178,11 @@ class Posterior:
         seen = self.likelihood.seen(observation)
         terms = (*seen, *self.likelihood.priors, *self.known)
         found = PoseEnergy(self.likelihood, terms).by_cue(poses)
+        gradient, hessian = found.energy.derivatives()
+        free = ~resting(poses, gradient, self.body.lower, self.body.upper)
         fit = ImageFit(
             found.energy, found.values[:, :2].sum(1), found.hessians[:, 0], found.hessians[:, 1],
-            found.outline_costs,
+            found.outline_costs, free, free_covariances(hessian, free),
         )  # fmt: skip
         self._last_fit = (poses, observation, fit)
         return fit
@@ -195,10 +201,9 @@ class Posterior:
             variables that rest on a limit, and inverse Hessians (K, d, d), in which they do not
             move.
         """
-        gradient, hessian = self.fit(poses, observation).energy.derivatives()
-        free = ~resting(poses, gradient, self.body.lower, self.body.upper)
-        both = free[:, :, None] & free[:, None, :]
-        return gradient * free, np.where(both, free_covariances(hessian, free), 0.0)
+        fit = self.fit(poses, observation)
+        gradient, free = fit.energy.derivatives()[0], fit.free
+        return gradient * free, fit.covariances * (free[:, :, None] & free[:, None, :])
 
     def covariances(self, fit: ImageFit, free: Mask, dt: float) -> Array:
         """Covariances (K, d, d) that an image alone leaves, on the free variables (K, d).

@@ -129,8 +129,8 @@ class ShapeEstimate:
             information += weight * (linear.curvature[k] - mixed @ (covariance @ mixed.T))
             pull += weight * (linear.by_shape[k] - mixed @ shift)
         before = self.covariance + np.diag((WANDERING * self._spread) ** 2 * dt)
-        precision = np.linalg.inv(before) + trust * 0.5 * (information + information.T)
-        after = np.linalg.inv(precision)
+        gained = trust * 0.5 * (information + information.T)
+        after = np.linalg.solve(np.eye(size) + before @ gained, before)
         self.covariance = 0.5 * (after + after.T)
         move = -trust * self.covariance @ pull
         furthest = np.abs(move / self._spread).max()
@@ -193,10 +193,10 @@ class ShapeEstimate:
         excess = shift[turns] * (
             1.0 - min(1.0, LARGEST_SHIFT / max(float(np.abs(shift[turns]).max()), 1e-12))
         )
-        among = covariance[np.ix_(turns, turns)]
         result = shift.copy()
         result[turns] -= excess
         # Angles that rest on a limit have no variance.
-        by_turns = np.linalg.lstsq(among, excess, rcond=1e-12)[0]
-        result[~turns] -= covariance[np.ix_(~turns, turns)] @ by_turns
+        free = turns & (np.diagonal(covariance) > 0)
+        by_turns = np.linalg.solve(covariance[np.ix_(free, free)], excess[free[turns]])
+        result[~turns] -= covariance[np.ix_(~turns, free)] @ by_turns
         return result

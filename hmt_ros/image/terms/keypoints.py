@@ -354,25 +354,24 @@ def _slopes(skeleton: Skeleton, camera: Camera, keypoints: Keypoints, sigma: flo
     if keypoints.positions is not None:
         lifted = _first_of(keypoints.names, keypoints.positions)
     pixels = _first_of(keypoints.names, keypoints.pixels)
-    pairs, directions, rays, slopes, weights, groups = [], [], [], [], [], []
+    pairs, directions, bones, middles, weights, groups = [], [], [], [], [], []
     for bone, segments, along in _bones(skeleton) if lifted else ():
         measured, middle = _direction(lifted, bone), _middle(pixels, bone)
         if measured is None or middle is None:
             continue
-        ray = camera.rays(middle[None])[0]
-        ray = ray / np.linalg.norm(ray)
         first = skeleton.joint_index([bone.ends[0].replace('mid_', 'left_')])
         pairs.append(segments)
         directions.append(along)
-        rays.append(ray)
-        slopes.append(float(measured @ ray))
+        bones.append(measured)
+        middles.append(middle)
         weights.append(1.0 / (sigma * bone.sigma))
         groups.append(_group_of(skeleton, int(skeleton.joint_segments[first][0])))
     n = len(pairs)
+    rays = camera.rays(np.reshape(middles, (n, 2)))
+    slopes = np.einsum('mk,mk->m', np.reshape(bones, (n, 3)), rays)
     return Slopes(
-        np.reshape(pairs, (n, 2)).astype(np.int64), np.reshape(directions, (n, 2, 3)),
-        np.reshape(rays, (n, 3)), np.array(slopes, np.float64), np.array(weights, np.float64),
-        np.array(groups, np.int64),
+        np.reshape(pairs, (n, 2)).astype(np.int64), np.reshape(directions, (n, 2, 3)), rays, slopes,
+        np.array(weights, np.float64), np.array(groups, np.int64),
     )  # fmt: skip
 
 
