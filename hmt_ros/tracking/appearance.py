@@ -35,6 +35,8 @@ from hmt_ros.tracking.view import View
 # Fraction of the usual value at which a silhouette says nothing; at none of it somebody is absent,
 # at twice as much present.
 UNDECIDED = 0.25
+# Colours are learned once in so many seconds: they hardly change.
+LEARNED = 0.1
 # More than this fraction of an image, or of a person, is most of it.
 MOST = 0.5
 
@@ -71,6 +73,7 @@ class Appearance:
         self._depth = self._magnification = math.nan
         self._share, self._area = MOST, math.nan
         self._stamp = 0
+        self._coloured: int | None = None
         # Of the last image: foreground on the raster, and the piece of it that is a person.
         self._foreground: Mask | None = None
         self._piece: Piece | None = None
@@ -169,7 +172,10 @@ class Appearance:
             area = self._piece.area / free
             known = not math.isnan(self._area)
             self._area = self._area + gain * (area - self._area) if known else area
-        self.colours.learn(_coarse(view), model, dt)
+        since = math.inf if self._coloured is None else seconds(stamp - self._coloured)
+        if since >= LEARNED:
+            self.colours.learn(_coarse(view), model, since)
+            self._coloured = stamp
 
 
 def _coarse(view: View) -> Image:
