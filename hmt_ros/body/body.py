@@ -184,7 +184,7 @@ class Body:
         """Names of the joints that no chain moves."""
         return self.skeleton.trunk_joints
 
-    @property
+    @cached_property
     def trunk_pairs(self) -> tuple[tuple[str, str], ...]:
         """Names of the left and right joints of the trunk, which tell where the person faces."""
         return sided_pairs(self.skeleton.trunk_joints)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,7 +191,7 @@ class Skeleton:
         Raises:
             KeyError: a name that the skeleton does not have.
         """
-        return _positions(names, self.dof_names, 'degree of freedom', self.name)
+        return _positions(tuple(names), self.dof_names, 'degree of freedom', self.name)
 
     def joint_index(self, names: list[str] | tuple[str, ...]) -> Index:
         """Positions of named joints.
@@ -199,7 +199,7 @@ class Skeleton:
         Raises:
             KeyError: a name that the skeleton does not have.
         """
-        return _positions(names, self.joint_names, 'joint', self.name)
+        return _positions(tuple(names), self.joint_names, 'joint', self.name)
 
     def with_lengths(self, lengths: Mapping[str, float]) -> Skeleton:
         """The same skeleton with other values (m) of some lengths.
@@ -231,11 +231,13 @@ def other_side(name: str) -> str:
     return name
 
 
-def _positions(
-    names: list[str] | tuple[str, ...], known: tuple[str, ...], kind: str, owner: str
-) -> Index:
+@lru_cache(maxsize=256)
+def _positions(names: tuple[str, ...], known: tuple[str, ...], kind: str, owner: str) -> Index:
+    """Positions of names among those that are known; not to be written to."""
     place = {name: i for i, name in enumerate(known)}
     missing = [name for name in names if name not in place]
     if missing:
         raise KeyError(f'{owner} has no {kind} {missing}; it has {list(known)}')
-    return np.array([place[name] for name in names], dtype=np.intp)
+    result = np.array([place[name] for name in names], dtype=np.intp)
+    result.flags.writeable = False
+    return result

@@ -30,8 +30,8 @@ from hmt_ros.image.optical_flow import FlowInputs, FlowTerm
 from hmt_ros.image.pose_energy_kernel import NO_DESCENT, Compiled, Descent, solve
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import NO_MAP
-from hmt_ros.image.terms.keypoint_kernel import KeypointInputs, Points, Slopes
-from hmt_ros.image.terms.keypoints import KeypointTerm
+from hmt_ros.image.terms.keypoint_kernel import KeypointInputs, Points
+from hmt_ros.image.terms.keypoints import NO_SLOPES, KeypointTerm
 from hmt_ros.image.terms.registry import TERMS, Model
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
@@ -306,9 +306,6 @@ _KNOWN: tuple[Any, ...] = (
 NOTHING_SEEN = Observation()
 _NONE, _NO_PAIRS = np.zeros(0, dtype=np.int64), np.zeros((0, 2), dtype=np.int64)
 _NO_POINTS = Points(_NO_PAIRS, np.zeros((0, 2, 3)), np.zeros((0, 2)), np.zeros((0, 2, 2)), _NONE)
-_NO_SLOPES = Slopes(
-    _NO_PAIRS, np.zeros((0, 2, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), _NONE
-)
 _NO_FLOW = FlowInputs(
     SurfacePoints(
         _NONE, np.zeros((0, 0), np.int64), np.zeros((0, 0, 3)), np.zeros((0, 0, 2))
@@ -320,7 +317,7 @@ _ONE, _SURE = np.zeros(1), np.zeros((1, 1))
 
 def _no_keypoints(model: Model) -> KeypointInputs:
     return KeypointInputs(
-        _NO_POINTS, _NO_SLOPES, model.tree, model.lens, 1.0, _ONE, _AS_CALLED, _SURE
+        _NO_POINTS, NO_SLOPES, model.tree, model.lens, 1.0, _ONE, _AS_CALLED, _SURE
     )
 
 

@@ -147,8 +147,7 @@ def of_keypoints(term: KeypointTerm, poses: Array) -> Misfit:
     counts = np.bincount(groups, minlength=count).astype(np.float64)
     if len(groups) == 0:
         return Misfit(np.zeros(count), counts)
-    distances = [term.distances(forward(term.skeleton, pose[None])) for pose in poses]
-    missed = ~(np.stack(distances) < UNEXPLAINED)
+    missed = ~(term.distances(forward(term.skeleton, poses)) < UNEXPLAINED)
     best = missed[missed.mean(1).argmin()]
     found = np.bincount(groups, weights=best, minlength=count)
     return Misfit(found / np.maximum(counts, 1.0), counts)

@@ -210,6 +210,25 @@ def list_keypoints(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _list_room(count):  # type: ignore[no-untyped-def]
+    """Room for the list of the residuals of so many keypoints."""
+    return (
+        np.empty((count, 2)), np.empty((2 * count, 2), np.intp), np.empty((2 * count, 3)),
+        np.empty((2 * count, 3)), np.empty(2 * count), np.empty(2 * count),
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def keypoint_errors(inputs, columns, origins, errors):  # type: ignore[no-untyped-def]
+    """Fills the errors (N, P, 2) of `list_keypoints` at the frames of N poses."""
+    for n in range(len(columns)):
+        _, which, places, directions, pulls, curvatures = _list_room(errors.shape[1])
+        list_keypoints(
+            inputs, columns[n], origins[n], errors[n], which, places, directions, pulls, curvatures
+        )
+
+
+@njit(cache=True, nogil=True)
 def record_keypoints(inputs, joints, columns, origins, residuals):  # type: ignore[no-untyped-def]
     """Lists the residuals of keypoints at N poses as `registry.record_residuals` does.
 
@@ -221,10 +240,7 @@ def record_keypoints(inputs, joints, columns, origins, residuals):  # type: igno
         columns, origins: (N, S, 3, 3), (N, S, 3) frames of the segments.
         residuals: (N, 1 + 2 P, 9) result.
     """
-    count = len(joints)
-    errors, which = np.empty((count, 2)), np.empty((2 * count, 2), np.intp)
-    places, directions = np.empty((2 * count, 3)), np.empty((2 * count, 3))
-    pulls, curvatures = np.empty(2 * count), np.empty(2 * count)
+    errors, which, places, directions, pulls, curvatures = _list_room(len(joints))
     for n in range(len(columns)):
         m = list_keypoints(
             inputs, columns[n], origins[n], errors, which, places, directions, pulls, curvatures

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,7 @@ from hmt_ros.image.terms.keypoint_kernel import (
     add_keypoints,
     exchange_log_posterior,
     group_energies,
-    list_keypoints,
+    keypoint_errors,
     record_keypoints,
 )
 from hmt_ros.image.terms.residuals import tree_of
@@ -245,9 +246,9 @@ class KeypointTerm:
             residual by the position, (M,) derivative and (M,) curvature of the energy by the
             residual; two residuals a keypoint. Landmarks behind the camera have none.
         """
-        _, which, places, directions, pulls, curvatures = self._listed(frames)
-        joints = self.measured.joints[which[:, 0], which[:, 1]]
-        return joints, places, directions, pulls, curvatures
+        (found,) = self.recorded(frames)
+        rows = found[1 : 1 + int(found[0, 0])]
+        return rows[:, 0].astype(np.intp), rows[:, 1:4], rows[:, 4:7], rows[:, 7], rows[:, 8]
 
     def recorded(self, frames: Frames) -> Array:
         """The residuals at the frames of N poses, as `residuals` of one; see `record_keypoints`.
@@ -262,24 +263,13 @@ class KeypointTerm:
         return result
 
     def distances(self, frames: Frames) -> Array:
-        """How far the keypoints (P,) that were seen are from the pose of frames, in deviations.
+        """How far the P keypoints that were seen are from N poses, (N, P), in deviations.
 
         The exchange of sides is the likeliest; of a landmark behind the camera it is NaN.
         """
-        return np.asarray(np.linalg.norm(self._listed(frames)[0], axis=1))
-
-    def _listed(self, frames: Frames) -> tuple[Array, Index, Array, Array, Array, Array]:
-        """Errors of the keypoints and residuals at one pose; see `list_keypoints`."""
-        count = len(self.measured.points.groups)
-        errors, which = np.empty((count, 2)), np.empty((2 * count, 2), dtype=np.intp)
-        places, directions = np.empty((2, 2 * count, 3))
-        pulls, curvatures = np.empty((2, 2 * count))
-        columns, origins = frames.by_pose()
-        n = list_keypoints(
-            self.compiled, columns[0], origins[0], errors, which, places, directions, pulls,
-            curvatures,
-        )  # fmt: skip
-        return errors, which[:n], places[:n], directions[:n], pulls[:n], curvatures[:n]
+        errors = np.empty((frames.count, len(self.measured.joints), 2))
+        keypoint_errors(self.compiled, *frames.by_pose(), errors)
+        return np.asarray(np.linalg.norm(errors, axis=2))
 
     def _priors(self, rows: Index, count: int) -> tuple[NDArray[np.int64], Array]:
         """Which groups each exchange exchanges (E, G), and log priors (N, E)."""
@@ -350,29 +340,75 @@ def _whitened(keypoints: Keypoints, sigma: float, magnification: float) -> tuple
 
 def _slopes(skeleton: Skeleton, camera: Camera, keypoints: Keypoints, sigma: float) -> Slopes:
     """The bones that were lifted."""
-    lifted: dict[str, Array] = {}
-    if keypoints.positions is not None:
-        lifted = _first_of(keypoints.names, keypoints.positions)
-    pixels = _first_of(keypoints.names, keypoints.pixels)
-    pairs, directions, bones, middles, weights, groups = [], [], [], [], [], []
-    for bone, segments, along in _bones(skeleton) if lifted else ():
-        measured, middle = _direction(lifted, bone), _middle(pixels, bone)
-        if measured is None or middle is None:
-            continue
-        first = skeleton.joint_index([bone.ends[0].replace('mid_', 'left_')])
-        pairs.append(segments)
-        directions.append(along)
-        bones.append(measured)
-        middles.append(middle)
-        weights.append(1.0 / (sigma * bone.sigma))
-        groups.append(_group_of(skeleton, int(skeleton.joint_segments[first][0])))
-    n = len(pairs)
-    rays = camera.rays(np.reshape(middles, (n, 2)))
-    slopes = np.einsum('mk,mk->m', np.reshape(bones, (n, 3)), rays)
+    if keypoints.positions is None:
+        return NO_SLOPES
+    known = _known_bones(skeleton, keypoints.names)
+    ends, middles = (
+        _first_of(known.codes, values)[known.ends].mean(2)
+        for values in (keypoints.positions, keypoints.pixels)
+    )
+    along, middles = ends[:, 1] - ends[:, 0], middles.mean(1)
+    lengths = np.linalg.norm(along, axis=1)
+    seen = np.flatnonzero((lengths > 0) & np.isfinite(lengths) & np.isfinite(middles).all(1))
+    rays = camera.rays(middles[seen])
     return Slopes(
-        np.reshape(pairs, (n, 2)).astype(np.int64), np.reshape(directions, (n, 2, 3)), rays, slopes,
-        np.array(weights, np.float64), np.array(groups, np.int64),
+        known.segments[seen], known.directions[seen], rays,
+        np.einsum('mk,mk->m', along[seen] / lengths[seen, None], rays),
+        1.0 / (sigma * known.sigmas[seen]), known.groups[seen],
     )  # fmt: skip
+
+
+NO_SLOPES = Slopes(
+    np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0),
+    np.zeros(0, np.int64),
+)  # fmt: skip
+
+
+class _KnownBones(NamedTuple):
+    """The B bones of a skeleton whose ends are among P names.
+
+    Attributes:
+        codes: (P,) of the names, the same for the same name.
+        ends: (B, 2, 2) codes of both ends; an end lies between two names, or is twice the same.
+        segments, directions, sigmas, groups: (B, 2), (B, 2, 3), (B,), (B,) of the bones.
+    """
+
+    codes: Index
+    ends: Index
+    segments: NDArray[np.int64]
+    directions: Array
+    sigmas: Array
+    groups: NDArray[np.int64]
+
+
+@lru_cache(maxsize=16)
+def _known_bones(skeleton: Skeleton, names: tuple[str, ...]) -> _KnownBones:
+    code = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    rows = []
+    for bone, segments, along in _bones(skeleton):
+        pairs = [[x.replace('mid_', side) for side in ('left_', 'right_')] for x in bone.ends]
+        if any(name not in code for pair in pairs for name in pair):
+            continue
+        first = skeleton.joint_index([pairs[0][0]])
+        group = _group_of(skeleton, int(skeleton.joint_segments[first][0]))
+        rows.append(([[code[x] for x in pair] for pair in pairs], segments, along, bone, group))
+    n = len(rows)
+    return _KnownBones(
+        np.array([code[name] for name in names], dtype=np.intp),
+        np.reshape([row[0] for row in rows], (n, 2, 2)).astype(np.intp),
+        np.reshape([row[1] for row in rows], (n, 2)).astype(np.int64),
+        np.reshape([row[2] for row in rows], (n, 2, 3)).astype(np.float64),
+        np.array([row[3].sigma for row in rows], dtype=np.float64),
+        np.array([row[4] for row in rows], dtype=np.int64),
+    )
+
+
+def _first_of(codes: Index, values: Array) -> Array:
+    """The first finite value of each code, (C, ...); NaN where there is none."""
+    rows = np.flatnonzero(np.isfinite(values).all(1))[::-1]
+    result = np.full((int(codes.max(initial=-1)) + 1, values.shape[1]), np.nan)
+    result[codes[rows]] = values[rows]
+    return result
 
 
 @lru_cache(maxsize=16)
@@ -397,15 +433,6 @@ def _bones(skeleton: Skeleton) -> list[tuple[SlopeModel, tuple[int, int], Array]
     return result
 
 
-def _first_of(names: tuple[str, ...], values: Array) -> dict[str, Array]:
-    """Finite values by name, the first of each name."""
-    result: dict[str, Array] = {}
-    for name, value in zip(names, values, strict=True):
-        if name not in result and np.isfinite(value).all():
-            result[name] = value
-    return result
-
-
 def _end(places: Mapping[str, Array], name: str) -> Array | None:
     """A place by name; that of `mid_x` is between the left and the right x."""
     if not name.startswith('mid_'):
@@ -423,12 +450,6 @@ def _direction(places: Mapping[str, Array], bone: SlopeModel) -> Array | None:
         return None
     length = float(np.linalg.norm(last - first))
     return (last - first) / length if length > 0 else None
-
-
-def _middle(pixels: Mapping[str, Array], bone: SlopeModel) -> Array | None:
-    """Pixel (2,) half way along a bone."""
-    first, last = (_end(pixels, name) for name in bone.ends)
-    return None if first is None or last is None else 0.5 * (first + last)
 
 
 def _group_of(skeleton: Skeleton, segment: int) -> int:
