@@ -43,10 +43,14 @@ class StageClock:
 
     Args:
         stages: owner of a part, its name there, and the stage that it is.
+        clock: that is read, s.
     """
 
-    def __init__(self, stages: Stages = STAGES) -> None:
+    def __init__(
+        self, stages: Stages = STAGES, clock: Callable[[], float] = time.perf_counter
+    ) -> None:
         self._stages = stages
+        self._clock = clock
         self.seconds: dict[str, float] = {}
         self._stack: list[str] = []
         self._since = 0.0
@@ -71,7 +75,7 @@ class StageClock:
         self._stack.pop()
 
     def _charge(self) -> None:
-        now = time.perf_counter()
+        now = self._clock()
         if self._stack:
             stage = self._stack[-1]
             self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._since

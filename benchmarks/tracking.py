@@ -66,7 +66,7 @@ from hmt_ros.tracking import TrackerSettings
 Array = NDArray[np.float64]
 
 USUAL_PARTS = ('accuracy', 'ablations', 'sizes', 'oracle', 'speed')
-PARTS = (*USUAL_PARTS, 'rules')
+PARTS = (*USUAL_PARTS, 'scaling', 'rules')
 SEEDS = (0, 1, 2)
 RATES = (USUAL_RATE,)
 ABLATIONS: tuple[tuple[str, Any], ...] = (*(('max_hypotheses', k) for k in (1, 2, 4, 8, 16)),)
@@ -259,6 +259,11 @@ def measure(
         result['speed'] = speed(read_clip(timed, QUICK if quick else 60))
         priced = [folder for folder in still if folder.name in PRICED] or [timed]
         result['costs'] = [row for folder in priced for row in costs(folder, limit)]
+    if timed is not None and 'scaling' in parts:
+        # Here, so that the other parts need no inner modules of the tracker.
+        from benchmarks.tracking_scaling import scaling
+
+        result['scaling'] = scaling(read_clip(timed, QUICK if quick else 60))
     if timed is not None and frames > 0:
         result['memory'] = memory(read_clip(timed), frames)
     return result

@@ -148,6 +148,10 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         parts.append(speed_as_text(result['speed'], cores, markdown=markdown))
         parts.append(f'Processor time of a step in floors, that of {OPENCV} of the same images:')
         parts.append(costs_as_text(result['costs'], markdown=markdown))
+    if 'scaling' in result:
+        from benchmarks.tracking_scaling import scaling_as_text
+
+        parts.append(scaling_as_text(result['scaling'], markdown=markdown))
     if 'memory' in result:
         parts.append(memory_as_text(result['memory']))
     return '\n\n'.join(parts)

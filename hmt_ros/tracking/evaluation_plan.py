@@ -1,7 +1,9 @@
 """What the evaluations of one image are spent on: a count, so that results do not depend on speed.
 
     budget B    predictions descend    limbs and trunks are rated    candidates descend
-    share       about B / 8            at most 2 B / 5, and searches  about B / 5
+    share       about B / 8            at most 2 B / 3                about B / 5
+
+Of what is rated, 2 B / 5 are left where limbs are searched for, too.
 
 What is left goes to what is made of the modes: covariances, shape, the likelihood alone. Settings
 bound each part; a budget below them takes from all parts. An image in which the heaviest mode is
@@ -36,7 +38,9 @@ class EvaluationPlan:
         candidates: maximum number of hypotheses that are fully optimised.
         iterations: number of Newton steps on the predictions, and on the candidates.
         groups: maximum number of groups of modes with a trunk of their own that are searched.
-        rated: maximum number of poses that are rated, all groups together.
+        rated: maximum number of poses that are rated, all groups together, where limbs are
+            searched for.
+        rated_alone: the same where none is.
         alternatives: maximum number of configurations of a limb.
         combinations: maximum number of combinations on each trunk.
         searched_chains: number of limbs searched in each group.
@@ -48,6 +52,7 @@ class EvaluationPlan:
     iterations: int
     groups: int
     rated: int
+    rated_alone: int
     alternatives: int
     combinations: int
     searched_chains: int
@@ -70,8 +75,9 @@ def plan_of(settings: TrackerSettings, *, surprising: bool = False) -> Evaluatio
         hypotheses=hypotheses,
         candidates=max(min(s.candidates, budget // 40), hypotheses),
         iterations=min(s.iterations, max(budget // 60, 1)),
-        groups=min(3, max(budget // 130, 1)),
+        groups=min(3, max(budget // 65, 1)),
         rated=2 * budget // 5,
+        rated_alone=2 * budget // 3,
         alternatives=min(s.alternatives, max(budget // 65, 2)),
         combinations=min(s.combinations, max(budget // 8, 4)),
         searched_chains=min(s.searched_chains, searched),

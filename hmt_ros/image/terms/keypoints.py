@@ -319,7 +319,7 @@ def _measured(
     own = np.zeros((len(joints), 3)) if counted.offsets is None else counted.offsets
     offsets = skeleton.joint_offsets[joints] + np.stack([own, own * MIRROR], axis=1)
     segments = skeleton.joint_segments[joints].astype(np.int64)
-    groups = np.array([_group_of(skeleton, i) for i in segments[:, 0]], dtype=np.int64)
+    groups = np.array([group_of(skeleton, i) for i in segments[:, 0]], dtype=np.int64)
     points = Points(segments, offsets, counted.pixels, whiteners, groups)
     return MeasuredKeypoints(joints, points, _slopes(skeleton, camera, counted, sigma))
 
@@ -390,7 +390,7 @@ def _known_bones(skeleton: Skeleton, names: tuple[str, ...]) -> _KnownBones:
         if any(name not in code for pair in pairs for name in pair):
             continue
         first = skeleton.joint_index([pairs[0][0]])
-        group = _group_of(skeleton, int(skeleton.joint_segments[first][0]))
+        group = group_of(skeleton, int(skeleton.joint_segments[first][0]))
         rows.append(([[code[x] for x in pair] for pair in pairs], segments, along, bone, group))
     n = len(rows)
     return _KnownBones(
@@ -452,7 +452,7 @@ def _direction(places: Mapping[str, Array], bone: SlopeModel) -> Array | None:
     return (last - first) / length if length > 0 else None
 
 
-def _group_of(skeleton: Skeleton, segment: int) -> int:
+def group_of(skeleton: Skeleton, segment: int) -> int:
     """Group that what lies on a segment is exchanged with."""
     for chain, segments in skeleton.chains.items():
         if segment in segments:

@@ -1,9 +1,9 @@
 """Kinematic jump sampling: other configurations of the limbs and of the trunk (KJS 3, 4).
 
 For each trunk that the modes have, every limb has alternatives: those of the modes, all their
-flips, and what a search of the image found. Combinations of alternatives are rated on the trunk as
-it is, with limbs exchanged that were taken for each other, and with the torso flipped; the best
-that stand for all become candidates.
+flips, and, where no keypoints show it, what a search of the image found. Combinations of
+alternatives are rated on the trunk as it is, with limbs exchanged that were taken for each other,
+and with the torso flipped; the best that stand for all become candidates.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from functools import cached_property
 import numpy as np
 
 from hmt_ros.flips.limb_products import LimbProducts
+from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.keypoints import group_of
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.error_model import ERRORS
@@ -44,7 +46,8 @@ class KinematicJumps:
     ) -> Hypotheses:
         """See `Proposal`."""
         s, body = self.posterior.settings, self.posterior.body
-        plan, left = search.plan, search.plan.rated
+        plan, limbs = search.plan, self._not_shown(search.observation)
+        left = plan.rated if limbs else plan.rated_alone
         share = ERRORS['image'].share(search.dt)
         price = {name: x.price(search.dt) for name, x in body.symmetries.items()}
         everything: list[tuple[Array, Index, Array]] = []
@@ -54,7 +57,7 @@ class KinematicJumps:
             likely = prior[group].max() > prior.max() - LIKELY
             products = LimbProducts.of(
                 body, base.x[group],
-                self._search(search, base.x[group[0]], sources.ancestors[group[0]], rng)
+                self._search(limbs, search, base.x[group[0]], sources.ancestors[group[0]], rng)
                 if likely else {},
                 price['limb_flip'], apart=DISTINCT, most=plan.alternatives,
             ).at_most(left)  # fmt: skip
@@ -109,26 +112,54 @@ class KinematicJumps:
             left = [i for i, ok in zip(left, near) if not ok]
         return groups
 
+    def _not_shown(self, observation: Observation) -> list[str]:
+        """The limbs that an image is searched for: those that it shows without keypoints.
+
+        Two keypoints fix a limb but for its flips; samples beside them only find what the image
+        has of other limbs and of the background.
+        """
+        if not {'coverage', 'edges'} & observation.evidence.keys():
+            return []
+        names, keypoints = list(self._searches), observation.keypoints
+        if keypoints is None or self.posterior.settings.likelihood.keypoints.weight == 0:
+            return names
+        skeleton, beliefs = self.posterior.body.skeleton, observation.beliefs
+        seen = {name for name, known in zip(keypoints.names, keypoints.seen, strict=True) if known}
+
+        def shown(limb: str) -> bool:
+            if beliefs is not None:
+                group = group_of(skeleton, skeleton.chains[limb][0])
+                if beliefs.keypoints[group] < 0.5:
+                    return False
+            joints = (skeleton.joint_names[j] for j in skeleton.chain_joints[limb])
+            return len(seen.intersection(joints)) >= 2
+
+        return [limb for limb in names if not shown(limb)]
+
     def _search(
-        self, search: Search, pose: Array, ancestor: int, rng: np.random.Generator
+        self,
+        limbs: list[str],
+        search: Search,
+        pose: Array,
+        ancestor: int,
+        rng: np.random.Generator,
     ) -> dict[str, Array]:
         """Configurations of some limbs that fit the image, where the others are as in a pose (d,).
 
         Args:
+            limbs: that may be searched for.
             search: of the image.
             pose: (d,) the first of a group.
             ancestor: of it.
             rng: source of randomness.
         """
-        plan, evidence = search.plan, search.observation.evidence
-        shape = 'coverage' in evidence or 'edges' in evidence
-        names = list(self._searches) if shape else []
-        count = min(plan.searched_chains, len(names))
+        plan = search.plan
+        count = min(plan.searched_chains, len(limbs))
         if count == 0:
             return {}
-        chosen = rng.choice(len(names), size=count, replace=False)
+        chosen = rng.choice(len(limbs), size=count, replace=False)
         covariance = search.states.searched[ancestor]
         return {
-            names[i]: self._searches[names[i]].find(pose, covariance, search.observation, plan, rng)
+            limbs[i]: self._searches[limbs[i]].find(pose, covariance, search.observation, plan, rng)
             for i in sorted(chosen)
         }

@@ -24,8 +24,6 @@ from hmt_ros.tracking.posterior import Posterior
 
 # Degrees of freedom of the Student prior that keeps a limb near its prediction: heavy tails.
 TAILS = 4.0
-# Number of samples that are put where the keypoints are, and of Newton steps that do it.
-PLACED, PLACING_STEPS = 4, 8
 # Factor on the standard deviations of the body's prior, of the samples that are drawn from it.
 WIDE = 1.3
 
@@ -78,8 +76,6 @@ class LimbSearch:
         s = self.posterior.settings.search
         block = covariance[np.ix_(own, own)]
         samples = self._draw(pose[own], block, plan.samples, rng)
-        placed = self._placed(pose, samples[:: max(len(samples) // PLACED, 1)], observation)
-        samples = np.concatenate([samples, placed])
         others = self._rest.energies(
             forward(body.skeleton, pose[None]), observation, derivatives=False
         )
@@ -93,20 +89,6 @@ class LimbSearch:
         return term.minimise(
             best, step_scale=0.4, damping=1.0, max_iterations=s.iterations, tolerance=0.05
         ).x
-
-    def _placed(self, pose: Array, starts: Array, observation: Observation) -> Array:
-        """Angles of the limb, from starts (A, chain dofs), that put it where its keypoints are."""
-        placing = self.posterior.placing(observation)
-        own = self.dofs
-        if placing is None:
-            return starts[:0]
-        return (
-            replace(placing, point=pose, free=own)
-            .minimise(
-                starts, step_scale=0.4, damping=1.0, max_iterations=PLACING_STEPS, tolerance=0.05
-            )
-            .x
-        )
 
     def _draw(self, angles: Array, block: Array, n: int, rng: np.random.Generator) -> Array:
         """N samples from the mode, from it stretched, and from the body's prior: a third each."""
