@@ -112,7 +112,7 @@ def _merged_pairs(
     count = len(w)
     if count < 2 or not go_on(count, 0.0):
         return mixture
-    log_det = np.linalg.slogdet(s)[1]
+    log_det = mixture.log_determinants.copy()
     costs, active = np.full((count, count), np.inf), np.ones(count, dtype=bool)
     pairs = np.stack(np.triu_indices(count, 1), axis=1)
     costs[pairs[:, 0], pairs[:, 1]] = cost(w, m, s, log_det, pairs)
@@ -229,6 +229,6 @@ def gaussian_divergences(a: GaussianMixture, b: GaussianMixture) -> Array:
     trace = a.covariances.reshape(len(a), -1) @ inverse.reshape(len(b), -1).T
     offsets = a.means - b.means[:, None]
     square = ((offsets @ inverse) * offsets).sum(2).T
-    log_det = np.linalg.slogdet(b.covariances)[1] - np.linalg.slogdet(a.covariances)[1][:, None]
+    log_det = b.log_determinants - a.log_determinants[:, None]
     result: Array = 0.5 * (trace + square + log_det - a.dimension)
     return result
