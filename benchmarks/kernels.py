@@ -241,11 +241,11 @@ def _smoothing(seconds: float) -> Iterator[dict[str, Any]]:
 
 def _serial_links(means: Any, covariances: Any, pairs: Any) -> Any:
     """On one core."""
-    ones = np.ones(len(means))
     squares, log_determinants = np.empty((2, len(pairs)))
     gaussian_pairs._whitened_pairs(
-        means, covariances, ones, means, covariances, ones, pairs, squares, log_determinants
-    )
+        means, covariances, means, covariances, pairs, np.ones((len(pairs), 2)),
+        squares, log_determinants,
+    )  # fmt: skip
     return -0.5 * (squares + log_determinants + means.shape[1] * np.log(2 * np.pi))
 
 

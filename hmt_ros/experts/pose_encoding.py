@@ -105,21 +105,20 @@ class PoseEncoding:
         by_root[:, 3:AXES] = from_rotation @ _rotation_by_root(roots)
         return by_target, by_root
 
-    def encoding_jacobian(self, pose: ArrayLike) -> Array:
-        """Derivative (D, d) of `encode` at a pose (d,)."""
-        pose = np.asarray(pose, dtype=np.float64)[None]
+    def encoding_jacobians(self, poses: ArrayLike) -> Array:
+        """Derivatives (N, D, d) of `encode` at poses (N, d)."""
+        poses = np.asarray(poses, dtype=np.float64)
         d = self.body.dimension
-        result = np.zeros((d, d))
-        to_ray = ray_rotations(pose[:, :3])[0].T
-        axes = forward(self.body.skeleton, pose).axes[3:AXES, :, 0].T  # (3, angle)
-        front_up = root_rotations(self.body, pose)[0].T[1:]  # camera frame
-        by_root = _rotation_by_root(pose[:, :3])[0]
-        for k, axis in enumerate(front_up):
-            rows = slice(3 * k, 3 * k + 3)
-            result[rows, 3:AXES] = to_ray @ np.cross(axes, axis, axisa=0, axisc=0)
-            # The frame of the ray turns with the root, so in it the axis turns back.
-            result[rows, :3] = to_ray @ np.cross(axis, by_root, axisb=0, axisc=0)
-        result[AXES:, AXES:] = np.eye(d - AXES)
+        result = np.zeros((len(poses), d, d))
+        to_ray = ray_rotations(poses[:, :3]).transpose(0, 2, 1)
+        axes = forward(self.body.skeleton, poses).axes[3:AXES].transpose(2, 1, 0)  # (N, 3, angle)
+        turned = root_rotations(self.body, poses)  # camera frame
+        # The frame of the ray turns with the root, so in it an axis turns back.
+        turns = np.concatenate([-_rotation_by_root(poses[:, :3]), axes], axis=2)
+        for k in range(2):  # front and up
+            moved = np.cross(turns, turned[:, :, k + 1, None], axis=1)
+            result[:, 3 * k : 3 * k + 3, :AXES] = to_ray @ moved
+        result[:, AXES:, AXES:] = np.eye(d - AXES)
         return result
 
     def _checked(self, targets: ArrayLike, roots: ArrayLike) -> tuple[Array, Array]:

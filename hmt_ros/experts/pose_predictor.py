@@ -216,7 +216,7 @@ class PosePredictor:
 
     def _to_targets(self, poses: GaussianMixture) -> GaussianMixture:
         """The mixture over targets of a mixture over poses."""
-        slopes = np.stack([self.encoding.encoding_jacobian(mean) for mean in poses.means])
+        slopes = self.encoding.encoding_jacobians(poses.means)
         covariances = slopes @ poses.covariances @ slopes.transpose(0, 2, 1)
         # Axes of unit length have no spread along themselves.
         covariances += JITTER * np.eye(self.encoding.size)

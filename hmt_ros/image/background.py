@@ -33,8 +33,8 @@ BESIDE = 8
 # levels.
 AGREEING = 10
 AGREEMENT = 20.0
-# Learning rate at which nothing is learned; at 0 the KNN model would replace its samples at once.
-FROZEN = 1e-7
+# Learning rates at which nothing is learned; at 0 the KNN model would replace its samples at once.
+FROZEN = {'mog2': 0.0, 'knn': 1e-7}
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,8 @@ class BackgroundModel:
         if parts is None and self._last is not None and self._last[0] is image:
             return self._last[1]
         small = self._smaller(image)
-        raw = np.asarray(self._model.apply(small, learningRate=FROZEN), dtype=np.uint8)
+        rate = FROZEN[self.settings.method]
+        raw = np.asarray(self._model.apply(small, learningRate=rate), dtype=np.uint8)
         raw[(raw == FOREGROUND) & self._is_beside(small)] = 0
         if parts is not None:
             raw[self._any_of(parts.unknown)] = 0

@@ -18,17 +18,16 @@ Index = NDArray[np.int64]
 
 # Pairs whose covariances are factorised side by side.
 LANES = 4
-# How many parts the pairs are split into; fixed, so that no result depends on the machine.
-PARTS = 4
+# How many parts the pairs are split into, from so many pairs on.
+PARTS, LEAST_SHARED = 4, 256
 
 
 def pair_log_densities(
     means_a: Array, covariances_a: Array, means_b: Array, covariances_b: Array, pairs: Index
 ) -> Array:
     """log N(a_i; b_j, A_i + B_j), shape (P,), of pairs (P, 2) of indices i, j."""
-    ones_a, ones_b = np.ones(len(means_a)), np.ones(len(means_b))
     squares, log_determinants = _of_pairs(
-        pairs, means_a, covariances_a, ones_a, means_b, covariances_b, ones_b
+        pairs, np.ones((len(pairs), 2)), means_a, covariances_a, means_b, covariances_b
     )
     constant = means_a.shape[1] * np.log(2 * np.pi)
     result: Array = -0.5 * (squares + log_determinants + constant)
@@ -37,22 +36,44 @@ def pair_log_densities(
 
 def pair_distances(means: Array, covariances: Array, scales: Array, pairs: Index) -> Array:
     """(m_i - m_j)' (s_i C_i + s_j C_j)^-1 (m_i - m_j), shape (P,), of pairs (P, 2)."""
-    return _of_pairs(pairs, means, covariances, scales, means, covariances, scales)[0]
+    return _of_pairs(pairs, scales[pairs], means, covariances, means, covariances)[0]
 
 
-def _of_pairs(pairs: Index, *sets: Array) -> tuple[Array, Array]:
-    """D and log |C|, both (P,), of pairs from two sets of means, covariances and scales."""
+def pair_mixture_log_determinants(
+    means: Array, covariances: Array, weights: Array, pairs: Index
+) -> Array:
+    """log |S|, shape (P,), of the covariances S that pairs (P, 2) of weighted Gaussians have.
+
+    S = a A + b B + a b D D' with the shares a + b = 1 of the weights and the offset D of the means,
+    so that log |S| = log |a A + b B| + log(1 + a b D' (a A + b B)^-1 D).
+    """
+    shares = weights[pairs] / weights[pairs].sum(1, keepdims=True)
+    squares, log_determinants = _of_pairs(pairs, shares, means, covariances, means, covariances)
+    result: Array = log_determinants + np.log1p(shares[:, 0] * shares[:, 1] * squares)
+    return result
+
+
+def _of_pairs(pairs: Index, scales: Array, *sets: Array) -> tuple[Array, Array]:
+    """D and log |C|, both (P,), of pairs from two sets of means and covariances.
+
+    Args:
+        pairs: (P, 2).
+        scales: (P, 2) factors on the two covariances of each pair.
+        *sets: means and covariances of the first set, and of the second.
+    """
     # Arrays of one kind: for others, read-only ones for example, another kernel would be compiled.
-    a, big_a, s, b, big_b, r = (np.require(x, np.float64, ('C', 'W')) for x in sets)
+    a, big_a, b, big_b, s = (np.require(x, np.float64, ('C', 'W')) for x in (*sets, scales))
     pairs = np.require(pairs, np.int64, ('C', 'W'))
     squares, log_determinants = np.empty((2, len(pairs)))
-    edges = np.linspace(0, len(pairs), PARTS + 1).astype(int)
+    # What a pair gives does not depend on the pairs beside it; few are not worth a thread.
+    parts = PARTS if len(pairs) >= LEAST_SHARED else 1
+    edges = np.linspace(0, len(pairs), parts + 1).astype(int)
 
     def work(part: int) -> None:
         at = slice(edges[part], edges[part + 1])
-        _whitened_pairs(a, big_a, s, b, big_b, r, pairs[at], squares[at], log_determinants[at])
+        _whitened_pairs(a, big_a, b, big_b, pairs[at], s[at], squares[at], log_determinants[at])
 
-    list(threads().map(work, range(PARTS)))
+    list((threads().map if parts > 1 else map)(work, range(parts)))
     return squares, log_determinants
 
 
@@ -66,11 +87,10 @@ def threads() -> ThreadPoolExecutor:
 def _whitened_pairs(
     means_a: Array,
     covariances_a: Array,
-    scales_a: Array,
     means_b: Array,
     covariances_b: Array,
-    scales_b: Array,
     pairs: Index,
+    scales: Array,
     squares: Array,
     log_determinants: Array,
 ) -> None:
@@ -83,12 +103,13 @@ def _whitened_pairs(
     for first in range(0, len(pairs), LANES):
         count = min(LANES, len(pairs) - first)
         for lane in range(LANES):
-            i, j = pairs[first + min(lane, count - 1)]
+            p = first + min(lane, count - 1)
+            i, j = pairs[p]
             for a in range(d):
                 f[d, a, lane] = means_a[i, a] - means_b[j, a]
                 for b in range(a + 1):
                     one, two = covariances_a[i, a, b], covariances_b[j, a, b]
-                    f[a, b, lane] = scales_a[i] * one + scales_b[j] * two
+                    f[a, b, lane] = scales[p, 0] * one + scales[p, 1] * two
         for i in range(d + 1):
             j = 0
             while j + 1 < i:

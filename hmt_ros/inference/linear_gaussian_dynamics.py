@@ -10,8 +10,10 @@ velocity, and what is white is the acceleration.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +21,8 @@ from scipy.linalg import expm, logm
 
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockTridiagonal
+
+T = TypeVar('T', bound=tuple[Any, ...])
 
 # Number of intervals whose transitions are kept.
 MOST_INTERVALS = 64
@@ -209,19 +213,26 @@ class LinearGaussianDynamics:
 
     def transition(self, interval: float) -> tuple[Array, Array]:
         """A and Q, both (n, n), over an interval in seconds; those of the last ones are kept."""
-        known = self._transitions.get(interval)
-        if known is None:
-            known = self._transition(interval)
-            for part in known:
-                part.setflags(write=False)
-            if len(self._transitions) >= MOST_INTERVALS:
-                self._transitions.clear()
-            self._transitions[interval] = known
-        return known
+        return _kept(self._transitions, interval, self._transition)
 
     @cached_property
     def _transitions(self) -> dict[float, tuple[Array, Array]]:
         return {}
+
+    @cached_property
+    def _couplings(self) -> dict[float, tuple[Array, Array, Array, float]]:
+        return {}
+
+    def _coupling(self, interval: float) -> tuple[Array, Array, Array, float]:
+        """A' Q^-1 A, Q^-1 and Q^-1 A, all (n, n), and log |Q| over an interval in seconds."""
+
+        def make(interval: float) -> tuple[Array, Array, Array, float]:
+            a, q = self.transition(interval)
+            inverse, log_det = _precision_of(q)
+            forth = inverse @ a
+            return a.T @ forth, inverse, forth, log_det
+
+        return _kept(self._couplings, interval, make)
 
     @cached_property
     def unknown_velocity(self) -> Array:
@@ -305,16 +316,28 @@ class LinearGaussianDynamics:
         )
         different, which = np.unique(intervals, return_inverse=True)
         for i, interval in enumerate(different):
-            a, q = self.transition(float(interval))
-            inverse, log_det = _precision_of(q)
+            before, after, forth, log_det = self._coupling(float(interval))
             at = np.flatnonzero(which == i)
-            forth = inverse @ a
-            diagonal[at] += a.T @ forth
-            diagonal[at + 1] += inverse
+            diagonal[at] += before
+            diagonal[at + 1] += after
             lower[at] = -forth
             constant += 0.5 * len(at) * (n * np.log(2 * np.pi) + log_det)
         precision = BlockTridiagonal(diagonal, lower)
         return TrajectoryPrior(precision, information, float(constant), self.dimension)
+
+
+def _kept(known: dict[float, T], interval: float, make: Callable[[float], T]) -> T:
+    """What is known of an interval; else what is made of it, which is kept."""
+    found = known.get(interval)
+    if found is None:
+        found = make(interval)
+        for part in found:
+            if isinstance(part, np.ndarray):
+                part.setflags(write=False)
+        if len(known) >= MOST_INTERVALS:
+            known.clear()
+        known[interval] = found
+    return found
 
 
 def _precision_of(covariance: Array) -> tuple[Array, float]:

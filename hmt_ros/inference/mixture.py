@@ -9,6 +9,7 @@ VMS 4, BME 2).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -74,6 +75,11 @@ class GaussianMixture:
     def dimension(self) -> int:
         """Number of variables, d."""
         return int(self.means.shape[1])
+
+    @cached_property
+    def log_determinants(self) -> Array:
+        """log |S_k|, (K,)."""
+        return np.asarray(np.linalg.slogdet(self.covariances)[1], dtype=np.float64)
 
     def cholesky(self) -> Array:
         """Lower triangular factors (K, d, d) of the covariances.

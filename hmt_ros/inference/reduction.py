@@ -22,9 +22,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.linalg.lapack import dtrtrs
 
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.gaussian_pairs import pair_distances
+from hmt_ros.inference.gaussian_pairs import pair_distances, pair_mixture_log_determinants
 from hmt_ros.inference.mixture import GaussianMixture
 
 # Components with a smaller share than this of the weight are dropped by `reduced`.
@@ -84,22 +85,22 @@ def merged_if_alike(
         distance: between means, in standard deviations of the one compared with.
         log_determinant: between the logarithms of the determinants of covariances.
     """
-    whiteners = np.linalg.inv(mixture.cholesky())
-    log_det = -2.0 * np.log(np.diagonal(whiteners, axis1=1, axis2=2)).sum(1)
+    factors = mixture.cholesky()
+    log_det = 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
     owner: Index = np.full(len(mixture), -1)
     for i in range(len(mixture)):
         if owner[i] >= 0:
             continue
         at = np.flatnonzero(owner < 0)
-        white = (mixture.means[at] - mixture.means[i]) @ whiteners[i].T
-        near = (white * white).sum(1) < distance**2
+        white = dtrtrs(factors[i], (mixture.means[at] - mixture.means[i]).T, lower=1)[0]
+        near = (white * white).sum(0) < distance**2
         near &= np.abs(log_det[at] - log_det[i]) < log_determinant
         owner[at[near]] = i
     return merged(mixture, (owner[:, None] == np.unique(owner)).astype(np.float64))
 
 
-# cost(weights, means, covariances, log determinants, i, j) of merging i with each of j (J,)
-PairCosts = Callable[[Array, Array, Array, Array, int, Index], Array]
+# cost(weights, means, covariances, log determinants, pairs (P, 2)) of merging each pair, (P,)
+PairCosts = Callable[[Array, Array, Array, Array, Index], Array]
 
 
 def _merged_pairs(
@@ -109,46 +110,42 @@ def _merged_pairs(
     mixture = mixture[mixture.weights > 0] if (mixture.weights == 0).any() else mixture
     w, m, s = (np.array(x) for x in (mixture.weights, mixture.means, mixture.covariances))
     count = len(w)
-    log_det = np.linalg.slogdet(s)[1]
+    if count < 2 or not go_on(count, 0.0):
+        return mixture
+    log_det = mixture.log_determinants.copy()
     costs, active = np.full((count, count), np.inf), np.ones(count, dtype=bool)
-    if go_on(count, 0.0):
-        for i in range(count - 1):
-            costs[i, i + 1 :] = cost(w, m, s, log_det, i, np.arange(i + 1, count))
+    pairs = np.stack(np.triu_indices(count, 1), axis=1)
+    costs[pairs[:, 0], pairs[:, 1]] = cost(w, m, s, log_det, pairs)
     for left in range(count, 1, -1):
         i, j = (int(x) for x in np.unravel_index(int(np.argmin(costs)), costs.shape))
         if not go_on(left, float(costs[i, j])):
             break
-        total, mean, covariance = _pair_moments(w, m, s, i, np.array([j]))
-        w[i], m[i], s[i] = total[0], mean[0], covariance[0]
+        w[i], m[i], s[i] = _pair_moments(w, m, s, i, j)
         log_det[i] = np.linalg.slogdet(s[i])[1]
         active[j] = False
         costs[j, :] = costs[:, j] = np.inf
         others = np.flatnonzero(active & (np.arange(count) != i))
         if len(others):
-            costs[np.minimum(i, others), np.maximum(i, others)] = cost(w, m, s, log_det, i, others)
+            pairs = np.stack([np.minimum(i, others), np.maximum(i, others)], axis=1)
+            costs[pairs[:, 0], pairs[:, 1]] = cost(w, m, s, log_det, pairs)
     return GaussianMixture(w[active], m[active], s[active])
 
 
-def _pair_moments(w: Array, m: Array, s: Array, i: int, j: Index) -> tuple[Array, Array, Array]:
-    """Weight, mean and covariance of component i with each of the components j."""
+def _pair_moments(w: Array, m: Array, s: Array, i: int, j: int) -> tuple[float, Array, Array]:
+    """Weight, mean and covariance of the components i and j together."""
     total = w[i] + w[j]
     a, b = w[i] / total, w[j] / total
     offset = m[j] - m[i]
-    mean = m[i] + b[:, None] * offset
-    spread = (a * b)[:, None, None] * offset[:, :, None] * offset[:, None, :]
-    return total, mean, a[:, None, None] * s[i] + b[:, None, None] * s[j] + spread
+    return total, m[i] + b * offset, a * s[i] + b * s[j] + a * b * np.outer(offset, offset)
 
 
-def _divergence_costs(w: Array, m: Array, s: Array, log_det: Array, i: int, j: Index) -> Array:
-    total, _, covariance = _pair_moments(w, m, s, i, j)
-    result: Array = 0.5 * (
-        total * np.linalg.slogdet(covariance)[1] - w[i] * log_det[i] - w[j] * log_det[j]
-    )
+def _divergence_costs(w: Array, m: Array, s: Array, log_det: Array, pairs: Index) -> Array:
+    together = w[pairs].sum(1) * pair_mixture_log_determinants(m, s, w, pairs)
+    result: Array = 0.5 * (together - (w * log_det)[pairs].sum(1))
     return result
 
 
-def _squared_distances(w: Array, m: Array, s: Array, log_det: Array, i: int, j: Index) -> Array:
-    pairs = np.stack([np.full(len(j), i), j], axis=1)
+def _squared_distances(w: Array, m: Array, s: Array, log_det: Array, pairs: Index) -> Array:
     return pair_distances(m, s, np.full(len(m), 0.5), pairs)
 
 
@@ -232,6 +229,6 @@ def gaussian_divergences(a: GaussianMixture, b: GaussianMixture) -> Array:
     trace = a.covariances.reshape(len(a), -1) @ inverse.reshape(len(b), -1).T
     offsets = a.means - b.means[:, None]
     square = ((offsets @ inverse) * offsets).sum(2).T
-    log_det = np.linalg.slogdet(b.covariances)[1] - np.linalg.slogdet(a.covariances)[1][:, None]
+    log_det = b.log_determinants - a.log_determinants[:, None]
     result: Array = 0.5 * (trace + square + log_det - a.dimension)
     return result

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
@@ -45,6 +44,21 @@ class EmbeddedNetwork:
         """T."""
         return len(self.nodes)
 
+    def later(self) -> EmbeddedNetwork:
+        """The network without its first layer."""
+        return EmbeddedNetwork(self.nodes[1:], self.links[1:])
+
+    def followed_by(
+        self,
+        mixture: GaussianMixture,
+        last: GaussianMixture,
+        dynamics: LinearGaussianDynamics,
+        interval: float,
+    ) -> EmbeddedNetwork:
+        """The network with the modes of one more mixture, an interval (s) after the last one."""
+        new = embedded_network([last, mixture], dynamics, np.array([interval]))
+        return EmbeddedNetwork((*self.nodes, new.nodes[1]), (*self.links, new.links[0]))
+
     def log_value(self, path: NDArray[np.intp]) -> float:
         """Sum of the log values along a path (T,)."""
         total = sum(float(nodes[k]) for nodes, k in zip(self.nodes, path))
@@ -58,6 +72,7 @@ def embedded_network(
     dynamics: LinearGaussianDynamics,
     intervals: Array,
     first: GaussianMixture | None = None,
+    rest: EmbeddedNetwork | None = None,
 ) -> EmbeddedNetwork:
     """The network of Gaussian modes, in closed form.
 
@@ -67,18 +82,18 @@ def embedded_network(
         intervals: (T-1,) s; (T,) with `first`.
         first: a density of the state (n variables) at a time before the mixtures; its components
             are the first layer of nodes.
+        rest: with `first`: the network of the mixtures alone; None: it is to be made.
 
     Raises:
         ValueError: mixtures that can not be smoothed.
     """
     if first is not None:
-        return _with_first(first, mixtures, dynamics, intervals)
+        return _with_first(first, mixtures, dynamics, intervals, rest)
     check_mixtures(mixtures, factorise=False)
     d, n = dynamics.dimension, dynamics.state_dimension
     begin = np.concatenate([[0], np.cumsum([len(mixture) for mixture in mixtures])])
     means = np.concatenate([mixture.means for mixture in mixtures])
     covariances = np.concatenate([mixture.covariances for mixture in mixtures])
-    velocity = _velocity_covariance(dynamics)
     different, which = np.unique(intervals, return_inverse=True)
 
     # Where every mode is expected at the next time, and how widely.
@@ -86,7 +101,7 @@ def embedded_network(
     for i, interval in enumerate(different):
         a, q = dynamics.transition(float(interval))
         own, other = a[:d, :d], a[:d, d:]
-        noise = q[:d, :d] + other @ velocity @ other.T if n > d else q
+        noise = q[:d, :d] + other @ dynamics.unknown_velocity @ other.T if n > d else q
         at: Any = slice(0, begin[-2])
         if len(different) > 1:
             at = np.repeat(which == i, np.diff(begin[:-1])).nonzero()[0]
@@ -114,19 +129,26 @@ def embedded_network(
 
     nodes, links = [], []
     done = 0
-    for mixture, (row, column) in zip(mixtures, within):
-        log = np.empty((len(mixture), len(mixture)))
-        log[row, column] = log[column, row] = node_values[done : done + len(row)]
-        done += len(row)
-        # scipy's logsumexp, without what it spends on axes and signs.
-        top = log.max(1, keepdims=True)
-        nodes.append(np.log(np.exp(log - top) @ mixture.weights) + top[:, 0])
+    for mixture, pairs in zip(mixtures, within):
+        nodes.append(_node_values(mixture.weights, node_values[done:], pairs))
+        done += pairs.shape[1]
     done = 0
     for left, right in pairwise(mixtures):
         size = len(left) * len(right)
         links.append(link_values[done : done + size].reshape(len(left), len(right)))
         done += size
     return EmbeddedNetwork(tuple(nodes), tuple(links))
+
+
+def _node_values(weights: Array, densities: Array, pairs: Index) -> Array:
+    """log (K,) of the sums over modes of weights times densities, given for pairs (2, P)."""
+    row, column = pairs
+    log = np.empty((len(weights), len(weights)))
+    log[row, column] = log[column, row] = densities[: len(row)]
+    # scipy's logsumexp, without what it spends on axes and signs.
+    top = log.max(1, keepdims=True)
+    result: Array = np.log(np.exp(log - top) @ weights) + top[:, 0]
+    return result
 
 
 @lru_cache(maxsize=256)
@@ -144,27 +166,24 @@ def _with_first(
     mixtures: Sequence[GaussianMixture],
     dynamics: LinearGaussianDynamics,
     intervals: Array,
+    rest: EmbeddedNetwork | None,
 ) -> EmbeddedNetwork:
     """The network with a layer of components of the state before the modes."""
-    pairs = np.indices((len(first), len(first))).reshape(2, -1).T
-    own = pair_log_densities(first.means, first.covariances, first.means, first.covariances, pairs)
-    with np.errstate(divide='ignore'):
-        log_weights = np.log(first.weights)
-    nodes = logsumexp(own.reshape(len(first), -1) + log_weights, axis=1)
+    pairs = _pairs_within(len(first))
+    own = pair_log_densities(
+        first.means, first.covariances, first.means, first.covariances, pairs.T
+    )
+    nodes = _node_values(first.weights, own, pairs)
     if len(mixtures) == 0:
         return EmbeddedNetwork((nodes,), ())
-    rest = embedded_network(mixtures, dynamics, intervals[1:])
+    if rest is None:
+        rest = embedded_network(mixtures, dynamics, intervals[1:])
     d = dynamics.dimension
     means, spread = dynamics.predict(first.means, first.covariances, float(intervals[0]))
-    pairs = np.indices((len(first), len(mixtures[0]))).reshape(2, -1).T
+    pairs = _pairs_across(len(first), len(mixtures[0]))
     links = pair_log_densities(
-        means[:, :d], spread[:, :d, :d], mixtures[0].means, mixtures[0].covariances, pairs
+        means[:, :d], spread[:, :d, :d], mixtures[0].means, mixtures[0].covariances, pairs.T
     )
     return EmbeddedNetwork(
         (nodes, *rest.nodes), (links.reshape(len(first), len(mixtures[0])), *rest.links)
     )
-
-
-def _velocity_covariance(dynamics: LinearGaussianDynamics) -> Array:
-    d = dynamics.dimension
-    return np.asarray(np.linalg.inv(dynamics.initial_precision[d:, d:]), dtype=np.float64)

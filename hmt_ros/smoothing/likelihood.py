@@ -86,6 +86,18 @@ class MixtureLikelihood:
             whiteners.swapaxes(1, 2) @ whiteners,
         )
 
+    @classmethod
+    def joined(cls, parts: Sequence[MixtureLikelihood]) -> MixtureLikelihood:
+        """The likelihood of all times of some, one after the other."""
+        counts = np.concatenate([np.diff(part.first) for part in parts])
+        return cls(
+            np.concatenate([[0], np.cumsum(counts)]),
+            np.concatenate([part.log_scales for part in parts]),
+            np.concatenate([part.means for part in parts]),
+            np.concatenate([part.whiteners for part in parts]),
+            np.concatenate([part.precisions for part in parts]),
+        )
+
     @property
     def times(self) -> int:
         """T."""
@@ -94,6 +106,11 @@ class MixtureLikelihood:
     def modes_of(self, path: Index) -> tuple[Array, Array, Array]:
         """log scales (T,), means (T, d) and precisions (T, d, d) of the modes along a path (T,)."""
         at = self.first[:-1] + path
+        return self.log_scales[at], self.means[at], self.precisions[at]
+
+    def modes_at(self, t: int) -> tuple[Array, Array, Array]:
+        """log scales (K_t,), means (K_t, d) and precisions (K_t, d, d) of the modes at a time."""
+        at = slice(self.first[t], self.first[t + 1])
         return self.log_scales[at], self.means[at], self.precisions[at]
 
     def energy(
@@ -152,6 +169,12 @@ class WindowLikelihood:
             np.concatenate([mean, means]),
             np.concatenate([precision, precisions]),
         )
+
+    def modes_at(self, t: int) -> tuple[Array, Array, Array]:
+        """As for `MixtureLikelihood`: over n variables at the first time, over d later."""
+        if t == 0 or self.later is None:
+            return self.first.modes_at(t)
+        return self.later.modes_at(t - 1)
 
     def energy(
         self, x: Array, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE

@@ -12,11 +12,15 @@ from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.block_tridiagonal import BlockCholesky
+from hmt_ros.inference.block_tridiagonal import BackwardCholesky, BlockCholesky
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.smoothing.likelihood import LikelihoodPart, SequenceLikelihood, check_mixtures
-from hmt_ros.smoothing.mode_sequence import ModeSequence, path_gaussians
+from hmt_ros.smoothing.mode_sequence import (
+    ModeSequence,
+    path_gaussians,
+    path_gaussians_from_the_end,
+)
 from hmt_ros.smoothing.paths import Paths
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states, refine
@@ -56,11 +60,6 @@ class Candidates:
     weights: Array
     states: Array
     factors: tuple[BlockCholesky, ...]
-
-    @property
-    def inflation(self) -> Array:
-        """(M,) ones."""
-        return np.ones(len(self.weights))
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,20 +269,26 @@ class MixtureSmoother:
         """The mixture that is closest to the posterior, from the candidates on."""
         iterations = self.max_iterations if self.adapt else 0
         found = self._descended(candidates, prior, likelihood, seed, iterations)
-        result = self._mixture(found, prior, likelihood, stamps_ns)
+        result = self._mixture(
+            found.weights, found.states, found.factors, found.inflation, prior, likelihood,
+            stamps_ns,
+        )  # fmt: skip
         return replace(result, free_energy=found.free_energy, free_energy_fresh=found.fresh)
 
     def _mixture(
         self,
-        found: VariationalMixture | Candidates,
+        weights: Array,
+        states: Array,
+        factors: Sequence[BlockCholesky | BackwardCholesky],
+        inflation: Array,
         prior: TrajectoryPrior,
         likelihood: SequenceLikelihood,
         stamps_ns: Sequence[int] | None,
     ) -> TrajectoryMixture:
         """The components, heaviest first, with their log joint densities."""
         low, high = self._limits()
-        order = np.argsort(-found.weights, kind='stable')
-        states = found.states[order]
+        order = np.argsort(-weights, kind='stable')
+        states = states[order]
         count, times, _ = states.shape
         energies, _ = prior.energy(states)
         at = np.tile(np.arange(times), count)
@@ -291,10 +296,10 @@ class MixtureSmoother:
         seen = likelihood.energy(poses, at, derivatives=Derivatives.NONE).value
         d = self.dynamics.dimension
         return TrajectoryMixture(
-            weights=found.weights[order],
+            weights=weights[order],
             states=states,
-            factors=tuple(found.factors[i] for i in order),
-            inflation=found.inflation[order],
+            factors=tuple(factors[i] for i in order),
+            inflation=inflation[order],
             log_joint=-(energies + seen.reshape(count, times).sum(1)),
             free_energy=np.empty(0),
             dimension=d,
@@ -340,8 +345,18 @@ class PathSmoother(MixtureSmoother):
         """
         if observation is not None:
             raise ValueError('paths are smoothed by the mixtures alone, without an observation')
-        found = self._on_paths(sequence, self.paths(sequence))
-        return self._mixture(found, sequence.prior, sequence.likelihood, stamps_ns)
+        states, log_weights, factors = path_gaussians_from_the_end(
+            self.paths(sequence).nodes, sequence.prior, sequence.likelihood
+        )
+        return self._mixture(
+            np.exp(log_weights - logsumexp(log_weights)),
+            np.clip(states, *self._limits()),
+            factors,
+            np.ones(len(states)),
+            sequence.prior,
+            sequence.likelihood,
+            stamps_ns,
+        )
 
 
 def with_refined_parts(

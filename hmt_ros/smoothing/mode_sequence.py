@@ -21,10 +21,17 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg.lapack import dtrtrs
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.block_tridiagonal import BlockCholesky, add_diagonal, factorise_band
+from hmt_ros.inference.block_tridiagonal import (
+    BackwardCholesky,
+    BlockCholesky,
+    NotPositiveDefiniteError,
+    add_diagonal,
+    factorise_band,
+)
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, embedded_network
@@ -42,6 +49,19 @@ CANDIDATES = 4
 
 
 @dataclass(frozen=True, eq=False)
+class KnownModes:
+    """What need not be computed of mixtures that are smoothed again with others.
+
+    Attributes:
+        network: their embedded network.
+        likelihood: -log of them.
+    """
+
+    network: EmbeddedNetwork
+    likelihood: MixtureLikelihood
+
+
+@dataclass(frozen=True, eq=False)
 class ModeSequence:
     """Mixtures at T times.
 
@@ -50,12 +70,14 @@ class ModeSequence:
         dynamics: of the state, n variables.
         intervals: (T-1,) s.
         first: a density of the first state, over n variables, in the place of a likelihood.
+        known: with `first`: of `mixtures` alone; None: nothing.
     """
 
     mixtures: tuple[GaussianMixture, ...]
     dynamics: LinearGaussianDynamics
     intervals: Array
     first: GaussianMixture | None = None
+    known: KnownModes | None = None
 
     @property
     def layers(self) -> tuple[GaussianMixture, ...]:
@@ -67,7 +89,9 @@ class ModeSequence:
         """-log of the mixtures."""
         if self.first is None:
             return MixtureLikelihood.of(self.mixtures)
-        later = MixtureLikelihood.of(self.mixtures) if self.mixtures else None
+        later = None
+        if self.mixtures:
+            later = self.known.likelihood if self.known else MixtureLikelihood.of(self.mixtures)
         return WindowLikelihood(MixtureLikelihood.of([self.first]), later)
 
     @cached_property
@@ -81,7 +105,8 @@ class ModeSequence:
     @cached_property
     def network(self) -> EmbeddedNetwork:
         """The embedded network."""
-        return embedded_network(self.mixtures, self.dynamics, self.intervals, self.first)
+        rest = self.known.network if self.known else None
+        return embedded_network(self.mixtures, self.dynamics, self.intervals, self.first, rest)
 
     def paths(self, count: int, *, through_modes: bool = False) -> Paths:
         """At most `count` paths that are probable and differ from each other.
@@ -118,9 +143,8 @@ class ModeSequence:
 
     def merged(self, distance: float) -> ModeSequence:
         """The sequence with modes merged that are closer than so many standard deviations."""
-        return replace(
-            self, mixtures=tuple(merged_if_close(mixture, distance) for mixture in self.mixtures)
-        )
+        mixtures = tuple(merged_if_close(mixture, distance) for mixture in self.mixtures)
+        return replace(self, mixtures=mixtures, known=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +160,76 @@ class PathGaussians:
     states: Array
     factors: tuple[BlockCholesky, ...]
     log_weights: Array
+
+
+def path_gaussians_from_the_end(
+    nodes: Index, prior: TrajectoryPrior, likelihood: MixtureLikelihood | WindowLikelihood
+) -> tuple[Array, Array, tuple[BackwardCholesky, ...]]:
+    """States, log weights and factors as of `path_gaussians`, eliminated from the last time on.
+
+    What paths have in common from a time on is computed once: those of a window differ in its first
+    state, and few of them after it.
+
+    Raises:
+        NotPositiveDefiniteError: the precision of a path is not positive definite.
+    """
+    count, times = nodes.shape
+    n = prior.information.shape[1]
+    # From the last time to the first: of each path, which of the distinct ends it has; of these
+    # their log weights, the blocks R_t and W_{t-1}, and y_t of R y = right side.
+    owners: list[Index] = []
+    roots: list[Array] = []
+    besides: list[Array] = []
+    whites: list[Array] = []
+    owner, log = np.zeros(count, dtype=np.intp), np.zeros(1)
+    for t in range(times - 1, -1, -1):
+        _, chosen, inverse = np.unique(
+            np.stack([nodes[:, t], owner]), axis=1, return_index=True, return_inverse=True
+        )
+        mode, later, owner = nodes[chosen, t], owner[chosen], inverse.reshape(-1)
+        log_scales, means, precisions = likelihood.modes_at(t)
+        pull = (precisions @ means[:, :, None])[:, :, 0]
+        d = pull.shape[1]
+        log = log[later] + (log_scales - 0.5 * np.einsum('kd,kd->k', means, pull))[mode]
+        matrix = np.tile(prior.precision.diagonal[t], (len(mode), 1, 1))
+        matrix[:, :d, :d] += precisions[mode]
+        right = np.tile(prior.information[t], (len(mode), 1))
+        right[:, :d] += pull[mode]
+        if besides:
+            matrix -= (besides[-1] @ besides[-1].swapaxes(1, 2))[later]
+            right -= (besides[-1] @ whites[-1][:, :, None])[later, :, 0]
+        try:
+            root = np.linalg.cholesky(matrix)
+        except np.linalg.LinAlgError:
+            raise NotPositiveDefiniteError(
+                f'the precision of a path is not positive definite at time {t} of {times}'
+            ) from None
+        white = np.array([dtrtrs(r, y, lower=1)[0] for r, y in zip(root, right)])
+        log += 0.5 * (white * white).sum(1)
+        log -= np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
+        owners.append(owner)
+        roots.append(root)
+        whites.append(white)
+        if t > 0:
+            coupling = prior.precision.lower[t - 1]
+            besides.append(np.array([dtrtrs(r, coupling, lower=1)[0].T for r in root]))
+    owners, roots, besides, whites = owners[::-1], roots[::-1], besides[::-1], whites[::-1]
+    states = np.empty((count, times, n))
+    for t in range(times):
+        for i, root in enumerate(roots[t]):
+            mine = owners[t] == i
+            right = np.tile(whites[t][i], (mine.sum(), 1))
+            if t > 0:
+                right -= states[mine, t - 1] @ besides[t - 1][i]
+            states[mine, t] = dtrtrs(root, right.T, lower=1, trans=1)[0].T
+    factors = tuple(
+        BackwardCholesky(
+            tuple(root[i] for root, i in zip(roots, ends)),
+            tuple(beside[i] for beside, i in zip(besides, ends[1:])),
+        )
+        for ends in np.stack(owners, axis=1)
+    )
+    return states, log[owner] - prior.constant + 0.5 * times * n * np.log(2 * np.pi), factors
 
 
 def path_gaussians(

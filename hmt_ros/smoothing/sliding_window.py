@@ -26,9 +26,10 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.gaussian_pairs import pair_log_densities
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.reduction import merged_if_alike
-from hmt_ros.smoothing.likelihood import check_mixtures
+from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, embedded_network
+from hmt_ros.smoothing.likelihood import MixtureLikelihood
 from hmt_ros.smoothing.mixture_smoother import MixtureSmoother, intervals_of
-from hmt_ros.smoothing.mode_sequence import ModeSequence
+from hmt_ros.smoothing.mode_sequence import KnownModes, ModeSequence
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 
 SECOND_NS = 10**9
@@ -120,6 +121,9 @@ class SlidingWindow:
         self.next_identity = self.first_identity
         self._stamps: list[int] = []
         self._mixtures: list[GaussianMixture] = []
+        # The same of each mixture, and the network of all of them: they stay while it moves on.
+        self._likelihoods: list[MixtureLikelihood] = []
+        self._network: EmbeddedNetwork | None = None
         self._first: GaussianMixture | None = None
         self._last: TrajectoryMixture | None = None
         # Poses of the window, the oldest, that are final already.
@@ -142,7 +146,7 @@ class SlidingWindow:
                 window is as it was.
         """
         dynamics = self.smoother.dynamics
-        check_mixtures([mixture])
+        likelihood = MixtureLikelihood.of([mixture])
         if mixture.dimension != dynamics.dimension:
             raise ValueError(
                 f'the mixture has {mixture.dimension} variables, the dynamics {dynamics.dimension}'
@@ -155,8 +159,16 @@ class SlidingWindow:
         mixture = mixture[mixture.weights > 0]
         if self._first is None:
             self._first = first_state(mixture, dynamics)
+        if self._network is None:
+            self._network = embedded_network([mixture], dynamics, np.empty(0))
+        else:
+            interval = (int(stamp_ns) - self._stamps[-1]) * 1e-9
+            self._network = self._network.followed_by(
+                mixture, self._mixtures[-1], dynamics, interval
+            )
         self._stamps.append(int(stamp_ns))
         self._mixtures.append(mixture)
+        self._likelihoods.append(likelihood)
         for number in range(1, self._final + 1):
             self._advance(number)
         found = self._smooth()
@@ -194,6 +206,7 @@ class SlidingWindow:
             number: of the next one among the poses of the trajectories found last.
         """
         assert self._first is not None
+        assert self._network is not None
         interval = (self._stamps[1] - self._stamps[0]) * 1e-9
         followed = None
         if self._last is not None and self._last.times > number:
@@ -206,13 +219,21 @@ class SlidingWindow:
             self.smoother.max_trajectories,
             followed,
         )
-        del self._stamps[0], self._mixtures[0]
+        del self._stamps[0], self._mixtures[0], self._likelihoods[0]
+        self._network = self._network.later()
 
     def _smooth(self) -> TrajectoryMixture:
         assert self._first is not None
+        assert self._network is not None
         smoother, dynamics = self.smoother, self.smoother.dynamics
         intervals = intervals_of(self._stamps, len(self._stamps), dynamics.step)
-        sequence = ModeSequence(tuple(self._mixtures[1:]), dynamics, intervals, self._first)
+        known = None
+        if len(self._mixtures) > 1:
+            known = KnownModes(
+                self._network.later(), MixtureLikelihood.joined(self._likelihoods[1:])
+            )
+        mixtures = tuple(self._mixtures[1:])
+        sequence = ModeSequence(mixtures, dynamics, intervals, self._first, known)
         found = smoother.smooth_sequence(sequence, self.seed, self._stamps)
         return replace(found, identities=self._identities(found))
 
@@ -318,7 +339,7 @@ def filtered_state(
         count: components at most.
         followed: weights (M,) of trajectories and their states (M, n) at the new time.
     """
-    d, n = dynamics.dimension, dynamics.state_dimension
+    d = dynamics.dimension
     means, covariances = dynamics.predict(state.means, state.covariances, interval)
     pairs = np.indices((len(state), len(mixture))).reshape(2, -1).T
     log = pair_log_densities(
@@ -332,10 +353,10 @@ def filtered_state(
         covariances[i][:, :d, :d] + mixture.covariances[k], covariances[i][:, :d, :]
     ).swapaxes(1, 2)
     fused = means[i] + np.einsum('pij,pj->pi', gain, mixture.means[k] - means[i][:, :d])
-    # Joseph's form keeps them positive definite.
-    keep = np.eye(n) - np.concatenate([gain, np.zeros((len(i), n, n - d))], axis=2)
-    spread = keep @ covariances[i] @ keep.swapaxes(1, 2)
-    spread += gain @ mixture.covariances[k] @ gain.swapaxes(1, 2)
+    # Joseph's form, (1 - G C) S (1 - G C)' + G R G', keeps them positive definite.
+    before = covariances[i]
+    kept = before - gain @ before[:, :d]
+    spread = kept + (gain @ mixture.covariances[k] - kept[:, :, :d]) @ gain.swapaxes(1, 2)
     weights = np.exp(log[order] - logsumexp(log[order]))
     found = GaussianMixture(weights, fused, 0.5 * (spread + spread.swapaxes(1, 2)))
     found = merged_if_alike(found, MERGE_DISTANCE, MERGE_LOG_DETERMINANT)

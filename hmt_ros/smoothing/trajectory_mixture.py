@@ -20,7 +20,11 @@ from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.block_tridiagonal import BlockCholesky, BlockTridiagonal
+from hmt_ros.inference.block_tridiagonal import (
+    BackwardCholesky,
+    BlockCholesky,
+    BlockTridiagonal,
+)
 
 
 class TrajectoryContent(Protocol):
@@ -44,7 +48,7 @@ class TrajectoryMixture:
     Attributes:
         weights: (M,) sum to 1.
         states: (M, T, n) means; the first d of the n variables are the pose.
-        factors: M Cholesky factors of the precisions P_i, without inflation.
+        factors: M factors of the precisions P_i, without inflation.
         inflation: (M,) s_i, factor on standard deviations.
         log_joint: (M,) log p(M_i, R) at the means.
         free_energy: (I,) per iteration, nats, on the samples of the descent.
@@ -62,7 +66,7 @@ class TrajectoryMixture:
 
     weights: Array
     states: Array
-    factors: tuple[BlockCholesky, ...]
+    factors: tuple[BlockCholesky | BackwardCholesky, ...]
     inflation: Array
     log_joint: Array
     free_energy: Array
@@ -184,9 +188,9 @@ class TrajectoryMixture:
         offset[:, :, :d] = (x - self.means[i]) / scale
         log = 0.5 * factor.log_determinant
         if n > d:
-            diagonal, lower = _precision_blocks(factor)
-            hidden = BlockTridiagonal(diagonal[:, d:, d:], lower[:, d:, d:]).cholesky()
-            pull = BlockTridiagonal(diagonal, lower).product(offset)[:, :, d:]
+            whole = factor.matrix()
+            hidden = BlockTridiagonal(whole.diagonal[:, d:, d:], whole.lower[:, d:, d:]).cholesky()
+            pull = whole.product(offset)[:, :, d:]
             offset[:, :, d:] = -hidden.solve(pull)
             log -= 0.5 * hidden.log_determinant
         white = factor.whiten(offset)
@@ -264,11 +268,3 @@ class TrajectoryMixture:
             final_until_ns=content.final_until_ns,
             identities=tuple(int(number) for number in content.identities),
         )
-
-
-def _precision_blocks(factor: BlockCholesky) -> tuple[Array, Array]:
-    """D_t and E_t of P = L L'."""
-    own, below = factor.blocks
-    diagonal = own @ own.swapaxes(1, 2)
-    diagonal[1:] += below @ below.swapaxes(1, 2)
-    return diagonal, below @ own[:-1].swapaxes(1, 2)

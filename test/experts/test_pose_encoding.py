@@ -98,16 +98,16 @@ def test_jacobians_are_those_of_decoding(encoding: PoseEncoding) -> None:
 
 
 def test_jacobian_of_encoding(encoding: PoseEncoding) -> None:
-    pose = random_poses(encoding.body, 1, 6)
+    poses = random_poses(encoding.body, 3, 6)
     h = 1e-6
     numeric = np.stack(
         [
-            (encoding.encode(pose + h * e)[0] - encoding.encode(pose - h * e)[0]) / (2 * h)
+            (encoding.encode(poses + h * e) - encoding.encode(poses - h * e)) / (2 * h)
             for e in np.eye(encoding.size)
         ],
-        axis=1,
+        axis=2,
     )
-    np.testing.assert_allclose(encoding.encoding_jacobian(pose[0]), numeric, atol=1e-7)
+    np.testing.assert_allclose(encoding.encoding_jacobians(poses), numeric, atol=1e-7)
 
 
 def test_a_gaussian_is_decoded_as_its_samples_are(encoding: PoseEncoding) -> None:

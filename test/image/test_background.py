@@ -53,6 +53,17 @@ def test_shadow_is_no_foreground(scene, method):
     assert strict.silhouette(image)[20:100, 10:50].mean() > 0.9
 
 
+def test_what_is_found_does_not_depend_on_images_before():
+    scene = np.full((60, 80, 3), 100, np.uint8)
+    # So far from the background is just foreground: any drift of its variance decides otherwise.
+    image = scene + 10
+    background = model(scene, 'mog2')
+    assert background.foreground(image).all()
+    for brighter in (6, 4, 6):
+        background.foreground(scene + brighter)
+    assert background.foreground(image.copy()).all()
+
+
 @pytest.mark.parametrize('method', METHODS)
 def test_background_learned_while_a_person_walks_through(scene, method):
     background = BackgroundModel(BackgroundSettings(method=method))

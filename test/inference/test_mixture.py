@@ -33,6 +33,7 @@ def test_log_density_equals_scipy(k, d):
         axis=1,
     )
     np.testing.assert_allclose(mixture.component_log_densities(x), components, rtol=1e-9)
+    np.testing.assert_allclose(np.exp(mixture.log_determinants), np.linalg.det(mixture.covariances))
     expected = np.log(np.exp(components) @ mixture.weights)
     np.testing.assert_allclose(mixture.log_density(x), expected, rtol=1e-9)
 

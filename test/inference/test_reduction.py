@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.gaussian_pairs import pair_distances, pair_log_densities
+from hmt_ros.inference.gaussian_pairs import (
+    pair_distances,
+    pair_log_densities,
+    pair_mixture_log_determinants,
+)
 from hmt_ros.inference.reduction import (
     clustered,
     divergence_bound,
@@ -126,3 +130,14 @@ def test_pairs_equal_the_written_out_formulas(rng):
         offset = a.means[i] - a.means[j]
         spread = scales[i] * a.covariances[i] + scales[j] * a.covariances[j]
         assert value == pytest.approx(offset @ np.linalg.solve(spread, offset), abs=1e-10)
+
+
+def test_determinants_of_pairs_are_those_of_their_moments(rng):
+    for count in (2, 30):
+        mixture = random_mixture(rng, count, 5)
+        pairs = np.stack(np.triu_indices(count, 1), axis=1)
+        found = pair_mixture_log_determinants(
+            mixture.means, mixture.covariances, mixture.weights, pairs
+        )
+        wanted = [np.linalg.slogdet(mixture[pair].covariance())[1] for pair in pairs]
+        np.testing.assert_allclose(found, wanted, atol=1e-12)

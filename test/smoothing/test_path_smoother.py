@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.block_tridiagonal import NotPositiveDefiniteError
 from hmt_ros.smoothing import LinearGaussianDynamics, SlidingWindow
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
+from hmt_ros.smoothing.mode_sequence import (
+    ModeSequence,
+    path_gaussians,
+    path_gaussians_from_the_end,
+)
 
 
 def test_it_is_exact_where_all_paths_are_kept(modes, walk, exact):
@@ -65,3 +73,73 @@ def test_windows_agree_with_the_filter_where_there_is_one_mode():
     for t in (2, 3, 4):
         assert final[t].mixture.mean()[0] == pytest.approx(wanted[t])
         assert final[t].mixture.covariance()[0, 0] == pytest.approx(covariance[t, t])
+
+
+@pytest.mark.parametrize('times', [1, 2, 5])
+@pytest.mark.parametrize('window', [False, True])
+def test_elimination_from_the_end_agrees_with_the_dense_precision(modes, times, window):
+    dynamics = LinearGaussianDynamics.constant_velocity([0.4, 0.7], 0.9)
+    n = dynamics.state_dimension
+    mixtures = tuple(modes(2.0, times=times))
+    first = modes(1.0, seed=3, times=1, d=n)[0] if window else None
+    sequence = ModeSequence(mixtures, dynamics, np.ones(times - (not window)), first)
+    prior, likelihood = sequence.prior, sequence.likelihood
+    nodes = sequence.paths(40).nodes
+    states, log_weights, factors = path_gaussians_from_the_end(nodes, prior, likelihood)
+    forwards = path_gaussians(nodes, prior, likelihood)
+    np.testing.assert_allclose(states, forwards.states, atol=1e-9)
+    np.testing.assert_allclose(log_weights, forwards.log_weights, atol=1e-9)
+    length = likelihood.times
+    rng = np.random.default_rng(1)
+    for path, factor in zip(nodes[:5], factors):
+        dense = np.zeros((length, n, length, n))
+        for t in range(length):
+            _, _, precisions = likelihood.modes_at(t)
+            d = precisions.shape[1]
+            dense[t, :, t] = prior.precision.diagonal[t]
+            dense[t, :d, t, :d] += precisions[path[t]]
+        for t, block in enumerate(prior.precision.lower):
+            dense[t + 1, :, t], dense[t, :, t + 1] = block, block.T
+        flat = dense.reshape(length * n, -1)
+        inverse = np.linalg.inv(flat)
+        blocks = inverse.reshape(length, n, length, n)
+        assert (factor.times, factor.size) == (length, n)
+        assert factor.log_determinant == pytest.approx(np.linalg.slogdet(flat)[1])
+        x = rng.normal(size=(3, length, n))
+        squares = np.square(factor.whiten(x)).reshape(3, -1).sum(1)
+        np.testing.assert_allclose(
+            squares, ((x.reshape(3, -1) @ flat) * x.reshape(3, -1)).sum(1), 1e-9
+        )
+        coloured = factor.solve_transposed(np.eye(length * n).reshape(-1, length, n))
+        coloured = coloured.reshape(length * n, -1)
+        np.testing.assert_allclose(coloured.T @ coloured, inverse, atol=1e-9)
+        np.testing.assert_allclose(factor.whiten(factor.solve_transposed(x)), x, atol=1e-9)
+        whole = factor.matrix()
+        covariances, neighbours = factor.inverse_blocks()
+        for t in range(length):
+            np.testing.assert_allclose(whole.diagonal[t], dense[t, :, t], atol=1e-9)
+            np.testing.assert_allclose(covariances[t], blocks[t, :, t], atol=1e-9)
+            np.testing.assert_allclose(factor.inverse_block(t, 2), blocks[t, :2, t, :2], atol=1e-9)
+        for t in range(length - 1):
+            np.testing.assert_allclose(whole.lower[t], prior.precision.lower[t], atol=1e-9)
+            np.testing.assert_allclose(neighbours[t], blocks[t + 1, :, t], atol=1e-9)
+
+
+def test_paths_of_a_precision_that_is_not_positive_definite_are_refused(modes, walk):
+    sequence = ModeSequence(tuple(modes(2.0, times=3)), walk, np.ones(2))
+    likelihood = sequence.likelihood
+    broken = replace(likelihood, precisions=-9.0 * likelihood.precisions)
+    with pytest.raises(NotPositiveDefiniteError, match='at time 2 of 3'):
+        path_gaussians_from_the_end(sequence.paths(2).nodes, sequence.prior, broken)
+
+
+def test_a_window_that_moves_on_computes_what_one_from_scratch_does(modes, walk):
+    mixtures = modes(1.5, times=6)
+    window = SlidingWindow(PathSmoother(walk, max_trajectories=8), fixed_lag=2)
+    for t, mixture in enumerate(mixtures):
+        found = window.step(t * 10**9, mixture).trajectories
+    sequence = ModeSequence(tuple(mixtures[-2:]), walk, np.ones(2), window._first)
+    wanted = PathSmoother(walk, max_trajectories=8).smooth_sequence(sequence)
+    np.testing.assert_allclose(found.states, wanted.states, atol=1e-12)
+    np.testing.assert_allclose(found.weights, wanted.weights, atol=1e-12)
+    np.testing.assert_allclose(found.log_joint, wanted.log_joint, atol=1e-12)
