@@ -143,7 +143,8 @@ def _checked(skeleton: Skeleton, poses: ArrayLike) -> Array:
     Raises:
         ValueError: they do not have d columns or are not finite.
     """
-    q = np.ascontiguousarray(poses, dtype=np.float64)
+    # Writable: compiled code is compiled again for what can not be written.
+    q = np.require(poses, np.float64, ('C', 'W'))
     if q.ndim != 2 or q.shape[1] != skeleton.dimension:
         raise ValueError(
             f'poses of {skeleton.name} must have shape (N, {skeleton.dimension}), saw {q.shape}'
@@ -180,6 +181,7 @@ def directed_derivatives(
     """
     skeleton = frames.skeleton
     axes, origins = (x[0] for x in frames.dofs_by_pose())
+    points, directions = (np.ascontiguousarray(x) for x in (points, directions))
     result = np.zeros((len(points), skeleton.dimension))
     _directed(
         skeleton.moves, skeleton.dof_is_rotation, axes, origins, segments, points, directions,

@@ -136,7 +136,7 @@ def _ends(limbs, c, columns, origins):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _hang(limbs, c, columns, origins, pose, ends, slack, given, leaves, out):  # type: ignore[no-untyped-def]
+def _hang(limbs, c, columns, origins, pose, ends, slack, leaves, out):  # type: ignore[no-untyped-def]
     """Writes the leaves of the tree of limb c into rows (A, D) of out; returns their number.
 
     Args:
@@ -144,17 +144,17 @@ def _hang(limbs, c, columns, origins, pose, ends, slack, given, leaves, out):  #
         columns, origins: frames of the trunk that it hangs on.
         pose: (d,) whose angles are near.
         ends: (K, 3, 1) points on the rays of its joints.
-        slack: see `grow_leaves`.
-        given: whether the ends are those of the pose, which is left out.
+        slack: see `grow_leaves`; 0: the ends are those of the pose, which is left out.
         leaves: (1, 2^K, D) room for their angles.
         out: (A, D).
     """
-    links = _links(limbs, c)
-    count = 1 << limbs.links[c]
+    links, given = _links(limbs, c), slack == 0.0
+    count, width = 1 << limbs.links[c], leaves.shape[2]
     valid = np.zeros((1, count), np.bool_)
     grow_leaves(
         links, columns.reshape(len(columns), 3, 3, 1), origins.reshape(len(origins), 3, 1),
-        pose.reshape(1, len(pose)), ends, slack, given, leaves[:, :count], valid,
+        pose.reshape(1, len(pose)), ends, slack, given, leaves[0, :count].reshape(1, count, width),
+        valid,
     )  # fmt: skip
     n = 0
     for leaf in range(1 if given else 0, count):
@@ -239,7 +239,7 @@ def fill_configurations(tree, limbs, modes, found, found_counts, flipped, price,
             n += 1
         if limbs.siblings[c] >= 0:
             ends = _ends(limbs, limbs.siblings[c], columns, origins)
-            n += _hang(limbs, c, columns, origins, lead, ends, SLACK, False, leaves, angles[n:])
+            n += _hang(limbs, c, columns, origins, lead, ends, SLACK, leaves, angles[n:])
         given = n
         for i in range(given):
             pose[:] = lead
@@ -247,7 +247,7 @@ def fill_configurations(tree, limbs, modes, found, found_counts, flipped, price,
                 pose[limbs.own[c, j]] = angles[i, j]
             place_pose(tree, pose, moved, places, axes, on_axes)
             ends = _ends(limbs, c, moved, places)
-            n += _hang(limbs, c, moved, places, pose, ends, 0.0, True, leaves, angles[n:])
+            n += _hang(limbs, c, moved, places, pose, ends, 0.0, leaves, angles[n:])
         moved[:], places[:], pose[:] = columns, origins, lead
         most = result.angles.shape[2]
         kept, owner = _distinct_angles(tree, limbs, c, moved, places, pose, angles[:n], apart, most)
@@ -273,7 +273,7 @@ def fill_configurations(tree, limbs, modes, found, found_counts, flipped, price,
         for turn in range(2):
             own, sibling = (c, other) if turn == 0 else (other, c)
             ends = _ends(limbs, sibling, columns, origins)
-            n = _hang(limbs, own, columns, origins, lead, ends, SLACK, False, leaves, angles)
+            n = _hang(limbs, own, columns, origins, lead, ends, SLACK, leaves, angles)
             if n == 0:
                 reached = False
                 break
@@ -292,7 +292,7 @@ def fill_configurations(tree, limbs, modes, found, found_counts, flipped, price,
         place_pose(tree, flipped[f], moved, places, axes, on_axes)
         for c in range(limit):
             ends = _ends(limbs, c, columns, origins)
-            n = _hang(limbs, c, moved, places, flipped[f], ends, SLACK, False, leaves, angles)
+            n = _hang(limbs, c, moved, places, flipped[f], ends, SLACK, leaves, angles)
             if n == 0:
                 for j in range(limbs.dofs[c]):
                     angles[0, j] = flipped[f, limbs.own[c, j]]

@@ -111,13 +111,12 @@ class Room(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _room(compiled, point, f, cues):  # type: ignore[no-untyped-def]
-    segments, d = len(compiled.placing.parents), len(point)
+def _room(model, terms, point, f, cues):  # type: ignore[no-untyped-def]
+    segments, d = len(model.tree.parents), len(point)
     room = Room(
         np.empty((1, d)), np.empty((1, segments, 3, 3)), np.empty((1, segments, 3)),
         np.empty((1, d, 3)), np.zeros((1, d, 3)),
-        new_view(compiled.model),
-        np.empty((segments, 6)), np.empty((segments, 6, 6)), np.empty(len(compiled.inputs)),
+        new_view(model), np.empty((segments, 6)), np.empty((segments, 6, 6)), np.empty(terms),
         np.empty(cues), np.empty((1, 2)), np.zeros(1, np.int64), np.empty((cues, d)),
         np.empty((cues, d, d)), np.empty(f), np.empty((f, f)),
     )  # fmt: skip
@@ -195,11 +194,9 @@ def _add_terms(compiled, number, row, exact, room, gradient, hessian):  # type: 
 
 
 @njit(cache=True, nogil=True)
-def _add_motion(compiled, row, x, slope, curve):  # type: ignore[no-untyped-def]
+def _add_motion(centre, precision, nu, x, slope, curve):  # type: ignore[no-untyped-def]
     """Energy of the motion at x (f,); its derivatives are added to slopes (f,), where wanted."""
     f = len(x)
-    own = row if len(compiled.centres) > 1 else 0
-    centre, precision, nu = compiled.centres[own], compiled.precisions[own], compiled.tails
     pulled = np.empty(f)
     distance = 0.0
     for i in range(f):
@@ -243,7 +240,10 @@ def _energy_at(compiled, number, row, free, x, exact, room, slope, curve):  # ty
                 for j in range(f):
                     curve[i, j] += hessian[cue, free[i], free[j]]
     if len(compiled.centres) > 0:
-        value += _add_motion(compiled, row, x, slope, curve)
+        own = row if len(compiled.centres) > 1 else 0
+        value += _add_motion(
+            compiled.centres[own], compiled.precisions[own], compiled.tails, x, slope, curve
+        )
     return value
 
 
@@ -270,7 +270,7 @@ def solve(  # type: ignore[no-untyped-def]
         status, iterations: (n,) results.
     """
     f, apart = len(free), len(by_cue[0]) > 0
-    room = _room(compiled, point, f, 3 if apart else 1)
+    room = _room(compiled.model, len(compiled.inputs), point, f, 3 if apart else 1)
     slope, curve = room.slope, room.curve
     low, high, step, trial, scratch = (
         np.empty(f), np.empty(f), np.empty(f), np.empty(f), np.empty(f),

@@ -84,8 +84,9 @@ def minimise(
     lower, upper = (np.asarray(limit, dtype=np.float64) for limit in (lower, upper))
     x = np.clip(np.array(x, dtype=np.float64, ndmin=2), lower, upper)
     n, d = x.shape
-    lower, upper = (np.broadcast_to(limit, (n, d)) for limit in (lower, upper))
-    metric = np.broadcast_to(np.asarray(step_scale, dtype=np.float64) ** -2.0, (d,))
+    # Copies: compiled code is compiled again for every layout and for what can not be written.
+    lower, upper = (np.array(np.broadcast_to(limit, (n, d)), order='C') for limit in (lower, upper))
+    metric = np.full(d, np.asarray(step_scale, dtype=np.float64) ** -2.0)
 
     everyone = np.arange(n)
     first = term.energy(x, everyone)
