@@ -198,12 +198,11 @@ def path_gaussians_from_the_end(
         if besides:
             matrix -= (besides[-1] @ besides[-1].swapaxes(1, 2))[later]
             right -= (besides[-1] @ whites[-1][:, :, None])[later, :, 0]
-        try:
-            root = np.linalg.cholesky(matrix)
-        except np.linalg.LinAlgError:
+        root = _cholesky(matrix)
+        if root is None:
             raise NotPositiveDefiniteError(
                 f'the precision of a path is not positive definite at time {t} of {times}'
-            ) from None
+            )
         white = np.array([dtrtrs(r, y, lower=1)[0] for r, y in zip(root, right)])
         log += 0.5 * (white * white).sum(1)
         log -= np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
@@ -230,6 +229,16 @@ def path_gaussians_from_the_end(
         for ends in np.stack(owners, axis=1)
     )
     return states, log[owner] - prior.constant + 0.5 * times * n * np.log(2 * np.pi), factors
+
+
+def _cholesky(matrices: Array) -> Array | None:
+    """Lower factors of matrices (K, n, n); None: one is not positive definite, or not finite."""
+    try:
+        factors = np.asarray(np.linalg.cholesky(matrices), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        return None
+    # numpy lets NaN pass.
+    return factors if np.isfinite(factors[:, -1, -1]).all() else None
 
 
 def path_gaussians(

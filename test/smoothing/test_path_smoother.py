@@ -125,10 +125,11 @@ def test_elimination_from_the_end_agrees_with_the_dense_precision(modes, times, 
             np.testing.assert_allclose(neighbours[t], blocks[t + 1, :, t], atol=1e-9)
 
 
-def test_paths_of_a_precision_that_is_not_positive_definite_are_refused(modes, walk):
+@pytest.mark.parametrize('factor', [-9.0, np.nan])
+def test_paths_of_a_precision_that_is_not_positive_definite_are_refused(modes, walk, factor):
     sequence = ModeSequence(tuple(modes(2.0, times=3)), walk, np.ones(2))
     likelihood = sequence.likelihood
-    broken = replace(likelihood, precisions=-9.0 * likelihood.precisions)
+    broken = replace(likelihood, precisions=factor * likelihood.precisions)
     with pytest.raises(NotPositiveDefiniteError, match='at time 2 of 3'):
         path_gaussians_from_the_end(sequence.paths(2).nodes, sequence.prior, broken)
 
