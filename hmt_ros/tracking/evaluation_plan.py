@@ -45,6 +45,7 @@ class EvaluationPlan:
         combinations: maximum number of combinations on each trunk.
         searched_chains: number of limbs searched in each group.
         samples, refined: number of samples that a limb draws, and of the best that are refined.
+        surprising: whether the image is.
     """
 
     hypotheses: int
@@ -58,6 +59,7 @@ class EvaluationPlan:
     searched_chains: int
     samples: int
     refined: int
+    surprising: bool
 
 
 def plan_of(settings: TrackerSettings, *, surprising: bool = False) -> EvaluationPlan:
@@ -83,4 +85,5 @@ def plan_of(settings: TrackerSettings, *, surprising: bool = False) -> Evaluatio
         searched_chains=min(s.searched_chains, searched),
         samples=min(s.search.samples, max(budget // 8, 6)),
         refined=min(s.search.refined, max(budget // 130, 1)),
+        surprising=surprising,
     )

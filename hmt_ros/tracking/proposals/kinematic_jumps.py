@@ -1,7 +1,7 @@
 """Kinematic jump sampling: other configurations of the limbs and of the trunk (KJS 3, 4).
 
 For each trunk that the modes have, every limb has alternatives: those of the modes, all their
-flips, and, where no keypoints show it, what a search of the image found. Combinations of
+flips, and, where no keypoints show it or the image is surprising, what a search of it found. Combinations of
 alternatives are rated on the trunk as it is, with limbs exchanged that were taken for each other,
 and with the torso flipped; the best that stand for all become candidates.
 """
@@ -46,7 +46,7 @@ class KinematicJumps:
     ) -> Hypotheses:
         """See `Proposal`."""
         s, body = self.posterior.settings, self.posterior.body
-        plan, limbs = search.plan, self._not_shown(search.observation)
+        plan, limbs = search.plan, self._not_shown(search.observation, search.plan.surprising)
         left = plan.rated if limbs else plan.rated_alone
         share = ERRORS['image'].share(search.dt)
         price = {name: x.price(search.dt) for name, x in body.symmetries.items()}
@@ -112,16 +112,20 @@ class KinematicJumps:
             left = [i for i, ok in zip(left, near) if not ok]
         return groups
 
-    def _not_shown(self, observation: Observation) -> list[str]:
-        """The limbs that an image is searched for: those that it shows without keypoints.
+    def _not_shown(self, observation: Observation, surprising: bool) -> list[str]:
+        """The limbs that an image is searched for: those that no keypoints show.
 
-        Two keypoints fix a limb but for its flips; samples beside them only find what the image
-        has of other limbs and of the background.
+        Two keypoints fix a limb but for its flips; samples beside them mostly find what the image
+        has of other limbs and of the background. Where an image is surprising they may be wrong.
         """
         if not {'coverage', 'edges'} & observation.evidence.keys():
             return []
         names, keypoints = list(self._searches), observation.keypoints
-        if keypoints is None or self.posterior.settings.likelihood.keypoints.weight == 0:
+        if (
+            surprising
+            or keypoints is None
+            or self.posterior.settings.likelihood.keypoints.weight == 0
+        ):
             return names
         skeleton, beliefs = self.posterior.body.skeleton, observation.beliefs
         seen = {name for name, known in zip(keypoints.names, keypoints.seen, strict=True) if known}
