@@ -167,7 +167,7 @@ class Upright(NamedTuple):
     sigma: Array
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=16)
 def upright_segments(body: Body) -> Upright:
     """Pelvis and trunk of a body whose root turns about z, y and x; nothing of another."""
     if not len(_root_turns(body)) or 'neck' not in body.joint_names:

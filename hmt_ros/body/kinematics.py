@@ -354,7 +354,7 @@ class Placing(NamedTuple):
     offsets: Array
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def placing_of(skeleton: Skeleton) -> Placing:
     """The compiled code's view of a skeleton."""
     counts = [len(own) for own in skeleton.segment_dofs]
@@ -462,7 +462,7 @@ def _place_joints(tree, poses, joint_segments, joint_offsets, joints):  # type: 
                 )
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def _coupled_pairs(skeleton: Skeleton) -> tuple[Index, Index]:
     """Pairs (i, j) of degrees of freedom with i on the path from the root to j, or i = j."""
     moves = skeleton.moves[skeleton.dof_segments]  # (d, d): column moves the segment of the row

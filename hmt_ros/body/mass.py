@@ -57,7 +57,7 @@ class Masses:
         return result
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=16)
 def masses(body: Body) -> Masses:
     """The masses of a body whose segments have the names of `SHARES`; else none are known."""
     skeleton = body.skeleton

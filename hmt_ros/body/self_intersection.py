@@ -79,7 +79,7 @@ def self_intersection_energy(
     return value, gradient, hessian
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def overlaps_of(body: Body, sigma: float) -> Overlaps:
     """What compiled code reads of the parts of a body; sigma as for `self_intersection_energy`."""
     first, second = _pairs(body)
@@ -144,7 +144,7 @@ def _deepest(parts, pairs, columns, origins, rows, other_rows, result):  # type:
             result[m] = max(result[m], found[9])
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def _axes_of(body: Body) -> _Axes:
     parts = body.flesh.parts
     radii = np.array([p.radii for p in parts]).reshape(-1, 3)
@@ -159,7 +159,7 @@ def _axes_of(body: Body) -> _Axes:
     )
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def _pairs(body: Body) -> tuple[Index, Index]:
     """Pairs of parts that are no neighbours along the skeleton and do not touch at rest."""
     parts = body.flesh.parts

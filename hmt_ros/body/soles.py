@@ -42,7 +42,7 @@ class Soles:
         return len(self.segments)
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=16)
 def soles(body: Body) -> Soles:
     """The soles of a body; none where it lacks an ankle or a toe of either side."""
     names = body.joint_names

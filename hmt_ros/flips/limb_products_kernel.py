@@ -48,7 +48,7 @@ class Limbs(NamedTuple):
     siblings: NDArray[np.int64]
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def limbs_of(skeleton: Skeleton) -> Limbs:
     """The limbs of a skeleton, in the order of its chains.
 

@@ -71,7 +71,7 @@ class _Torso(NamedTuple):
     flips: Mask
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def _torso_of(skeleton: Skeleton) -> _Torso | None:
     """The torso of a skeleton; None: it has none that can flip."""
     (root, axes), trunk = rotations_of(skeleton, 0), _trunk_dofs(skeleton)

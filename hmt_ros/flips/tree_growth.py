@@ -57,7 +57,7 @@ class ChainLinks(NamedTuple):
     sides: NDArray[np.bool_]
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=64)
 def chain_links(skeleton: Skeleton, name: str) -> ChainLinks:
     """The links of a chain.
 

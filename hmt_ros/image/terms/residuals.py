@@ -37,7 +37,7 @@ class Tree(NamedTuple):
     dof_is_rotation: NDArray[np.bool_]
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)
 def tree_of(skeleton: Skeleton) -> Tree:
     """The compiled code's view of a skeleton."""
     last_of: list[int] = []  # the last degree of freedom on the path to each segment
