@@ -1,6 +1,6 @@
-"""Progress of a command on stderr: a bar on a terminal, a line every five seconds elsewhere.
+"""Progress of a command on stderr: a bar on a terminal, a line every few seconds elsewhere.
 
-The lines come from a thread, so that a step which takes long shows that the command still works.
+Both come from a thread, so that a step which takes long shows that the command still works.
 stdout is left to results.
 
     with show_progress(str(output), 'images', total=120) as bar:
@@ -24,7 +24,7 @@ from hmt_ros.compiled_code import compiling
 
 Item = TypeVar('Item')
 
-INTERVAL = 5.0  # s, between two lines
+INTERVAL = 4.0  # s, between two lines; a bar shows the time every second
 
 
 class ProgressLines:
@@ -102,6 +102,25 @@ class ProgressLines:
         print(f'{self._what}: {text}', file=self._file, flush=True)
 
 
+class _Bar(tqdm):
+    """A bar that shows the time also while nothing is counted."""
+
+    def __init__(self, **options: Any) -> None:
+        self._ended = Event()
+        super().__init__(**options)
+        if not self.disable:
+            Thread(target=self._show_time, name='progress', daemon=True).start()
+
+    def _show_time(self) -> None:
+        while not self._ended.wait(1.0):
+            self.refresh()
+
+    def close(self) -> None:
+        """Removes the bar, or leaves it."""
+        self._ended.set()
+        super().close()
+
+
 Progress: TypeAlias = 'tqdm[Any] | ProgressLines'
 
 
@@ -118,7 +137,7 @@ def show_progress(
     """
     if quiet or _is_wide_terminal():
         # One bar below another is removed at its end.
-        return tqdm(desc=what, unit=f' {unit}', total=total, disable=quiet, leave=None)
+        return _Bar(desc=what, unit=f' {unit}', total=total, disable=quiet, leave=None)
     return ProgressLines(what, unit, total)
 
 
