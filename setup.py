@@ -27,29 +27,51 @@ class Install(install):
         super().finalize_options()
 
     def run(self) -> None:
-        """Install hmt_msgs, then hmt_ros."""
+        """Install hmt_msgs, then hmt_ros, and compile its kernels."""
         prefix = Path(self.install_base)
         if in_colcon(prefix) or (self.prefix_is_given and 'AMENT_PREFIX_PATH' in os.environ):
             build_base = Path(self.get_finalized_command('build').build_base)
             install_messages(build_base / MESSAGES, prefix, str(self.root or ''))
         super().run()
+        if in_colcon(prefix):
+            compile_kernels(Path(self.install_lib))
 
 
 class Develop(develop):
     """``develop``, and the messages with it, for ``colcon build --symlink-install``."""
 
     def run(self) -> None:
-        """Install hmt_msgs, then hmt_ros."""
+        """Install hmt_msgs, then hmt_ros, and compile its kernels."""
         prefix = Path(self.prefix or sys.prefix)
         if in_colcon(prefix):
             build_base = Path(self.get_finalized_command('build').build_base)
             install_messages(build_base / MESSAGES, prefix, '')
         super().run()
+        if in_colcon(prefix):
+            compile_kernels(ROOT)
 
 
 def in_colcon(prefix: Path) -> bool:
     """Whether colcon installs into this folder, alone or together with other packages."""
     return any((x / '.colcon_install_layout').is_file() for x in (prefix, prefix.parent))
+
+
+def compile_kernels(folder: Path) -> None:
+    """Compile the kernels of the package in a folder, for this processor.
+
+    Not where the variable HMT_ROS_KERNELS says 'later'. A failure is no fault of the build: nodes
+    compile what is missing before they are active.
+    """
+    if os.environ.get('HMT_ROS_KERNELS') == 'later':
+        return
+    path = os.pathsep.join(filter(None, [str(folder), os.environ.get('PYTHONPATH', '')]))
+    command = [sys.executable, '-m', PACKAGE, 'compile', '--quiet']
+    done = subprocess.run(command, env=dict(os.environ, PYTHONPATH=path), cwd='/', check=False)
+    if done.returncode != 0:
+        sys.stderr.write(
+            f'{PACKAGE}: its kernels could not be compiled, see above; "ros2 run {PACKAGE} '
+            'compile" compiles them later, or each node when it starts\n'
+        )
 
 
 def install_messages(build: Path, prefix: Path, root: str) -> None:

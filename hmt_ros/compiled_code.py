@@ -10,22 +10,30 @@ import hashlib
 import os
 import shutil
 import sys
+import tempfile
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any
 
 VARIABLE = 'NUMBA_CACHE_DIR'
 _PREFIX = 'compiled-'
 # Code of other states is kept for so long, s: a process that still runs may be using it.
 KEPT = 24 * 3600.0
+# Between two lines about kernels that are being compiled, s, and between two looks whether any is.
+INTERVAL, _GLANCE = 5.0, 0.1
 
 
 def keep_compiled_code_apart(package: Path) -> None:
     """Has numba keep what it compiles in a folder of this state of a package.
 
-    The folder is in the package, or in the user's cache where that can not be written. One that
-    the environment names (`NUMBA_CACHE_DIR`) is used as it is.
+    The folder is in the package, or in the user's cache where that can not be written. There it
+    begins with a copy of what was compiled when the package was installed: numba loads nothing
+    from a folder that it can not write. One that the environment names (`NUMBA_CACHE_DIR`) is used
+    as it is.
     """
     if os.environ.get(VARIABLE):
         return
@@ -34,6 +42,11 @@ def keep_compiled_code_apart(package: Path) -> None:
         for other in folder.parent.glob(f'{_PREFIX}*'):
             if time.time() - other.stat().st_mtime > KEPT:
                 shutil.rmtree(other, ignore_errors=True)
+        installed = package / '__pycache__' / folder.name
+        if installed.is_dir():
+            # Where nothing can be written at all, numba says so.
+            with suppress(OSError):
+                _copy(installed, folder)
     os.environ[VARIABLE] = str(folder)
     if 'numba' in sys.modules:
         sys.modules['numba'].config.CACHE_DIR = str(folder)
@@ -51,6 +64,19 @@ def folder_of(package: Path) -> Path:
         own = hashlib.sha256(str(package).encode()).hexdigest()[:12]
         parent = Path(cache) / 'hmt_ros' / own
     return parent / f'{_PREFIX}{state.hexdigest()[:16]}'
+
+
+def _copy(source: Path, target: Path) -> None:
+    """Copies a folder, the contents of its files alone, so that all of it can be written."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+        for path in source.rglob('*'):
+            if path.is_file():
+                copy = Path(folder) / target.name / path.relative_to(source)
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, copy)
+        # Another process may have been faster.
+        (Path(folder) / target.name).rename(target)
 
 
 def folder_in_use() -> str:
@@ -88,3 +114,39 @@ def compiled_functions() -> CompiledFunctions:
 def compiling() -> bool:
     """Whether a function is being compiled, of those since the first call; never without numba."""
     return 'numba' in sys.modules and compiled_functions().busy
+
+
+def prepare(work: Callable[[], None], tell: Callable[[str], None]) -> None:
+    """Does work that compiles kernels, or loads them, and tells of it while it takes long.
+
+    Args:
+        work: what runs them.
+        tell: takes lines of text: when a kernel begins to be compiled, every `INTERVAL` s from then
+            on, and at the end. It is called from another thread, too, but never at the same time.
+    """
+    compiled, start, ended = compiled_functions(), time.monotonic(), Event()
+    before = compiled.count
+
+    def report() -> None:
+        while not compiled.busy:
+            if ended.wait(_GLANCE):
+                return
+        tell('compiling kernels, once after an update: this takes about a minute')
+        while not ended.wait(INTERVAL):
+            tell(f'compiling kernels: {compiled.count - before} functions, {since(start)} so far')
+
+    reporter = Thread(target=report, name='kernels', daemon=True)
+    reporter.start()
+    try:
+        work()
+    finally:
+        ended.set()
+        reporter.join()
+    count = compiled.count - before
+    done = f'{count} functions compiled in {since(start)}, kept in {folder_in_use()}'
+    tell(done if count else f'kernels loaded in {since(start)}')
+
+
+def since(start: float) -> str:
+    """Time since a moment of `time.monotonic`, for a line of text."""
+    return f'{time.monotonic() - start:.1f} s'

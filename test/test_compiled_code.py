@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numba import njit
 
 import hmt_ros
-from hmt_ros.compiled_code import KEPT, VARIABLE, folder_of, keep_compiled_code_apart
+from hmt_ros.compiled_code import (
+    KEPT,
+    VARIABLE,
+    folder_of,
+    keep_compiled_code_apart,
+    prepare,
+)
 
 
 @pytest.fixture
@@ -67,3 +77,56 @@ def test_it_counts_where_numba_came_first():
         [sys.executable, '-c', code], env=environment, capture_output=True, text=True, check=True
     ).stdout.strip()
     assert found == str(folder_of(Path(hmt_ros.__file__).parent))
+
+
+def test_what_was_compiled_at_install_serves_who_can_not_write_there(
+    package, monkeypatch, tmp_path
+):
+    monkeypatch.delenv(VARIABLE)
+    installed = folder_of(package)
+    (installed / 'part').mkdir(parents=True)
+    (installed / 'part' / 'kernel.nbi').write_text('index', 'utf-8')
+    (installed / 'part').chmod(0o555)
+    monkeypatch.setattr(os, 'access', lambda *_: False)
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
+    keep_compiled_code_apart(package)
+    folder = folder_of(package)
+    assert os.environ[VARIABLE] == str(folder) != str(installed)
+    assert (folder / 'part' / 'kernel.nbi').read_text('utf-8') == 'index'
+    assert (folder / 'part').stat().st_mode & 0o200
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+    # It is copied once: what is compiled since then stays.
+    (folder / 'part' / 'kernel.nbi').write_text('newer', 'utf-8')
+    keep_compiled_code_apart(package)
+    monkeypatch.delenv(VARIABLE)
+    keep_compiled_code_apart(package)
+    assert (folder / 'part' / 'kernel.nbi').read_text('utf-8') == 'newer'
+
+
+def test_loading_or_compiling_is_told(monkeypatch):
+    monkeypatch.setattr('hmt_ros.compiled_code.INTERVAL', 0.01)
+
+    @njit
+    def thrice(x):
+        return 3 * x + np.arange(5).sum()
+
+    lines = []
+    prepare(lambda: thrice(2), lines.append)
+    assert lines[0].startswith('compiling kernels, once after an update')
+    assert all(line.startswith('compiling kernels: ') for line in lines[1:-1])
+    assert re.fullmatch(r'\d+ functions compiled in \d+\.\d s, kept in .*', lines[-1])
+    lines.clear()
+    prepare(lambda: thrice(2), lines.append)
+    (line,) = lines
+    assert line.startswith('kernels loaded in ')
+
+
+def test_what_fails_ends_the_report():
+    def fail():
+        raise ValueError('no')
+
+    lines = []
+    with pytest.raises(ValueError, match='no'):
+        prepare(fail, lines.append)
+    assert lines == []
+    assert not [thread for thread in threading.enumerate() if thread.name == 'kernels']

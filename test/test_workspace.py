@@ -53,6 +53,7 @@ def ros_without_this_package() -> dict[str, str]:
         venv = Path(sys.prefix)
         kept = [x for x in folders if x == venv or not any(x.is_relative_to(y) for y in own)]
         environment[name] = os.pathsep.join(map(str, kept))
+    environment['HMT_ROS_KERNELS'] = 'later'
     environment.pop('COLCON_PREFIX_PATH', None)
     environment.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None)
     # Where tools/workspace.sh has unpacked the headers of Python.
@@ -262,6 +263,29 @@ def test_only_an_installation_into_ros_builds_messages(
     (tmp_path / 'install' / '.colcon_install_layout').write_text('isolated\n', 'utf-8')
     assert install_messages.in_colcon(tmp_path / 'install' / 'hmt_ros')
     assert install_messages.in_colcon(tmp_path / 'install')
+
+
+@pytest.mark.parametrize(('variable', 'code'), [('', 0), ('', 1), ('later', 0)])
+def test_kernels_are_compiled_where_the_package_is_installed(
+    install_messages: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    variable: str,
+    code: int,
+) -> None:
+    runs: list[tuple[list[str], str]] = []
+
+    def run(command: list[str], *, env: dict[str, str], cwd: str, check: bool) -> SimpleNamespace:
+        runs.append((command[1:], env['PYTHONPATH'].split(os.pathsep)[0]))
+        return SimpleNamespace(returncode=code)
+
+    monkeypatch.setattr(install_messages.subprocess, 'run', run)
+    monkeypatch.setenv('HMT_ROS_KERNELS', variable)
+    install_messages.compile_kernels(tmp_path)
+    wanted = [(['-m', 'hmt_ros', 'compile', '--quiet'], str(tmp_path))]
+    assert runs == ([] if variable else wanted)
+    assert ('ros2 run hmt_ros compile' in capsys.readouterr().err) == bool(code)
 
 
 # ---- What colcon, rosdep and bloom read ----

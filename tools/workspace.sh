@@ -220,6 +220,7 @@ colcon_build() {
     export CPATH=$headers/usr/include
   fi
   output=$(
+    export HMT_ROS_KERNELS=later # The stage does it, and shows how far it is.
     export VIRTUAL_ENV=$venv PATH=$venv/bin:$PATH AMENT_PREFIX_PATH=$venv CMAKE_PREFIX_PATH=$venv
     colcon --log-base "$(dirname "$build_base")/log" build --build-base "$build_base" "$@" \
       --event-handlers console_cohesion+ console_start_end- console_stderr- status- \

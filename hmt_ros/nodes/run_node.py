@@ -21,7 +21,7 @@ from msg_tools.files.error_line import error_line
 # Environment variable with the id of the process without which a node ends.
 OWNER = 'HMT_ROS_OWNER'
 
-# Time for a last estimate at the end, s; too short to wait for kernels that are being compiled.
+# Time for a last estimate at the end, s.
 _LAST_ESTIMATE = 5.0
 
 
@@ -33,8 +33,17 @@ def run(kind: type[SessionNode[Any, Any]], args: list[str] | None = None) -> int
         return 0
     # The handlers of rclpy end the context in the middle of the work; ours let the work finish.
     stopped = threading.Event()
+    node: SessionNode[Any, Any] | None = None
+
+    def stop(*_: object) -> None:
+        stopped.set()
+        if node is not None and node.preparing:
+            # Nothing is lost: what has been compiled is kept, function by function.
+            sys.stderr.flush()
+            os._exit(0)
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopped.set())
+        signal.signal(number, stop)
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = kind()

@@ -25,6 +25,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from hmt_ros.compiled_code import prepare
 from hmt_ros.nodes.diagnostics import MiddlewareEvents, Rates, trouble_of_period
 from hmt_ros.nodes.estimating_thread import EstimatingThread, InnerFaults
 from hmt_ros.nodes.node_parameters import (
@@ -70,6 +71,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         SUBJECT: what the diagnostics are about.
         SESSION: class of the session.
         DEFAULTS: parameters with their default values.
+        preparing: whether kernels are being compiled or loaded, which may take a minute.
     """
 
     NAME: ClassVar[str]
@@ -90,6 +92,7 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._warn_of_unknown(qos=False)
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._refuse_impossible_transitions()
+        self.preparing = False
         self._session: AnySession | None = None
         self._thread: EstimatingThread | None = None
         self._outputs: dict[str, Any] = {}
@@ -180,15 +183,20 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
     # Lifecycle.
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Reads files, opens topics."""
+        """Reads files, compiles or loads kernels, opens topics."""
         try:
-            self._session = self._new_session(self._settings, self._publish, self._is_wanted)
+            session = self._new_session(self._settings, self._publish, self._is_wanted)
         except ValueError as error:
             self._failure = f'{error_line(error)}; {next_step(self, error, self.SESSION.CHECKED)}'
             self.get_logger().error(self._failure)
             self._diagnose()
             return TransitionCallbackReturn.FAILURE
         self._failure = ''
+        if self.SESSION.prepare is not Session.prepare:
+            self.preparing = True
+            prepare(session.prepare, self.get_logger().info)
+            self.preparing = False
+        self._session = session
         for topic, published in self.SESSION.TOPICS.items():
             self._outputs[topic] = self._new_publisher(topic, *published_with(published))
         self._handled = self._new_publisher('~/handled', HANDLED, ANSWERS)

@@ -54,6 +54,7 @@ from hmt_ros.sessions.camera_session import (
 )
 from hmt_ros.sessions.handled import Fault, Output
 from hmt_ros.sessions.session import PublishedTopic, SessionState, everything
+from hmt_ros.sessions.warm_up import film
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import decode_image, image_message
@@ -156,6 +157,12 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._height, self._support = 0, math.nan
         self._masked = False
         self.state = self._present_state()
+
+    def prepare(self) -> None:
+        """See `Session`."""
+        shown, previous = film(), None
+        for mask in shown.masks[:2]:
+            previous = self._seen(mask, shown.camera, previous).mixture
 
     def _forget(self) -> None:
         # What is known of the background stays.

@@ -60,6 +60,7 @@ from hmt_ros.sessions.track_messages import (
 from hmt_ros.sessions.track_reports import TrackCondition, report_change
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
+from hmt_ros.sessions.warm_up import warm_up_tracking
 from hmt_ros.tracking import PosePrediction, Status, Tracker
 from hmt_ros.tracking.ground import KnownGround
 from msg_tools.files.error_line import error_line
@@ -119,6 +120,10 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
         # Of an image that was left out since the last estimate.
         self._late_prediction: PosePrediction | None = None
         self.state = self._present_state()
+
+    def prepare(self) -> None:
+        """See `Session`."""
+        warm_up_tracking()
 
     def restart(self, start: TrackStart | None = None) -> None:
         """Drops the track; the next image starts a new one.

@@ -45,6 +45,7 @@ from hmt_ros.sessions.session import NeededInput, PublishedTopic, everything
 from hmt_ros.sessions.track_messages import TOPICS
 from hmt_ros.sessions.track_start import TrackStart, prepare_start
 from hmt_ros.sessions.transform_buffer import TF_STATIC, TRANSFORMS
+from hmt_ros.sessions.warm_up import warm_up_tracking
 from hmt_ros.tracking.areas import grown, hull, unknown_area
 from hmt_ros.tracking.association import GATE, ImageTrack, Sighting, assigned
 from hmt_ros.tracking.camera_motion import CameraPose
@@ -125,6 +126,10 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
         self._info_stamp = 0
         self._forget()
         self.state = self._present_state()
+
+    def prepare(self) -> None:
+        """See `Session`."""
+        warm_up_tracking()
 
     def restart(self, start: TrackStart | None = None) -> None:
         """Drops all tracks; people start anew.

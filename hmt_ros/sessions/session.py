@@ -165,6 +165,13 @@ class Session(ABC, Generic[Parameters, State]):
         self._frame_id = ''
         self.topic_names: Mapping[str, str] = {}
 
+    def prepare(self) -> None:
+        """Compiles, or loads, what the messages will need; nothing is estimated or published.
+
+        It takes a second or, the first time after an update, a minute. To be called before the
+        first message.
+        """
+
     @property
     def most_waiting(self) -> int:
         """Maximum number of messages to be estimated from that wait for an estimate."""

@@ -48,6 +48,7 @@ from hmt_ros.sessions.smoothed_messages import (
     window_messages,
 )
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.warm_up import likelihoods
 from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow
 from hmt_ros.smoothing.likelihood import counted
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
@@ -173,6 +174,14 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._first_identity = 1
         self.kept = KeptMixtures(None, ())
         self.state = self._present_state()
+
+    def prepare(self) -> None:
+        """See `Session`."""
+        other = SmootherSession(self.parameters, lambda output: None)
+        for message in likelihoods(known_body(self.parameters.body_model or 'human37')):
+            other.take(MIXTURE, message)
+        other.smooth_span()
+        other.finish()
 
     # Inputs.
 

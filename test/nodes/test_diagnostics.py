@@ -174,7 +174,7 @@ def status_lines(world):
     """Lines that the node has logged as information, since it became active."""
     world.logged += world.stderr.readouterr().err
     lines = re.findall(r'^\[INFO\] \[[0-9.]+\] \[filter_node\]: (.*)$', world.logged, re.MULTILINE)
-    return lines[1:]
+    return lines[1 + next(i for i, line in enumerate(lines) if 'waits for' in line) :]
 
 
 def test_status_line(running, small_camera):

@@ -499,7 +499,24 @@ def test_a_track_leaves_lines_in_the_log(running, small_camera, stub_tracker):
 def test_ends_cleanly(number, subject_file, executable):
     file = f'subject_file:={subject_file}'
     node = executable('filter_node', '-p', file, '--params-file', str(CONFIG))
-    assert len(node.stop_at('images from /image', number)) == 1
+    lines = node.stop_at('images from /image', number)
+    assert 'images from /image' in lines[-1]
+    # Before it listened, it has loaded or compiled what it runs.
+    assert 'kernels loaded in' in lines[0] or 'compiling kernels' in lines[0]
+
+
+def test_kernels_are_ready_before_the_node_listens(world, monkeypatch):
+    prepared = []
+
+    def prepare(session):
+        prepared.append((one.node.preparing, dict(one.node._outputs)))
+
+    monkeypatch.setattr('hmt_ros.sessions.filter_session.FilterSession.prepare', prepare)
+    one = world()
+    one.node.trigger_configure()
+    assert prepared == [(True, {})]
+    assert not one.node.preparing
+    assert one.node._outputs
 
 
 @pytest.mark.parametrize(

@@ -30,8 +30,8 @@ from hmt_ros.sessions.transform_buffer import TF_STATIC
 from msg_tools.messages.cdr import canonical, deserialise, serialise
 
 # Long limits, which end a replay that hangs. The end of a node is noticed at once.
-START_SECONDS = 120.0
-MESSAGE_SECONDS = 600.0  # the first image may have to wait until kernels are compiled
+START_SECONDS = 600.0  # kernels may have to be compiled first
+MESSAGE_SECONDS = 120.0
 STOP_SECONDS = 20.0
 # Sources whose messages late subscribers get, too.
 LATCHED_SOURCES = (TF_STATIC,)

@@ -1,0 +1,69 @@
+"""What sessions run before the first message leaves nothing behind but code."""
+
+from __future__ import annotations
+
+import pytest
+
+from hmt_ros.compiled_code import compiled_functions
+from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.bme_session import BmeSession
+from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.filter_session import FilterSession
+from hmt_ros.sessions.people_parameters import PeopleParameters
+from hmt_ros.sessions.people_session import PeopleSession
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
+from hmt_ros.sessions.warm_up import film, likelihoods, warm_up_tracking
+from hmt_ros.tracking import Status, Tracker
+
+SESSIONS = [
+    (FilterSession, FilterParameters()),
+    (PeopleSession, PeopleParameters()),
+    (SmootherSession, SmootherParameters()),
+    (BmeSession, BmeParameters()),
+]
+
+
+@pytest.mark.parametrize(('kind', 'parameters'), SESSIONS, ids=lambda x: type(x).__name__)
+def test_preparing_estimates_and_publishes_nothing(kind, parameters, outputs):
+    session = kind(parameters, outputs.append)
+    before = session.state
+    warm_up_tracking.cache_clear()
+    session.prepare()
+    count = compiled_functions().count
+    warm_up_tracking.cache_clear()
+    session.prepare()
+    assert compiled_functions().count == count
+    assert session.state == before
+    assert outputs == []
+
+
+def test_a_tracker_is_the_same_after_it():
+    def tracked() -> list[bytes]:
+        shown = film()
+        tracker, found = Tracker(shown.body, shown.camera), []
+        for t, image in enumerate(shown.images):
+            for mixture in tracker.step(image, 10**9 + 10**8 * t, shown.keypoints(t)):
+                if mixture is not None:
+                    found += [mixture.means.tobytes(), mixture.weights.tobytes()]
+        assert tracker.status is Status.TRACKING
+        return found
+
+    before = tracked()
+    warm_up_tracking.cache_clear()
+    warm_up_tracking()
+    assert tracked() == before
+
+
+def test_a_smoother_is_the_same_after_it(outputs):
+    def smoothed(*, prepared: bool) -> list[object]:
+        outputs.clear()
+        session = SmootherSession(SmootherParameters(), outputs.append)
+        if prepared:
+            session.prepare()
+        for message in likelihoods(film().body):
+            assert session.take(MIXTURE, message).faults == ()
+        assert session.finish().source == FINISH
+        return list(outputs)
+
+    assert smoothed(prepared=True) == smoothed(prepared=False) != []
