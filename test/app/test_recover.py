@@ -76,8 +76,8 @@ def test_a_replay_that_was_killed(tmp_path, capsys):
         stderr=subprocess.PIPE,
     ) as process:
         size = 0
-        # A chunk is there.
-        while size < 400_000 and process.poll() is None:
+        # The first chunk is there, of 669 kB.
+        while size < 700_000 and process.poll() is None:
             time.sleep(0.02)
             size = sum(file.stat().st_size for file in tmp_path.glob('.out.*.partial/out.mcap'))
         os.kill(process.pid, signal.SIGKILL)
