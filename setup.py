@@ -59,8 +59,8 @@ def in_colcon(prefix: Path) -> bool:
 def compile_kernels(folder: Path) -> None:
     """Compile the kernels of the package in a folder, for this processor.
 
-    Not where the variable HMT_ROS_KERNELS says 'later'. A failure is no fault of the build: nodes
-    compile what is missing before they are active.
+    With HMT_ROS_KERNELS=later it does nothing. If it fails the build goes on: nodes compile what is
+    missing before they are active.
     """
     if os.environ.get('HMT_ROS_KERNELS') == 'later':
         return

@@ -107,10 +107,11 @@ class PoseEnergy:
         """The energy at poses x (n, d), cue by cue; pose i belongs to problem i.
 
         Raises:
-            ValueError: not all variables are free, or x is not as for `energy`.
+            ValueError: some variables are fixed, there is a motion, or x is not as for `energy`.
         """
         if self.point is not None or self.motion is not None:
-            raise ValueError('cues are told apart where all is free and nothing is expected')
+            seen = 'a motion' if self.point is None else 'variables that are fixed'
+            raise ValueError(f'by_cue wants the terms of a whole pose alone, saw {seen}')
         asked = Derivatives.POSITIVE if derivatives else Derivatives.NONE
         energy, parts, compiled = self._evaluated(x, None, asked, apart=True)
         costs = next((y.costs for y in compiled.inputs if hasattr(y, 'costs')), None)

@@ -65,7 +65,7 @@ def _of_pairs(pairs: Index, scales: Array, *sets: Array) -> tuple[Array, Array]:
     a, big_a, b, big_b, s = (np.require(x, np.float64, ('C', 'W')) for x in (*sets, scales))
     pairs = np.require(pairs, np.int64, ('C', 'W'))
     squares, log_determinants = np.empty((2, len(pairs)))
-    # What a pair gives does not depend on the pairs beside it; few are not worth a thread.
+    # Each pair is worked out alone, so any split gives the same. A few are not worth a thread.
     parts = PARTS if len(pairs) >= LEAST_SHARED else 1
     edges = np.linspace(0, len(pairs), parts + 1).astype(int)
 

@@ -194,8 +194,10 @@ class SessionNode(LifecycleNode, Generic[AnySession, Parameters]):
         self._failure = ''
         if self.SESSION.prepare is not Session.prepare:
             self.preparing = True
-            prepare(session.prepare, self.get_logger().info)
-            self.preparing = False
+            try:
+                prepare(session.prepare, self.get_logger().info)
+            finally:
+                self.preparing = False
         self._session = session
         for topic, published in self.SESSION.TOPICS.items():
             self._outputs[topic] = self._new_publisher(topic, *published_with(published))

@@ -23,6 +23,7 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.body.shape import ShapeSpace
 from hmt_ros.image.likelihood import ImageLikelihood
 from hmt_ros.image.observation import Observation
+from hmt_ros.image.terms.residuals import RECORDED
 from hmt_ros.inference.arrays import Array
 
 # Standard deviations over people and clothes, by kind of growth: logarithms, m.
@@ -173,7 +174,7 @@ class ShapeEstimate:
             if np.array_equal(known[:n], poses):
                 return Linearised(*(x[:n] for x in found))
         frames = forward(self._space.body.skeleton, poses)
-        of_joints = np.zeros((n, 1, 9))
+        of_joints = np.zeros((n, 1, RECORDED))
         if observation.keypoints is not None and likelihood.settings.keypoints.weight > 0:
             of_joints = likelihood.keypoint_term(observation, None).recorded(frames)
         of_flesh = likelihood.recorded(frames, observation)

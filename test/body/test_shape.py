@@ -109,7 +109,7 @@ def test_points_on_the_flesh_have_their_derivatives(space, body, random_poses):
     wanted = np.einsum('mk,mkp->mp', directions, moved)
     by_pose = directed_derivatives(frames, segments, points(body), directions)
     found = space.second_order(frames, rows[None], NO_RESIDUALS)
-    check_sums(found, wanted, by_pose, rows[1:, 7], rows[1:, 8])
+    assert are_sums(found, wanted, by_pose, rows[1:, 7], rows[1:, 8])
 
 
 def test_joints_have_their_derivatives(space, body, random_poses):
@@ -123,7 +123,7 @@ def test_joints_have_their_derivatives(space, body, random_poses):
     rows = residuals(joints, places, directions)
     found = space.second_order(frames, NO_RESIDUALS, rows[None])
     wanted = np.einsum('mk,mkp->mp', directions, moved)
-    check_sums(found, wanted, by_pose, rows[1:, 7], rows[1:, 8])
+    assert are_sums(found, wanted, by_pose, rows[1:, 7], rows[1:, 8])
     assert not found[0][:, space.lengths :].any()
 
 
@@ -152,12 +152,11 @@ def residuals(owners, points, directions):
     return np.concatenate([np.array([[len(rows), *8 * [0.0]]]), rows])
 
 
-def check_sums(found, by_shape, by_pose, pull, curvature):
-    """Against the rows (M, P), (M, d) of each residual."""
-    gradient, hessian, mixed = found
-    assert np.allclose(gradient[0], pull @ by_shape, atol=1e-7)
-    assert np.allclose(hessian[0], (curvature[:, None] * by_shape).T @ by_shape, atol=1e-7)
-    assert np.allclose(mixed[0], (curvature[:, None] * by_shape).T @ by_pose, atol=1e-7)
+def are_sums(found, by_shape, by_pose, pull, curvature):
+    """Whether they are those over the rows (M, P), (M, d) of each residual."""
+    weighed = (curvature[:, None] * by_shape).T
+    wanted = (pull @ by_shape, weighed @ by_shape, weighed @ by_pose)
+    return all(np.allclose(x[0], y, atol=1e-7) for x, y in zip(found, wanted, strict=True))
 
 
 # Growth of a body.

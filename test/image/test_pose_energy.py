@@ -169,8 +169,12 @@ def test_what_is_not_there_has_no_energy_of_its_own(terms, poses):
     assert not found.values[:, :2].any()
     assert not found.hessians[:, :2].any()
     assert found.outline_costs.shape == (COUNT, 0)
-    with pytest.raises(ValueError, match='cues are told apart where all is free'):
+    wanted = 'by_cue wants the terms of a whole pose alone, saw '
+    with pytest.raises(ValueError, match=f'{wanted}a motion'):
         PoseEnergy(likelihood, (image,), motion_of(poses, 'gaussian', 37)).by_cue(poses)
+    free = np.arange(5)
+    with pytest.raises(ValueError, match=f'{wanted}variables that are fixed'):
+        PoseEnergy(likelihood, (image,), None, poses[0], free).by_cue(poses[:, free])
 
 
 @pytest.mark.parametrize('motion', ['none', 'student'])

@@ -221,8 +221,8 @@ def _list_room(count):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def keypoint_errors(inputs, columns, origins, errors):  # type: ignore[no-untyped-def]
     """Fills the errors (N, P, 2) of `list_keypoints` at the frames of N poses."""
+    _, which, places, directions, pulls, curvatures = _list_room(errors.shape[1])
     for n in range(len(columns)):
-        _, which, places, directions, pulls, curvatures = _list_room(errors.shape[1])
         list_keypoints(
             inputs, columns[n], origins[n], errors[n], which, places, directions, pulls, curvatures
         )
@@ -238,7 +238,7 @@ def record_keypoints(inputs, joints, columns, origins, residuals):  # type: igno
         inputs: as for `list_keypoints`.
         joints: (P, 2) of the skeleton that the keypoints show, as called and exchanged.
         columns, origins: (N, S, 3, 3), (N, S, 3) frames of the segments.
-        residuals: (N, 1 + 2 P, 9) result.
+        residuals: (N, 1 + 2 P, RECORDED) result.
     """
     errors, which, places, directions, pulls, curvatures = _list_room(len(joints))
     for n in range(len(columns)):

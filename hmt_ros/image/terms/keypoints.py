@@ -42,7 +42,7 @@ from hmt_ros.image.terms.keypoint_kernel import (
     keypoint_errors,
     record_keypoints,
 )
-from hmt_ros.image.terms.residuals import tree_of
+from hmt_ros.image.terms.residuals import RECORDED, tree_of
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
 
@@ -254,11 +254,11 @@ class KeypointTerm:
         """The residuals at the frames of N poses, as `residuals` of one; see `record_keypoints`.
 
         Returns:
-            (N, 1 + M, 9): rows 1 to m of a pose are joint, position, derivative of the residual by
-            it, derivative and curvature of the energy; m is the first number of row 0.
+            (N, 1 + M, RECORDED): rows 1 to m of a pose are joint, position, derivative of the
+            residual by it, derivative and curvature of the energy; m is the first number of row 0.
         """
         measured = self.measured
-        result = np.zeros((frames.count, 1 + 2 * len(measured.joints), 9))
+        result = np.zeros((frames.count, 1 + 2 * len(measured.joints), RECORDED))
         record_keypoints(self.compiled, measured.joints, *frames.by_pose(), result)
         return result
 
