@@ -197,14 +197,14 @@ def _add_terms(compiled, number, row, exact, room, gradient, hessian):  # type: 
 def _add_motion(centre, precision, nu, x, slope, curve):  # type: ignore[no-untyped-def]
     """Energy of the motion at x (f,); its derivatives are added to slopes (f,), where wanted."""
     f = len(x)
-    pulled = np.empty(f)
+    pulled = np.zeros(f)
+    for j in range(f):  # along rows of a symmetric matrix: so the compiler takes many at once
+        moved = x[j] - centre[j]
+        for i in range(f):
+            pulled[i] += precision[j, i] * moved
     distance = 0.0
     for i in range(f):
-        total = 0.0
-        for j in range(f):
-            total += precision[i, j] * (x[j] - centre[j])
-        pulled[i] = total
-        distance += total * (x[i] - centre[i])
+        distance += pulled[i] * (x[i] - centre[i])
     value, shrinkage = 0.5 * distance, 1.0
     if nu > 0.0:
         value = 0.5 * (nu + f) * np.log1p(distance / nu)

@@ -170,13 +170,15 @@ def box_step(gradient, hessian, low, high, damping, metric, step, curve):  # typ
 @njit(cache=True, nogil=True, error_model='numpy')
 def _decrease(gradient, hessian, step, curve):  # type: ignore[no-untyped-def]
     """What the quadratic model says that a step gains; `curve` becomes H step."""
+    count = len(step)
+    curve[:] = 0.0
+    for j in range(count):  # along rows of a symmetric matrix: so the compiler takes many at once
+        moved = step[j]
+        for i in range(count):
+            curve[i] += hessian[j, i] * moved
     total = 0.0
-    for i in range(len(step)):
-        value = 0.0
-        for j in range(len(step)):
-            value += hessian[i, j] * step[j]
-        curve[i] = value
-        total -= step[i] * (gradient[i] + 0.5 * value)
+    for i in range(count):
+        total -= step[i] * (gradient[i] + 0.5 * curve[i])
     return total
 
 

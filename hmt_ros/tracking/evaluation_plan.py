@@ -6,10 +6,14 @@
 Of what is rated, 2 B / 5 are left where limbs are searched for, too.
 
 What is left goes to what is made of the modes: covariances, shape, the likelihood alone. Settings
-bound each part; a budget below them takes from all parts. An image in which the heaviest mode is
-not found where the motion prior has it, as where people move fast, gets more:
+bound each part; a budget below them takes from all parts. An image that moves the heaviest mode
+far from where the motion prior has it, as where people move fast, gets more. How far is usual grows
+with what the image tells, so with the time between two images:
 
-    (x - f)' P (x - f) / 2 > `SURPRISING`            x: its optimum, f, P^-1: its prediction
+    m' P m  >  `SURPRISING` E m' P m  =  `SURPRISING` tr(I - P H^-1)
+
+m leads from the mode's prediction, which has the precision P, to its optimum, where the energy has
+the Hessian H; so the covariance of m is P^-1 - H^-1.
 """
 
 from __future__ import annotations
@@ -17,16 +21,32 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from hmt_ros.inference.arrays import Array
+
 if TYPE_CHECKING:
     from hmt_ros.tracking.settings import TrackerSettings
 
 # Budgets of the nodes, which have to keep up with a camera, and of everything else.
 LIVE, ACCURATE = 300, 400
-# Nats by which the motion of the heaviest mode is surprising, and how many times the budget such an
-# image has.
-SURPRISING, MORE = 3.0, 4
+# Share of what is expected from which on the motion of the heaviest mode is surprising: the motion
+# prior is wider than most motions. And how many times the budget such an image has.
+SURPRISING, MORE = 0.4, 4
 # Below this budget no limb is searched.
 LEAST_SEARCHED = 100
+
+
+def is_surprising(moved: Array, precision: Array, hessian: Array) -> bool:
+    """Whether an image has moved a mode far for what it tells of it; never if that is nothing.
+
+    Args:
+        moved: (d,) from the prediction of the mode to its optimum.
+        precision: (d, d) of the prediction.
+        hessian: (d, d) of the energy, motion prior included, at the optimum.
+    """
+    expected = len(moved) - np.trace(np.linalg.solve(hessian, precision))
+    return bool(moved @ precision @ moved > SURPRISING * max(expected, 1.0))
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.camera_motion import CameraMotion
 from hmt_ros.tracking.classes import Facing
 from hmt_ros.tracking.contact import FootContacts
-from hmt_ros.tracking.evaluation_plan import SURPRISING
+from hmt_ros.tracking.evaluation_plan import is_surprising
 from hmt_ros.tracking.ground import GroundEstimator
 from hmt_ros.tracking.hypotheses import (
     Hypotheses,
@@ -263,7 +263,7 @@ class MixtureFilter:
             posterior.given(seen, predicted, precisions), predicted.poses, s.plan.iterations
         )
         moved = base.x[0] - continuity.predicted[0]
-        surprising = 0.5 * moved @ precisions[0] @ moved > SURPRISING
+        surprising = is_surprising(moved, precisions[0], base.hessian[0])
         plan = s.thorough_plan if surprising else s.plan
         search = Search(posterior, seen, states, precisions, continuity, plan)
         proposals: list[Proposal] = [self._proposal]

@@ -9,7 +9,13 @@ import pytest
 
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.tracking import Subject, Tracker, TrackerSettings
-from hmt_ros.tracking.evaluation_plan import ACCURATE, LEAST_SEARCHED, LIVE
+from hmt_ros.tracking.evaluation_plan import (
+    ACCURATE,
+    LEAST_SEARCHED,
+    LIVE,
+    SURPRISING,
+    is_surprising,
+)
 
 FRAME = 100_000_000
 
@@ -38,6 +44,22 @@ def test_the_least_budget_still_follows_one_mode():
     plan = TrackerSettings(evaluation_budget=1).plan
     assert (plan.hypotheses, plan.candidates, plan.iterations, plan.searched_chains) == (1, 1, 1, 0)
     assert TrackerSettings(evaluation_budget=LEAST_SEARCHED).plan.searched_chains == 1
+
+
+@pytest.mark.parametrize('seconds', [0.03, 0.3])
+def test_a_motion_surprises_by_what_the_image_tells_of_it(seconds):
+    rng, d, count = np.random.default_rng(2), 12, 4000
+    spread, factor = rng.normal(size=(2, d, d))
+    prior = seconds * (spread @ spread.T + np.eye(d))
+    precision = np.linalg.inv(prior)
+    hessian = precision + 100.0 * factor @ factor.T
+    moves = rng.multivariate_normal(np.zeros(d), prior - np.linalg.inv(hessian), size=count)
+    mean = np.einsum('ni,ij,nj->n', moves, precision, moves).mean()
+    usual = moves[0] * np.sqrt(SURPRISING * mean / (moves[0] @ precision @ moves[0]))
+    assert not is_surprising(0.9 * usual, precision, hessian)
+    assert is_surprising(1.1 * usual, precision, hessian)
+    # An image that tells nothing moves nothing.
+    assert not is_surprising(np.zeros(d), precision, precision)
 
 
 @pytest.fixture(scope='module')
