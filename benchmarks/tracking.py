@@ -33,6 +33,7 @@ from benchmarks.runs import (
     run_all,
 )
 from benchmarks.tracker_changes import changed, parsed_changes
+from benchmarks.tracking_budgets import budgets
 from benchmarks.tracking_means import (
     APART,
     CHOSEN,
@@ -66,7 +67,7 @@ from hmt_ros.tracking import TrackerSettings
 Array = NDArray[np.float64]
 
 USUAL_PARTS = ('accuracy', 'ablations', 'sizes', 'oracle', 'speed')
-PARTS = (*USUAL_PARTS, 'scaling', 'rules')
+PARTS = (*USUAL_PARTS, 'budgets', 'scaling', 'rules')
 SEEDS = (0, 1, 2)
 RATES = (USUAL_RATE,)
 ABLATIONS: tuple[tuple[str, Any], ...] = (*(('max_hypotheses', k) for k in (1, 2, 4, 8, 16)),)
@@ -105,7 +106,7 @@ def main(argv: list[str]) -> int:
     )  # fmt: skip
     parser.add_argument(
         '--parts', nargs='+', choices=PARTS,
-        help='all but rules, or none where settings or checkouts are compared',
+        help='all but the last three, or none where settings or checkouts are compared',
     )  # fmt: skip
     parser.add_argument(
         '--against', nargs='+', default=(), metavar='SETTING=VALUE',
@@ -237,6 +238,8 @@ def measure(
             for rate in dict.fromkeys(one.rate for one in runs)
         ]
         result['accuracy'] = grouped(entries)
+    if 'budgets' in parts:
+        result['budgets'] = budgets(runs, processes)
     if against:
         result['against'] = comparison(runs, against, processes)
     if baseline is not None:

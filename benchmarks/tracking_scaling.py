@@ -130,7 +130,17 @@ def executors(clip: Clip, settings: TrackerSettings) -> dict[str, float]:
 @contextmanager
 def _recording(file: Path) -> Iterator[None]:
     """Has `perf` sample this process."""
-    command = ['perf', 'record', '-q', '-F', str(FREQUENCY), '-p', str(os.getpid()), '-o', file]
+    command = [
+        'perf',
+        'record',
+        '-q',
+        '-F',
+        str(FREQUENCY),
+        '-p',
+        str(os.getpid()),
+        '-o',
+        str(file),
+    ]
     recorder = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     time.sleep(1.0)
     try:

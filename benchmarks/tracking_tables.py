@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.clips import table
 from benchmarks.runs import GIVEN
+from benchmarks.tracking_budgets import budgets_as_text
 from benchmarks.tracking_means import DETECTOR
 from benchmarks.tracking_oracle import as_text as oracle_as_text
 from benchmarks.tracking_speed import OPENCV, costs_as_text, memory_as_text, speed_as_text
@@ -115,6 +116,8 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
                 'from the pelvis in the frame of the trunk.'
             )
             parts.append(_table({**group, 'clips': []}, OFFSETS, markdown))
+    if 'budgets' in result:
+        parts.append(budgets_as_text(result['budgets'], markdown=markdown))
     if 'against' in result:
         found = result['against']
         what = f'{", ".join(found["changes"])} minus the usual settings'

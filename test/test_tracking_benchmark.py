@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import runs, tracking, tracking_oracle, tracking_rules, tracking_speed
+from benchmarks import (
+    runs,
+    tracking,
+    tracking_budgets,
+    tracking_oracle,
+    tracking_rules,
+    tracking_speed,
+)
 from benchmarks.clips import LANDMARK_NAMES, at_rate, read_clip, resized, rounded, rows_at_rate
 from benchmarks.runs import (
     BOTH,
@@ -93,7 +100,7 @@ def quick_runs(monkeypatch, tmp_path):
             done.append(one)
         return records
 
-    for module in (tracking, tracking_rules):
+    for module in (tracking, tracking_budgets, tracking_rules):
         monkeypatch.setattr(module, 'run_all', run_here)
     return done
 
@@ -980,3 +987,25 @@ def test_speed_is_told(timed):
     text = tracking_speed.speed_as_text(timed[0], 2, markdown=True)
     assert text.startswith('reach 480x360, 3 images, 2 cores: ')
     assert '| candidates' in text
+
+
+# Budgets.
+
+
+def test_budgets_are_compared_on_the_same_images(quick_runs):
+    some = [
+        Run(REACH, given, seed, rate=rate)
+        for given in (IMAGES, KEYPOINTS) for rate in (0.0, 3.0) for seed in (0, 1)
+    ]  # fmt: skip
+    rows = tracking_budgets.budgets(some)
+    # Not one of the clips that settings were chosen on, so no smaller budgets.
+    budgets = tracking_budgets.PROFILES.values()
+    assert [(row['rate'], row['budget']) for row in rows] == [
+        (rate, budget) for rate in (0.0, 3.0) for budget in budgets
+    ]
+    # Nothing is drawn where there are keypoints alone: one seed says all.
+    assert len(quick_runs) == 2 * (4 + 2)
+    assert {one.seed for one in quick_runs if one.inputs == KEYPOINTS} == {0}
+    assert {dict(one.changes).get('evaluation_budget') for one in quick_runs} == {None, 300}
+    text = tracking_budgets.budgets_as_text(rows)
+    assert 'Other clips' in text and '300, live' in text and 'nan' not in text
