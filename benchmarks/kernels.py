@@ -1,4 +1,8 @@
-"""kernels: what is compiled against vectorised numpy that computes the same."""
+"""kernels: what is compiled against vectorised numpy, and what an evaluation of a pose computes.
+
+An evaluation is told term by term, with its share of the peak of one core: the rate of a product of
+matrices.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +23,8 @@ from benchmarks import (
 from benchmarks.arm_waving import waving
 from benchmarks.clips import table
 from benchmarks.command import benchmark_parser, show
-from benchmarks.machine import best_time, description
+from benchmarks.kernel_flops import ALL, KINDS, PLACING, counts, energies
+from benchmarks.machine import best_time, description, dgemm_rate
 from benchmarks.smoothing_relations import CLOSE, layers_of
 from hmt_ros.body import Camera, load_body
 from hmt_ros.body.camera import Viewpoint
@@ -37,6 +42,9 @@ from hmt_ros.rendering.scene import Scene
 from hmt_ros.smoothing.component_overlaps import add_overlaps
 from hmt_ros.smoothing.trajectory_refinement import refine
 from hmt_ros.tracking.selection import choose_hypotheses
+
+# Poses of one call whose evaluations are measured.
+POSES = 64
 
 
 def main(argv: list[str]) -> int:
@@ -63,7 +71,22 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
                 f'{entry["difference"]:.0e}',
             ]
         )
-    return table(rows, markdown=markdown)
+    parts = [table(rows, markdown=markdown)]
+    rows = [['of an evaluation', 'KiB read from']]
+    for kind in KINDS:
+        rows[0] += [f'{kind}, us', 'kflop', 'Gflop/s', 'of peak, %']
+    for entry in result['evaluation']:
+        row = [entry['what'], f'{entry["bytes"] / 1024:.0f}']
+        for kind in KINDS:
+            own = entry[kind]
+            row += [
+                f'{own["us"]:.1f}', f'{own["flops"] / 1e3:.0f}', f'{own["rate"] / 1e9:.1f}',
+                f'{100.0 * own["rate"] / result["peak"]:.0f}',
+            ]  # fmt: skip
+        rows.append(row)
+    parts.append(table(rows, markdown=markdown))
+    parts.append(f'Peak of one core: {result["peak"] / 1e9:.0f} Gflop/s in double precision.')
+    return '\n\n'.join(parts)
 
 
 def measure(seconds: float = 1.0) -> dict[str, Any]:
@@ -77,7 +100,30 @@ def measure(seconds: float = 1.0) -> dict[str, Any]:
             *_overlaps(seconds),
             *_smoothing(seconds),
         ],
+        'peak': dgemm_rate(),
+        'evaluation': list(_evaluation(seconds)),
     }
+
+
+def _evaluation(seconds: float) -> Iterator[dict[str, Any]]:
+    """Costs of one evaluation; those of terms on top of the frames of the segments."""
+    some, poses = energies(POSES)
+    counted, placed = counts(), dict.fromkeys(KINDS, 0.0)
+    for what, energy in some.items():
+        times = {
+            kind: 1e6 / POSES
+            * best_time(partial(energy.energy, poses, derivatives=derivatives), seconds=seconds)
+            for kind, derivatives in KINDS.items()
+        }  # fmt: skip
+        alone = what in {PLACING, ALL}
+        entry: dict[str, Any] = {'what': what, 'bytes': counted[what]['bytes']}
+        for kind in KINDS:
+            own = times[kind] - (0.0 if alone else placed[kind])
+            flops = counted[what][kind] - (0.0 if alone else counted[PLACING][kind])
+            entry[kind] = {'us': own, 'flops': flops, 'rate': 1e6 * flops / own}
+        if what == PLACING:
+            placed = times
+        yield entry
 
 
 def _likelihoods(seconds: float) -> Iterator[dict[str, Any]]:

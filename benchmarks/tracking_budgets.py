@@ -1,7 +1,7 @@
 """What the evaluations that an image may cost bring: errors and processor time by their budget.
 
-The two budgets of the product, at every rate of images; smaller ones at the first rate, on the
-clips that settings were chosen on. An interval is that of `tracking_scores.interval`.
+The two budgets of the product, at every rate of images; smaller ones at the first rate with one
+seed, on the clips that settings were chosen on. An interval is that of `tracking_scores.interval`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def budgets(runs: Sequence[Run], processes: int = 0) -> list[dict[str, Any]]:
         (budget, one)
         for budget in SMALLER
         for one in runs
-        if one.rate == first and group_of(one.clip) == OF_CHOSEN
+        if one.rate == first and one.seed == seed and group_of(one.clip) == OF_CHOSEN
     ]
     found = run_all([_with(budget, one) for budget, one in asked], processes)
     rows: dict[tuple[str, float, int], dict[str, dict[str, list[Record]]]] = {}

@@ -143,6 +143,14 @@ def test_compiled_and_vectorised_code_compute_the_same():
         assert case['difference'] < 1e-9, case
         assert case['numpy_ms'] > 0
         assert case['compiled_ms'] > 0
+    rows = {row['what']: row for row in result['evaluation']}
+    # The motion is one product with a matrix of 37 rows, a difference and a scalar product.
+    assert rows['motion']['value']['flops'] == 2 * 37**2 + 4 * 37 + 2
+    for kind in kernels.KINDS:
+        parts = [rows[x][kind]['flops'] for x in ('keypoints', 'pose prior', 'motion')]
+        assert 0 < sum(parts) < rows[kernels.ALL][kind]['flops']
+    assert all(row['sums']['flops'] >= row['value']['flops'] for row in rows.values())
+    assert 'of peak' in kernels.as_text(result)
 
 
 def test_a_clip_of_the_repository(clip):
