@@ -7,12 +7,9 @@ over the image terms t of `terms.registry`. `ImageLikelihood.given` is this sum 
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, field, make_dataclass, replace
-from functools import cached_property, lru_cache
-from itertools import pairwise
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -38,9 +35,9 @@ from hmt_ros.image.terms.registry import (
 from hmt_ros.image.terms.residuals import RECORDED, tree_of
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy
+from hmt_ros.inference.threads import in_threads
 
 OFF = TermSettings(0.0, 1.0, 1.0)
-MOST_THREADS = 8
 
 # One field a term of the registry, so that a new term needs no line here.
 _ImageTerms: Any = make_dataclass(
@@ -117,8 +114,8 @@ class ImageLikelihood:
         settings: of the terms.
         parts: the parts of the flesh that are compared with the image; None: all.
         occluders: the parts that hide others; None: all.
-        threads: number of threads that share poses; 0: one a core, at most `MOST_THREADS`. Results
-            do not depend on it.
+        threads: number of threads that share poses; 0: one a core, see `in_threads`. Results do not
+            depend on it.
     """
 
     body: Body
@@ -310,35 +307,3 @@ def _selected(parts: Sequence[int] | None, count: int) -> NDArray[np.bool_]:
         result[:] = False
         result[list(parts)] = True
     return result
-
-
-@lru_cache(maxsize=1)
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(MOST_THREADS, thread_name_prefix='likelihood')
-
-
-@lru_cache(maxsize=1)
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
-
-
-def in_threads(
-    work: Callable[[int, int], None], count: int, least: int = 4, threads: int = 0
-) -> None:
-    """Shares poses among threads; each is worked on alone, so the result does not depend on it.
-
-    Args:
-        work: on the poses from one number up to another.
-        count: number of poses.
-        least: number of poses that are worth a thread.
-        threads: their number at most; 0: as many as there are cores, up to `MOST_THREADS`.
-    """
-    threads = min(threads or _cores(), MOST_THREADS, count // least)
-    if threads < 2:
-        work(0, count)
-        return
-    ends = [count * i // threads for i in range(threads + 1)]
-    jobs = [_pool().submit(work, a, b) for a, b in pairwise(ends[1:])]
-    work(0, ends[1])
-    for job in jobs:
-        job.result()

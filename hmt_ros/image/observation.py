@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import cv2
@@ -17,6 +18,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.image.terms.registry import TERMS
 from hmt_ros.image.terms.silhouette import Outline
 from hmt_ros.inference.arrays import Array, Image, Mask
+from hmt_ros.inference.threads import together
 
 Box = tuple[int, int, int, int]
 
@@ -86,6 +88,7 @@ def observe(
     unsure: Mask | None = None,
     others: Mask | None = None,
     depth: NDArray[np.floating] | None = None,
+    threads: int = 0,
 ) -> Observation:
     """The evidence that an image gives to the terms of the likelihood.
 
@@ -102,6 +105,7 @@ def observe(
         others: (H, W) pixels that somebody else covers; None: none.
         depth: (H, W) depth along the axis of the camera, m; None: unknown. 0, NaN and what is out
             of range says nothing.
+        threads: that take it; 0: one a core, see `together`.
 
     Raises:
         ValueError: shapes that contradict each other.
@@ -136,12 +140,11 @@ def observe(
         np.ascontiguousarray(image[rows, columns]), left, top, mask, before, doubtful, hidden,
         None if measured is None else measured[rows, columns],
     )  # fmt: skip
-    evidence = {
-        term.name: found
-        for term in TERMS
-        if (wanted is None or term.name in wanted) and (found := term.evidence(part)) is not None
-    }
-    return Observation(known, keypoints, evidence, flow=optical_flow(part), others=others)
+    terms = [term for term in TERMS if wanted is None or term.name in wanted]
+    takes = [partial(term.evidence, part) for term in terms]
+    flow, *found = together([partial(optical_flow, part), *takes], threads)
+    evidence = {term.name: x for term, x in zip(terms, found, strict=True) if x is not None}
+    return Observation(known, keypoints, evidence, flow=flow, others=others)
 
 
 def _box(mask: Mask) -> Box:

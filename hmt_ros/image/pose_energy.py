@@ -24,7 +24,7 @@ from hmt_ros.body.kinematics import forward, placing_of
 from hmt_ros.body.pose_prior import MixturePrior, gaussian_model
 from hmt_ros.body.pose_terms import AnglePrior, FrameTerm, SelfIntersection
 from hmt_ros.body.self_intersection import overlaps_of
-from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage, in_threads
+from hmt_ros.image.likelihood import ImageLikelihood, ObservedImage
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.optical_flow import FlowInputs, FlowTerm
 from hmt_ros.image.pose_energy_kernel import NO_DESCENT, Compiled, Descent, solve
@@ -36,6 +36,7 @@ from hmt_ros.image.terms.registry import TERMS, Model
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
 from hmt_ros.inference.energy import Derivatives, Energy, Quadratic, Student, add_energies
+from hmt_ros.inference.threads import in_threads
 
 Term = TypeVar('Term')
 
@@ -185,7 +186,7 @@ class PoseEnergy:
                 value, gradient, hessian, parts, status, iterations,
             )  # fmt: skip
 
-        in_threads(work, n, 4, self.likelihood.threads)
+        in_threads(work, n, 2, self.likelihood.threads)
         if self.counted is not None:
             self.counted(n + int(iterations.sum()))
         free = ~resting(x, gradient, lower, upper)

@@ -5,21 +5,19 @@ D = (a - b)' C^-1 (a - b),     log N(a; b, C) = -1/2 (D + log |C| + d log(2 pi))
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.threads import in_threads
 
 Index = NDArray[np.int64]
 
 # Pairs whose covariances are factorised side by side.
 LANES = 4
-# How many parts the pairs are split into, from so many pairs on.
-PARTS, LEAST_SHARED = 4, 256
+# Pairs that are worth a thread.
+LEAST_SHARED = 128
 
 
 def pair_log_densities(
@@ -65,22 +63,13 @@ def _of_pairs(pairs: Index, scales: Array, *sets: Array) -> tuple[Array, Array]:
     a, big_a, b, big_b, s = (np.require(x, np.float64, ('C', 'W')) for x in (*sets, scales))
     pairs = np.require(pairs, np.int64, ('C', 'W'))
     squares, log_determinants = np.empty((2, len(pairs)))
-    # Each pair is worked out alone, so any split gives the same. A few are not worth a thread.
-    parts = PARTS if len(pairs) >= LEAST_SHARED else 1
-    edges = np.linspace(0, len(pairs), parts + 1).astype(int)
 
-    def work(part: int) -> None:
-        at = slice(edges[part], edges[part + 1])
+    def work(first: int, last: int) -> None:
+        at = slice(first, last)
         _whitened_pairs(a, big_a, b, big_b, pairs[at], s[at], squares[at], log_determinants[at])
 
-    list((threads().map if parts > 1 else map)(work, range(parts)))
+    in_threads(work, len(pairs), LEAST_SHARED)
     return squares, log_determinants
-
-
-@lru_cache(maxsize=1)
-def threads() -> ThreadPoolExecutor:
-    """The threads of the smoother's kernels."""
-    return ThreadPoolExecutor(2, thread_name_prefix='smoothing')
 
 
 @njit(cache=True, nogil=True)

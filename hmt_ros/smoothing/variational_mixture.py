@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +31,9 @@ from scipy.special import logsumexp
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.block_tridiagonal import BlockCholesky, add_band_product
 from hmt_ros.inference.energy import Derivatives
-from hmt_ros.inference.gaussian_pairs import pair_distances, threads
+from hmt_ros.inference.gaussian_pairs import pair_distances
 from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
+from hmt_ros.inference.threads import together
 from hmt_ros.smoothing.component_overlaps import NEGLIGIBLE, add_overlaps
 from hmt_ros.smoothing.likelihood import SequenceLikelihood
 
@@ -406,7 +408,7 @@ class FreeEnergy:
                 if derivatives:
                     slope[i] += pull
 
-        list(threads().map(work, range(PARTS)))
+        together([partial(work, part) for part in range(PARTS)])
         return each, slope, tuple(sum(column[1:], start=column[0]) for column in zip(*sums))
 
     def _energy(self, points: Array) -> tuple[Array, Array]:

@@ -126,6 +126,7 @@ class Observer:
             view.image, view.silhouette if validity.believes(SILHOUETTE) else None, keypoints,
             last_image=self.last_image if self._settings.flow_weight > 0 else None, wanted=wanted,
             unsure=view.unsure, others=view.others, depth=view.depth,
+            threads=self._settings.threads,
         )  # fmt: skip
         evidence = dict(found.evidence)
         depths = evidence.get(DEPTH.name)

@@ -1,0 +1,61 @@
+"""Work that is shared among threads: of what releases the interpreter lock, with the same results.
+
+Each piece is worked on alone and stays in its place, so that nothing depends on their number.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+# Threads at most, however many cores there are.
+MOST_THREADS = 8
+
+
+def in_threads(
+    work: Callable[[int, int], None], count: int, least: int = 4, threads: int = 0
+) -> None:
+    """Shares poses among threads.
+
+    Args:
+        work: on the poses from one number up to another.
+        count: number of poses.
+        least: number of poses that are worth a thread.
+        threads: their number at most; 0: as many as there are cores, up to `MOST_THREADS`.
+    """
+    threads = min(threads or _cores(), MOST_THREADS, count // least)
+    if threads < 2:
+        work(0, count)
+        return
+    ends = [count * i // threads for i in range(threads + 1)]
+    jobs = [_pool().submit(work, a, b) for a, b in pairwise(ends[1:])]
+    work(0, ends[1])
+    for job in jobs:
+        job.result()
+
+
+def together(calls: Sequence[Callable[[], Any]], threads: int = 0) -> list[Any]:
+    """Results of some calls, the first of which this thread does itself.
+
+    Args:
+        calls: none of which calls this or `in_threads`.
+        threads: as for `in_threads`.
+    """
+    if min(threads or _cores(), len(calls)) < 2:
+        return [call() for call in calls]
+    jobs = [_pool().submit(call) for call in calls[1:]]
+    return [calls[0](), *(job.result() for job in jobs)]
+
+
+@lru_cache(maxsize=1)
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(MOST_THREADS, thread_name_prefix='hmt_ros')
+
+
+@lru_cache(maxsize=1)
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
