@@ -43,7 +43,7 @@ saying_how_long() {
   (
     trap 'kill "$pause"; exit' TERM
     while true; do
-      sleep 4 &
+      sleep 3 &
       pause=$!
       wait "$pause"
       say "$what, $((SECONDS - start)) s so far"
