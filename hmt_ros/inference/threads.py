@@ -14,6 +14,13 @@ from typing import Any
 
 # Threads at most, however many cores there are.
 MOST_THREADS = 8
+_most = MOST_THREADS
+
+
+def limit_threads(count: int) -> None:
+    """Shares nothing among more threads than this in this process, whatever is asked for."""
+    global _most
+    _most = min(count, MOST_THREADS)
 
 
 def in_threads(
@@ -27,7 +34,7 @@ def in_threads(
         least: number of poses that are worth a thread.
         threads: their number at most; 0: as many as there are cores, up to `MOST_THREADS`.
     """
-    threads = min(threads or _cores(), MOST_THREADS, count // least)
+    threads = min(threads or _cores(), _most, count // least)
     if threads < 2:
         work(0, count)
         return
@@ -45,7 +52,7 @@ def together(calls: Sequence[Callable[[], Any]], threads: int = 0) -> list[Any]:
         calls: none of which calls this or `in_threads`.
         threads: as for `in_threads`.
     """
-    if min(threads or _cores(), len(calls)) < 2:
+    if min(threads or _cores(), _most, len(calls)) < 2:
         return [call() for call in calls]
     jobs = [_pool().submit(call) for call in calls[1:]]
     return [calls[0](), *(job.result() for job in jobs)]

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from hmt_ros.inference.threads import in_threads, together
+from hmt_ros.inference.threads import MOST_THREADS, in_threads, limit_threads, together
 
 
 @pytest.mark.parametrize('threads', [1, 2, 5])
@@ -52,3 +52,15 @@ def test_errors_reach_the_caller(at, threads):
     calls[at] = fail
     with pytest.raises(ValueError, match='seen'):
         together(calls, threads)
+
+
+def test_a_process_can_be_limited():
+    parts = []
+    limit_threads(1)
+    try:
+        in_threads(lambda first, last: parts.append((first, last)), 40, 2, 4)
+        own = set(together(3 * [threading.get_ident], 4))
+    finally:
+        limit_threads(MOST_THREADS)
+    assert parts == [(0, 40)]
+    assert own == {threading.get_ident()}

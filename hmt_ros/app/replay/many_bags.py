@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 from tqdm import tqdm
 
 import hmt_ros
@@ -27,6 +28,7 @@ from hmt_ros.app.command_line import INTERRUPTED
 from hmt_ros.app.progress import show_progress
 from hmt_ros.app.replay.one_bag import Tell, replay_bag
 from hmt_ros.app.replay.options import ReplayOptions, parameters_of_bag
+from hmt_ros.inference.threads import limit_threads
 from msg_tools import BagError
 from msg_tools.bags.bag_folder import unfinished_folders
 from msg_tools.bags.bag_metadata import FILE_NAME, SUFFIXES
@@ -167,11 +169,18 @@ def _by_dask(jobs: Sequence[Job], scheduler: str) -> Iterator[Outcome]:
             client = opened.enter_context(distributed.Client(address, timeout=_PATIENCE))
         except (OSError, ValueError, RuntimeError) as error:
             raise ValueError(f'--scheduler {scheduler}: {error_line(error)}') from error
-        job_of = {client.submit(replay_job, job, pure=False): job for job in jobs}
+        job_of = {client.submit(_replay_in_worker, job, pure=False): job for job in jobs}
         for future in distributed.as_completed(job_of):
             # An error of the future is one of Dask, for example a killed worker.
             fault = future.exception()
             yield future.result() if fault is None else _failed(job_of[future], fault, ())
+
+
+def _replay_in_worker(job: Job) -> Outcome:
+    """`replay_job` on one core: the others have workers of their own."""
+    limit_threads(1)
+    cv2.setNumThreads(1)
+    return replay_job(job)
 
 
 def replay_job(job: Job) -> Outcome:
