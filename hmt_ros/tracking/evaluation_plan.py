@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 LIVE, ACCURATE = 300, 400
 # Share of what is expected from which on the motion of the heaviest mode is surprising: the motion
 # prior is wider than most motions. And how many times the budget such an image has.
-SURPRISING, MORE = 0.4, 4
+SURPRISING, MORE = 0.3, 4
 # Below this budget no limb is searched.
 LEAST_SEARCHED = 100
 
