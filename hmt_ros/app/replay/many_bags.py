@@ -7,6 +7,7 @@ this package) and whether it is complete. The record is written before and after
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import hashlib
 import importlib
@@ -58,6 +59,10 @@ class Job(NamedTuple):
     target: Path
     options: ReplayOptions
     shows: bool = False
+
+
+# Parameters of glibc's mallopt and their values, bytes: see `_keep_memory`.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = (-1, 256 << 20), (-3, 32 << 20)
 
 
 @dataclass(frozen=True)
@@ -180,7 +185,20 @@ def _replay_in_worker(job: Job) -> Outcome:
     """`replay_job` on one core: the others have workers of their own."""
     limit_threads(1)
     cv2.setNumThreads(1)
+    _keep_memory()
     return replay_job(job)
+
+
+def _keep_memory() -> None:
+    """Has the C library keep the memory of an image for the next one.
+
+    Dask starts workers with an environment in which it gives all back at once: a third of their
+    time the system then fills pages with zeros.
+    """
+    mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)  # glibc has it
+    if mallopt is not None:
+        for parameter, value in (_TRIM_THRESHOLD, _MMAP_THRESHOLD):
+            mallopt(parameter, value)
 
 
 def replay_job(job: Job) -> Outcome:
