@@ -1,7 +1,7 @@
 """kernels: what is compiled against vectorised numpy, and what an evaluation of a pose computes.
 
-An evaluation is told term by term, with its share of the peak of one core: the rate of a product of
-matrices.
+Of an evaluation each term has a row, with its share of the peak of one core, which is the rate of a
+product of matrices.
 """
 
 from __future__ import annotations

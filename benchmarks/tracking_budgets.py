@@ -58,7 +58,7 @@ def budgets(runs: Sequence[Run], processes: int = 0) -> list[dict[str, Any]]:
 
 
 def _with(budget: int, one: Run) -> Run:
-    """The run with a budget; the usual one is no change, so that kept runs are found."""
+    """The run with a budget. The usual budget changes no setting: records of usual runs serve."""
     return one if budget == ACCURATE else replace(one, changes=(('evaluation_budget', budget),))
 
 
