@@ -50,8 +50,10 @@ saying_how_long() {
     done
   ) 9<&- &
   ticker=$!
-  "$@"
+  local code=0
+  "$@" || code=$?
   stop_ticker
+  return $code
 }
 
 stop_ticker() {
@@ -213,7 +215,7 @@ stage_build() {
 
 # The kernels of the sources, which commands run in this folder use, and of the installed package.
 stage_kernels() {
-  local key log
+  local key log installed
   key=$("$venv/bin/python" -c 'from pathlib import Path; import hmt_ros.compiled_code as code
 for place in Path("."), *Path("install").glob("hmt_ros/lib/*/site-packages"):
     print(code.folder_of((place / "hmt_ros").resolve()))')
@@ -221,8 +223,9 @@ for place in Path("."), *Path("install").glob("hmt_ros/lib/*/site-packages"):
   say 'compiling kernels, once after an update (a minute or two)'
   log=$(mktemp)
   compile_in / --quiet >"$log" 2>&1 &
+  installed=$!
   compile_in . || fail 'the kernels could not be compiled'
-  wait $! || fail "the kernels of the installed package could not be compiled:"$'\n'"$(cat "$log")"
+  saying_how_long 'waiting for the kernels of the installed package' wait "$installed" || fail "the kernels of the installed package could not be compiled:"$'\n'"$(cat "$log")"
   rm "$log"
   echo "$key" >"$stamps/kernels"
 }
