@@ -106,7 +106,7 @@ def main(argv: list[str]) -> int:
     )  # fmt: skip
     parser.add_argument(
         '--parts', nargs='+', choices=PARTS,
-        help='all but the last three, or none where settings or checkouts are compared',
+        help=f'{_listed(USUAL_PARTS)}; none where settings or checkouts are compared',
     )  # fmt: skip
     parser.add_argument(
         '--against', nargs='+', default=(), metavar='SETTING=VALUE',

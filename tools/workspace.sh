@@ -225,7 +225,8 @@ for place in Path("."), *Path("install").glob("hmt_ros/lib/*/site-packages"):
   compile_in / --quiet >"$log" 2>&1 &
   installed=$!
   compile_in . || fail 'the kernels could not be compiled'
-  saying_how_long 'waiting for the kernels of the installed package' wait "$installed" || fail "the kernels of the installed package could not be compiled:"$'\n'"$(cat "$log")"
+  saying_how_long 'waiting for the kernels of the installed package' wait "$installed" ||
+    fail "the kernels of the installed package could not be compiled:"$'\n'"$(cat "$log")"
   rm "$log"
   echo "$key" >"$stamps/kernels"
 }

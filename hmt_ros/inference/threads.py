@@ -46,16 +46,20 @@ def in_threads(
 
 
 def together(calls: Sequence[Callable[[], Any]], threads: int = 0) -> list[Any]:
-    """Results of some calls, the first of which this thread does itself.
+    """Results of some calls, shared among threads as poses are.
 
     Args:
         calls: none of which calls this or `in_threads`.
         threads: as for `in_threads`.
     """
-    if min(threads or _cores(), _most, len(calls)) < 2:
-        return [call() for call in calls]
-    jobs = [_pool().submit(call) for call in calls[1:]]
-    return [calls[0](), *(job.result() for job in jobs)]
+    results: list[Any] = [None] * len(calls)
+
+    def work(first: int, last: int) -> None:
+        for i in range(first, last):
+            results[i] = calls[i]()
+
+    in_threads(work, len(calls), 1, threads)
+    return results
 
 
 @lru_cache(maxsize=1)

@@ -38,6 +38,15 @@ def test_results_stay_in_their_place(threads):
     assert together([], threads) == []
 
 
+@pytest.mark.parametrize('threads', [1, 2, 3])
+def test_calls_use_no_more_threads_than_they_may(threads):
+    def working():
+        time.sleep(0.01)
+        return threading.get_ident()
+
+    assert len(set(together(6 * [working], threads))) <= threads
+
+
 def test_one_thread_is_the_callers_own():
     assert set(together(3 * [threading.get_ident], 1)) == {threading.get_ident()}
 

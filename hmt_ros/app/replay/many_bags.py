@@ -192,8 +192,8 @@ def _replay_in_worker(job: Job) -> Outcome:
 def _keep_memory() -> None:
     """Has the C library keep the memory of an image for the next one.
 
-    Dask starts workers with an environment in which it gives all back at once: a third of their
-    time the system then fills pages with zeros.
+    Dask starts workers with an environment in which it gives all back at once: more than a quarter
+    of their time the system then fills pages with zeros.
     """
     mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)  # glibc has it
     if mallopt is not None:
