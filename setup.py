@@ -191,6 +191,7 @@ setup(
     extras_require={
         'test': ['pytest', 'hypothesis'],
         'dask': ['distributed'],
+        'learning': ['jax', 'optax'],
         'mediapipe': ['mediapipe==0.10.21'],
     },
     zip_safe=False,
@@ -203,6 +204,7 @@ setup(
             'people_node = hmt_ros.nodes.people_node:main',
             'track-video = hmt_ros.app.track_video:main',
             'import-video = hmt_ros.app.import_video.command:main',
+            'lift = hmt_ros.app.lift:main',
             'subject = hmt_ros.app.subject:main',
             'keypoints_node = hmt_ros.nodes.keypoints_node:main',
             'keypoints_adapter_node = hmt_ros.nodes.keypoints_adapter_node:main',
@@ -215,6 +217,7 @@ setup(
             'train = hmt_ros.app.train:main',
             'learn-prior = hmt_ros.app.learn_prior:main',
             'learn-motion = hmt_ros.app.learn_motion:main',
+            'learn-lifter = hmt_ros.app.learn_lifter:main',
             'learn-lengths = hmt_ros.app.learn_lengths:main',
             'report = hmt_ros.app.report.command:main',
             'evaluate = hmt_ros.app.evaluate:main',

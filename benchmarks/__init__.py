@@ -21,6 +21,7 @@ BENCHMARKS = {
     'keypoint_noise': 'where landmarks of a detector lie on the body, and how they err',
     'kernels': 'the compiled likelihood against vectorised numpy',
     'kjs': 'kinematic jumps against random sampling at finding minima',
+    'lifting': 'poses from keypoints alone, on clips with truth',
     'live': 'the nodes at the images of a camera that does not wait for them',
     'motion_prior': 'how well the motion prior predicts motions of other people',
     'nodes': 'images at the rate of a camera, through DDS',

@@ -3,9 +3,9 @@
 The poses of the body, with the true lengths, that come nearest to the true joints of rendered
 clips. Of every landmark the offset from its joint, in the frame of the joint's segment, that
 explains the detector's pixels best (robust least squares, both sides mirrored onto the right); the
-deviations that are left, in m at the person, by confidence and from image to image; slopes of the
-bones that the detector lifts; how often it takes left for right. What was made of it stands in
-`hmt_ros/image/keypoint_schemes.yaml`.
+deviations that are left, in m at the person, by confidence and from image to image, and how much of
+their variance lasts; depths of the joints that the detector lifts; how often it takes left for
+right. What was made of it stands in `hmt_ros/image/keypoint_schemes.yaml`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 from benchmarks.clips import SCHEME, Clip, read_clip, read_detections, table, with_file
 from benchmarks.command import benchmark_parser, show, told
@@ -26,7 +27,9 @@ from benchmarks.machine import description
 from benchmarks.tracking_oracle import STARTS, best_poses, with_true_lengths
 from hmt_ros.body import Body, load_body
 from hmt_ros.body.kinematics import forward
+from hmt_ros.experts.lifter import lifted_positions
 from hmt_ros.image.keypoint_schemes import MIRROR, schemes
+from hmt_ros.image.lifted_poses import HIPS
 from hmt_ros.image.terms.keypoints import EXCHANGED, Keypoints, KeypointTerm
 from hmt_ros.tracking import read_subject
 from hmt_ros.tracking.initialisation import start_from_keypoints
@@ -42,6 +45,8 @@ BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0001)
 IMAGES_APART = (1, 2, 5, 10, 20)
 # Deviations count up to this in correlations, m.
 FURTHEST = 0.1
+# Images a second of the clips; median of the absolute of a Gaussian, in deviations.
+RATE, MEDIAN = 30.0, 0.6745
 KINDS = ('none', 'all', 'arms', 'legs')
 # Fewer are no sample.
 FEWEST = 20
@@ -68,11 +73,11 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Clips:
-    """What was found in clips: landmarks, exchanges image by image, slopes by bone."""
+    """What was found in clips: landmarks, exchanges image by image, errors of depths by joint."""
 
     seen: list[Seen]
     exchanges: list[NDArray[np.intp]]
-    slopes: list[tuple[str, Array]]
+    depths: list[tuple[str, Array]]
 
 
 def measured(folder: Path) -> Clips:
@@ -93,7 +98,7 @@ def measured(folder: Path) -> Clips:
     )
     return Clips(
         _landmarks(body, clip, stamps, poses, found, exchanges), [exchanges],
-        _slopes(body, clip, found, poses, exchanges),
+        _depths(body, clip, found, poses, exchanges),
     )  # fmt: skip
 
 
@@ -168,24 +173,24 @@ def read_raw(folder: Path, stamps: Sequence[int]) -> tuple[dict[str, Array], dic
     )
 
 
-def _slopes(
+def _depths(
     body: Body,
     clip: Clip,
     found: Sequence[Keypoints],
     poses: Array,
     exchanges: NDArray[np.intp],
 ) -> list[tuple[str, Array]]:
-    """Measured less true slopes of the bones that were lifted, by segment."""
-    result = []
+    """Measured less true depths of the joints that were lifted, from the hips, by joint, m."""
+    skeleton, result = body.skeleton, []
+    hips = skeleton.joint_index(HIPS)
     for keypoints, pose, exchange in zip(found, poses, exchanges, strict=True):
-        if exchange != 0:
+        lifted = lifted_positions(clip.camera, keypoints) if exchange == 0 else None
+        if lifted is None:
             continue
-        slopes = _term(body, clip, keypoints, pose).measured.slopes
-        columns = forward(body.skeleton, pose[None]).by_pose()[0][0]
-        own = slopes.segments[:, 0]
-        directions = np.einsum('bci,bc->bi', columns[own], slopes.directions[:, 0])
-        errors = slopes.slopes - (directions * slopes.rays).sum(1)
-        names = [body.skeleton.segment_names[s].split('_', 1)[-1] for s in own]
+        joints = body.joint_positions(pose[None])[0]
+        true = (joints[skeleton.joint_index(lifted.joints)] - joints[hips].mean(0)) @ lifted.axes[2]
+        errors = lifted.sized(skeleton)[0, :, 2] - true
+        names = [name.rpartition('_')[2] for name in lifted.joints]
         result += [(name, np.array([error])) for name, error in zip(names, errors, strict=True)]
     return result
 
@@ -217,7 +222,7 @@ def correlation(errors: Sequence[Array], images: Sequence[NDArray[np.intp]], apa
 
 
 def summary(found: Sequence[Clips]) -> dict[str, Any]:
-    """Offsets, deviations, correlations, slopes and exchanges of clips."""
+    """Offsets, deviations, correlations, depths and exchanges of clips."""
     every = [seen for clip in found for seen in clip.seen]
     landmarks, left, confidences, images = {}, [], [], []
     for name in dict.fromkeys(seen.name for seen in every):
@@ -248,19 +253,21 @@ def summary(found: Sequence[Clips]) -> dict[str, Any]:
                     'rms': float(np.sqrt((inside**2).mean())),
                 }
             )
-    slopes: dict[str, list[float]] = {}
+    depths: dict[str, list[float]] = {}
     for clip in found:
-        for name, error in clip.slopes:
-            slopes.setdefault(name, []).append(float(error[0]))
+        for name, error in clip.depths:
+            depths.setdefault(name, []).append(float(error[0]))
     moves = np.zeros((len(KINDS), len(KINDS)))
     for clip in found:
         for kinds in clip.exchanges:
             np.add.at(moves, (kinds[:-1], kinds[1:]), 1.0)
+    correlations = {str(n): correlation(left, images, n) for n in IMAGES_APART}
     return {
         'landmarks': landmarks,
         'noise': bins,
-        'correlations': {str(n): correlation(left, images, n) for n in IMAGES_APART},
-        'slopes': {name: float(np.sqrt(np.square(x).mean())) for name, x in slopes.items()},
+        'correlations': correlations,
+        'lasting': lasting_shares(correlations),
+        'depths': {name: float(np.median(np.abs(x)) / MEDIAN) for name, x in depths.items()},
         'exchanges': {
             name: {
                 'share': float(row.sum() / moves.sum()),
@@ -269,6 +276,25 @@ def summary(found: Sequence[Clips]) -> dict[str, Any]:
             for name, row in zip(KINDS, moves, strict=True)
         },
     }
+
+
+def lasting_shares(correlations: dict[str, float]) -> dict[str, float]:
+    """Shares of the variance that differ from image to image, last for `time` s, and stay.
+
+    The least squares that keep all shares positive, at the time that fits best.
+    """
+    gaps = np.array([int(n) for n in correlations]) / RATE
+    wanted = np.array(list(correlations.values()))
+    best: tuple[float, dict[str, float]] = (np.inf, {})
+    for time in np.arange(0.05, 1.01, 0.05):
+        basis = np.stack([np.exp(-gaps / time), np.ones(len(gaps))], axis=1)
+        shares, misfit = nnls(basis, wanted)
+        if misfit < best[0]:
+            lasting, constant = shares.tolist()
+            white = max(1.0 - lasting - constant, 0.0)
+            found = {'white': white, 'lasting': lasting, 'constant': constant, 'time': float(time)}
+            best = misfit, found
+    return best[1]
 
 
 def robust_sigma(errors: Array) -> float:
@@ -312,14 +338,16 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     ]
     lasting = [['images apart', *result['correlations']]]
     lasting += [['correlation', *(f'{x:.2f}' for x in result['correlations'].values())]]
-    slopes = [['bone', 'rms error of the slope']]
-    slopes += [[name, f'{x:.2f}'] for name, x in result['slopes'].items()]
+    shares = [['errors', *result['lasting']]]
+    shares += [['share; s', *(f'{x:.2f}' for x in result['lasting'].values())]]
+    depths = [['joint', 'deviation of the depth by the median, mm']]
+    depths += [[name, mm(x)] for name, x in result['depths'].items()]
     exchanges = [['exchanged', 'share', *(f'then {name}' for name in KINDS)]]
     exchanges += [
         [name, f'{row["share"]:.3f}', *(f'{x:.3f}' for x in row['next'])]
         for name, row in result['exchanges'].items()
     ]
-    parts = (landmarks, noise, lasting, slopes, exchanges)
+    parts = (landmarks, noise, lasting, shares, depths, exchanges)
     return '\n\n'.join(table(rows, markdown=markdown) for rows in parts)
 
 

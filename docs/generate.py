@@ -38,6 +38,7 @@ PAGES = {
     'error_model': 'tracking.md',
     'gate': 'tracking.md',
     'joint_errors': 'body.md',
+    'lifting': 'lifting.md',
     'keypoint_noise': 'keypoints.md',
     'motion_prior': 'motion_prior.md',
     'people': 'people.md',

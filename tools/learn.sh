@@ -17,6 +17,7 @@ export HMT_SHARED=$data
 mirrored=(cmu_13_traffic cmu_12_0x_walk cmu_signals_a1 cmu_signals_a2 cmu_run_a)
 thanks='The data used in this project was obtained from mocap.cs.cmu.edu. The database was created with funding from NSF EIA-0196217.'
 source='CMU Graphics Lab Motion Capture Database, http://mocap.cs.cmu.edu: free for all uses; the data themselves may not be resold, even in converted form.'
+prmd='Motions prmd_* are of UI-PRMD, public domain.'
 people=("$mocap"/index.csv "$mocap"/train_more/index.csv)
 
 learn() {  # name of the result, then the command
@@ -33,4 +34,10 @@ learn contour_noise benchmarks contour_noise
 learn error_model benchmarks error_model
 learn joint_errors benchmarks joint_errors
 learn experts hmt_ros train --motions procedural --samples 1800 -o "$out/procedural.npz" --overwrite
+if python -c 'import jax, optax' 2>/dev/null; then
+  learn lifter hmt_ros learn-lifter "$mocap"/train "$mocap"/train_more "$mocap"/train_wide --without "${mirrored[@]}" \
+    --alike prmd --test "$mocap"/dev --acknowledgement "$source $thanks $prmd" -o "$out/keypoints.npz" --overwrite
+else
+  echo "learn: lifter left out: it needs jax and optax" >&2
+fi
 echo "learn: done; $out has the files and tables to compare with those that ship"

@@ -15,6 +15,7 @@ COMMANDS = {
         'hmt_ros.app.import_video.command',
         'write a video and the keypoints of a detector into a bag',
     ),
+    'lift': ('hmt_ros.app.lift', 'tell the poses of a person from keypoints alone'),
     'subject': ('hmt_ros.app.subject', 'write the start of a track from keypoints in a bag'),
     'replay': (
         'hmt_ros.app.replay.command',
@@ -37,6 +38,10 @@ COMMANDS = {
     'learn-motion': (
         'hmt_ros.app.learn_motion',
         'learn how poses move, from recorded motions',
+    ),
+    'learn-lifter': (
+        'hmt_ros.app.learn_lifter',
+        'learn experts that tell depths from keypoints, from recorded motions',
     ),
     'learn-lengths': (
         'hmt_ros.app.learn_lengths',

@@ -96,7 +96,7 @@ def _learn(options: LearningOptions) -> int:
     if not output.parent.is_dir():
         raise ValueError(f'there is no folder {output.parent} for {output.name}')
     body = load_body(options.body)
-    paths = _chosen(options)
+    paths = chosen_motions(options.motions, options.without)
     quiet = options.quiet
     shown = with_progress(paths, 'reading', 'motions', len(paths), quiet=quiet)
     read = [_sequence(path, body) for path in shown]
@@ -115,10 +115,14 @@ def _learn(options: LearningOptions) -> int:
     return 0
 
 
-def _chosen(options: LearningOptions) -> list[Path]:
-    """The motion files, without those that are left out."""
+def chosen_motions(motions: list[Path], without: list[str]) -> list[Path]:
+    """Motion files, and those in folders, but some names of files without suffix.
+
+    Raises:
+        ValueError: a file that is no motion, a folder without any, or a name that there is not.
+    """
     found: list[Path] = []
-    for path in options.motions:
+    for path in motions:
         if path.is_dir():
             found += motion_files(path)
         elif path.suffix.lower() in MOTION_SUFFIXES:
@@ -126,10 +130,10 @@ def _chosen(options: LearningOptions) -> list[Path]:
         else:
             raise ValueError(f'{path}: wanted a folder or a motion ({", ".join(MOTION_SUFFIXES)})')
     names = {path.stem for path in found}
-    unknown = [name for name in options.without if name not in names]
+    unknown = [name for name in without if name not in names]
     if unknown:
         raise ValueError(f'--without: there is no motion {unknown[0]!r}')
-    return [path for path in found if path.stem not in options.without]
+    return [path for path in found if path.stem not in without]
 
 
 def _sequence(path: Path, body: Body) -> PoseSequence | None:

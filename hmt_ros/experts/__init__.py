@@ -1,4 +1,4 @@
-"""Experts: pose mixtures predicted from one image (BME)."""
+"""Experts: pose mixtures predicted from one image, or from a window of keypoints (BME)."""
 
 from hmt_ros.experts.calibrated_experts import CalibratedExperts
 from hmt_ros.experts.conditional_density import ConditionalDensity
@@ -8,6 +8,8 @@ from hmt_ros.experts.expert_mixture import (
     JointExperts,
     RelevanceVectorRegression,
 )
+from hmt_ros.experts.lifted_fit import lift_poses
+from hmt_ros.experts.lifter import Lifter, load_lifter
 from hmt_ros.experts.neighbour_models import LocalExperts, NearestNeighbours
 from hmt_ros.experts.pose_predictor import PosePredictor, load_predictor
 
@@ -16,10 +18,13 @@ __all__ = [
     'ConditionalDensity',
     'ConditionalExperts',
     'JointExperts',
+    'Lifter',
     'LocalExperts',
     'NearestNeighbours',
     'PosePredictor',
     'RelevanceVectorRegression',
+    'lift_poses',
+    'load_lifter',
     'load_predictor',
     'propagate',
     'propagate_by_dynamics',

@@ -300,11 +300,11 @@ def _views(count: int, s: TrainingSettings, rng: np.random.Generator) -> Array:
     heading = rng.uniform(-np.pi, np.pi, count)
     elevation = np.radians(np.clip(rng.normal(s.elevation, s.elevation_spread, count), -20.0, 50.0))
     roll = np.radians(rng.normal(0.0, s.roll_spread, count))
-    result: Array = _about(2, roll) @ _about(0, elevation) @ _about(1, heading)
+    result: Array = about(2, roll) @ about(0, elevation) @ about(1, heading)
     return result
 
 
-def _about(axis: int, angle: Array) -> Array:
+def about(axis: int, angle: Array) -> Array:
     """Rotations (N, 3, 3) about an axis of the camera frame."""
     i, j = (axis + 1) % 3, (axis + 2) % 3
     result = np.zeros((len(angle), 3, 3))
@@ -403,7 +403,7 @@ def seen_from(
     x, _, z = root_rotations(body, poses)[:, :, 1].mean(0)
     turn = np.arctan2(z, x) + 0.5 * np.pi - np.radians(heading)
     down = np.full(len(poses), np.radians(elevation))
-    view = _about(0, down) @ _about(1, np.full(len(poses), turn))
+    view = about(0, down) @ about(1, np.full(len(poses), turn))
     poses, _ = _seen(body, poses, poses, view, np.full(len(poses), distance))
     rng = np.random.default_rng(seed)
     drawn = render_silhouettes(body, poses, _fitting_camera(body, poses))

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from hmt_ros.body.skeleton import other_side
 from hmt_ros.inference.arrays import Array
 from msg_tools.files.plain_yaml import read_plain_yaml
 
@@ -39,29 +38,6 @@ class Landmark:
     joint: str
     offset: Array
     sigma: float
-
-
-@dataclass(frozen=True)
-class SlopeModel:
-    """A bone of a lifted skeleton whose slope against the line of sight is a measurement.
-
-    Attributes:
-        segment: of the body that it is fixed to.
-        ends: names of the joints from which and to which it goes; `mid_x` is between the left and
-            the right x.
-        sigma: standard deviation of the cosine of its angle with the line of sight.
-        sign: of the slope where sides are exchanged, against that of the bone of the other side.
-    """
-
-    segment: str
-    ends: tuple[str, str]
-    sigma: float
-    sign: float
-
-    def mirrored(self) -> SlopeModel:
-        """The bone of the other side."""
-        first, last = map(other_side, self.ends)
-        return SlopeModel(other_side(self.segment), (first, last), self.sigma, self.sign)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,24 +67,29 @@ def _table() -> Any:
 
 
 @cache
-def schemes() -> Mapping[str, Scheme]:
-    """All schemes by name."""
-    content = _table()
-    landmarks: dict[str, Landmark] = {}
-    for template, entry in content['landmarks'].items():
+def landmarks() -> Mapping[str, Landmark]:
+    """All landmarks by their canonical names."""
+    result: dict[str, Landmark] = {}
+    for template, entry in _table()['landmarks'].items():
         for side in SIDES if '{side}' in template else SIDES[:1]:
             name = template.format(side=side)
             offset = np.array(entry.get('offset', (0.0, 0.0, 0.0)), dtype=np.float64)
             joint = entry.get('joint', '').format(side=side)
             sigma = float(entry.get('sigma', 0.0))
-            landmarks[name] = Landmark(
+            result[name] = Landmark(
                 name, joint, offset * MIRROR if side == 'left' else offset, sigma
             )
+    return result
+
+
+@cache
+def schemes() -> Mapping[str, Scheme]:
+    """All schemes by name."""
     result = {}
-    for scheme, entries in content['schemes'].items():
+    for scheme, entries in _table()['schemes'].items():
         pairs = [next(iter(x.items())) if isinstance(x, dict) else (x, x) for x in entries]
         names = tuple(name for name, _ in pairs)
-        result[scheme] = Scheme(scheme, names, tuple(landmarks[x] for _, x in pairs))
+        result[scheme] = Scheme(scheme, names, tuple(landmarks()[x] for _, x in pairs))
     return result
 
 
@@ -134,13 +115,13 @@ def scheme_of(names: Sequence[str], scheme: str = AUTO) -> Scheme | None:
 
 
 def recognised(names: Sequence[str]) -> Scheme | None:
-    """The scheme that has all of the names, the smallest, if it has points of a face among them.
+    """The scheme that has all of the names, the smallest, if a face or a spine is among them.
 
     Limbs and trunk have the same names everywhere: alone they are taken for joints.
     """
     fitting = [x for x in schemes().values() if set(names) <= set(x.names)]
     found = min(fitting, key=lambda x: len(x.names), default=None)
-    return found if 'nose' in names else None
+    return found if {'nose', 'spine1'} & {*names} else None
 
 
 def landmarks_of(
@@ -169,23 +150,68 @@ def landmark_called(name: str) -> Landmark | None:
     return next((landmark for landmark in found if landmark is not None), None)
 
 
-@cache
-def slope_models() -> tuple[SlopeModel, ...]:
-    """The bones of lifted skeletons."""
-    result = []
-    for segment, first, last, sigma, sign in _table()['slopes']:
-        for side in SIDES if '{side}' in segment else SIDES[:1]:
-            ends = (first.format(side=side), last.format(side=side))
-            segment_name = segment.format(side=side)
-            result.append(SlopeModel(segment_name, ends, float(sigma), float(sign)))
-    return tuple(result)
-
-
 def noise_of(confidences: Array) -> Array:
     """Standard deviations (n,) of keypoints of some confidences (n,), m at the person."""
     model = _table()['noise']
     result: Array = np.interp(confidences, model['confidence'], model['sigma'])
     return result
+
+
+@dataclass(frozen=True)
+class DetectorErrors:
+    """How a detector errs: what experts learn with.
+
+    Attributes:
+        sigma: Standard deviation of a keypoint that is sure, m at the person.
+        spread: Standard deviation of its logarithm over persons.
+        white, lasting, constant: Shares of the variance of errors that differ from image to image,
+            that last for `time`, and that stay.
+        time: Time for which the second kind lasts, s.
+        hidden, always_hidden: Shares of the landmarks that are unsure for a while, and always.
+        hidden_time: Half of that while, s.
+        hidden_factor: Largest factor on the errors of an unsure landmark.
+        heavy: Share of the landmarks that err as much and do not say so.
+        unconfident: Share of detectors that have no confidences.
+        missing: Share of landmarks, of single keypoints and of images that are missing.
+        cut: Share of windows in which the border of the image cuts the person.
+        exchanged: Shares of windows where nothing, all, arms, legs are called by the other side.
+        exchange_time: Half of the time for which they are, s; half of them stay.
+    """
+
+    sigma: float
+    spread: float
+    white: float
+    lasting: float
+    constant: float
+    time: float
+    hidden: float
+    always_hidden: float
+    hidden_time: float
+    hidden_factor: float
+    heavy: float
+    unconfident: float
+    missing: float
+    cut: float
+    exchanged: tuple[float, ...]
+    exchange_time: float
+
+
+@cache
+def position_deviations(scheme: str | None) -> Mapping[str, float]:
+    """Standard deviations of depths that a detector says, by the kind of the joint, m.
+
+    Args:
+        scheme: name of the detector's; None or one that was not measured: the usual ones.
+    """
+    content = _table()['positions']
+    return {**content['usual'], **content.get(scheme, {})}
+
+
+@cache
+def detector_errors() -> DetectorErrors:
+    """How detectors err."""
+    content = dict(_table()['errors'])
+    return DetectorErrors(exchanged=tuple(content.pop('exchanged')), **content)
 
 
 @cache

@@ -154,7 +154,11 @@ class ImageLikelihood:
         return (image, self.keypoint_term(observation, exchanges))
 
     def keypoint_term(
-        self, observation: Observation, exchanges: Array | None, share: float = 1.0
+        self,
+        observation: Observation,
+        exchanges: Array | None,
+        share: float = 1.0,
+        lifted_share: float = 1.0,
     ) -> KeypointTerm:
         """The term of the keypoints of an observation that has some.
 
@@ -162,6 +166,7 @@ class ImageLikelihood:
             observation: of the image.
             exchanges: of sides, see `KeypointTerm`; None: as usual for detectors.
             share: of the energy that counts, beside what is known of the exchanges.
+            lifted_share: the same of the energy of lifted poses.
         """
         assert observation.keypoints is not None
         exchanges = usual_exchanges() if exchanges is None else exchanges
@@ -169,7 +174,7 @@ class ImageLikelihood:
             self.body.skeleton, self.camera, observation.keypoints,
             replace(self.settings.keypoints, weight=share * self.settings.keypoints.weight),
             observation.magnification, exchanges,
-            None if observation.beliefs is None else observation.beliefs.keypoints,
+            None if observation.beliefs is None else observation.beliefs.keypoints, lifted_share,
         )  # fmt: skip
 
     @cached_property

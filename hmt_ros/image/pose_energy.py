@@ -31,7 +31,7 @@ from hmt_ros.image.pose_energy_kernel import NO_DESCENT, Compiled, Descent, solv
 from hmt_ros.image.surface_points import SurfacePoints
 from hmt_ros.image.terms.image_term import NO_MAP
 from hmt_ros.image.terms.keypoint_kernel import KeypointInputs, Points
-from hmt_ros.image.terms.keypoints import NO_SLOPES, KeypointTerm
+from hmt_ros.image.terms.keypoints import NOT_LIFTED, KeypointTerm
 from hmt_ros.image.terms.registry import TERMS, Model
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum, minimise, resting
@@ -319,7 +319,7 @@ _ONE, _SURE = np.zeros(1), np.zeros((1, 1))
 
 def _no_keypoints(model: Model) -> KeypointInputs:
     return KeypointInputs(
-        _NO_POINTS, NO_SLOPES, model.tree, model.lens, 1.0, _ONE, _AS_CALLED, _SURE
+        _NO_POINTS, NOT_LIFTED, model.tree, model.lens, 1.0, _ONE, _AS_CALLED, _SURE
     )
 
 

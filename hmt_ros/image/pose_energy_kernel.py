@@ -166,7 +166,7 @@ def _add_terms(compiled, number, row, exact, room, gradient, hessian):  # type: 
                 hessian[0],
             )  # fmt: skip
     keypoints = compiled.keypoints
-    if len(keypoints.points.groups) + len(keypoints.slopes.groups) > 0:
+    if len(keypoints.points.groups) > 0 or keypoints.lifted.weight > 0.0:
         own = row if len(keypoints.log_priors) > 1 else 0
         add_keypoints(
             keypoints, keypoints.log_priors[own : own + 1], columns, origins, axes, dof_origins,

@@ -87,12 +87,14 @@ def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:
 TOGETHER = 0.29
 
 # Chosen, not learned, at 30 and 3 images a second (docs/tracking.md). The prior of the pose is
-# counted like a cue, because the same pose is judged again in every image. `shape` is what an image
-# says of lengths and flesh: poses that differ tell of these apart, whatever error they share.
+# counted like a cue, because the same pose is judged again in every image. `lifted` is what experts
+# say of depths, beside a weight of their own. `shape` is what an image says of lengths and flesh:
+# poses that differ tell of these apart, whatever error they share.
 ERRORS: Mapping[str, CueErrors] = MappingProxyType(
     {
         'image': CueErrors(0.15, 0.019),
         'keypoints': CueErrors(0.35, 0.053),
+        'lifted': CueErrors(1.0, 0.067),
         'prior': CueErrors(0.15, 0.019),
         'shape': CueErrors(0.35, 0.053),
     }

@@ -21,8 +21,10 @@ from hmt_ros.nodes.subscribed_topic import (
 )
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import TRACK, BmeSession
+from hmt_ros.sessions.keypoint_inputs import KEYPOINTS
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.cdr import serialise
+from msg_tools.messages.keypoints import KEYPOINTS_2D
 
 
 class BmeNode(SessionNode[BmeSession, BmeParameters]):
@@ -40,6 +42,9 @@ class BmeNode(SessionNode[BmeSession, BmeParameters]):
         yield CAMERA_INFO_TOPIC
         if self._settings.tracked_interval > 0:
             yield SubscribedTopic(TRACK, TRACK, 'hmt_msgs/msg/PoseMixture', RELIABLE)
+        if self._settings.use_keypoints:
+            yield SubscribedTopic(KEYPOINTS, KEYPOINTS, KEYPOINTS_2D)
+            return
         yield from MASK_TOPICS
         yield image_topic(self._settings.image_transport)
 

@@ -10,7 +10,9 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 
+from hmt_ros.experts.lifter import SHIPPED as LIFTER
 from hmt_ros.image.background import BackgroundSettings
+from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, schemes
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     NEXT_CONFIGURE,
@@ -35,6 +37,11 @@ class BmeParameters(CameraNodeParameters):
             where there is no background_file.
         stature: Height of the person, m; 0 selects that of the model.
         least_height: Minimum height of a silhouette that counts as a person, px.
+        use_keypoints: If true, poses are predicted from the keypoints of a detector (topic
+            keypoints) instead of silhouettes: no image is needed.
+        keypoint_scheme: What the names of keypoints mean, as for filter_node.
+        lifter: Experts that predict from keypoints, 'keypoints', which ships, or a file that
+            learn-lifter wrote.
         propagate: If true, a prediction also depends on the poses in the image before.
         longest_interval: Maximum interval without a person after which the images before are still
             taken into account, s.
@@ -49,6 +56,9 @@ class BmeParameters(CameraNodeParameters):
     background_images: int = parameter_field(30, AT_ONCE, (1, 10_000))
     stature: float = parameter_field(0.0, NEXT_CONFIGURE, (0.0, 3.0))
     least_height: int = parameter_field(40, AT_ONCE, (1, 10_000))
+    use_keypoints: bool = parameter_field(False, NEXT_CONFIGURE)
+    keypoint_scheme: str = parameter_field(AUTO, NEXT_CONFIGURE)
+    lifter: str = parameter_field(LIFTER, NEXT_CONFIGURE)
     propagate: bool = parameter_field(False, AT_ONCE)
     longest_interval: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
     max_hypotheses: int = parameter_field(5, AT_ONCE, (1, 64))
@@ -57,6 +67,14 @@ class BmeParameters(CameraNodeParameters):
         default_factory=BackgroundSettings,
         metadata=nested_parameters(NEXT_CONFIGURE, BACKGROUND, 'background.'),
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        known = (AUTO, JOINTS, *schemes())
+        if self.keypoint_scheme not in known:
+            raise ValueError(
+                f'keypoint_scheme must be one of {known}, saw {self.keypoint_scheme!r}'
+            )
 
 
 if __name__ == '__main__':

@@ -18,6 +18,9 @@ order give the same bytes. The rules, besides those of `CameraSession`:
   with `reset_on_time_jump`.
 - With `propagate` a prediction takes the one before into account, unless this is older than
   `longest_interval`, comes from another calibration, or from before a jump in time.
+- With `use_keypoints` every message of keypoints gets one prediction, from them and those of the
+  last second (`experts.lifter`), in place of the images; without components where fewer than five
+  landmarks are seen.
 - What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
@@ -35,10 +38,13 @@ from numpy.typing import NDArray
 from hmt_ros.body import Camera
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
+from hmt_ros.experts.lifted_fit import KNOWN_SIZE, UNKNOWN_SIZE, poses_of
+from hmt_ros.experts.lifter import KeypointHistory, Lifter, landmark_rays, load_lifter
 from hmt_ros.experts.pose_predictor import SHIPPED, PosePredictor, Prediction, load_predictor
 from hmt_ros.experts.root_placement import SIZE_SPREAD
 from hmt_ros.experts.training_set import RATE
 from hmt_ros.image.background import BackgroundModel, one_person
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Mask
 from hmt_ros.sessions.bme_parameters import BmeParameters
@@ -53,11 +59,21 @@ from hmt_ros.sessions.camera_session import (
     read_picture,
 )
 from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.session import PublishedTopic, SessionState, everything
+from hmt_ros.sessions.keypoint_inputs import KEYPOINTS
+from hmt_ros.sessions.session import (
+    NeededInput,
+    Order,
+    PublishedTopic,
+    SessionState,
+    everything,
+)
 from hmt_ros.sessions.warm_up import film
+from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
+from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import decode_image, image_message
+from msg_tools.messages.keypoints import keypoints_of
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,
@@ -133,7 +149,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
     TOPICS = _TOPICS_OF_NODE
     DONE = 'predicted'
     ESTIMATE = 'the sequence'
-    CHECKED = ('model_file', 'background_file', 'stature')
+    CHECKED = ('model_file', 'background_file', 'stature', 'lifter')
 
     def __init__(
         self,
@@ -156,11 +172,17 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._tracked: int | None = None
         self._height, self._support = 0, math.nan
         self._masked = False
+        self._lifter = _lifter_of(parameters)
+        self._history: KeypointHistory | None = None
         self.state = self._present_state()
 
     def prepare(self) -> None:
         """See `Session`."""
         shown, previous = film(), None
+        if self.parameters.use_keypoints:
+            self._lifted(shown.keypoints(0), 0, shown.camera)
+            self._history = None
+            return
         for mask in shown.masks[:2]:
             previous = self._seen(mask, shown.camera, previous).mixture
 
@@ -168,15 +190,75 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         # What is known of the background stays.
         self._previous = None
         self._looked = self._tracked = None
+        self._history = None
+
+    def needed_inputs(self) -> list[NeededInput]:
+        """See `Session`."""
+        needed = super().needed_inputs()
+        if not self.parameters.use_keypoints:
+            return needed
+        return [NeededInput((KEYPOINTS,)), *(x for x in needed if x.sources == (CAMERA_INFO,))]
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
-        if source != TRACK:
+        if source == KEYPOINTS:
+            if self.parameters.use_keypoints:
+                self._take_keypoints(message, stamp)
+        elif source != TRACK:
             super()._take(source, message, stamp)
         elif self._tracked is None or stamp > self._tracked:
             tracked = message.state == TrackState.TRACKING and len(message.components)
             self._tracked = stamp if tracked else None
 
+    def _take_keypoints(self, message: Any, stamp: int) -> None:
+        """Predicts from keypoints and those of the last second."""
+        self._log.counts['received'] += 1
+        frame_id = self._frame_id = str(message.header.frame_id)
+        order = self._order(stamp, self._newest)
+        if order is Order.SKIPPED:
+            return
+        if order is Order.JUMP:
+            self._start_anew()
+        camera = self._camera
+        if camera is None:
+            self._log.skip(
+                Fault.CAMERA_INFO,
+                f'keypoints of {stamp} ns are left out: no calibrated camera_info has come',
+            )
+            return
+        self._newest = stamp
+        try:
+            content = NO_KEYPOINTS if len(message.names) == 0 else keypoints_of(message, 0.0)
+            mixture = self._lifted(content, stamp, camera)
+        except (MessageError, ValueError, ArithmeticError) as error:
+            text = f'no prediction from the keypoints of {stamp} ns: {error_line(error)}'
+            self._log.skip(Fault.KEYPOINTS, text)
+            return
+        self._log.counts['predicted'] += 1
+        if mixture is None:
+            self._log.counts['empty'] += 1
+        self._weights = np.empty(0) if mixture is None else mixture.weights
+        if self._wanted(PREDICTION):
+            made = self._message(mixture, stamp, frame_id or self._frame or FRAME_ID)
+            self._publish(PREDICTION, stamp, made)
+
+    def _lifted(self, content: Keypoints, stamp: int, camera: Camera) -> GaussianMixture | None:
+        """The prediction from keypoints; None: too few are seen."""
+        if self._history is None:
+            self._history = KeypointHistory(camera)
+        body, scheme = self._predictor.body, self.parameters.keypoint_scheme
+        known, _ = content.named_for(body, scheme)
+        self._history.add(known, 1e-9 * stamp)
+        (lifted,) = self._lifter.of_inputs(self._history.inputs(None, None))
+        if lifted is None:
+            return None
+        rays, confidences = landmark_rays(camera, known)
+        spread = KNOWN_SIZE if self.parameters.stature else UNKNOWN_SIZE
+        (found,) = poses_of(body, [lifted], rays[None], confidences[None], spread)
+        return found[: self.parameters.max_hypotheses].normalised()
+
     def _take_image(self, message: Any, stamp: int) -> None:
+        if self.parameters.use_keypoints:
+            return
         in_turn = not self._waiting and self._newest is not None and stamp > self._newest
         if not in_turn or not self._is_left_to_track(stamp) or self._wanted(SILHOUETTE):
             super()._take_image(message, stamp)
@@ -351,7 +433,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         )
 
     def _status(self) -> tuple[str, str]:
-        missing = self._images_to_learn()
+        missing = 0 if self.parameters.use_keypoints else self._images_to_learn()
         if missing and not self._masked:
             return 'learning', f'{missing} more images of the empty scene'
         return 'predicting' if len(self._weights) else 'nobody', ''
@@ -367,6 +449,13 @@ def _predictor_of(parameters: BmeParameters) -> tuple[PosePredictor, float]:
         return predictor, SIZE_SPREAD
     body = predictor.body.with_stature(parameters.stature)
     return predictor.with_body(body), _MEASURED_SPREAD
+
+
+def _lifter_of(parameters: BmeParameters) -> Lifter:
+    try:
+        return load_lifter(parameters.lifter)
+    except OSError as error:
+        raise ValueError(error_line(error)) from error
 
 
 def _height(mask: Mask) -> int:

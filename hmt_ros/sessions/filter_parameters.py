@@ -35,6 +35,7 @@ _TRACKER = {
     'evaluation_budget': (1, 100_000),
     'max_hypotheses': (1, 64),
     'flow_weight': NOT_NEGATIVE,
+    'lifter': None,
     'threads': (0, 64),
     **{f'likelihood.{term.name}.weight': NOT_NEGATIVE for term in TERMS},
     'likelihood.keypoints.weight': NOT_NEGATIVE,

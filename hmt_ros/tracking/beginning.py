@@ -29,6 +29,8 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.mirror import reverse_depth
+from hmt_ros.experts.lifted_fit import KNOWN_SIZE, poses_of
+from hmt_ros.experts.lifter import landmark_rays
 from hmt_ros.image.observation import Box, Observation
 from hmt_ros.image.sampling import ImageMap
 from hmt_ros.image.terms.depth import DEPTH
@@ -214,6 +216,8 @@ def beginning_seen(
             model, camera, Subject(0, keypoints, {}), upright=upright, depths=depths
         )
         poses = [with_reversals(begun.body, begun.poses)]
+        lifted = lifted_poses(begun.body, camera, keypoints)
+        poses.append(moved_to_depth(begun.body, camera, lifted, depths))
         if prediction is not None:
             predicted = prediction.seen_as(begun.body).means
             poses.append(moved_to_depth(begun.body, camera, predicted, depths))
@@ -229,6 +233,16 @@ def beginning_seen(
         return None
     outlined = moved_to_depth(model, camera, poses_from_outline(model, camera, outline), depths)
     return Beginning(Source.MASK, model, outlined)
+
+
+def lifted_poses(body: Body, camera: Camera, keypoints: Keypoints) -> Array:
+    """Poses (N, d) of a person by what experts say of the depths of keypoints, if anything."""
+    lifted = keypoints.lifted
+    if lifted is None or not lifted.are_whole:
+        return np.empty((0, body.dimension))
+    rays, confidences = landmark_rays(camera, keypoints)
+    (found,) = poses_of(body, [lifted], rays[None], confidences[None], KNOWN_SIZE)
+    return found.means
 
 
 def _mixture_at(
@@ -258,6 +272,7 @@ def poses_to_search(
     if keypoints is not None and keypoints.seen.sum() >= FEWEST_KEYPOINTS:
         explained = poses_from_keypoints(body, camera, keypoints, upright, depths)
         found.append(with_reversals(body, explained))
+        found.append(lifted_poses(body, camera, keypoints))
     elif observation.outline is not None:
         poses = poses_from_outline(body, camera, observation.outline)
         found.append(moved_to_depth(body, camera, poses, depths))

@@ -237,7 +237,11 @@ class Posterior:
 
         image, *keypoints = self.likelihood.seen(observation)
         if keypoints:
-            keypoints = [self.likelihood.keypoint_term(observation, exchanges, share['keypoints'])]
+            keypoints = [
+                self.likelihood.keypoint_term(
+                    observation, exchanges, share['keypoints'], share['lifted']
+                )
+            ]
         terms = (image, *keypoints, *self.likelihood.priors, *self.known)
         values = PoseEnergy(self.likelihood, terms).by_cue(poses, derivatives=False).values
         return np.asarray(values @ [share['image'], 1.0, share['prior']])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
+from hmt_ros.experts.lifter import SHIPPED
 from hmt_ros.image.likelihood import LikelihoodSettings
 from hmt_ros.tracking.evaluation_plan import ACCURATE, EvaluationPlan, plan_of
 from hmt_ros.tracking.ground import GroundSettings
@@ -56,6 +57,9 @@ class TrackerSettings:
             corrects predictions; 0 switches it off.
         least_log_weight: Smallest log weight of a mode that is kept, nats.
         estimate_shape: Whether lengths and flesh of the person are estimated while the track lasts.
+        lifter: Experts that tell from the keypoints of the last images how deep the joints are:
+            'keypoints', which ships, or a file that learn-lifter wrote; if empty, keypoints count
+            by themselves.
         threads: Number of threads that share the poses of an image; 0 takes one a core, 8 at most.
             Results do not depend on it.
         likelihood: settings of the likelihood.
@@ -78,6 +82,7 @@ class TrackerSettings:
     flow_weight: float = 5.0
     least_log_weight: float = -14.0
     estimate_shape: bool = True
+    lifter: str = SHIPPED
     threads: int = 0
     likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
     search: LimbSearchSettings = field(default_factory=LimbSearchSettings)

@@ -20,7 +20,9 @@ from numpy.typing import ArrayLike, NDArray
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
 from hmt_ros.body.pose_terms import FrameTerm
+from hmt_ros.experts.lifter import KeypointHistory, lifted_positions, load_lifter
 from hmt_ros.image.background import BackgroundModel
+from hmt_ros.image.lifted_poses import pooled
 from hmt_ros.image.observation import Box, Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Image, Mask
@@ -114,6 +116,9 @@ class Tracker:
         self._camera_path = CameraPath()
         self._camera_pose: CameraPose | None = None
         self._newer_gravity: KnownGround | None = None
+        chosen = self.settings.lifter
+        self._lifter = load_lifter(chosen) if chosen else None
+        self._seen = KeypointHistory(camera)
 
     def reset(
         self, start: Subject | GaussianMixture | None = None, *, box: Box | None = None
@@ -144,6 +149,7 @@ class Tracker:
         self._existence, self._nobody = Existence(), False
         self._last_stamp = None
         self._camera_path = CameraPath()
+        self._seen = KeypointHistory(self.camera)
         self._ground.forget_scene()
 
     def step(
@@ -197,6 +203,7 @@ class Tracker:
             self._ground.look(image, self.camera, stamp)
         known = self.background.frames > 0 and not self.silhouettes.doubted
         self._ground.still = self._camera_path.known or (known and not self._ground.turning)
+        keypoints = self._lifted(keypoints, stamp)
         near, dt = None, 0.0
         if self._followed is not None and not self._track.lost:
             near, dt = self.modes.poses, seconds(stamp - self._followed)
@@ -352,6 +359,7 @@ class Tracker:
         motion = self._camera_path.advance(stamp, pose)
         if motion is not None:
             self._ground.carry(motion)
+            self._seen.carry(motion.rotation)
             self._point.carry(self.body, motion)
             if self._track.begun:
                 self._track.carry(motion)
@@ -360,6 +368,21 @@ class Tracker:
             self._ground.set_gravity(newer.up, newer.camera_height)
         if pose is not None:
             self.silhouettes.see_from(pose, self.camera)
+
+    def _lifted(self, keypoints: Keypoints | None, stamp: int) -> Keypoints | None:
+        """Keypoints with what experts, and a detector that lifts, say of the whole pose."""
+        if keypoints is None or not keypoints.seen.any():
+            return keypoints
+        opinions = []
+        if self._lifter is not None:
+            self._seen.add(keypoints, seconds(stamp))
+            begun = self._track.begun
+            person = self._lifter.proportions(self.body) if begun else None
+            opinions += self._lifter.of_inputs(self._seen.inputs(self.vertical, person))
+        if keypoints.positions is not None:
+            opinions.append(lifted_positions(self.camera, keypoints))
+        said = [one for one in opinions if one is not None]
+        return replace(keypoints, lifted=pooled(said)) if said else keypoints
 
     @property
     def _gravity(self) -> Gravity | None:

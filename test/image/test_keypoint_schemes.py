@@ -7,18 +7,20 @@ import pytest
 
 from hmt_ros.body import load_body
 from hmt_ros.image.keypoint_schemes import (
+    detector_errors,
     exchange_rates,
     noise_of,
+    position_deviations,
     recognised,
     scheme_of,
     schemes,
-    slope_models,
     usual_exchanges,
 )
 from hmt_ros.image.terms.keypoints import Keypoints
 
 COUNTS = {
     'coco17': 17, 'halpe26': 26, 'body25': 25, 'mediapipe33': 33, 'h36m17': 17, 'skeleton2d': 18,
+    'smpl24': 24,
 }  # fmt: skip
 
 
@@ -88,10 +90,17 @@ def test_less_sure_keypoints_are_noisier():
     assert sigma[0] > 3.0 * sigma[-1]
 
 
-def test_bones_of_lifted_skeletons_belong_to_the_body():
-    body = load_body('human37')
-    assert {x.segment for x in slope_models()} <= set(body.skeleton.segment_names)
-    assert {x.mirrored() for x in slope_models() if '_' in x.segment} <= set(slope_models())
+def test_depths_of_unknown_detectors_are_less_sure():
+    known, other = position_deviations('mediapipe33'), position_deviations(None)
+    assert known.keys() == other.keys()
+    assert all(known[name] <= other[name] for name in known)
+    assert position_deviations('coco17') == other
+
+
+def test_errors_of_detectors_are_shares():
+    e = detector_errors()
+    assert e.white + e.lasting + e.constant == pytest.approx(1.0, abs=0.05)
+    assert sum(e.exchanged) == pytest.approx(1.0)
 
 
 def test_exchanges_are_rare():

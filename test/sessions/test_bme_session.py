@@ -5,15 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hmt_ros.body import Camera
+from hmt_ros.body import Camera, load_body
 from hmt_ros.body.motion_prior import motion_prior
+from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, SILHOUETTE, TOPICS, TRACK, BmeSession
 from hmt_ros.sessions.camera_session import MASK
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Handled
+from msg_tools import RosbagsMessages
+from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.images import compressed_image_message, decode_mask, image_message
+from msg_tools.messages.keypoints import keypoints_message
 from msg_tools.messages.pose_mixtures import MixtureKind, TrackState, pose_mixture_of
 
 FRAME_NS = 100_000_000
@@ -414,3 +418,68 @@ def test_silhouettes_are_empty_while_the_background_is_learned(session, outputs,
         one.take(IMAGE, somebody.empty(index))
     messages = [deserialise(output.data, 'sensor_msgs/msg/Image') for output in outputs]
     assert [decode_mask(message).any() for message in messages] == [False, False]
+
+
+# Keypoints.
+
+
+@pytest.fixture
+def walker():
+    """A camera, and keypoints of somebody in front of it."""
+    body, camera = load_body('human37'), Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
+    pose = body.prior_mean.copy()
+    pose[:3] = 0.2, 0.0, 4.0
+    pixels = camera.project(body.joint_positions(pose[None])[0])
+    n = len(pixels)
+    unknown = np.full((n, 2, 2), np.nan)
+    return body, camera, pose, Keypoints(body.joint_names, pixels, unknown, np.ones(n))
+
+
+def keypoint_session(outputs, **values):
+    values = {'use_keypoints': True, **values}
+    return BmeSession(with_values(BmeParameters(), values), outputs.append)
+
+
+def test_keypoints_have_predictions_without_images(outputs, walker):
+    body, camera, pose, seen = walker
+    messages, one = RosbagsMessages(), keypoint_session(outputs)
+    assert [x.sources for x in one.needed_inputs()] == [('keypoints',), (CAMERA_INFO,)]
+    early = one.take('keypoints', keypoints_message(messages, seen, 5, 'lens'))
+    assert 'no calibrated camera_info' in early.faults[0]
+    one.take(CAMERA_INFO, camera_info_message(messages, camera, 10, 'lens'))
+    for t in range(3):
+        stamp = 10 + t * FRAME_NS
+        handled = one.take('keypoints', keypoints_message(messages, seen, stamp, 'lens'))
+        assert handled.published == (('pose_prediction', stamp),)
+        assert not handled.faults
+    content = pose_mixture_of(predictions(outputs)[-1])
+    assert content.kind == MixtureKind.PREDICTION
+    assert 1 <= len(content.weights) <= 5
+    assert content.weights.sum() == pytest.approx(1.0)
+    joints = body.joint_positions(content.means[:1])[0]
+    off = np.linalg.norm(camera.project(joints) - seen.pixels, axis=1)
+    assert np.median(off) < 15.0
+    assert content.means[0, 2] == pytest.approx(pose[2], rel=0.15)
+    assert one.state.status == 'predicting'
+    assert one.state.counts['predicted'] == 3
+
+
+def test_few_keypoints_are_nobody(outputs, walker):
+    _, camera, _, seen = walker
+    messages, one = RosbagsMessages(), keypoint_session(outputs)
+    one.take(CAMERA_INFO, camera_info_message(messages, camera, 10, 'lens'))
+    few = seen[np.arange(3)]
+    one.take('keypoints', keypoints_message(messages, few, 20, 'lens'))
+    none = seen[np.arange(0)]
+    one.take('keypoints', keypoints_message(messages, none, 30, 'lens'))
+    assert [len(x.components) for x in predictions(outputs)] == [0, 0]
+    assert one.state.counts['empty'] == 2
+    late = one.take('keypoints', keypoints_message(messages, seen, 20, 'lens'))
+    assert 'comes after one of 30 ns' in late.faults[0]
+
+
+def test_a_lifter_that_is_not_there_is_told(outputs):
+    with pytest.raises(ValueError, match=r'none\.npz'):
+        keypoint_session(outputs, lifter='none.npz')
+    with pytest.raises(ValueError, match='keypoint_scheme must be one of'):
+        keypoint_session(outputs, keypoint_scheme='none')

@@ -41,6 +41,7 @@ def keypoint_settings(**values) -> TrackerSettings:
             'likelihood': ONLY_KEYPOINTS,
             'flow_weight': 0.0,
             'estimate_shape': False,
+            'lifter': '',  # what experts add is tested apart
             **values,
         }
     )

@@ -3,6 +3,7 @@
     E(x) = -log sum_e p_e exp(-sum_g E_g,e(x))          e: exchange, g: group of landmarks
 
 Given what a detector takes for what, groups add; over what it may take for what, likelihoods do.
+To what the groups cost comes what the whole pose does, by a mixture over depths (`lifted_poses`).
 """
 
 from __future__ import annotations
@@ -41,31 +42,39 @@ class Points(NamedTuple):
     groups: Ints
 
 
-class Slopes(NamedTuple):
-    """Bones (B,) of a lifted skeleton: how far each points away from the camera.
+class Lifted(NamedTuple):
+    """How far joints (J,) are behind the middle of the hips, by a mixture of C components.
 
     Attributes:
-        segments: (B, 2) that the bone is fixed to, and that of the other side.
-        directions: (B, 2, 3) of the bone in the frames of the segments, unit vectors.
-        rays: (B, 3) lines of sight, unit vectors.
-        slopes: (B,) cosine of the angle between bone and line of sight, measured.
-        weights: (B,) square roots of the precisions.
-        groups: (B,) that are exchanged together.
+        segments: (J,) that carry the joints.
+        offsets: (J, 3) of the joints in the frames of the segments, m.
+        middle: (3,) middle of the hips in the frame of the root, m.
+        ray: (3,) line of sight, unit vector.
+        log_weights: (C,) with the normalisers of the components.
+        depths: (2, C, J) along the ray from the middle of the hips, m, as the sides are called and
+            exchanged.
+        precisions: (2, C, J) square roots, 1/m.
+        readings: (E,) 0 or 1: how an exchange of sides reads the mixture.
+        weight: factor on the energy; 0: there is no mixture.
     """
 
     segments: Ints
-    directions: Array
-    rays: Array
-    slopes: Array
-    weights: Array
-    groups: Ints
+    offsets: Array
+    middle: Array
+    ray: Array
+    log_weights: Array
+    depths: Array
+    precisions: Array
+    readings: Ints
+    weight: float
 
 
 class KeypointInputs(NamedTuple):
     """What the energy of keypoints reads.
 
     Attributes:
-        points, slopes: that were measured.
+        points: that were measured.
+        lifted: the mixture over whole poses.
         tree, lens: skeleton and camera.
         scale: of the kernel, in standard deviations.
         weights: (G,) factors on the energies of the groups.
@@ -74,7 +83,7 @@ class KeypointInputs(NamedTuple):
     """
 
     points: Points
-    slopes: Slopes
+    lifted: Lifted
     tree: Tree
     lens: Lens
     scale: float
@@ -97,7 +106,7 @@ def point_residual(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def group_energies(points, slopes, lens, scale, columns, origins, result):  # type: ignore[no-untyped-def]
+def group_energies(points, lens, scale, columns, origins, result):  # type: ignore[no-untyped-def]
     """Energies (G, 2) of the groups at one pose, as they are called and exchanged."""
     pixels, projections, place = np.empty((1, 2)), np.empty((1, 2, 3)), np.empty(3)
     segments, offsets, seen, whiteners, groups = points
@@ -113,41 +122,107 @@ def group_energies(points, slopes, lens, scale, columns, origins, result):  # ty
                     residual = whiteners[k, i, 0] * (pixels[0, 0] - seen[k, 0])
                     residual += whiteners[k, i, 1] * (pixels[0, 1] - seen[k, 1])
                 result[groups[k], e] += geman_mcclure(residual, scale, 1.0)[0]
-    groups = slopes.groups
-    for k in range(len(groups)):
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def lifted_energies(lifted, columns, origins, behind, places, shares, result):  # type: ignore[no-untyped-def]
+    """Minus the log densities of the mixture at one pose, as the sides are called and exchanged.
+
+    Args:
+        lifted: the mixture.
+        columns, origins: frames of the pose.
+        behind: (J,) becomes how far the joints are behind the middle of the hips.
+        places: (1 + J, 3) become the middle of the hips and the joints.
+        shares: (2, C) become the posterior probabilities of the components.
+        result: (2,).
+    """
+    segments, offsets, ray = lifted.segments, lifted.offsets, lifted.ray
+    for i in range(3):
+        places[0, i] = origins[0, i]
+        for j in range(3):
+            places[0, i] += columns[0, j, i] * lifted.middle[j]
+    for k in range(len(segments)):
+        behind[k] = 0.0
+        for i in range(3):
+            place = origins[segments[k], i]
+            for j in range(3):
+                place += columns[segments[k], j, i] * offsets[k, j]
+            places[1 + k, i] = place
+            behind[k] += (place - places[0, i]) * ray[i]
+    for e in range(2):
+        top = -np.inf
+        for c in range(len(lifted.log_weights)):
+            total = lifted.log_weights[c]
+            for k in range(len(segments)):
+                residual = lifted.precisions[e, c, k] * (behind[k] - lifted.depths[e, c, k])
+                total -= 0.5 * residual * residual
+            shares[e, c] = total
+            top = max(top, total)
+        mass = 0.0
+        for c in range(len(lifted.log_weights)):
+            shares[e, c] = np.exp(shares[e, c] - top)
+            mass += shares[e, c]
+        shares[e] /= mass
+        result[e] = -top - np.log(mass)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def add_lifted(  # type: ignore[no-untyped-def]
+    lifted, tree, readings, behind, places, shares, axes, dof_origins, gradient, hessian
+):
+    """Adds the derivatives of the mixture at one pose.
+
+    A joint moves against the middle of the hips, so that what moves these counts as if it turned
+    about them and shifted nothing.
+
+    Args:
+        lifted, tree: the mixture, and the skeleton.
+        readings: (2,) probabilities of the readings.
+        behind, places, shares: of `lifted_energies`.
+        axes, dof_origins: (d, 3) of the degrees of freedom.
+        gradient, hessian: (d,), (d, d) results.
+    """
+    own_axes, own_origins = axes.copy(), dof_origins.copy()
+    for j in range(len(axes)):
+        if tree.dof_segments[j] == 0:
+            if tree.dof_is_rotation[j]:
+                own_origins[j] = places[0]
+            else:
+                own_axes[j] = 0.0
+    wrenches = np.zeros((len(tree.parents), 6))
+    stiffnesses = np.zeros((len(tree.parents), 6, 6))
+    ray = lifted.ray
+    for k in range(len(lifted.segments)):
+        pull, curvature = 0.0, 0.0
         for e in range(2):
-            residual = slope_residual(slopes, k, e, columns)[0]
-            result[groups[k], e] += geman_mcclure(residual, scale, 1.0)[0]
+            for c in range(len(lifted.log_weights)):
+                share = lifted.weight * readings[e] * shares[e, c]
+                share *= lifted.precisions[e, c, k] ** 2
+                pull += share * (behind[k] - lifted.depths[e, c, k])
+                curvature += share
+        add_residual(
+            wrenches, stiffnesses, lifted.segments[k], places[1 + k, 0], places[1 + k, 1],
+            places[1 + k, 2], ray[0], ray[1], ray[2], pull, curvature,
+        )  # fmt: skip
+    assemble_pose(tree, own_axes, own_origins, wrenches, stiffnesses, gradient, hessian)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def slope_residual(slopes, k, e, columns):  # type: ignore[no-untyped-def]
-    """Residual of the slope of bone k in exchange e, and the direction of the bone (3,)."""
-    s = slopes.segments[k, e]
-    d0, d1, d2 = 0.0, 0.0, 0.0
-    for j in range(3):
-        local = slopes.directions[k, e, j]
-        d0 += columns[s, j, 0] * local
-        d1 += columns[s, j, 1] * local
-        d2 += columns[s, j, 2] * local
-    slope = d0 * slopes.rays[k, 0] + d1 * slopes.rays[k, 1] + d2 * slopes.rays[k, 2]
-    return slopes.weights[k] * (slope - slopes.slopes[k]), d0, d1, d2
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def exchange_log_posterior(energies, weights, exchanged, log_prior, result):  # type: ignore[no-untyped-def]
+def exchange_log_posterior(energies, lifted, weights, exchanged, readings, log_prior, result):  # type: ignore[no-untyped-def]
     """Log probabilities (E,) of exchanges; returns minus the log of their sum before.
 
     Args:
         energies: (G, 2) of the groups, as they are called and exchanged, of weight 1.
+        lifted: (2,) of the whole pose, as it is called and exchanged.
         weights: (G,) factors on the energies.
         exchanged: (E, G) 1 where an exchange exchanges a group.
+        readings: (E,) 1 where it exchanges the whole pose.
         log_prior: (E,).
         result: (E,).
     """
     top = -np.inf
     for e in range(len(exchanged)):
-        total = log_prior[e]
+        total = log_prior[e] - lifted[readings[e]]
         for g in range(len(energies)):
             total -= weights[g] * energies[g, exchanged[e, g]]
         result[e] = total
@@ -178,13 +253,21 @@ def list_keypoints(  # type: ignore[no-untyped-def]
     Returns:
         The number of residuals, two a landmark before the camera.
     """
-    points, slopes, lens, scale = inputs.points, inputs.slopes, inputs.lens, inputs.scale
+    points, lens, scale = inputs.points, inputs.lens, inputs.scale
     weights, exchanged = inputs.weights, inputs.exchanged
     energies, posterior = np.empty((exchanged.shape[1], 2)), np.empty(len(exchanged))
     pixels, projections, place = np.empty((1, 2)), np.empty((1, 2, 3)), np.empty(3)
     segments, offsets, seen, whiteners, groups = points
-    group_energies(points, slopes, lens, scale, columns, origins, energies)
-    exchange_log_posterior(energies, weights, exchanged, inputs.log_priors[0], posterior)
+    group_energies(points, lens, scale, columns, origins, energies)
+    lifted = np.zeros(2)
+    if inputs.lifted.weight > 0.0:
+        behind, shares, joints = _lifted_room(inputs.lifted)
+        lifted_energies(inputs.lifted, columns, origins, behind, joints, shares, lifted)
+        lifted *= inputs.lifted.weight
+    exchange_log_posterior(
+        energies, lifted, weights, exchanged, inputs.lifted.readings, inputs.log_priors[0],
+        posterior,
+    )  # fmt: skip
     likeliest = exchanged[np.argmax(posterior)]
     m = 0
     for k in range(len(groups)):
@@ -207,6 +290,13 @@ def list_keypoints(  # type: ignore[no-untyped-def]
                 directions[m, x] = w0 * projections[0, 0, x] + w1 * projections[0, 1, x]
             m += 1
     return m
+
+
+@njit(cache=True, nogil=True)
+def _lifted_room(lifted):  # type: ignore[no-untyped-def]
+    """Room for `lifted_energies` of one pose."""
+    joints = len(lifted.segments)
+    return np.empty(joints), np.empty((2, len(lifted.log_weights))), np.empty((1 + joints, 3))
 
 
 @njit(cache=True, nogil=True)
@@ -261,7 +351,7 @@ def add_keypoints(  # type: ignore[no-untyped-def]
 
     Hessians of no pose: no derivatives are wanted.
     """
-    points, slopes, tree, lens = inputs.points, inputs.slopes, inputs.tree, inputs.lens
+    points, lifted, tree, lens = inputs.points, inputs.lifted, inputs.tree, inputs.lens
     scale, weights, exchanged = inputs.scale, inputs.weights, inputs.exchanged
     groups = exchanged.shape[1]
     energies, posterior = np.empty((groups, 2)), np.empty(len(exchanged))
@@ -270,12 +360,16 @@ def add_keypoints(  # type: ignore[no-untyped-def]
     stiffnesses = np.empty((len(tree.parents), 6, 6))
     pixels, projections, place = np.empty((1, 2)), np.empty((1, 2, 3)), np.empty(3)
     segments, offsets, seen, whiteners, point_groups = points
-    slope_groups, rays, slope_weights, carriers = (
-        slopes.groups, slopes.rays, slopes.weights, slopes.segments,
-    )  # fmt: skip
+    whole, readings = np.zeros(2), np.empty(2)
+    behind, components, joints = _lifted_room(lifted)
     for n in range(len(value)):
-        group_energies(points, slopes, lens, scale, columns[n], origins[n], energies)
-        value[n] += exchange_log_posterior(energies, weights, exchanged, log_priors[n], posterior)
+        group_energies(points, lens, scale, columns[n], origins[n], energies)
+        if lifted.weight > 0.0:
+            lifted_energies(lifted, columns[n], origins[n], behind, joints, components, whole)
+            whole *= lifted.weight
+        value[n] += exchange_log_posterior(
+            energies, whole, weights, exchanged, lifted.readings, log_priors[n], posterior
+        )
         if len(hessian) == 0:
             continue
         shares[:] = 0.0
@@ -311,22 +405,12 @@ def add_keypoints(  # type: ignore[no-untyped-def]
                         w0 * projections[0, 0, 1] + w1 * projections[0, 1, 1],
                         w0 * projections[0, 0, 2] + w1 * projections[0, 1, 2], pull, curvature,
                     )  # fmt: skip
-        for k in range(len(slope_groups)):
-            for e in range(2):
-                share = weights[slope_groups[k]] * shares[slope_groups[k], e]
-                if share < 1e-6:
-                    continue
-                residual, d0, d1, d2 = slope_residual(slopes, k, e, columns[n])
-                _, pull, curvature = geman_mcclure(residual, scale, share)
-                # A rotation w of the segment moves the bone's direction d by w x d.
-                q0, q1, q2 = rays[k, 0], rays[k, 1], rays[k, 2]
-                turn = np.empty(3)
-                turn[0] = slope_weights[k] * (d1 * q2 - d2 * q1)
-                turn[1] = slope_weights[k] * (d2 * q0 - d0 * q2)
-                turn[2] = slope_weights[k] * (d0 * q1 - d1 * q0)
-                s = carriers[k, e]
-                for i in range(3):
-                    wrenches[s, 3 + i] += pull * turn[i]
-                    for j in range(i, 3):
-                        stiffnesses[s, 3 + i, 3 + j] += curvature * turn[i] * turn[j]
         assemble_pose(tree, axes[n], dof_origins[n], wrenches, stiffnesses, gradient[n], hessian[n])
+        if lifted.weight > 0.0:
+            readings[:] = 0.0
+            for e in range(len(exchanged)):
+                readings[lifted.readings[e]] += np.exp(posterior[e])
+            add_lifted(
+                lifted, tree, readings, behind, joints, components, axes[n], dof_origins[n],
+                gradient[n], hessian[n],
+            )  # fmt: skip

@@ -11,35 +11,34 @@ landmarks of the other side. What a detector says of depth counts by the slopes 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
-from hmt_ros.body.kinematics import Frames, forward
+from hmt_ros.body.kinematics import Frames
 from hmt_ros.body.skeleton import Skeleton, other_side
 from hmt_ros.image.keypoint_schemes import (
     MIRROR,
-    SlopeModel,
     landmarks_of,
     noise_of,
-    slope_models,
+    scheme_of,
 )
+from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, bone_lengths, middle_of_hips, ordered
 from hmt_ros.image.surface import lens_of
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoint_kernel import (
     KeypointInputs,
+    Lifted,
     Points,
-    Slopes,
     add_keypoints,
     exchange_log_posterior,
     group_energies,
     keypoint_errors,
+    lifted_energies,
     record_keypoints,
 )
 from hmt_ros.image.terms.residuals import RECORDED, tree_of
@@ -53,6 +52,11 @@ USUAL_EXTENT = 1.4
 USUAL_STATURE = 1.7
 # Least standard deviation of a keypoint whose noise is learned, px.
 SMALLEST_SIGMA = 1.5
+# Probability that a pose is none of those that were lifted, whatever its depths; the standard
+# deviation of these, as a share of how far a joint can be; the share of the mixture that is
+# independent, because joints err together; and by how much depths from a real detector's keypoints
+# err more than those that were learned from. Chosen, with the time of `ERRORS['lifted']`.
+ANYHOW, ANY_DEPTH, LIFTED_WEIGHT, LIFTED_SIGMA = 0.02, 0.6, 0.08, 1.8
 # Groups of landmarks that are exchanged together, and which of them (E, G) an exchange exchanges:
 # nothing, all, arms, legs.
 CENTRE, ARMS, LEGS = range(3)
@@ -73,6 +77,11 @@ class Keypoints:
         confidences: (n,) from 0, ignore, to 1, sure.
         positions: (n, 3) of a detector that lifts, m, along the axes of the camera from an origin
             that all share; NaN where there is none. None: it does not lift.
+        landmarks: (n,) canonical names of what was seen (`keypoint_schemes`), '' for joints; None:
+            all names are those of joints.
+        scheme: of the detector, once it is known.
+        lifted: what is made of keypoints or positions: a mixture over whole poses, of which depths
+            count, because what it says across the line of sight the keypoints say themselves.
         offsets: (n, 3) of what was seen from the joint in the frame of its segment, m; None: joints
             were seen.
         noise: (n,) standard deviation beside the covariances, m on the person; it accounts for the
@@ -86,6 +95,9 @@ class Keypoints:
     positions: Array | None = None
     offsets: Array | None = None
     noise: Array | None = None
+    landmarks: tuple[str, ...] | None = None
+    scheme: str | None = None
+    lifted: LiftedPoses | None = None
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -110,8 +122,10 @@ class Keypoints:
         }
         names = tuple(self.names[i] for i in which)
         return Keypoints(
-            names, self.pixels[which], self.covariances[which], self.confidences[which], **more
-        )
+            names, self.pixels[which], self.covariances[which], self.confidences[which], **more,
+            landmarks=None if self.landmarks is None else tuple(self.landmarks[i] for i in which),
+            scheme=self.scheme, lifted=self.lifted,
+        )  # fmt: skip
 
     def named_for(self, body: Body, scheme: str = 'auto') -> tuple[Keypoints, list[str]]:
         """Those that are at joints of a body, under the body's names, and the names of the others.
@@ -127,6 +141,7 @@ class Keypoints:
             ValueError: there is no such scheme.
         """
         marks = landmarks_of(self.names, body.joint_names, scheme)
+        found = scheme_of(self.names, scheme)
         names = [
             name if mark is None else mark.joint
             for name, mark in zip(self.names, marks, strict=True)
@@ -158,6 +173,8 @@ class Keypoints:
             covariances=covariances,
             offsets=offsets if offsets.any() else None,
             noise=noise,
+            landmarks=tuple('' if (mark := marks[i]) is None else mark.name for i in kept),
+            scheme=None if found is None else found.name,
         )
         return renamed, strange
 
@@ -184,6 +201,7 @@ class KeypointTerm:
         exchanges: (R, E) log probability of each exchange before the image, a row for each problem
             or one for all; None: nothing is exchanged.
         beliefs: (G,) factors on the energies of the groups of landmarks; None: 1.
+        lifted_share: factor on the energy of the mixture over whole poses.
 
     Raises:
         KeyError: a keypoint that is not a joint of the body.
@@ -196,6 +214,7 @@ class KeypointTerm:
     magnification: float = 0.0
     exchanges: Array | None = None
     beliefs: Array | None = None
+    lifted_share: float = 1.0
 
     def energy(
         self, frames: Frames, rows: Index, *, derivatives: Derivatives = Derivatives.POSITIVE
@@ -218,7 +237,7 @@ class KeypointTerm:
         exchanges = np.zeros((1, 1)) if self.exchanges is None else self.exchanges
         measured = self.measured
         return KeypointInputs(
-            measured.points, measured.slopes, tree_of(self.skeleton), lens_of(self.camera),
+            measured.points, self._lifted(), tree_of(self.skeleton), lens_of(self.camera),
             float(self.settings.scale), self.weights,
             EXCHANGED[: exchanges.shape[1]], np.ascontiguousarray(exchanges, dtype=np.float64),
         )  # fmt: skip
@@ -229,13 +248,22 @@ class KeypointTerm:
         exchanged, priors = self._priors(rows, frames.count)
         result = np.empty(priors.shape)
         energies = np.empty((exchanged.shape[1], 2))
+        lifted = self._lifted()
+        count = len(lifted.segments)
+        room = np.empty(count), np.empty((1 + count, 3)), np.empty((2, len(lifted.log_weights)))
         columns, origins = frames.by_pose()
         for n in range(frames.count):
             group_energies(
-                measured.points, measured.slopes, lens_of(self.camera), float(self.settings.scale),
-                columns[n], origins[n], energies,
+                measured.points, lens_of(self.camera), float(self.settings.scale), columns[n],
+                origins[n], energies,
             )  # fmt: skip
-            exchange_log_posterior(energies, self.weights, exchanged, priors[n], result[n])
+            whole = np.zeros(2)
+            if lifted.weight > 0:
+                lifted_energies(lifted, columns[n], origins[n], *room, whole)
+            exchange_log_posterior(
+                energies, lifted.weight * whole, self.weights, exchanged,
+                lifted.readings[: len(exchanged)], priors[n], result[n],
+            )  # fmt: skip
         return result
 
     def residuals(self, frames: Frames) -> tuple[Index, Array, Array, Array, Array]:
@@ -278,6 +306,11 @@ class KeypointTerm:
         chosen = self.exchanges[rows] if len(self.exchanges) > 1 else self.exchanges[[0] * count]
         return EXCHANGED, np.ascontiguousarray(chosen)
 
+    def _lifted(self) -> Lifted:
+        """The mixture over whole poses, with its share."""
+        lifted = self.measured.lifted
+        return lifted._replace(weight=self.lifted_share * lifted.weight)
+
     @property
     def weights(self) -> Array:
         """Factors (G,) on the energies of the groups."""
@@ -298,12 +331,12 @@ class MeasuredKeypoints:
     Attributes:
         joints: (P, 2) of the skeleton that they show, as they are called and exchanged.
         points: where they were seen, and on which segment they lie.
-        slopes: of the bones that were lifted.
+        lifted: the mixture over whole poses.
     """
 
     joints: Index
     points: Points
-    slopes: Slopes
+    lifted: Lifted
 
 
 # A track makes a term for every set of hypotheses of an image, and a start one for every trial of
@@ -321,7 +354,7 @@ def _measured(
     segments = skeleton.joint_segments[joints].astype(np.int64)
     groups = np.array([group_of(skeleton, i) for i in segments[:, 0]], dtype=np.int64)
     points = Points(segments, offsets, counted.pixels, whiteners, groups)
-    return MeasuredKeypoints(joints, points, _slopes(skeleton, camera, counted, sigma))
+    return MeasuredKeypoints(joints, points, _lifted(skeleton, keypoints.lifted, sigma))
 
 
 @lru_cache(maxsize=16)
@@ -338,118 +371,42 @@ def _whitened(keypoints: Keypoints, sigma: float, magnification: float) -> tuple
     return k, np.ascontiguousarray(np.linalg.cholesky(precision).transpose(0, 2, 1))
 
 
-def _slopes(skeleton: Skeleton, camera: Camera, keypoints: Keypoints, sigma: float) -> Slopes:
-    """The bones that were lifted."""
-    if keypoints.positions is None:
-        return NO_SLOPES
-    known = _known_bones(skeleton, keypoints.names)
-    ends, middles = (
-        _first_of(known.codes, values)[known.ends].mean(2)
-        for values in (keypoints.positions, keypoints.pixels)
-    )
-    along, middles = ends[:, 1] - ends[:, 0], middles.mean(1)
-    lengths = np.linalg.norm(along, axis=1)
-    seen = np.flatnonzero((lengths > 0) & np.isfinite(lengths) & np.isfinite(middles).all(1))
-    rays = camera.rays(middles[seen])
-    return Slopes(
-        known.segments[seen], known.directions[seen], rays,
-        np.einsum('mk,mk->m', along[seen] / lengths[seen, None], rays),
-        1.0 / (sigma * known.sigmas[seen]), known.groups[seen],
-    )  # fmt: skip
-
-
-NO_SLOPES = Slopes(
-    np.zeros((0, 2), np.int64), np.zeros((0, 2, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0),
-    np.zeros(0, np.int64),
+NOT_LIFTED = Lifted(
+    np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(1),
+    np.zeros((2, 1, 0)), np.zeros((2, 1, 0)), np.zeros(len(EXCHANGED), np.int64), 0.0,
 )  # fmt: skip
 
 
-class _KnownBones(NamedTuple):
-    """The B bones of a skeleton whose ends are among P names.
-
-    Attributes:
-        codes: (P,) of the names, the same for the same name.
-        ends: (B, 2, 2) codes of both ends; an end lies between two names, or is twice the same.
-        segments, directions, sigmas, groups: (B, 2), (B, 2, 3), (B,), (B,) of the bones.
-    """
-
-    codes: Index
-    ends: Index
-    segments: NDArray[np.int64]
-    directions: Array
-    sigmas: Array
-    groups: NDArray[np.int64]
-
-
 @lru_cache(maxsize=16)
-def _known_bones(skeleton: Skeleton, names: tuple[str, ...]) -> _KnownBones:
-    code = {name: i for i, name in enumerate(dict.fromkeys(names))}
-    rows = []
-    for bone, segments, along in _bones(skeleton):
-        pairs = [[x.replace('mid_', side) for side in ('left_', 'right_')] for x in bone.ends]
-        if any(name not in code for pair in pairs for name in pair):
-            continue
-        first = skeleton.joint_index([pairs[0][0]])
-        group = group_of(skeleton, int(skeleton.joint_segments[first][0]))
-        rows.append(([[code[x] for x in pair] for pair in pairs], segments, along, bone, group))
-    n = len(rows)
-    return _KnownBones(
-        np.array([code[name] for name in names], dtype=np.intp),
-        np.reshape([row[0] for row in rows], (n, 2, 2)).astype(np.intp),
-        np.reshape([row[1] for row in rows], (n, 2)).astype(np.int64),
-        np.reshape([row[2] for row in rows], (n, 2, 3)).astype(np.float64),
-        np.array([row[3].sigma for row in rows], dtype=np.float64),
-        np.array([row[4] for row in rows], dtype=np.int64),
-    )
+def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lifted:
+    """A mixture over whole poses as compiled code reads it, with a component of any depths."""
+    known = set(skeleton.joint_names)
+    if poses is None or not known.issuperset(HIPS):
+        return NOT_LIFTED
+    poses = poses.of_joints([name for name in poses.joints if name in known])
+    joints = skeleton.joint_index(poses.joints)
+    both = poses, poses.exchanged()
+    depths = np.stack([x.sized(skeleton)[:, :, 2] for x in both])
+    deviations = LIFTED_SIGMA * sigma * np.stack([x.deviations[:, :, 2] for x in both])
+    lengths = bone_lengths(skeleton, poses.joints)
+    anywhere = np.tile(np.maximum(ANY_DEPTH * _reach(poses.joints, lengths), 0.02), (2, 1, 1))
+    depths = np.concatenate([depths, np.zeros_like(anywhere)], axis=1)
+    deviations = np.concatenate([deviations, anywhere], axis=1)
+    log_weights = np.append(poses.log_weights + np.log1p(-ANYHOW), np.log(ANYHOW))
+    return Lifted(
+        skeleton.joint_segments[joints].astype(np.int64), skeleton.joint_offsets[joints],
+        middle_of_hips(skeleton), poses.axes[2],
+        log_weights - np.log(deviations[0]).sum(1), np.ascontiguousarray(depths),
+        1.0 / deviations, EXCHANGED.min(1), LIFTED_WEIGHT,
+    )  # fmt: skip
 
 
-def _first_of(codes: Index, values: Array) -> Array:
-    """The first finite value of each code, (C, ...); NaN where there is none."""
-    rows = np.flatnonzero(np.isfinite(values).all(1))[::-1]
-    result = np.full((int(codes.max(initial=-1)) + 1, values.shape[1]), np.nan)
-    result[codes[rows]] = values[rows]
+def _reach(joints: tuple[str, ...], lengths: Array) -> Array:
+    """How far joints (J,) can be from the middle of the hips, m."""
+    result = np.zeros(len(joints))
+    for j, carrier in ordered(joints):
+        result[j] = lengths[j] + (0.0 if carrier < 0 else result[carrier])
     return result
-
-
-@lru_cache(maxsize=16)
-def _bones(skeleton: Skeleton) -> list[tuple[SlopeModel, tuple[int, int], Array]]:
-    """The bones that a skeleton has: their model, segments as called and exchanged, and directions.
-
-    The directions (2, 3) are in the frames of these segments; that of the other side has the sign
-    of the model.
-    """
-    at_rest = forward(skeleton, np.zeros((1, skeleton.dimension)))
-    places = dict(zip(skeleton.joint_names, at_rest.joints()[..., 0], strict=True))
-    columns = at_rest.by_pose()[0][0]
-    result = []
-    for bone in slope_models():
-        other = bone.mirrored()
-        known = {bone.segment, other.segment} <= {*skeleton.segment_names}
-        own, far = _direction(places, bone), _direction(places, other)
-        if known and own is not None and far is not None:
-            i, j = (skeleton.segment_names.index(x.segment) for x in (bone, other))
-            directions = np.stack([columns[i] @ own, bone.sign * columns[j] @ far])
-            result.append((bone, (i, j), directions))
-    return result
-
-
-def _end(places: Mapping[str, Array], name: str) -> Array | None:
-    """A place by name; that of `mid_x` is between the left and the right x."""
-    if not name.startswith('mid_'):
-        return places.get(name)
-    pair = [places.get(name.replace('mid_', side)) for side in ('left_', 'right_')]
-    if pair[0] is None or pair[1] is None:
-        return None
-    return 0.5 * (pair[0] + pair[1])
-
-
-def _direction(places: Mapping[str, Array], bone: SlopeModel) -> Array | None:
-    """Unit vector (3,) along a bone; None: an end is missing, or both are one."""
-    first, last = (_end(places, name) for name in bone.ends)
-    if first is None or last is None:
-        return None
-    length = float(np.linalg.norm(last - first))
-    return (last - first) / length if length > 0 else None
 
 
 def group_of(skeleton: Skeleton, segment: int) -> int:

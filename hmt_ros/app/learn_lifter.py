@@ -1,0 +1,247 @@
+"""learn-lifter: learns experts that know depth, from recorded motions.
+
+    learn-lifter FILES_OR_FOLDERS ... -o keypoints.npz --test PEOPLE_LEFT_OUT
+
+The tracker takes the file that lies in `hmt_ros/experts/models` as keypoints.npz; any other one by
+its path.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
+from hmt_ros.app.learn_motion import chosen_motions
+from hmt_ros.app.progress import show_progress, tell_user, with_progress
+from hmt_ros.body import Body, load_body
+from hmt_ros.experts.keypoint_training import WindowSettings, keypoint_tracks, training_windows
+from hmt_ros.experts.lifter import Lifter
+from hmt_ros.experts.lifter_learning import LearningSettings, learn_lifter, lifter_scores
+from hmt_ros.experts.training_set import RATE, PoseSequence, recorded_sequence
+from msg_tools.files.error_line import error_line
+
+# Windows that a lifter is scored on.
+SCORED_WINDOWS = 2000
+
+
+@dataclass(frozen=True)
+class LifterOptions:
+    """Options of the command.
+
+    Attributes:
+        motions: Files or folders of recorded motions.
+        output: File to write; '.npz' is appended where it is missing.
+        without: Names of motions that are left out, without suffix.
+        test: Folder of motions of other people to score on, or None.
+        alike: Names that start with it are of few motions, each done many times.
+        alike_share: Factor on how often a window is drawn from these.
+        body: Body model: a name or a YAML file.
+        steps: Number of steps.
+        batch: Windows a step.
+        experts: Number of experts.
+        seed: Seed of all random choices.
+        resume: Whether a training that was broken off goes on.
+        acknowledgement: What to say of the sources in the file.
+        overwrite: Whether an existing file is replaced.
+        quiet: Whether progress and summary are suppressed.
+    """
+
+    motions: list[Path]
+    output: Path
+    without: list[str]
+    test: Path | None
+    alike: str
+    alike_share: float
+    body: str
+    steps: int
+    batch: int
+    experts: int
+    seed: int
+    resume: bool
+    acknowledgement: str
+    overwrite: bool
+    quiet: bool
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command; returns 0, or 1 after bad input, which one line on stderr explains."""
+    return run_command(_parser(), lambda arguments: _learn(LifterOptions(**vars(arguments))), argv)
+
+
+def _parser() -> CommandParser:
+    usual = LearningSettings()
+    parser = CommandParser(
+        prog='learn-lifter',
+        description='Learns to tell the depths of joints from windows of keypoints.',
+    )
+    parser.add_argument(
+        'motions', nargs='+', type=Path, metavar='MOTION',
+        help='file (.bvh, or .amc beside its .asf), or folder of them with its subfolders',
+    )  # fmt: skip
+    parser.add_argument(
+        '-o', '--output', type=Path, required=True, metavar='FILE.npz', help='file to write'
+    )
+    parser.add_argument(
+        '--without', nargs='+', default=[], metavar='NAME',
+        help='motions to leave out, names of files without suffix',
+    )  # fmt: skip
+    parser.add_argument(
+        '--test', type=Path, metavar='DIR', help='motions of other people to score on'
+    )
+    parser.add_argument(
+        '--alike', default='', metavar='PREFIX',
+        help='motions whose names start with it are few exercises, each done many times',
+    )  # fmt: skip
+    parser.add_argument(
+        '--alike-share', type=number(0.0, 1.0), default=0.35, metavar='SHARE',
+        help='factor on how often these are drawn (0.35)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--body', default='human37', help='body model: a name or a YAML file (human37)'
+    )
+    parser.add_argument(
+        '--steps',
+        type=whole_number(1),
+        default=usual.steps,
+        help=f'number of steps ({usual.steps})',
+    )
+    parser.add_argument(
+        '--batch', type=whole_number(2), default=usual.batch, help=f'windows a step ({usual.batch})'
+    )
+    parser.add_argument(
+        '--experts', type=whole_number(1, 32), default=usual.experts,
+        help=f'number of experts ({usual.experts})',
+    )  # fmt: skip
+    parser.add_argument(
+        '--seed', type=whole_number(0), default=0, help='seed of all random choices (0)'
+    )
+    parser.add_argument(
+        '--resume', action='store_true',
+        help='go on with a training that was broken off, marked beside FILE as FILE.resume',
+    )  # fmt: skip
+    parser.add_argument(
+        '--acknowledgement', default='', metavar='TEXT', help='what the file says of the sources'
+    )
+    parser.add_argument('--overwrite', action='store_true', help='replace an existing file')
+    parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
+    return parser
+
+
+def _learn(options: LifterOptions) -> int:
+    output, quiet = options.output, options.quiet
+    if output.suffix != '.npz':
+        output = output.with_name(output.name + '.npz')
+    if output.exists() and not options.overwrite:
+        raise ValueError(f'{output} exists: --overwrite replaces it')
+    if not output.parent.is_dir():
+        raise ValueError(f'there is no folder {output.parent} for {output.name}')
+    mark = output.with_suffix('.resume')
+    if mark.exists() and not options.resume:
+        raise ValueError(f'{mark} marks a training that was broken off: --resume, or remove it')
+    body = load_body(options.body)
+    learned = _read(chosen_motions(options.motions, options.without), options.body, quiet=quiet)
+    if not learned:
+        raise ValueError('none of the motions can be used')
+    tested = (
+        []
+        if options.test is None
+        else _read(chosen_motions([options.test], []), options.body, quiet=quiet)
+    )
+    shares = [
+        options.alike_share if options.alike and one.name.startswith(options.alike) else 1.0
+        for one in learned
+    ]
+    settings = LearningSettings(
+        experts=options.experts, steps=options.steps, batch=options.batch, seed=options.seed
+    )
+    windows = WindowSettings()
+    with show_progress('placing', quiet=quiet):
+        tracks = keypoint_tracks(body, learned, shares, seed=options.seed)
+    notes = {
+        'card': _card(learned, tested, options.acknowledgement),
+        'learning': asdict(settings), 'windows': asdict(windows),
+    }  # fmt: skip
+    with show_progress('learning', 'steps', options.steps, quiet=quiet) as bar:
+        done = 0
+
+        def told(step: int, _loss: float) -> None:
+            nonlocal done
+            bar.update(step - done)
+            done = step
+
+        lifter = learn_lifter(body, tracks, settings, windows, notes, told, mark)
+    if tested:
+        lifter.notes['scores'] = _scores(body, tested, lifter, windows)
+    lifter.save(output)
+    mark.unlink(missing_ok=True)
+    if not quiet:
+        size = output.stat().st_size / 1e6
+        print(f'{output}: {len(learned)} motions, {size:.1f} MB', flush=True)
+        for name, value in lifter.notes.get('scores', {}).items():
+            print(f'  {name}: {value}', flush=True)
+    return 0
+
+
+def _read(paths: list[Path], body: str, *, quiet: bool) -> list[PoseSequence]:
+    """The motions that can be used."""
+    with ProcessPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+        found = pool.map(partial(_sequence, body=body), paths, chunksize=2)
+        return [
+            one
+            for one in with_progress(found, 'reading', 'motions', len(paths), quiet=quiet)
+            if one is not None
+        ]
+
+
+def _sequence(path: Path, body: str) -> PoseSequence | None:
+    """The motion of a file; None, with one line on stderr, if the file cannot be used."""
+    try:
+        return recorded_sequence(path, load_body(body))
+    except (ValueError, OSError, ArithmeticError) as error:
+        tell_user('learn-lifter', f'skipped {path.name}: {error_line(error)}')
+        return None
+
+
+def _scores(
+    body: Body, tested: list[PoseSequence], lifter: Lifter, windows: WindowSettings
+) -> dict[str, str]:
+    """Scores on motions of other people, as text by what the keypoints are."""
+    tracks = keypoint_tracks(body, tested, [1.0] * len(tested), variants=1)
+    known = replace(
+        windows, cut=0.0, causal=0.0, gravity_spread=0.0, lengths_spread=0.0, lengths=1.0
+    )
+    kinds = {
+        'clean keypoints': replace(known, noise=0.0),
+        'a detector that errs': known,
+        'the same, causal': replace(known, causal=1.0),
+        'the same, lengths unknown': replace(known, causal=1.0, lengths=0.0),
+    }
+    result = {}
+    for name, kind in kinds.items():
+        drawn = training_windows(tracks, SCORED_WINDOWS, np.random.default_rng(0), kind, 0)
+        s = lifter_scores(lifter, *drawn)
+        result[name] = (
+            f'{1e3 * s.heaviest:.0f} mm heaviest, {1e3 * s.best:.0f} best, '
+            f'{s.log_density:.2f} nats, {100 * s.within:.0f} % within 90'
+        )
+    return result
+
+
+def _card(learned: list[PoseSequence], tested: list[PoseSequence], acknowledgement: str) -> str:
+    """What the file says of its motions."""
+    seconds = sum(len(one.poses) for one in learned) / RATE
+    names = ', '.join(sorted(one.name for one in learned))
+    said = f'{acknowledgement.strip()}\n' if acknowledgement.strip() else ''
+    scored = f' Scored on {", ".join(sorted(one.name for one in tested))}.' if tested else ''
+    return f'{said}Learned from {len(learned)} motions, {seconds:.0f} s: {names}.{scored}'
+
+
+if __name__ == '__main__':
+    sys.exit(main())

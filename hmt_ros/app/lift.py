@@ -1,0 +1,262 @@
+"""lift: from the keypoints of a detector to mixtures over poses, without any image.
+
+    lift walk.json -o walk --fov 60 --size 1280x720 --fps 30
+
+See `experts.lifter`; with images, `track-video` says more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
+from hmt_ros.app.import_video.camera_file import camera_of_view, read_camera
+from hmt_ros.app.import_video.frames import Frame, FrameSource, Selection
+from hmt_ros.app.import_video.keypoint_files import FoundPersons, read_keypoints
+from hmt_ros.app.import_video.persons import Choice, Chooser
+from hmt_ros.app.progress import show_progress, tell_user
+from hmt_ros.app.rendered_bag import START_NS
+from hmt_ros.app.report.command import ReportOptions, write_report
+from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body.ground_terms import FloorPlane
+from hmt_ros.experts.lifted_fit import lift_poses
+from hmt_ros.experts.lifter import SHIPPED, load_lifter
+from hmt_ros.image.keypoint_schemes import AUTO
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.sessions.bme_session import PREDICTION
+from hmt_ros.sessions.camera_session import CAMERA_INFO, FRAME_ID
+from hmt_ros.tracking.gravity import Gravity
+from hmt_ros.tracking.initialisation import body_from_keypoints
+from hmt_ros.tracking.keypoint_evidence import FEWEST_KEYPOINTS
+from msg_tools import BagWriter, RosbagsMessages
+from msg_tools.files.error_line import error_line
+from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.headers import SECOND_NS
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
+
+LIFTED, REPORT = 'lifted', 'report'
+# Standard deviation of a given vertical, rad.
+UP_SIGMA = 0.02
+
+EPILOG = """\
+KEYPOINTS is what import-video takes: COCO (.json), a folder of OpenPose, .npz or .csv.
+
+DIR gets
+  lifted/             a bag with pose_prediction: a mixture over poses for each image
+  report/report.html  the page that report writes, for a browser
+
+An image with fewer than five landmarks gets an empty mixture. The proportions of the person are
+those that the keypoints of a few images show. --stature makes the poses as large as the person;
+without it they are as large as people usually are.
+
+examples:
+  lift walk.json -o walk --fov 60 --size 1280x720 --fps 25
+  lift mediapipe.npz -o walk --camera camera.yaml --size 640x480 --fps 30 --level --stature 1.75
+
+exit code: 0 done, 1 bad input (one line on stderr explains it), 130 interrupted
+"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command; 0: the poses are there, 1: bad input, which one line on stderr explains."""
+    return run_command(_parser(), _lift, argv)
+
+
+def _parser() -> CommandParser:
+    parser = CommandParser(
+        'lift', 'Tells the poses of a person from the keypoints of a detector alone.', EPILOG
+    )
+    parser.add_argument('keypoints', type=Path, metavar='KEYPOINTS', help='file or folder')
+    parser.add_output('DIR', 'result', 'folder for the bag and the report')
+    camera = parser.add_argument_group('camera, one of these')
+    camera = camera.add_mutually_exclusive_group(required=True)
+    angle = number(1, 150, what='an angle', unit=' degrees')
+    camera.add_argument(
+        '--fov', type=angle, metavar='DEGREES', help='horizontal field of view of the image'
+    )
+    camera.add_argument(
+        '--vertical-fov', type=angle, metavar='DEGREES', help='field of view from top to bottom'
+    )
+    camera.add_argument(
+        '--camera', type=Path, metavar='FILE',
+        help='calibration file of OpenCV (YAML, XML, JSON) or of ROS (camera_info YAML)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--size', type=_size, metavar='WxH',
+        help='width and height of the images, px; not needed where the file tells it',
+    )  # fmt: skip
+    parser.add_argument(
+        '--fps', type=number(0.01, 1000), default=30.0, help='images per second (default: 30)'
+    )
+    parser.add_argument(
+        '--first-stamp', type=whole_number(1, 2**62), default=START_NS, metavar='NS',
+        help=f'stamp of the first image, ns (default: {START_NS})',
+    )  # fmt: skip
+    parser.add_argument(
+        '--first-number', type=whole_number(0), default=0, metavar='N',
+        help='number of the first image (default: 0)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--person', type=Choice.parse, default=Choice(), metavar='WHICH',
+        help='person among several, see import-video (default: nearest)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--stature', type=number(0.3, 3), help='stature of the person, m (default: not known)'
+    )
+    tilt = parser.add_mutually_exclusive_group()
+    tilt.add_argument(
+        '--level', action='store_true', help='the camera is level: gravity is down in the image'
+    )
+    tilt.add_argument(
+        '--gravity', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+        help='direction of gravity, of any length; x to the right of the image, y down, z forward '
+        '(default: not known)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--causal', action='store_true', help='as a camera sees it: later images do not count'
+    )
+    parser.add_argument(
+        '--scheme', default=AUTO, help='names of the keypoints, see docs/keypoints.md (auto)'
+    )
+    parser.add_argument(
+        '--lifter', default=SHIPPED, metavar='MODEL',
+        help='file that learn-lifter wrote (default: the one that ships)',
+    )  # fmt: skip
+    return parser
+
+
+def _size(text: str) -> tuple[int, int]:
+    try:
+        width, height = (int(x) for x in text.lower().split('x'))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'wanted WxH, such as 640x480, saw {text!r}') from None
+    if min(width, height) < 1:
+        raise argparse.ArgumentTypeError(f'wanted a size above 0, saw {text!r}')
+    return width, height
+
+
+class _NoFrames(FrameSource):
+    """What numbers frames that are not there."""
+
+    def frames(self, selection: Selection) -> Iterator[Frame]:
+        """None."""
+        yield from ()
+
+
+def _lift(arguments: argparse.Namespace) -> int:
+    folder, quiet = arguments.output, arguments.quiet
+    taken = [x for x in (LIFTED, REPORT) if (folder / x).exists()]
+    if taken and not arguments.overwrite:
+        raise ValueError(f'{folder / taken[0]} exists; give another name, or --overwrite')
+    lifter = load_lifter(arguments.lifter)
+    source = _NoFrames(arguments.keypoints, (), arguments.first_number)
+    found = read_keypoints(arguments.keypoints, source, arguments.first_stamp)
+    camera = _camera(arguments, found)
+    times, seen = _chosen(found, arguments.person, arguments.fps)
+    stamps = [arguments.first_stamp + time for time in times]
+    if not any(len(one.names) for one in seen):
+        raise ValueError(f'{arguments.keypoints}: no keypoints of the chosen person; see --person')
+    up = _up(arguments)
+    body = _body(camera, seen, arguments, up)
+    ups = None if up is None else np.tile(up, (len(stamps), 1))
+    with show_progress('lifting', quiet=quiet):
+        mixtures = lift_poses(
+            lifter, body, camera, 1e-9 * np.array(times, dtype=np.float64), seen, ups,
+            lengths_known=True, causal=arguments.causal, scheme=arguments.scheme,
+        )  # fmt: skip
+    if all(one is None for one in mixtures):
+        raise ValueError(
+            f'{arguments.keypoints}: no image shows five landmarks that are known; see --scheme'
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    messages = RosbagsMessages()
+    with BagWriter(folder / LIFTED, overwrite=arguments.overwrite) as bag:
+        for stamp, mixture in zip(stamps, mixtures, strict=True):
+            info = camera_info_message(messages, camera, stamp, FRAME_ID)
+            bag.write(CAMERA_INFO, stamp, info)
+            content = PoseMixture.of_body(body, mixture, MixtureKind.PREDICTION, stamp, FRAME_ID)
+            bag.write(PREDICTION, stamp, pose_mixture_message(messages, content))
+    options = ReportOptions(
+        folder / LIFTED, folder / REPORT, overwrite=arguments.overwrite, quiet=quiet,
+        topics=(PREDICTION,),
+    )  # fmt: skip
+    _, written = write_report(options)
+    if not quiet:
+        print(f'{folder / LIFTED}: {_summary(mixtures)}\n{written}')
+    return 0
+
+
+def _summary(mixtures: list[GaussianMixture | None]) -> str:
+    found = sum(one is not None for one in mixtures)
+    return f'{len(mixtures)} images, {found} with a pose'
+
+
+def _camera(arguments: argparse.Namespace, found: FoundPersons) -> Camera:
+    size = arguments.size or found.size
+    if size is None:
+        raise ValueError('the size of the images is unknown: --size WxH')
+    if arguments.camera is not None:
+        return read_camera(arguments.camera, size)
+    return camera_of_view(size, arguments.fov, arguments.vertical_fov)
+
+
+def _chosen(found: FoundPersons, choice: Choice, fps: float) -> tuple[list[int], list[Keypoints]]:
+    """Times, ns, and keypoints of the chosen person, without names where there are none."""
+    chooser = Chooser(choice)
+    if found.by_time:
+        frames = sorted(found.by_time)
+        persons = [found.by_time[time] for time in frames]
+        times = frames
+    else:
+        frames = list(range(found.last + 1))
+        persons = [found.by_number.get(frame, []) for frame in frames]
+        times = [round(frame * SECOND_NS / fps) for frame in frames]
+    seen = []
+    for i, those in enumerate(persons):
+        chosen = chooser.of(i, those)
+        seen.append(NOBODY if chosen is None else chosen.keypoints)
+    return times, seen
+
+
+NOBODY = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
+
+
+def _body(
+    camera: Camera, seen: list[Keypoints], arguments: argparse.Namespace, up: Array | None
+) -> Body:
+    """The body with the lengths that the keypoints show."""
+    body = load_body('human37')
+    named = [one.named_for(body, arguments.scheme)[0] for one in seen]
+    shown = [one for one in named if one.seen.sum() >= FEWEST_KEYPOINTS]
+    upright = None if up is None else Gravity(FloorPlane(up, UP_SIGMA, None, np.inf))
+    if shown:
+        try:
+            return body_from_keypoints(
+                body, camera, shown, stature=arguments.stature, upright=upright
+            )
+        except ValueError as error:
+            tell_user('lift', f'usual lengths are taken: {error_line(error)}')
+    return body if arguments.stature is None else body.with_stature(arguments.stature)
+
+
+def _up(arguments: argparse.Namespace) -> Array | None:
+    """(3,) unit vector against gravity; None: it is not known."""
+    gravity = (0.0, 1.0, 0.0) if arguments.level else arguments.gravity
+    if gravity is None:
+        return None
+    down = np.array(gravity, dtype=np.float64)
+    length = float(np.linalg.norm(down))
+    if not (np.isfinite(length) and length > 0):
+        raise ValueError(f'--gravity: wanted a direction, saw {gravity}')
+    return np.asarray(-down / length)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,227 @@
+"""Poses of a body that have lifted joints: each component of a mixture becomes a Gaussian.
+
+    E(x) = 1/2 sum_ja ((a' (J_j(x) - t) - m_ja) / s_ja)^2 + 1/2 sum_l |A_l P_l(x)|^2 / n_l^2
+           + E_prior(x)
+
+J_j is joint j of the pose x, a the axes of the person's view, t the middle of the hips; P_l is
+landmark l, A_l what it is across the ray of its keypoint, whose noise is n_l. A closed form gives
+the start (`motion.limb_angles`); linear least squares place it where the landmarks are seen;
+Newton's method within the limits gives the minimum, its Hessian the covariance. How far away the
+person is hardly shows: the spread of people's size is added along the line of sight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.kinematics import forward, point_energy
+from hmt_ros.body.pose_prior import LEARNED, pose_prior
+from hmt_ros.experts.keypoint_windows import landmark_offsets
+from hmt_ros.experts.lifter import Lifter, landmark_rays, lift_sequence
+from hmt_ros.image.keypoint_schemes import AUTO, noise_of
+from hmt_ros.image.lifted_poses import HIPS, WHOLE, LiftedPoses
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.bounded_newton import minimise
+from hmt_ros.inference.energy import EnergyFunction
+from hmt_ros.inference.mixture import GaussianMixture
+from hmt_ros.motion.limb_angles import limb_angles
+
+# Where the hips are until they are placed, m before the camera.
+AWAY = np.array([0.0, 0.0, 5.0])
+# Weight of the prior of the body, and of its means: what lifted joints leave open, such as twists.
+PRIOR_WEIGHT = 0.3
+ITERATIONS, TOLERANCE = 12, 0.05
+# Factor on deviations across the line of sight, which the keypoints themselves show, and scale of
+# the robust kernel of these, in standard deviations.
+ACROSS, KERNEL = 4.0, 4.0
+# Deviation of a landmark from its keypoint, m at the person.
+SEEN = 0.03
+# Factor on covariances: keypoints and joints err together. Chosen on clips, so that regions of 90 %
+# of single joints hold 88 %.
+TOGETHER = 4.0
+# Relative standard deviation of the size of a person.
+KNOWN_SIZE, UNKNOWN_SIZE = 0.02, 0.06
+# A person is at least this far away, m.
+NEAREST = 0.4
+
+
+def lift_poses(
+    lifter: Lifter,
+    body: Body,
+    camera: Camera,
+    stamps: Array,
+    keypoints: Sequence[Keypoints],
+    ups: Array | None = None,
+    *,
+    lengths_known: bool = False,
+    causal: bool = False,
+    scheme: str = AUTO,
+) -> list[GaussianMixture | None]:
+    """Mixtures over poses from the keypoints of a sequence, without any image.
+
+    Args:
+        lifter: see `load_lifter`.
+        body: of the person, with the lengths as far as they are known.
+        camera: that saw the keypoints, and stood still.
+        stamps: (T,) times of the images, increasing, s.
+        keypoints: T sets of keypoints of one person.
+        ups: (T, 3) unit vectors against gravity, camera frame; None: unknown.
+        lengths_known: whether the lengths of the body are those of the person.
+        causal: whether images after each do not count.
+        scheme: of the keypoints' names, see `keypoint_schemes`.
+
+    Returns:
+        T mixtures, heaviest first; None where fewer than five landmarks are seen.
+
+    Raises:
+        ValueError: there is no such scheme, or the body lacks joints.
+    """
+    lifted = lift_sequence(
+        lifter, camera, stamps, keypoints, ups, body.segment_lengths if lengths_known else None,
+        causal=causal, scheme=scheme,
+    )  # fmt: skip
+    rows = [i for i, one in enumerate(lifted) if one is not None]
+    seen = [landmark_rays(camera, keypoints[i], scheme) for i in rows]
+    result: list[GaussianMixture | None] = [None] * len(lifted)
+    spread = KNOWN_SIZE if lengths_known else UNKNOWN_SIZE
+    found = poses_of(
+        body, [one for one in lifted if one is not None],
+        np.array([rays for rays, _ in seen]), np.array([sure for _, sure in seen]), spread,
+    )  # fmt: skip
+    for row, mixture in zip(rows, found, strict=True):
+        result[row] = mixture
+    return result
+
+
+def poses_of(
+    body: Body,
+    lifted: Sequence[LiftedPoses],
+    rays: Array,
+    confidences: Array,
+    size_spread: float,
+) -> list[GaussianMixture]:
+    """Mixtures over poses of a body that has the joints of lifted poses.
+
+    Args:
+        body: of the person, with lengths as far as they are known.
+        lifted: N mixtures with the same joints and the same number of components.
+        rays: (N, L, 2) of the landmarks (`keypoint_windows.LANDMARKS`) at that time, x/z and y/z.
+        confidences: (N, L) of these; 0: not seen.
+        size_spread: relative standard deviation of the person's size.
+
+    Raises:
+        ValueError: the body lacks some of the joints, or the mixtures lack some of a whole pose.
+    """
+    if not lifted:
+        return []
+    if not lifted[0].are_whole:
+        raise ValueError(
+            f'lifted poses with the joints {lifted[0].joints} are not whole, wanted all of '
+            f'{sorted(WHOLE)}'
+        )
+    k = len(lifted[0].log_weights)
+    rays, confidences = np.repeat(rays, k, axis=0), np.repeat(confidences, k, axis=0)
+    poses, shifts = _placed(body, _postures(body, lifted), rays, confidences)
+    poses, covariances = _fitted(body, poses, lifted, rays, confidences)
+    size = (size_spread * poses[:, :3, None]) * (size_spread * poses[:, None, :3])
+    covariances[:, :3] = covariances[:, :, :3] = 0.0
+    covariances[:, :3, :3] = shifts + size
+    return [
+        GaussianMixture(
+            np.exp(one.log_weights), poses[i * k : (i + 1) * k], covariances[i * k : (i + 1) * k]
+        ).sorted()
+        for i, one in enumerate(lifted)
+    ]
+
+
+def _postures(body: Body, lifted: Sequence[LiftedPoses]) -> Array:
+    """Poses (N K, d) near the means, with the hips `AWAY`, in closed form."""
+    skeleton, joints = body.skeleton, lifted[0].joints
+    means = np.concatenate([one.sized(skeleton) @ one.axes for one in lifted]) + AWAY
+    place = {name: means[:, j] for j, name in enumerate(joints)}
+    # So few frames a second that none has neighbours.
+    return limb_angles(skeleton, place, 1e-3)
+
+
+def _fitted(
+    body: Body, poses: Array, lifted: Sequence[LiftedPoses], rays: Array, confidences: Array
+) -> tuple[Array, Array]:
+    """Minima from poses (M, d), and their covariances (M, d, d)."""
+    skeleton, joints = body.skeleton, lifted[0].joints
+    which = skeleton.joint_index(joints)
+    hips = body.joint_positions(poses)[:, skeleton.joint_index(HIPS)].mean(1)
+    means = np.concatenate([one.sized(skeleton) @ one.axes for one in lifted]) + hips[:, None]
+    axes = np.repeat([one.axes for one in lifted], len(lifted[0].log_weights), axis=0)
+    deviations = np.concatenate([one.deviations for one in lifted]) * (ACROSS, ACROSS, 1.0)
+    whiten = (axes[:, None] / deviations[..., None]).transpose(1, 2, 3, 0)
+    segments, local = _marks(body)
+    m, count = confidences.shape
+    # How far x and y are from those of the ray, a z and b z, m.
+    across = np.zeros((count, 3, 3, m))
+    across[:, 0, 0] = across[:, 1, 1] = 1.0
+    across[:, 0, 2], across[:, 1, 2] = -rays[..., 0].T, -rays[..., 1].T
+    error = np.einsum('jikn,jkn->jin', across, forward(skeleton, poses).points(segments, local))
+    precision = np.where(confidences.T > 0, noise_of(confidences.T) ** -2.0, 0.0)
+    precision /= (1.0 + (error**2).sum(1) * precision / KERNEL**2) ** 2
+    prior = pose_prior(body, LEARNED, PRIOR_WEIGHT)
+    ones, nothing = np.ones((len(joints), m)), np.zeros((count, 3, m))
+
+    def energy(x: Array, rows: Index) -> tuple[Array, Array, Array]:
+        frames = forward(skeleton, x)
+        known = prior.energy(frames, rows)
+        terms = (
+            (known.value, *known.derivatives()),
+            point_energy(
+                frames, skeleton.joint_segments[which], skeleton.joint_offsets[which],
+                means[rows].transpose(1, 2, 0), ones[:, rows], whiten[..., rows],
+            ),
+            point_energy(
+                frames, segments, local, nothing[..., rows], precision[:, rows], across[..., rows]
+            ),
+        )  # fmt: skip
+        first, second, third = terms
+        return (
+            first[0] + second[0] + third[0],
+            first[1] + second[1] + third[1],
+            first[2] + second[2] + third[2],
+        )
+
+    found = minimise(
+        EnergyFunction(energy), poses, body.lower, body.upper,
+        step_scale=np.where(skeleton.dof_is_rotation, 0.5, 0.3), damping=1.0,
+        max_iterations=ITERATIONS, tolerance=TOLERANCE,
+    )  # fmt: skip
+    covariances = np.linalg.inv(found.hessian + 1e-6 * np.eye(skeleton.dimension))
+    return found.x, np.asarray(0.5 * TOGETHER * (covariances + covariances.transpose(0, 2, 1)))
+
+
+def _placed(body: Body, poses: Array, rays: Array, confidences: Array) -> tuple[Array, Array]:
+    """Poses (M, d) whose landmarks are seen along rays (M, L, 2); covariances of their places."""
+    places = forward(body.skeleton, poses).points(*_marks(body)).transpose(2, 0, 1)
+    places = places - poses[:, None, :3]
+    a, b = rays[..., 0], rays[..., 1]
+    weight = np.sqrt(confidences)
+    one, none = np.ones_like(a), np.zeros_like(a)
+    rows = np.stack([np.stack([one, none, -a], 2), np.stack([none, one, -b], 2)], axis=2)
+    wanted = np.stack([a, b], axis=2) * places[..., 2:] - places[..., :2]
+    rows, wanted = rows * weight[..., None, None], wanted * weight[..., None]
+    rows, wanted = rows.reshape(len(poses), -1, 3), wanted.reshape(len(poses), -1)
+    normal = rows.transpose(0, 2, 1) @ rows + 1e-9 * np.eye(3)
+    roots = np.linalg.solve(normal, np.einsum('mri,mr->mi', rows, wanted)[..., None])[..., 0]
+    near = np.maximum(roots[:, 2], max(NEAREST, 1.05 * float(body.lower[2])))
+    roots *= (near / np.maximum(roots[:, 2], 1e-3))[:, None]
+    result = poses.copy()
+    result[:, :3] = np.clip(roots, body.lower[:3], body.upper[:3])
+    return result, np.asarray(SEEN**2 * np.linalg.inv(normal))
+
+
+def _marks(body: Body) -> tuple[Index, Array]:
+    """Segments (L,) that carry the landmarks, and places (L, 3) in their frames, m."""
+    names, offsets = landmark_offsets(body)
+    which = body.skeleton.joint_index(tuple(names))
+    return body.skeleton.joint_segments[which], body.skeleton.joint_offsets[which] + offsets

@@ -1,0 +1,320 @@
+"""Experts that know depth: a mixture of poses from a window of keypoints (BME 2, other inputs).
+
+    p(y | r) = sum_i g_i(r) N(y; f_i(r), diag s_i(r)^2)
+
+y are the joints of a person of usual lengths, from the middle of the hips, along the axes of a
+camera that looks at the person; r is a window of keypoints (`keypoint_windows`). Gates g, means f
+and deviations s are one network with shared layers [Bishop 1994], learned from motion capture seen
+by cameras and a detector that errs as real ones do (`keypoint_training`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hmt_ros.body.body import Body
+from hmt_ros.body.camera import Camera
+from hmt_ros.body.model_file import load_body
+from hmt_ros.experts.keypoint_windows import (
+    LANDMARKS,
+    NEAR,
+    PROPORTIONED,
+    TIMES,
+    WindowInputs,
+    filled,
+    places_of,
+    proportions,
+    window_inputs,
+)
+from hmt_ros.experts.model_file import (
+    FAULTS,
+    check_header,
+    damaged,
+    header,
+    parameters_of,
+    read_arrays,
+    write_arrays,
+)
+from hmt_ros.experts.pose_encoding import ray_rotations
+from hmt_ros.image.keypoint_schemes import AUTO, position_deviations
+from hmt_ros.image.lifted_poses import LiftedPoses, bone_lengths, from_positions
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.inference.arrays import Array
+
+FOLDER = Path(__file__).resolve().parent / 'models'
+SHIPPED = 'keypoints'
+KIND = 'lifter'
+LEAK = 0.1  # slope of a layer's units below 0
+
+# Earliest time of a window, s. Least z of a ray: one from beside the camera says little.
+EARLIEST, BEFORE = float((TIMES - NEAR).min()), 0.1
+# Standard deviation with which a keypoint is not looked at, m at the person.
+ANYWHERE = 0.15
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """What gates, means and deviations share: layers of units that leak, each added to the last.
+
+    Attributes:
+        mean, scale: (p,) of the inputs.
+        first, first_bias: (p, H), (H,).
+        hidden, hidden_biases: (M, H, H), (M, H).
+        last, last_bias: (H, K + 6 J K), gates, means and log deviations.
+        middle: (J, 3) what means are relative to, m.
+    """
+
+    mean: Floats
+    scale: Floats
+    first: Floats
+    first_bias: Floats
+    hidden: Floats
+    hidden_biases: Floats
+    last: Floats
+    last_bias: Floats
+    middle: Floats
+
+    @property
+    def experts(self) -> int:
+        """Number of experts, K."""
+        return int(self.last.shape[1]) // (1 + 6 * len(self.middle))
+
+    def __call__(self, inputs: Floats) -> tuple[Array, Array, Array]:
+        """Log gates (N, K), means (N, K, J, 3) and deviations (N, K, J, 3), m, of inputs (N, p)."""
+        whitened: Floats = (inputs - self.mean) / self.scale
+        units = _leaky(whitened @ self.first + self.first_bias)
+        for weights, bias in zip(self.hidden, self.hidden_biases, strict=True):
+            units = units + _leaky(units @ weights + bias)
+        out = (units @ self.last + self.last_bias).astype(np.float64)
+        n, k, j = len(inputs), self.experts, len(self.middle)
+        gates, means = out[:, :k], out[:, k : k * (1 + 3 * j)].reshape(n, k, j, 3)
+        spreads = out[:, k * (1 + 3 * j) :].reshape(n, k, j, 3)
+        gates = gates - gates.max(1, keepdims=True)
+        gates = gates - np.log(np.exp(gates).sum(1, keepdims=True))
+        return gates, MEANS * means + self.middle, np.exp(np.clip(spreads + SPREAD, *SPREADS))
+
+
+# Scale of the means, m; log of the usual deviation, and its limits, log m.
+MEANS, SPREAD, SPREADS = 0.3, -2.5, (-5.0, 1.0)
+
+
+def _leaky(x: Floats) -> Floats:
+    result: Floats = np.maximum(x, np.float32(LEAK) * x)
+    return result
+
+
+class Lifter:
+    """Predicts mixtures over whole poses from windows of keypoints.
+
+    Args:
+        network: that has learned.
+        joints: (J,) names of the joints of its poses.
+        usual: body with the usual lengths, whose joints they are.
+        notes: where it comes from, for its file.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        joints: Sequence[str],
+        usual: Body,
+        notes: dict[str, Any] | None = None,
+    ) -> None:
+        self.network, self.joints, self.usual = network, tuple(joints), usual
+        self.lengths = bone_lengths(usual.skeleton, self.joints)
+        self.notes = dict(notes or {})
+
+    def proportions(self, body: Body) -> Array | None:
+        """What a window takes in of a person's lengths; None: the body lacks some of them."""
+        lengths = body.segment_lengths
+        known = lengths.keys() >= {*PROPORTIONED}
+        return proportions(self.usual, lengths) if known else None
+
+    def of_inputs(self, inputs: WindowInputs) -> list[LiftedPoses | None]:
+        """The mixtures of N windows; None where nobody is seen."""
+        result: list[LiftedPoses | None] = [None] * len(inputs.known)
+        rows = np.flatnonzero(inputs.known)
+        if len(rows):
+            gates, means, deviations = self.network(inputs.values[rows])
+            for i, row in enumerate(rows):
+                result[row] = LiftedPoses(
+                    self.joints, gates[i], means[i], deviations[i], inputs.axes[row], self.lengths
+                )
+        return result
+
+    def save(self, path: str | Path) -> Path:
+        """Writes the lifter into an .npz file, with half precision, and returns its path."""
+        arrays = {
+            name: np.asarray(value, dtype=np.float16 if value.ndim > 1 else np.float32)
+            for name, value in vars(self.network).items()
+        }
+        parameters = {
+            'joints': list(self.joints), 'landmarks': list(LANDMARKS), 'times': TIMES.tolist(),
+            'body': self.usual.name, 'notes': self.notes,
+        }  # fmt: skip
+        return write_arrays(path, header(KIND, parameters) | arrays)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Lifter:
+        """Reads a lifter that `save` wrote.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is no lifter, or one of another version.
+        """
+        arrays = read_arrays(path, KIND)
+        check_header(arrays, KIND, str(path))
+        try:
+            parameters = parameters_of(arrays)
+            if parameters['landmarks'] != list(LANDMARKS) or parameters['times'] != TIMES.tolist():
+                raise ValueError(f'{path}: learned for other windows: train it anew')
+            network = Network(
+                **{name: np.asarray(arrays[name], dtype=np.float32) for name in _NETWORK}
+            )
+            usual = load_body(parameters['body'])
+            made = cls(network, parameters['joints'], usual, parameters['notes'])
+            network(np.zeros((1, len(network.mean)), dtype=np.float32))
+        except FAULTS as fault:
+            raise damaged(str(path), fault) from fault
+        return made
+
+
+_NETWORK = tuple(Network.__dataclass_fields__)
+
+
+@cache
+def load_lifter(model: str = SHIPPED) -> Lifter:
+    """A lifter that ships, by its name, or one from a file.
+
+    Raises:
+        FileNotFoundError: there is neither such a name nor such a file.
+        ValueError: the file is no lifter, or one of another version.
+    """
+    shipped = FOLDER / f'{model}.npz'
+    return Lifter.load(shipped if model == SHIPPED else model)
+
+
+class KeypointHistory:
+    """The keypoints of one person in the last images, from which a lifter sees a window.
+
+    Args:
+        camera: that sees them.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._stamps: list[float] = []
+        self._rays: list[Array] = []
+        self._confidences: list[Array] = []
+
+    def add(self, keypoints: Keypoints, stamp: float) -> None:
+        """Takes the keypoints of the next image.
+
+        Args:
+            keypoints: of the person.
+            stamp: of the image, s; later than those before.
+        """
+        rays, confidences = landmark_rays(self._camera, keypoints)
+        while self._stamps and self._stamps[0] < stamp + EARLIEST:
+            for values in (self._stamps, self._rays, self._confidences):
+                values.pop(0)
+        self._stamps.append(stamp)
+        self._rays.append(rays)
+        self._confidences.append(confidences)
+
+    def carry(self, rotation: Array) -> None:
+        """Takes what is known into the frame (rotation (3, 3)) of a camera that has turned."""
+        for i, rays in enumerate(self._rays):
+            turned = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) @ rotation.T
+            self._rays[i] = turned[:, :2] / np.maximum(turned[:, 2:], BEFORE)
+
+    def inputs(self, up: Array | None, person: Array | None) -> WindowInputs:
+        """Inputs of the window at the last image.
+
+        Args:
+            up: (3,) unit vector against gravity, camera frame; None: unknown.
+            person: proportions of the person; None: unknown.
+        """
+        stamps = np.array(self._stamps)
+        rows, there, times = filled(stamps, stamps[-1:], causal=True)
+        rays, confidences = np.array(self._rays)[rows], np.array(self._confidences)[rows]
+        return window_inputs(
+            rays, confidences * there[..., None], times,
+            np.zeros((1, 3)) if up is None else np.asarray(up)[None],
+            np.zeros((1, len(PROPORTIONED))) if person is None else person[None],
+        )  # fmt: skip
+
+
+def lift_sequence(
+    lifter: Lifter,
+    camera: Camera,
+    stamps: Array,
+    keypoints: Sequence[Keypoints],
+    ups: Array | None = None,
+    lengths: Mapping[str, float] | None = None,
+    *,
+    causal: bool = False,
+    scheme: str = AUTO,
+) -> list[LiftedPoses | None]:
+    """The mixtures of all images of a sequence; None where nobody is seen.
+
+    Args:
+        lifter: that has learned.
+        camera: that saw the keypoints, and stood still.
+        stamps: (T,) times of the images, increasing, s.
+        keypoints: T sets of keypoints of one person.
+        ups: (T, 3) unit vectors against gravity, camera frame; None: unknown.
+        lengths: of the person by name, m; None: unknown.
+        causal: whether images after each do not count.
+        scheme: of the names.
+
+    Raises:
+        ValueError: there is no such scheme.
+    """
+    seen = [landmark_rays(camera, one, scheme) for one in keypoints]
+    rays, confidences = (np.array([one[i] for one in seen]) for i in range(2))
+    rows, there, times = filled(stamps, stamps, causal=causal)
+    person = np.zeros(len(PROPORTIONED))
+    if lengths is not None:
+        person = proportions(lifter.usual, lengths)
+    inputs = window_inputs(
+        rays[rows], confidences[rows] * there[..., None], times,
+        np.zeros((len(stamps), 3)) if ups is None else ups, np.tile(person, (len(stamps), 1)),
+    )  # fmt: skip
+    return lifter.of_inputs(inputs)
+
+
+def landmark_rays(camera: Camera, keypoints: Keypoints, scheme: str = AUTO) -> tuple[Array, Array]:
+    """Rays (L, 2), x / z and y / z, and confidences (L,) of the landmarks that keypoints show."""
+    rays, confidences = np.zeros((len(LANDMARKS), 2)), np.zeros(len(LANDMARKS))
+    places = np.array(places_of(keypoints, scheme), dtype=np.intp)
+    shown = np.flatnonzero(keypoints.seen & (places >= 0))
+    if len(shown):
+        found = camera.rays(keypoints.pixels[shown])
+        rays[places[shown]] = found[:, :2] / np.maximum(found[:, 2:], BEFORE)
+        # A keypoint that may be anywhere says nothing, however confident it is.
+        sigma = np.sqrt(0.5 * np.trace(keypoints.covariances[shown], axis1=1, axis2=2))
+        known = ~(sigma > ANYWHERE * keypoints.magnification())
+        confidences[places[shown]] = np.where(known, keypoints.confidences[shown], 0.0)
+    return rays, confidences
+
+
+def lifted_positions(camera: Camera, keypoints: Keypoints) -> LiftedPoses | None:
+    """The one pose that a detector which lifts guesses; None: it shows no hips."""
+    assert keypoints.positions is not None
+    seen = keypoints.seen
+    if not seen.any():
+        return None
+    ray = camera.rays(keypoints.pixels[seen].mean(0, keepdims=True))
+    axes = ray_rotations(ray)[0].T
+    deviations = position_deviations(keypoints.scheme)
+    return from_positions(keypoints.names, keypoints.positions, axes, deviations)

@@ -1,0 +1,217 @@
+"""Whole poses that somebody has lifted from an image: a mixture over joints relative to the hips.
+
+    p(y) = sum_c w_c prod_ja N(y_ja; m_cja, s_cja^2),    y_j: joint j from the middle of the hips
+
+The axes a are those of a person: across the line of sight, and along it. Experts (`experts.lifter`)
+give several components; a network that guesses one pose gives one, and says nothing of how far it
+is to be believed, which is learned (`keypoint_schemes.yaml`).
+
+Positions are those of a person of some lengths. What counts are the directions of bones: for a
+person of other lengths every bone is scaled to its own length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.skeleton import Skeleton, other_side
+from hmt_ros.inference.arrays import Array, Index
+
+WHOLE = {
+    'pelvis', 'neck', 'head',
+    *(f'{side}_{name}' for name in ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle')
+      for side in ('left', 'right')),
+}  # fmt: skip
+# Deviation of a joint of which nothing is said, m.
+UNKNOWN = 0.5
+HIPS = ('left_hip', 'right_hip')
+# The joint that each joint hangs on by a bone; the others hang on the middle of the hips.
+CARRIERS = {
+    'head': 'neck', 'shoulder': 'neck', 'elbow': 'shoulder', 'wrist': 'elbow', 'hand': 'wrist',
+    'knee': 'hip', 'ankle': 'knee', 'toe': 'ankle',
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedPoses:
+    """A mixture over the joints of a person.
+
+    Attributes:
+        joints: (J,) names of joints of our bodies.
+        log_weights: (C,) of the components.
+        means: (C, J, 3) from the middle of the hips, along the axes, m.
+        deviations: (C, J, 3) standard deviations along the axes, m.
+        axes: (3, 3) unit vectors in rows, camera frame; the last one is the line of sight.
+        lengths: (J,) of the bones that the joints hang on, of the person whose joints they are, m.
+    """
+
+    joints: tuple[str, ...]
+    log_weights: Array
+    means: Array
+    deviations: Array
+    axes: Array
+    lengths: Array
+
+    def __post_init__(self) -> None:
+        c, j = len(self.log_weights), len(self.joints)
+        shapes = tuple(np.shape(x) for x in (self.means, self.deviations, self.axes, self.lengths))
+        if shapes != ((c, j, 3), (c, j, 3), (3, 3), (j,)):
+            raise ValueError(f'{c} poses of {j} joints with arrays of shapes {shapes}')
+
+    @property
+    def are_whole(self) -> bool:
+        """Whether a pose can be made of them alone: all joints but toes and hands are there."""
+        return {*self.joints} >= WHOLE
+
+    def of_joints(self, names: Sequence[str]) -> LiftedPoses:
+        """The mixture over some of the joints."""
+        rows = [self.joints.index(name) for name in names]
+        return LiftedPoses(
+            tuple(names), self.log_weights, self.means[:, rows], self.deviations[:, rows],
+            self.axes, self.lengths[rows],
+        )  # fmt: skip
+
+    def sized(self, skeleton: Skeleton) -> Array:
+        """The means (C, J, 3) of a person with the lengths of a skeleton that has the joints."""
+        return self._with_lengths(bone_lengths(skeleton, self.joints))
+
+    def _with_lengths(self, own: Array) -> Array:
+        factors = own / np.maximum(self.lengths, 1e-6)
+        result = np.empty_like(self.means)
+        for j, carrier in ordered(self.joints):
+            bone = self.means[:, j] if carrier < 0 else self.means[:, j] - self.means[:, carrier]
+            start = 0.0 if carrier < 0 else result[:, carrier]
+            result[:, j] = start + factors[j] * bone
+        return result
+
+    def resized(self, other: LiftedPoses) -> Array:
+        """The means (C, J, 3) with the lengths of another mixture, where it has a joint."""
+        lengths = dict(zip(other.joints, other.lengths.tolist(), strict=True))
+        own = [lengths.get(name, length) for name, length in zip(self.joints, self.lengths)]
+        return self._with_lengths(np.array(own))
+
+    def exchanged(self) -> LiftedPoses:
+        """As a person looks whose sides were exchanged: left for right, and away for towards."""
+        swapped = [self.joints.index(other_side(name)) for name in self.joints]
+        mirror = np.array([1.0, 1.0, -1.0])
+        return LiftedPoses(
+            self.joints, self.log_weights, self.means[:, swapped] * mirror,
+            self.deviations[:, swapped], self.axes, self.lengths[swapped],
+        )  # fmt: skip
+
+
+def pooled(opinions: Sequence[LiftedPoses]) -> LiftedPoses:
+    """One mixture of several opinions of one pose, each of which counts the same.
+
+    They read the same image, so that none confirms another: the density is the mean of theirs. Of
+    joints that one opinion lacks it says that they may be anywhere.
+    """
+    first = opinions[0]
+    if len(opinions) == 1:
+        return first
+    c = sum(len(one.log_weights) for one in opinions)
+    means = np.zeros((c, len(first.joints), 3))
+    deviations = np.full(means.shape, UNKNOWN)
+    row = 0
+    for one in opinions:
+        rows = slice(row, row + len(one.log_weights))
+        row = rows.stop
+        sized = one.resized(first)
+        for j, name in enumerate(first.joints):
+            if name in one.joints:
+                i = one.joints.index(name)
+                means[rows, j], deviations[rows, j] = sized[:, i], one.deviations[:, i]
+    weights = np.concatenate([one.log_weights for one in opinions]) - np.log(len(opinions))
+    return LiftedPoses(first.joints, weights, means, deviations, first.axes, first.lengths)
+
+
+def from_positions(
+    joints: Sequence[str], positions: Array, axes: Array, deviations: Mapping[str, float]
+) -> LiftedPoses | None:
+    """The one pose that a network guesses; None: it has no hips, or nothing else.
+
+    Args:
+        joints: (n,) names of joints; of several of one name the first counts.
+        positions: (n, 3) m, along the axes of the camera from any origin; NaN: unknown.
+        axes: (3, 3) of the person's view, in rows, camera frame.
+        deviations: of the depths of joints, by their kind, m.
+    """
+    known: dict[str, Array] = {}
+    for name, position in zip(joints, positions, strict=True):
+        if np.isfinite(position).all() and name.rpartition('_')[2] in deviations:
+            known.setdefault(name, position)
+    if not known.keys() >= {*HIPS} or len(known) <= len(HIPS):
+        return None
+    names = tuple(known)
+    middle = np.mean([known[name] for name in HIPS], axis=0)
+    places = np.array([known[name] - middle for name in names])
+    lengths = np.empty(len(names))
+    for j, carrier in ordered(names):
+        start = 0.0 if carrier < 0 else places[carrier]
+        lengths[j] = np.linalg.norm(places[j] - start)
+    spread = np.array([deviations[name.rpartition('_')[2]] for name in names])
+    return LiftedPoses(
+        names, np.zeros(1), (places @ axes.T)[None], np.repeat(spread[None, :, None], 3, axis=2),
+        axes, lengths,
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=64)
+def ordered(joints: tuple[str, ...]) -> tuple[tuple[int, int], ...]:
+    """Rows of joints and of those that they hang on (-1: the middle of the hips), these first."""
+    places = {name: i for i, name in enumerate(joints)}
+    result: list[tuple[int, int]] = []
+    done: set[str] = set()
+
+    def visit(name: str) -> None:
+        if name in done:
+            return
+        done.add(name)
+        carrier = carrier_of(name, joints)
+        if carrier:
+            visit(carrier)
+        result.append((places[name], places[carrier] if carrier else -1))
+
+    for name in joints:
+        visit(name)
+    return tuple(result)
+
+
+def carrier_of(name: str, joints: Sequence[str]) -> str:
+    """The joint that a joint hangs on, of some joints; '': the middle of the hips."""
+    side, _, kind = name.rpartition('_')
+    carrier = CARRIERS.get(kind, '')
+    while carrier:
+        for known in (f'{side}_{carrier}', carrier):
+            if known in joints:
+                return known
+        carrier = CARRIERS.get(carrier, '')
+    return ''
+
+
+@lru_cache(maxsize=16)
+def bone_lengths(skeleton: Skeleton, joints: tuple[str, ...]) -> Array:
+    """Lengths (J,) of the bones that joints hang on, at rest, m."""
+    places = forward(skeleton, np.zeros((1, skeleton.dimension))).joints()[..., 0]
+    chosen: Index = skeleton.joint_index(joints)
+    middle = places[skeleton.joint_index(HIPS)].mean(0)
+    result = np.empty(len(joints))
+    for j, carrier in ordered(joints):
+        start = middle if carrier < 0 else places[chosen[carrier]]
+        result[j] = np.linalg.norm(places[chosen[j]] - start)
+    return result
+
+
+@lru_cache(maxsize=16)
+def middle_of_hips(skeleton: Skeleton) -> Array:
+    """The middle of the hips (3,) in the frame of the root, m."""
+    frames = forward(skeleton, np.zeros((1, skeleton.dimension)))
+    columns, origins = frames.by_pose()
+    hips = frames.joints()[skeleton.joint_index(HIPS), :, 0]
+    result: Array = columns[0, 0] @ (hips.mean(0) - origins[0, 0])
+    return result

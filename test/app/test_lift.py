@@ -1,0 +1,122 @@
+"""`lift`: from files of detectors to a bag of mixtures and a report."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from hmt_ros.app import lift
+from hmt_ros.app.rendered_bag import START_NS
+from hmt_ros.body import Camera, load_body
+from hmt_ros.experts.training_set import procedural_sequence
+from hmt_ros.image.keypoint_schemes import schemes
+from msg_tools import BagReader
+from msg_tools.messages.pose_mixtures import pose_mixture_of
+
+BODY = load_body('human37')
+CAMERA = Camera(554.256, 554.256, 319.5, 239.5, 640, 480)
+SCHEME = schemes()['coco17']
+
+
+def seen(count=6):
+    """Keypoints (T, 17, 2) and confidences (T, 17) of somebody who walks, without eyes and ears."""
+    poses = procedural_sequence('walk', BODY, 1.0, 0).poses[:count].copy()
+    poses[:, :3] += np.array([0.0, 0.0, 4.0]) - poses[0, :3]
+    pixels = CAMERA.project(BODY.joint_positions(poses).reshape(-1, 3)).reshape(count, -1, 2)
+    result, sure = np.zeros((count, 17, 2)), np.zeros((count, 17))
+    for i, mark in enumerate(SCHEME.landmarks):
+        if mark.joint and 'ear' not in mark.name:
+            result[:, i] = pixels[:, BODY.joint_names.index(mark.joint)]
+            sure[:, i] = 0.9
+    return result, sure
+
+
+def arrays(path, **more):
+    pixels, sure = seen()
+    content = {'landmark_names': np.array(SCHEME.names), 'pixels': pixels, 'visibility': sure}
+    np.savez(path, **{**content, **more})
+    return path
+
+
+def mixtures(folder):
+    with BagReader(folder / 'lifted') as bag:
+        return [
+            pose_mixture_of(message.message)
+            for message in bag.messages()
+            if message.topic.endswith('pose_prediction')
+        ]
+
+
+USUAL = ['--fov', '60', '--size', '640x480', '--quiet']
+
+
+def test_arrays_become_mixtures_and_a_report(tmp_path):
+    path = arrays(tmp_path / 'walk.npz')
+    out = tmp_path / 'out'
+    assert lift.main([str(path), '-o', str(out), *USUAL, '--fps', '30', '--level']) == 0
+    found = mixtures(out)
+    assert len(found) == 6
+    assert found[0].stamp_ns == START_NS
+    assert found[1].stamp_ns == START_NS + round(1e9 / 30)
+    assert all(one.weights.sum() == pytest.approx(1.0) for one in found)
+    assert (out / 'report' / 'report.html').stat().st_size > 50_000
+    # Nothing is overwritten unless asked for.
+    assert lift.main([str(path), '-o', str(out), *USUAL]) == 1
+    assert lift.main([str(path), '-o', str(out), *USUAL, '--overwrite', '--causal']) == 0
+
+
+def test_coco_and_stature(tmp_path):
+    pixels, sure = seen()
+    entries = [
+        {
+            'image_id': t,
+            'keypoints': np.concatenate([pixels[t], sure[t, :, None]], axis=1).ravel().tolist(),
+        }
+        for t in range(len(pixels))
+    ]
+    path = tmp_path / 'walk.json'
+    path.write_text(json.dumps(entries))
+    sizes = {}
+    for stature in ('1.5', '1.9'):
+        out = tmp_path / stature
+        assert lift.main([str(path), '-o', str(out), *USUAL, '--stature', stature]) == 0
+        sizes[stature] = mixtures(out)[0].means[0, 2]
+    assert sizes['1.9'] / sizes['1.5'] == pytest.approx(1.9 / 1.5, rel=0.05)
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path):
+    path = arrays(tmp_path / 'walk.npz')
+    for name in ('a', 'b'):
+        assert lift.main([str(path), '-o', str(tmp_path / name), *USUAL]) == 0
+    first, second = (tmp_path / name / 'lifted' / 'lifted.mcap' for name in ('a', 'b'))
+    assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'said'),
+    [
+        (['--fov', '60'], 'the size of the images is unknown: --size WxH'),
+        ([*USUAL, '--lifter', 'none.npz'], 'none.npz'),
+        ([*USUAL, '--person', 'index:3'], 'no keypoints of the chosen person'),
+        ([*USUAL, '--scheme', 'none'], "there is no keypoint scheme 'none'"),
+        ([*USUAL, '--gravity', '0', '0', '0'], '--gravity: wanted a direction'),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, capsys, arguments, said):
+    path = arrays(tmp_path / 'walk.npz')
+    assert lift.main([str(path), '-o', str(tmp_path / 'out'), *arguments]) == 1
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count('\n') == 1
+    assert not (tmp_path / 'out' / 'lifted').exists()
+
+
+def test_too_few_landmarks_are_told(tmp_path, capsys):
+    sure = np.zeros((6, 17))
+    sure[:, 5:8] = 1.0
+    path = arrays(tmp_path / 'walk.npz', visibility=sure)
+    assert lift.main([str(path), '-o', str(tmp_path / 'out'), *USUAL]) == 1
+    assert 'five landmarks' in capsys.readouterr().err
+    assert lift.main([str(tmp_path / 'no.npz'), '-o', str(tmp_path / 'out'), *USUAL]) == 1

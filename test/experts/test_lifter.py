@@ -1,0 +1,453 @@
+"""Experts over windows of keypoints: windows, files, poses from lifted joints, learning."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hmt_ros.body import Camera, load_body
+from hmt_ros.body.kinematics import forward
+from hmt_ros.body.mirror import root_angles, root_rotations
+from hmt_ros.experts.keypoint_training import (
+    JOINTS,
+    WindowSettings,
+    keypoint_tracks,
+    training_windows,
+    with_errors,
+)
+from hmt_ros.experts.keypoint_windows import (
+    LANDMARKS,
+    PROPORTIONED,
+    TIMES,
+    filled,
+    landmark_offsets,
+    places_of,
+    proportions,
+    window_inputs,
+)
+from hmt_ros.experts.lifted_fit import lift_poses, poses_of
+from hmt_ros.experts.lifter import (
+    KeypointHistory,
+    Lifter,
+    Network,
+    landmark_rays,
+    lift_sequence,
+    load_lifter,
+)
+from hmt_ros.experts.lifter_learning import LearningSettings, learn_lifter, lifter_scores
+from hmt_ros.experts.pose_encoding import ray_rotations
+from hmt_ros.experts.training_set import procedural_sequence
+from hmt_ros.image.keypoint_schemes import schemes
+from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, bone_lengths, from_positions, pooled
+from hmt_ros.image.terms.keypoints import Keypoints
+
+BODY = load_body('human37')
+CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
+INPUTS = len(TIMES) * (3 * len(LANDMARKS) + 2) + 5 + len(PROPORTIONED) + 1
+
+
+def walking(count: int = 12) -> np.ndarray:
+    sequence = procedural_sequence('walk', BODY, 2.0, 0)
+    poses = sequence.poses[:count].copy()
+    poses[:, :3] += np.array([0.3, 0.1, 4.0]) - poses[0, :3]
+    return poses
+
+
+def detected(poses: np.ndarray, scheme: str = 'mediapipe33', body=BODY) -> list[Keypoints]:
+    """Exact keypoints of poses."""
+    names = schemes()[scheme].names
+    known, rows = [], []
+    for i, mark in enumerate(schemes()[scheme].landmarks):
+        if mark.joint:
+            known.append(mark.name)
+            rows.append(i)
+    joints, offsets = landmark_offsets(body, known)
+    which = body.skeleton.joint_index(tuple(joints))
+    places = forward(body.skeleton, poses).points(
+        body.skeleton.joint_segments[which], body.skeleton.joint_offsets[which] + offsets
+    )
+    result = []
+    for t in range(len(poses)):
+        pixels, sure = np.full((len(names), 2), np.nan), np.zeros(len(names))
+        pixels[rows], sure[rows] = CAMERA.project(places[:, :, t]), 1.0
+        unknown = np.full((len(names), 2, 2), np.nan)
+        result.append(Keypoints(names, pixels, unknown, sure))
+    return result
+
+
+def network(seed: int = 0, experts: int = 3, units: int = 8) -> Network:
+    rng = np.random.default_rng(seed)
+
+    def normal(*shape: int) -> np.ndarray:
+        return (0.1 * rng.standard_normal(shape)).astype(np.float32)
+
+    return Network(
+        normal(INPUTS), np.ones(INPUTS, np.float32), normal(INPUTS, units), normal(units),
+        normal(1, units, units), normal(1, units), normal(units, experts * (1 + 6 * len(JOINTS))),
+        normal(experts * (1 + 6 * len(JOINTS))), normal(len(JOINTS), 3),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def lifter() -> Lifter:
+    return Lifter(network(), JOINTS, BODY, {'card': 'of a test'})
+
+
+def test_network_is_the_mixture_of_its_layers(lifter):
+    net, x = lifter.network, np.random.default_rng(1).standard_normal((2, INPUTS)).astype('f')
+    gates, means, deviations = net(x)
+    assert gates.shape == (2, 3)
+    assert means.shape == deviations.shape == (2, 3, len(JOINTS), 3)
+    np.testing.assert_allclose(np.exp(gates).sum(1), 1.0)
+    assert (deviations > 0).all()
+    leak = lambda v: np.where(v > 0, v, 0.1 * v)  # noqa: E731
+    h = leak((x - net.mean) @ net.first + net.first_bias)
+    h = h + leak(h @ net.hidden[0] + net.hidden_biases[0])
+    out = h @ net.last + net.last_bias
+    j = len(JOINTS)
+    np.testing.assert_allclose(
+        means, 0.3 * out[:, 3 : 3 + 9 * j].reshape(2, 3, j, 3) + net.middle, atol=1e-5
+    )
+
+
+def test_file_keeps_the_lifter(lifter, tmp_path):
+    again = Lifter.load(lifter.save(tmp_path / 'one.npz'))
+    x = np.random.default_rng(1).standard_normal((1, INPUTS)).astype('f')
+    for a, b in zip(lifter.network(x), again.network(x)):
+        np.testing.assert_allclose(a, b, atol=5e-3)
+    assert again.notes == lifter.notes
+    assert again.joints == JOINTS
+
+
+def test_files_that_are_none_are_refused(lifter, tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load_lifter(str(tmp_path / 'none.npz'))
+    path = lifter.save(tmp_path / 'one.npz')
+    with np.load(path) as content:
+        arrays = dict(content)
+    arrays.pop('hidden')
+    np.savez(tmp_path / 'less.npz', **arrays)
+    with pytest.raises(ValueError, match=r'less\.npz'):
+        Lifter.load(tmp_path / 'less.npz')
+
+
+def test_windows_take_the_nearest_images():
+    stamps = np.arange(60) / 30.0
+    rows, there, times = filled(stamps, stamps[30:31], causal=False)
+    assert there.all()
+    assert rows[0, 0] == 30
+    assert np.abs(times[0] - TIMES).max() < 0.017 + 1e-9
+    _, there, _ = filled(stamps, stamps[30:31], causal=True)
+    assert (there[0] == (TIMES <= 0)).all()
+    slow = np.arange(6) / 2.0
+    rows, there, _ = filled(slow, slow[3:4], causal=False)
+    assert there[0, 0]
+    assert set(rows[0][there[0]]) <= {2, 3, 4}
+    _, there, _ = filled(np.zeros(1), np.zeros(1), causal=False)
+    assert (there[0] == (TIMES == 0)).all()
+
+
+def test_inputs_do_not_depend_on_where_the_person_is_in_the_image():
+    """A camera that turns sees the same person: the inputs are those of one that looks there."""
+    rng = np.random.default_rng(0)
+    rays = 0.1 * rng.normal(size=(1, len(TIMES), len(LANDMARKS), 2))
+    sure = np.ones((1, len(TIMES), len(LANDMARKS)))
+    ups, none = np.array([[0.0, -1.0, 0.0]]), np.zeros((1, len(PROPORTIONED)))
+    first = window_inputs(rays, sure, TIMES[None], ups, none)
+    turn = ray_rotations(np.array([[0.0, 0.3, 1.0]]))[0]
+    moved = np.concatenate([rays, np.ones((*rays.shape[:3], 1))], axis=3) @ turn.T
+    second = window_inputs(moved[..., :2] / moved[..., 2:], sure, TIMES[None], ups @ turn.T, none)
+    # The camera looks at the mean of the trunk, which is not that of the rays turned.
+    np.testing.assert_allclose(first.values, second.values, atol=0.05)
+
+
+def test_landmarks_have_one_place_whatever_the_scheme():
+    of_mediapipe = detected(walking(1))[0]
+    places = places_of(of_mediapipe)
+    assert LANDMARKS[places[of_mediapipe.names.index('left_foot_index')]] == 'left_toe'
+    named, _ = of_mediapipe.named_for(BODY, 'mediapipe33')
+    assert {LANDMARKS[i] for i in places_of(named) if i >= 0} == {
+        LANDMARKS[i] for i in places if i >= 0
+    }
+    joints = Keypoints(
+        ('pelvis', 'left_knee', 'tail'), np.zeros((3, 2)), np.zeros((3, 2, 2)), np.ones(3)
+    )
+    assert [LANDMARKS[i] if i >= 0 else '' for i in places_of(joints)] == [
+        'mid_hip',
+        'left_knee',
+        '',
+    ]
+
+
+def test_history_sees_what_a_causal_sequence_sees(lifter):
+    poses = walking(30)
+    seen, stamps = detected(poses), np.arange(30) / 30.0
+    whole = lift_sequence(lifter, CAMERA, stamps, seen, causal=True)
+    history = KeypointHistory(CAMERA)
+    for stamp, one in zip(stamps, seen):
+        history.add(one, stamp)
+        (last,) = lifter.of_inputs(history.inputs(None, None))
+    np.testing.assert_allclose(last.means, whole[-1].means, atol=1e-5)
+    later = lift_sequence(lifter, CAMERA, stamps, seen)
+    assert not np.allclose(later[5].means, whole[5].means, atol=1e-5)
+    np.testing.assert_allclose(later[-1].means, whole[-1].means, atol=1e-5)
+
+
+def test_history_follows_a_camera_that_turns(lifter):
+    poses = walking(5)
+    turn = ray_rotations(np.array([[0.1, 0.05, 1.0]]))[0]
+    history = KeypointHistory(CAMERA)
+    history.add(detected(poses)[0], 0.0)
+    before = history._rays[0].copy()
+    history.carry(turn)
+    ray = np.append(before[5], 1.0) @ turn.T
+    np.testing.assert_allclose(history._rays[0][5], ray[:2] / ray[2])
+
+
+def test_too_few_keypoints_are_nobody(lifter):
+    (one,) = detected(walking(1))
+    sure = one.confidences.copy()
+    sure[4:] = 0.0
+    few = Keypoints(one.names, one.pixels, one.covariances, sure)
+    assert lift_sequence(lifter, CAMERA, np.zeros(1), [few]) == [None]
+    none = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
+    assert lift_poses(lifter, BODY, CAMERA, np.zeros(1), [none]) == [None]
+
+
+def truly_lifted(poses: np.ndarray, body=BODY) -> list[LiftedPoses]:
+    joints = body.joint_positions(poses)
+    hips = joints[:, body.skeleton.joint_index(HIPS)].mean(1)
+    axes = ray_rotations(hips).transpose(0, 2, 1)
+    which = body.skeleton.joint_index(JOINTS)
+    lengths = bone_lengths(body.skeleton, JOINTS)
+    result = []
+    for t in range(len(poses)):
+        relative = (joints[t, which] - hips[t]) @ axes[t].T
+        two = np.stack([relative, relative * [1, 1, -1]])
+        spread = np.full(two.shape, 0.01)
+        result.append(LiftedPoses(JOINTS, np.log([0.8, 0.2]), two, spread, axes[t], lengths))
+    return result
+
+
+def test_poses_have_the_lifted_joints_where_the_keypoints_are():
+    poses = walking(4)
+    seen = [landmark_rays(CAMERA, one) for one in detected(poses)]
+    rays, sure = (np.array([x[i] for x in seen]) for i in range(2))
+    found = poses_of(BODY, truly_lifted(poses), rays, sure, 0.06)
+    for t, mixture in enumerate(found):
+        assert mixture.weights == pytest.approx([0.8, 0.2])
+        joints = BODY.joint_positions(np.stack([mixture.means[0], poses[t]]))
+        assert np.linalg.norm(joints[0] - joints[1], axis=1).max() < 0.05
+        assert np.linalg.eigvalsh(mixture.covariances).min() > 0
+        assert (mixture.means >= BODY.lower - 1e-9).all()
+        assert (mixture.means <= BODY.upper + 1e-9).all()
+        # How far away the person is depends on the size.
+        depth = mixture.covariances[0, 2, 2] ** 0.5
+        assert depth == pytest.approx(0.06 * mixture.means[0, 2], rel=0.3)
+
+
+def test_a_larger_person_is_further_away():
+    poses = walking(1)
+    large = BODY.with_segment_lengths({k: 1.1 * v for k, v in BODY.segment_lengths.items()})
+    rays, sure = (x[None] for x in landmark_rays(CAMERA, detected(poses)[0]))
+    usual, larger = (
+        poses_of(body, truly_lifted(poses), rays, sure, 0.02)[0] for body in (BODY, large)
+    )
+    assert larger.means[0, 2] == pytest.approx(1.1 * usual.means[0, 2], rel=0.02)
+
+
+def test_one_guess_has_the_depths_of_its_joints():
+    (pose,) = walking(1)
+    joints = BODY.joint_positions(pose[None])[0]
+    hips = joints[BODY.skeleton.joint_index(HIPS)].mean(0)
+    axes = ray_rotations(hips[None])[0].T
+    kinds = {name.rpartition('_')[2]: 0.1 for name in JOINTS}
+    which = BODY.skeleton.joint_index(JOINTS)
+    guess = from_positions(JOINTS, joints[which] + 3.0, axes, kinds)
+    np.testing.assert_allclose(guess.means[0], (joints[which] - hips) @ axes.T)
+    np.testing.assert_allclose(guess.sized(BODY.skeleton), guess.means, atol=0.02)
+    assert from_positions(JOINTS[:3], joints[:3], axes, kinds) is None
+    lost = joints[which].copy()
+    lost[JOINTS.index('left_knee')] = np.nan
+    assert 'left_knee' not in from_positions(JOINTS, lost, axes, kinds).joints
+
+
+def test_opinions_are_pooled():
+    first, second = truly_lifted(walking(2))
+    both = pooled([first, second.of_joints(JOINTS[:4])])
+    assert np.exp(both.log_weights) == pytest.approx([0.4, 0.1, 0.4, 0.1])
+    np.testing.assert_allclose(both.means[2, :4], second.means[0, :4])
+    assert (both.deviations[2, 4:] == 0.5).all()
+    assert pooled([first]) is first
+
+
+def tracks():
+    sequences = [procedural_sequence(name, BODY, 2.0, 0) for name in ('walk', 'dance')]
+    return keypoint_tracks(BODY, sequences, [1.0, 1.0], variants=3)
+
+
+def test_training_windows_show_what_the_camera_sees():
+    """Without errors the rays of a window are those of the joints that are to be learned."""
+    exact = WindowSettings(
+        noise=0.0, gravity=1.0, gravity_spread=0.0, lengths=1.0, lengths_spread=0.0, cut=0.0,
+        unusual=0.0,
+    )  # fmt: skip
+    found, rng = tracks(), np.random.default_rng(0)
+    values, joints = training_windows(found, 50, rng, exact, 0)
+    assert values.shape == (50, INPUTS)
+    assert joints.shape == (50, len(JOINTS), 3)
+    # Knees of the first image lie about where the knees of the pose do.
+    count = len(LANDMARKS)
+    plane = values[:, : 2 * count].reshape(50, count, 2)
+    hips = [LANDMARKS.index(name) for name in HIPS]
+    knee, of_pose = LANDMARKS.index('left_knee'), JOINTS.index('left_knee')
+    seen = plane[:, knee] - plane[:, hips].mean(1)
+    assert np.corrcoef(seen[:, 0], joints[:, of_pose, 0])[0, 1] > 0.9
+    assert np.corrcoef(seen[:, 1], joints[:, of_pose, 1])[0, 1] > 0.8
+
+
+def test_windows_are_the_same_with_the_same_seed():
+    found = tracks()
+    one, two = (training_windows(found, 8, np.random.default_rng(3)) for _ in range(2))
+    for a, b in zip(one, two):
+        assert np.array_equal(a, b)
+    assert np.isfinite(one[0]).all()
+
+
+def test_errors_grow_with_their_factor():
+    rng = np.random.default_rng(0)
+    rays = np.zeros((400, len(TIMES), len(LANDMARKS), 2), np.float32)
+    sure = np.ones(rays.shape[:3], np.float32)
+    times, far = np.tile(TIMES, (400, 1)), np.full(400, 2.0, np.float32)
+    small, _ = with_errors(rays, sure, far, times, rng, 1.0)
+    large, seen = with_errors(rays, sure, far, times, rng, 2.0)
+    ratio = np.median(np.abs(large)) / np.median(np.abs(small))
+    assert ratio == pytest.approx(2.0, rel=0.1)
+    assert ((seen >= 0) & (seen <= 1)).all()
+    # Errors last: neighbours in time are alike, more than those far apart.
+    x = small[..., 0].reshape(400, len(TIMES), -1)
+    near = np.corrcoef(x[:, 0].ravel(), x[:, 1].ravel())[0, 1]
+    far_apart = np.corrcoef(x[:, 0].ravel(), x[:, 5].ravel())[0, 1]
+    assert near > far_apart > 0.05
+
+
+def test_proportions_have_no_size():
+    larger = {k: 1.3 * v for k, v in BODY.segment_lengths.items()}
+    np.testing.assert_allclose(proportions(BODY, larger), 0.0, atol=1e-12)
+
+
+def test_learning_gains_and_repeats(tmp_path):
+    pytest.importorskip('jax')
+    pytest.importorskip('optax')
+    found = tracks()
+    settings = LearningSettings(experts=2, units=32, layers=1, steps=500, batch=64)
+    windows = WindowSettings(noise=0.3)
+    losses: list[float] = []
+    lifter = learn_lifter(
+        BODY, found, settings, windows, {}, lambda _, loss: losses.append(loss),
+        tmp_path / 'mark.npz',
+    )  # fmt: skip
+    assert np.mean(losses[-50:]) < np.mean(losses[:50]) - 0.3
+    inputs, joints = training_windows(found, 300, np.random.default_rng(9), windows)
+    scores = lifter_scores(lifter, inputs, joints)
+    assert scores.best <= scores.heaviest < 0.3
+    # What was marked at the last step is the same lifter.
+    again = learn_lifter(BODY, found, settings, windows, {}, None, tmp_path / 'mark.npz')
+    assert all(
+        np.array_equal(getattr(lifter.network, name), getattr(again.network, name))
+        for name in ('first', 'last', 'mean')
+    )
+    other = LearningSettings(experts=2, units=32, layers=1, steps=500, batch=32)
+    with pytest.raises(ValueError, match='other settings'):
+        learn_lifter(BODY, found, other, windows, {}, None, tmp_path / 'mark.npz')
+
+
+# What ships, on persons and keypoints that training has seldom seen or never.
+
+
+def turned(poses, axis, degrees):
+    """Poses of somebody turned about an axis of the camera."""
+    turn = Rotation.from_rotvec(np.radians(degrees) * np.array(axis)).as_matrix()
+    result = poses.copy()
+    result[:, 3:6] = root_angles(BODY, turn @ root_rotations(BODY, poses))
+    moved = poses[:, :3] - poses[0, :3]
+    result[:, :3] = poses[0, :3] + moved @ turn.T
+    return np.clip(result, BODY.lower, BODY.upper)
+
+
+def sitting(poses):
+    result = poses.copy()
+    for side in ('left', 'right'):
+        for dof, angle in ((f'{side}_hip_x', 85.0), (f'{side}_knee', -85.0)):
+            row = BODY.dof_names.index(dof)
+            result[:, row] = np.clip(np.radians(angle), BODY.lower[row], BODY.upper[row])
+    return result
+
+
+def only(names):
+    def edit(keypoints):
+        kept = np.array([name in names for name in keypoints.names])
+        return replace(keypoints, confidences=keypoints.confidences * kept)
+
+    return edit
+
+
+FIVE = ('nose', 'left_shoulder', 'right_shoulder', 'left_hip', 'right_hip')
+CASES = {
+    'walk': (lambda w: w, {}, 0.06),
+    'upside down': (lambda w: turned(w, [0, 0, 1], 180), {}, None),
+    'lying sideways': (lambda w: turned(w, [0, 0, 1], 90), {}, None),
+    'lying towards': (lambda w: turned(w, [1, 0, 0], 80), {}, None),
+    'lying away': (lambda w: turned(w, [1, 0, 0], -80), {}, None),
+    'child': (lambda w: w, {'size': 0.65}, 0.06),
+    'sitting': (sitting, {}, 0.12),
+    'five points': (lambda w: w, {'edit': only(FIVE)}, None),
+    'once a second': (lambda w: w, {'rate': 1.0}, 0.07),
+    '120 a second': (lambda w: w, {'rate': 120.0}, 0.08),
+    'another camera': (lambda w: w, {'camera': replace(CAMERA, fx=1200.0, fy=1200.0)}, 0.07),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_no_confident_wrong_pose(name):
+    """Where the heaviest pose is wrong the deviations are as large as its errors of depth."""
+    of, more, most = CASES[name]
+    size = more.get('size', 1.0)
+    body = BODY.with_segment_lengths({k: size * v for k, v in BODY.segment_lengths.items()})
+    poses = of(walking(20))
+    seen = [more.get('edit', lambda x: x)(one) for one in detected(poses, body=body)]
+    stamps = np.arange(len(seen)) / more.get('rate', 30.0)
+    camera = more.get('camera', CAMERA)
+    found = lift_sequence(load_lifter(), camera, stamps, seen, causal=True)
+    errors, ratios = [], []
+    for true, one in zip(truly_lifted(poses, body), found):
+        assert one is not None
+        off = one.sized(body.skeleton) - true.means[0]
+        distance = np.linalg.norm(off, axis=2).mean(1)
+        errors.append(distance[one.log_weights.argmax()])
+        nearest = distance.argmin()
+        ratios.append(np.mean((off[nearest, :, 2] / one.deviations[nearest, :, 2]) ** 2) ** 0.5)
+    assert np.mean(ratios) < 2.5
+    if most is not None:
+        assert np.mean(errors) < most
+
+
+def test_without_confidence_there_is_no_pose():
+    seen = [only(())(one) for one in detected(walking(2))]
+    assert lift_sequence(load_lifter(), CAMERA, np.arange(2) / 30.0, seen) == [None, None]
+
+
+def test_two_people_mixed_are_wide():
+    """Keypoints of two people who face opposite ways: nothing narrow comes of them."""
+    poses, rng = walking(10), np.random.default_rng(0)
+    pairs = zip(detected(poses), detected(turned(poses, [0, 1, 0], 180)))
+    seen = [
+        replace(a, pixels=np.where(rng.random((len(a.names), 1)) < 0.5, a.pixels, b.pixels))
+        for a, b in pairs
+    ]
+    usual = lift_sequence(load_lifter(), CAMERA, np.arange(10) / 30.0, detected(poses))
+    mixed = lift_sequence(load_lifter(), CAMERA, np.arange(10) / 30.0, seen)
+    assert mixed[-1].deviations[..., 2].mean() > 2.0 * usual[-1].deviations[..., 2].mean()

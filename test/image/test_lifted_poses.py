@@ -1,0 +1,169 @@
+"""Mixtures over whole poses: sizes, exchanged sides, and the energy of depths with keypoints."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import logsumexp
+
+from hmt_ros.body import Camera, load_body
+from hmt_ros.body.kinematics import forward
+from hmt_ros.image.keypoint_schemes import usual_exchanges
+from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, bone_lengths, carrier_of
+from hmt_ros.image.terms.keypoints import (
+    ANY_DEPTH,
+    ANYHOW,
+    LIFTED_SIGMA,
+    LIFTED_WEIGHT,
+    NOT_EXCHANGED,
+    Keypoints,
+    KeypointTerm,
+)
+
+JOINTS = (
+    'neck', 'head', 'left_shoulder', 'right_shoulder', 'left_elbow', 'right_elbow', 'left_wrist',
+    'right_wrist', 'left_hip', 'right_hip', 'left_knee', 'right_knee', 'left_ankle', 'right_ankle',
+)  # fmt: skip
+BODY = load_body('human37')
+CAMERA = Camera(500.0, 500.0, 320.0, 240.0, 640, 480)
+# Fits the term whose weight is that of the mixture.
+STEP = 1e-6
+
+
+def pose(seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    found = BODY.prior_mean + 0.4 * rng.normal(size=BODY.dimension)
+    found[:6] = 0.2, 0.1, 4.0, 0.5, 0.1, 0.1
+    return np.clip(found, BODY.lower, BODY.upper)
+
+
+def lifted(seed: int = 1, components: int = 3) -> LiftedPoses:
+    rng = np.random.default_rng(seed)
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    weights = rng.uniform(0.5, 1.0, components)
+    means = 0.3 * rng.normal(size=(components, len(JOINTS), 3))
+    spread = rng.uniform(0.05, 0.2, means.shape)
+    lengths = 1.07 * bone_lengths(BODY.skeleton, JOINTS)
+    return LiftedPoses(JOINTS, np.log(weights / weights.sum()), means, spread, axes, lengths)
+
+
+def term(poses: LiftedPoses, exchanges: np.ndarray | None) -> KeypointTerm:
+    """Of one keypoint that hardly counts, and of the mixture."""
+    pixels = CAMERA.project(BODY.joint_positions(pose()[None])[0][:1])
+    one = Keypoints(BODY.joint_names[:1], pixels, 1e12 * np.eye(2)[None], np.ones(1), lifted=poses)
+    return KeypointTerm(BODY.skeleton, CAMERA, one, exchanges=exchanges)
+
+
+def energy(poses: LiftedPoses, x: np.ndarray, exchanges: np.ndarray | None) -> float:
+    frames = forward(BODY.skeleton, x[None])
+    return float(term(poses, exchanges).energy(frames, np.zeros(1, np.intp)).value[0])
+
+
+def density(poses: LiftedPoses, x: np.ndarray) -> float:
+    """Minus the log density of depths, as the formula of the module says it."""
+    joints = BODY.joint_positions(x[None])[0]
+    hips = joints[BODY.skeleton.joint_index(HIPS)].mean(0)
+    depth = (joints[BODY.skeleton.joint_index(poses.joints)] - hips) @ poses.axes[2]
+    mean, sigma = poses.sized(BODY.skeleton)[:, :, 2], LIFTED_SIGMA * poses.deviations[:, :, 2]
+    each = poses.log_weights - (0.5 * ((depth - mean) / sigma) ** 2 + np.log(sigma)).sum(1)
+    reach = {}
+    lengths = dict(zip(poses.joints, bone_lengths(BODY.skeleton, poses.joints)))
+    for name in poses.joints:
+        at, total = name, 0.0
+        while at:
+            total += lengths[at]
+            at = carrier_of(at, poses.joints)
+        reach[name] = total
+    wide = np.maximum(ANY_DEPTH * np.array([reach[name] for name in poses.joints]), 0.02)
+    flat = np.log(ANYHOW) - (0.5 * (depth / wide) ** 2 + np.log(wide)).sum()
+    return -float(logsumexp(np.append(each + np.log1p(-ANYHOW), flat)))
+
+
+def test_energy_is_the_log_density_of_depths() -> None:
+    poses = lifted()
+    # What the term adds beside the mixture does not depend on the pose.
+    found = [energy(poses, pose(i), NOT_EXCHANGED) for i in range(4)]
+    wanted = [LIFTED_WEIGHT * density(poses, pose(i)) for i in range(4)]
+    assert np.ptp(np.array(found) - wanted) < 1e-8
+
+
+def test_exchanged_sides_read_the_poses_the_other_way_round() -> None:
+    poses, x = lifted(), pose()
+    all_exchanged = np.array([[-np.inf, 0.0, -np.inf, -np.inf]])
+    difference = energy(poses, x, all_exchanged) - energy(poses.exchanged(), x, NOT_EXCHANGED)
+    other = energy(poses, pose(3), all_exchanged) - energy(
+        poses.exchanged(), pose(3), NOT_EXCHANGED
+    )
+    assert difference == pytest.approx(other, abs=1e-9)
+    twice = poses.exchanged().exchanged()
+    assert np.array_equal(twice.means, poses.means)
+
+
+@pytest.mark.parametrize('exchanges', [NOT_EXCHANGED, usual_exchanges()])
+def test_gradient(exchanges: np.ndarray) -> None:
+    poses, x = lifted(), pose()
+    found = term(poses, exchanges).energy(forward(BODY.skeleton, x[None]), np.zeros(1, np.intp))
+    gradient, hessian = found.derivatives()
+    numeric = np.array(
+        [
+            (energy(poses, x + d, exchanges) - energy(poses, x - d, exchanges)) / (2 * STEP)
+            for d in STEP * np.eye(len(x))
+        ]
+    )
+    assert np.allclose(gradient[0], numeric, atol=1e-5 * max(1.0, np.abs(numeric).max()))
+    assert np.linalg.eigvalsh(hessian[0]).min() > -1e-9
+    assert np.abs(gradient[0, :3]).max() < 1e-6  # depths relative to the hips
+
+
+def test_hessian_of_one_component_is_that_of_squares() -> None:
+    one = lifted(components=1)
+    sure = LiftedPoses(
+        one.joints, one.log_weights, one.means, 1e-2 * one.deviations, one.axes, one.lengths
+    )
+    x = pose()
+    # At the mean itself the Gauss-Newton Hessian is the exact one.
+    joints = BODY.joint_positions(x[None])[0]
+    hips = joints[BODY.skeleton.joint_index(HIPS)].mean(0)
+    relative = (joints[BODY.skeleton.joint_index(JOINTS)] - hips) @ one.axes.T
+    at = LiftedPoses(
+        JOINTS, one.log_weights, relative[None], sure.deviations, one.axes,
+        bone_lengths(BODY.skeleton, JOINTS),
+    )  # fmt: skip
+    rows = np.zeros(1, np.intp)
+    hessian = (
+        term(at, NOT_EXCHANGED).energy(forward(BODY.skeleton, x[None]), rows).derivatives()[1][0]
+    )
+    step, numeric = 1e-5, []
+    for d in step * np.eye(len(x)):
+        up, down = (
+            term(at, NOT_EXCHANGED).energy(forward(BODY.skeleton, (x + s * d)[None]), rows)
+            for s in (1, -1)
+        )
+        numeric.append((up.derivatives()[0][0] - down.derivatives()[0][0]) / (2 * step))
+    assert np.allclose(hessian, numeric, atol=2e-3 * np.abs(hessian).max())
+
+
+def test_sizes_keep_directions() -> None:
+    poses = lifted()
+    longer = BODY.with_segment_lengths({k: 1.2 * v for k, v in BODY.segment_lengths.items()})
+    first, second = poses.sized(BODY.skeleton), poses.sized(longer.skeleton)
+    assert np.allclose(second, 1.2 * first)
+    own = bone_lengths(BODY.skeleton, JOINTS)
+    knee, hip = JOINTS.index('left_knee'), JOINTS.index('left_hip')
+    bone = poses.means[:, knee] - poses.means[:, hip]
+    assert np.allclose(first[:, knee] - first[:, hip], bone * own[knee] / poses.lengths[knee])
+
+
+def test_a_missing_joint_is_skipped_in_the_chain() -> None:
+    assert carrier_of('left_wrist', ('left_shoulder', 'neck')) == 'left_shoulder'
+    assert carrier_of('left_wrist', ('left_ankle',)) == ''
+    assert carrier_of('head', ('neck',)) == 'neck'
+
+
+def test_wrong_shapes_are_refused() -> None:
+    poses = lifted()
+    with pytest.raises(ValueError, match='3 poses of 14 joints'):
+        LiftedPoses(
+            poses.joints, poses.log_weights, poses.means[:, :2], poses.deviations, poses.axes,
+            poses.lengths,
+        )  # fmt: skip

@@ -1,0 +1,136 @@
+"""Experts that know depth, in the tracker: what they are given, and what they change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import Camera, load_body
+from hmt_ros.experts.training_set import procedural_sequence
+from hmt_ros.image.lifted_poses import HIPS
+from hmt_ros.image.likelihood import OFF
+from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.image.terms.registry import TERMS
+from hmt_ros.tracking import Tracker, TrackerSettings
+
+BODY, CAMERA = load_body('human37'), Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
+BLANK = np.full((480, 640, 3), 128, np.uint8)
+STEP = 33_333_333
+
+
+def settings(**values):
+    usual = TrackerSettings(evaluation_budget=100, flow_weight=0.0, threads=1)
+    off = {term.name: OFF for term in TERMS}
+    return replace(usual, likelihood=replace(usual.likelihood, **off), **values)
+
+
+@pytest.fixture(scope='module')
+def walk():
+    """Poses and keypoints of somebody who walks."""
+    poses = procedural_sequence('walk', BODY, 1.0, 0).poses[:10].copy()
+    poses[:, :3] += np.array([0.1, 0.1, 4.0]) - poses[0, :3]
+    joints = BODY.joint_positions(poses)
+    n = joints.shape[1]
+    noise = np.tile(4.0 * np.eye(2), (n, 1, 1))
+    seen = [Keypoints(BODY.joint_names, CAMERA.project(x), noise, np.ones(n)) for x in joints]
+    return poses, joints, seen
+
+
+def observed(tracker, monkeypatch):
+    """Keypoints that a tracker sees, image by image."""
+    seen, view = [], tracker._observer.view
+
+    def spy(image, keypoints, *arguments, **named):
+        seen.append(keypoints)
+        return view(image, keypoints, *arguments, **named)
+
+    monkeypatch.setattr(tracker._observer, 'view', spy)
+    return seen
+
+
+def test_keypoints_get_what_experts_say(walk, monkeypatch):
+    _, _, seen = walk
+    tracker = Tracker(BODY, CAMERA, settings(), seed=0)
+    given = observed(tracker, monkeypatch)
+    for t in range(3):
+        tracker.step(BLANK, t * STEP, seen[t])
+    assert all(one.lifted is not None for one in given)
+    assert len(given[0].lifted.log_weights) == 5
+
+
+def test_experts_can_be_switched_off(walk, monkeypatch):
+    _, _, seen = walk
+    tracker = Tracker(BODY, CAMERA, settings(lifter=''), seed=0)
+    given = observed(tracker, monkeypatch)
+    tracker.step(BLANK, 0, seen[0])
+    assert given[0].lifted is None
+    with pytest.raises((OSError, ValueError), match=r'none\.npz'):
+        Tracker(BODY, CAMERA, settings(lifter='none.npz'))
+
+
+def test_keypoints_that_may_be_anywhere_are_none(walk, monkeypatch):
+    _, _, seen = walk
+    faint = replace(seen[0], covariances=1e10 * np.ones_like(seen[0].covariances) * np.eye(2))
+    tracker = Tracker(BODY, CAMERA, settings(), seed=0)
+    given = observed(tracker, monkeypatch)
+    tracker.step(BLANK, 0, faint)
+    assert given[0].lifted is None
+
+
+def test_without_keypoints_nothing_changes(monkeypatch):
+    nobody = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
+    tracker = Tracker(BODY, CAMERA, settings(), seed=0)
+    given = observed(tracker, monkeypatch)
+    tracker.step(BLANK, 0, None)
+    tracker.step(BLANK, STEP, nobody)
+    assert given == [None, nobody]
+
+
+def test_a_guess_in_space_is_pooled_with_them(walk, monkeypatch):
+    _, joints, seen = walk
+    hips = BODY.skeleton.joint_index(HIPS)
+    guess = joints[0] - joints[0, hips].mean(0)
+    alone = Tracker(BODY, CAMERA, settings(lifter=''), seed=0)
+    given = observed(alone, monkeypatch)
+    alone.step(BLANK, 0, replace(seen[0], positions=guess))
+    assert len(given[0].lifted.log_weights) == 1
+    both = Tracker(BODY, CAMERA, settings(), seed=0)
+    given = observed(both, monkeypatch)
+    both.step(BLANK, 0, replace(seen[0], positions=guess))
+    assert np.exp(given[0].lifted.log_weights).sum() == pytest.approx(1.0)
+    assert len(given[0].lifted.log_weights) == 6
+    assert np.exp(given[0].lifted.log_weights[-1]) == pytest.approx(0.5)
+
+
+def test_a_true_guess_tells_towards_from_away(walk):
+    """Depths of a pose decide which way a limb points that keypoints leave open."""
+    _, joints, seen = walk
+    hips = BODY.skeleton.joint_index(HIPS)
+    guesses = [x - x[hips].mean(0) for x in joints]
+    errors = {}
+    for name in ('without', 'with'):
+        tracker = Tracker(BODY, CAMERA, settings(lifter=''), seed=0)
+        for t in range(6):
+            told = replace(seen[t], positions=guesses[t] if name == 'with' else None)
+            tracker.step(BLANK, t * STEP, told)
+        found = tracker.body.joint_positions(tracker.modes.poses[:1])[0]
+        off = (found - found[hips].mean(0)) - guesses[5]
+        errors[name] = float(np.linalg.norm(off, axis=1).mean())
+    assert errors['with'] < 0.06
+    assert errors['with'] <= errors['without'] + 0.005
+
+
+def test_a_mixture_that_is_wrong_costs_little(walk):
+    """Who says that everybody is turned round is not believed against the keypoints' own poses."""
+    _, joints, seen = walk
+    hips = BODY.skeleton.joint_index(HIPS)
+    tracker = Tracker(BODY, CAMERA, settings(lifter=''), seed=0)
+    far = np.random.default_rng(0).normal(size=joints[0].shape) * 2.0
+    far[hips] = 0.01
+    for t in range(4):
+        tracker.step(BLANK, t * STEP, replace(seen[t], positions=far))
+    found = tracker.body.joint_positions(tracker.modes.poses[:1])[0]
+    off = np.linalg.norm(CAMERA.project(found) - seen[3].pixels, axis=1)
+    assert np.median(off) < 6.0
