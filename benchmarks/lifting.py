@@ -1,7 +1,7 @@
 """lifting: poses from keypoints alone, without images and without a track, on clips with truth.
 
 The mixtures of `experts.lifter` on a real detector's keypoints, with later images and without,
-gravity given and not, lengths usual, fitted to the keypoints of a few images, or as measured:
+gravity given and not, lengths usual or measured:
 distances of the heaviest and of the best pose, of the heaviest after the similarity that fits best,
 slanted limbs whose slope has the wrong sign, and regions of single joints. The detector's own 3D
 stands beside. Clips that settings were chosen on, and the others, apart.
@@ -24,9 +24,7 @@ from benchmarks.machine import description
 from benchmarks.runs import GIVEN, UNKNOWN, in_processes, recorded
 from benchmarks.tracking_means import GROUPS, group_of
 from benchmarks.tracking_scores import detector_scores, scores_of
-from hmt_ros.app.lift import UP_SIGMA
 from hmt_ros.body import load_body
-from hmt_ros.body.ground_terms import FloorPlane
 from hmt_ros.experts.keypoint_training import (
     WindowSettings,
     keypoint_tracks,
@@ -38,15 +36,14 @@ from hmt_ros.experts.lifter_learning import PELVIS, SCORED, lifter_scores
 from hmt_ros.experts.predictor_learning import KINDS, new_model
 from hmt_ros.experts.training_set import motion_files, recorded_sequence
 from hmt_ros.tracking import read_subject
-from hmt_ros.tracking.gravity import Gravity
-from hmt_ros.tracking.initialisation import body_from_keypoints, start_from_keypoints
+from hmt_ros.tracking.initialisation import start_from_keypoints
 
 QUICK = 2
 SCORES = (
     'heaviest_mm', 'best_mm', 'aligned_mm', 'wrong_sign', 'joint_coverage_90', 'weights',
 )  # fmt: skip
 HEADS = ('heaviest', 'best', 'PA', 'wrong sign, %', '90 % regions, %', 'log(K w)')
-IMAGES, LENGTHS = ('all images', 'causal'), ('usual', 'fitted', 'known')
+IMAGES, LENGTHS = ('all images', 'causal'), ('usual', 'known')
 CONDITIONS = tuple(product(IMAGES, (UNKNOWN, GIVEN), LENGTHS))
 # Images that the cost is the median of.
 TIMED = 60
@@ -66,9 +63,6 @@ def lifted(work: tuple[Path, str, tuple[str, str, str]]) -> dict[str, float]:
     body, seen = usual, [found[stamp] for stamp in stamps]
     if lengths == 'known':
         body = start_from_keypoints(usual, clip.camera, read_subject(clip.subject, usual)).body
-    elif lengths == 'fitted':
-        upright = None if ups is None else Gravity(FloorPlane(ups[0], UP_SIGMA, None, np.inf))
-        body = body_from_keypoints(usual, clip.camera, seen, upright=upright)
     mixtures = lift_poses(
         load_lifter(model), body, clip.camera, 1e-9 * np.array(stamps, dtype=np.float64),
         seen, ups, lengths_known=lengths != 'usual', causal=images == 'causal',

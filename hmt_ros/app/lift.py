@@ -19,11 +19,10 @@ from hmt_ros.app.import_video.camera_file import camera_of_view, read_camera
 from hmt_ros.app.import_video.frames import Frame, FrameSource, Selection
 from hmt_ros.app.import_video.keypoint_files import FoundPersons, read_keypoints
 from hmt_ros.app.import_video.persons import Choice, Chooser
-from hmt_ros.app.progress import show_progress, tell_user
+from hmt_ros.app.progress import show_progress
 from hmt_ros.app.rendered_bag import START_NS
 from hmt_ros.app.report.command import ReportOptions, write_report
 from hmt_ros.body import Body, Camera, load_body
-from hmt_ros.body.ground_terms import FloorPlane
 from hmt_ros.experts.lifted_fit import lift_poses
 from hmt_ros.experts.lifter import SHIPPED, load_lifter
 from hmt_ros.image.keypoint_schemes import AUTO
@@ -32,18 +31,14 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.sessions.bme_session import PREDICTION
 from hmt_ros.sessions.camera_session import CAMERA_INFO, FRAME_ID
-from hmt_ros.tracking.gravity import Gravity
-from hmt_ros.tracking.initialisation import body_from_keypoints
-from hmt_ros.tracking.keypoint_evidence import FEWEST_KEYPOINTS
+from hmt_ros.tracking import read_subject
+from hmt_ros.tracking.initialisation import start_from_keypoints
 from msg_tools import BagWriter, RosbagsMessages
-from msg_tools.files.error_line import error_line
 from msg_tools.messages.camera_info import camera_info_message
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
 LIFTED, REPORT = 'lifted', 'report'
-# Standard deviation of a given vertical, rad.
-UP_SIGMA = 0.02
 
 EPILOG = """\
 KEYPOINTS is what import-video takes: COCO (.json), a folder of OpenPose, .npz or .csv.
@@ -52,9 +47,8 @@ DIR gets
   lifted/             a bag with pose_prediction: a mixture over poses for each image
   report/report.html  the page that report writes, for a browser
 
-An image with fewer than five landmarks gets an empty mixture. The proportions of the person are
-those that the keypoints of a few images show. --stature makes the poses as large as the person;
-without it they are as large as people usually are.
+An image with fewer than five landmarks gets an empty mixture. --stature makes the poses as large as
+the person, --subject tells the lengths too; without them they are as people usually are.
 
 examples:
   lift walk.json -o walk --fov 60 --size 1280x720 --fps 25
@@ -107,9 +101,14 @@ def _parser() -> CommandParser:
         '--person', type=Choice.parse, default=Choice(), metavar='WHICH',
         help='person among several, see import-video (default: nearest)',
     )  # fmt: skip
-    parser.add_argument(
+    person = parser.add_mutually_exclusive_group()
+    person.add_argument(
         '--stature', type=number(0.3, 3), help='stature of the person, m (default: not known)'
     )
+    person.add_argument(
+        '--subject', type=Path, metavar='FILE',
+        help='subject file with joints and lengths of the person, see subject',
+    )  # fmt: skip
     tilt = parser.add_mutually_exclusive_group()
     tilt.add_argument(
         '--level', action='store_true', help='the camera is level: gravity is down in the image'
@@ -164,12 +163,13 @@ def _lift(arguments: argparse.Namespace) -> int:
     if not any(len(one.names) for one in seen):
         raise ValueError(f'{arguments.keypoints}: no keypoints of the chosen person; see --person')
     up = _up(arguments)
-    body = _body(camera, seen, arguments, up)
+    body = _body(camera, arguments)
     ups = None if up is None else np.tile(up, (len(stamps), 1))
     with show_progress('lifting', quiet=quiet):
         mixtures = lift_poses(
             lifter, body, camera, 1e-9 * np.array(times, dtype=np.float64), seen, ups,
-            lengths_known=True, causal=arguments.causal, scheme=arguments.scheme,
+            lengths_known=arguments.subject is not None, causal=arguments.causal,
+            scheme=arguments.scheme,
         )  # fmt: skip
     if all(one is None for one in mixtures):
         raise ValueError(
@@ -228,21 +228,12 @@ def _chosen(found: FoundPersons, choice: Choice, fps: float) -> tuple[list[int],
 NOBODY = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 
 
-def _body(
-    camera: Camera, seen: list[Keypoints], arguments: argparse.Namespace, up: Array | None
-) -> Body:
-    """The body with the lengths that the keypoints show."""
+def _body(camera: Camera, arguments: argparse.Namespace) -> Body:
+    """The body with what is known of the person's lengths."""
     body = load_body('human37')
-    named = [one.named_for(body, arguments.scheme)[0] for one in seen]
-    shown = [one for one in named if one.seen.sum() >= FEWEST_KEYPOINTS]
-    upright = None if up is None else Gravity(FloorPlane(up, UP_SIGMA, None, np.inf))
-    if shown:
-        try:
-            return body_from_keypoints(
-                body, camera, shown, stature=arguments.stature, upright=upright
-            )
-        except ValueError as error:
-            tell_user('lift', f'usual lengths are taken: {error_line(error)}')
+    if arguments.subject is not None:
+        subject = read_subject(arguments.subject, body)
+        return start_from_keypoints(body, camera, subject).body
     return body if arguments.stature is None else body.with_stature(arguments.stature)
 
 

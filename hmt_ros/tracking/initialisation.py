@@ -13,7 +13,6 @@ are the first mixture.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,8 +48,6 @@ MEASURED, STATURE_MEASURED = 0.01, 0.02
 # A stature this many standard deviations from the usual one is not believed.
 MOST_UNUSUAL = 4.0
 HEADINGS = 8
-# Images in which lengths are measured.
-MEASURED_IMAGES = 7
 NO_POSE = 'no pose of the body explains the keypoints: are they in the image?'
 LEAST_SQUARES = TermSettings(1.0, 1.0, np.inf)
 # Axis of the camera, along which depths are measured.
@@ -106,57 +103,6 @@ def start_from_keypoints(
         if _is_a_stature(sized, start.body.skeleton.lengths) and misfit <= UNDECIDED[DEPTH.name]:
             return start
     return _start(body, camera, subject, prior_weight, upright, None)
-
-
-def body_from_keypoints(
-    body: Body,
-    camera: Camera,
-    sequence: Sequence[Keypoints],
-    *,
-    stature: float | None = None,
-    upright: Gravity | None = None,
-) -> Body:
-    """The body with the lengths of a person whose keypoints were seen in several images.
-
-    The medians over the starts in some of the images that show most of the person.
-
-    Args:
-        body: model of the person.
-        camera: that saw the keypoints.
-        sequence: keypoints of the images, as joints of the body (`Keypoints.named_for`).
-        stature: of the person, m; None: unknown.
-        upright: what is known of gravity.
-
-    Raises:
-        ValueError: no pose can be fitted in any of them.
-    """
-    sure = np.array([one.confidences[one.seen].sum() for one in sequence])
-    best = np.sort(np.argsort(-sure, kind='stable')[: max(len(sure) // 2, 1)])
-    chosen = best[np.unique(np.linspace(0, len(best) - 1, MEASURED_IMAGES).astype(int))]
-    found = [
-        lengths
-        for i in chosen.tolist()
-        if (lengths := _lengths_in(body, camera, sequence[i], stature, upright)) is not None
-    ]
-    if not found:
-        raise ValueError(NO_POSE)
-    lengths = np.median(found, axis=0).tolist()
-    return body.with_segment_lengths(dict(zip(body.skeleton.length_names, lengths, strict=True)))
-
-
-def _lengths_in(
-    body: Body,
-    camera: Camera,
-    keypoints: Keypoints,
-    stature: float | None,
-    upright: Gravity | None,
-) -> Array | None:
-    """Lengths of the start from the keypoints of an image; None: no pose explains them."""
-    try:
-        subject = Subject(0, keypoints, {}, stature)
-        return start_from_keypoints(body, camera, subject, upright=upright).body.skeleton.lengths
-    except ValueError:
-        return None
 
 
 def _start(

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 
 from hmt_ros.app import lift
 from hmt_ros.app.rendered_bag import START_NS
@@ -84,6 +85,21 @@ def test_coco_and_stature(tmp_path):
         assert lift.main([str(path), '-o', str(out), *USUAL, '--stature', stature]) == 0
         sizes[stature] = mixtures(out)[0].means[0, 2]
     assert sizes['1.9'] / sizes['1.5'] == pytest.approx(1.9 / 1.5, rel=0.05)
+
+
+def test_a_subject_file_tells_the_lengths(tmp_path):
+    pixels, _ = seen()
+    names = {SCHEME.landmarks[i].joint: pixels[0, i] for i in range(5, 17)}
+    content = {
+        'stamp_ns': 0, 'sigma_px': 2.0, 'stature_m': 1.9,
+        'keypoints': {name: [float(x) for x in place] for name, place in names.items()},
+    }  # fmt: skip
+    subject = tmp_path / 'subject.yaml'
+    subject.write_text(yaml.safe_dump(content))
+    path, out = arrays(tmp_path / 'walk.npz'), tmp_path / 'out'
+    assert lift.main([str(path), '-o', str(out), *USUAL, '--subject', str(subject)]) == 0
+    lengths = mixtures(out)[0].segment_lengths
+    assert lengths['thigh'] > 1.05 * BODY.segment_lengths['thigh']
 
 
 def test_the_same_input_gives_the_same_bytes(tmp_path):
