@@ -30,8 +30,8 @@ from hmt_ros.experts.keypoint_training import (
     keypoint_tracks,
     training_windows,
 )
-from hmt_ros.experts.lifted_fit import lift_poses, poses_of
-from hmt_ros.experts.lifter import SHIPPED, KeypointHistory, landmark_rays, load_lifter
+from hmt_ros.experts.lifted_fit import UNKNOWN_SIZE, lift_poses, poses_of
+from hmt_ros.experts.lifter import SHIPPED, KeypointHistory, load_lifter
 from hmt_ros.experts.lifter_learning import PELVIS, SCORED, lifter_scores
 from hmt_ros.experts.predictor_learning import KINDS, new_model
 from hmt_ros.experts.training_set import motion_files, recorded_sequence
@@ -88,12 +88,11 @@ def cost(folder: Path, model: str) -> dict[str, float]:
     history, mixture, poses = KeypointHistory(clip.camera), [], []
     for stamp in clip.stamps[: TIMED + 5]:
         start = time.perf_counter()
-        history.add(found[stamp], 1e-9 * stamp)
-        (one,) = lifter.of_inputs(history.inputs(None, None))
+        rays, sure = history.add(found[stamp], 1e-9 * stamp)
+        one = history.lift(lifter)
         between = time.perf_counter()
         if one is not None:
-            rays, sure = landmark_rays(clip.camera, found[stamp])
-            poses_of(body, [one], rays[None], sure[None], 0.06)
+            poses_of(body, [one], rays[None], sure[None], UNKNOWN_SIZE)
         mixture.append(between - start)
         poses.append(time.perf_counter() - between)
     return {

@@ -43,6 +43,41 @@ class CommandParser(argparse.ArgumentParser):
         self.add_argument('--overwrite', action='store_true', help=f'replace an existing {what}')
         self.add_argument('--quiet', action='store_true', help='print only warnings and errors')
 
+    def add_gravity(self) -> None:
+        """Adds --level and --gravity, for `gravity_of`."""
+        tilt = self.add_mutually_exclusive_group()
+        tilt.add_argument(
+            '--level', action='store_true', help='the camera is level: gravity is down in the image'
+        )
+        tilt.add_argument(
+            '--gravity', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
+            help='direction of gravity, of any length; x to the right of the image, y down, z '
+            'forward (default: not known)',
+        )  # fmt: skip
+
+    def add_motions(self) -> None:
+        """Adds what a command takes that learns from recorded motions, and its output."""
+        self.add_argument(
+            'motions', nargs='+', type=Path, metavar='MOTION',
+            help='file (.bvh, or .amc beside its .asf), or folder of them with its subfolders',
+        )  # fmt: skip
+        self.add_argument(
+            '-o', '--output', type=Path, required=True, metavar='FILE.npz', help='file to write'
+        )
+        self.add_argument(
+            '--without', nargs='+', default=[], metavar='NAME',
+            help='motions to leave out, names of files without suffix',
+        )  # fmt: skip
+        self.add_argument(
+            '--body', default='human37', help='body model: a name or a YAML file (human37)'
+        )
+        self.add_argument(
+            '--acknowledgement', default='', metavar='TEXT',
+            help='what the file says of the sources',
+        )  # fmt: skip
+        self.add_argument('--overwrite', action='store_true', help='replace an existing file')
+        self.add_argument('--quiet', action='store_true', help='no progress, no summary')
+
     def add_mixtures(self, verb: str) -> None:
         """Adds the bag, --truth, --topic and --body of a command that reads mixtures.
 
@@ -73,6 +108,26 @@ class CommandParser(argparse.ArgumentParser):
             help='body model of the poses: a name or a YAML file (default: the model that OUT '
             'names)',
         )
+
+
+def gravity_of(arguments: argparse.Namespace) -> list[float] | None:
+    """The direction of gravity that --level or --gravity tell; None: it is not known."""
+    return [0.0, 1.0, 0.0] if arguments.level else arguments.gravity
+
+
+def model_file(output: Path, *, overwrite: bool) -> Path:
+    """The file of a model, with '.npz' where that is missing.
+
+    Raises:
+        ValueError: it exists and is not to be overwritten, or its folder does not.
+    """
+    if output.suffix != '.npz':
+        output = output.with_name(output.name + '.npz')
+    if output.exists() and not overwrite:
+        raise ValueError(f'{output} exists: --overwrite replaces it')
+    if not output.parent.is_dir():
+        raise ValueError(f'there is no folder {output.parent} for {output.name}')
+    return output
 
 
 def run_command(

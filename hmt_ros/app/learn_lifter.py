@@ -17,14 +17,19 @@ from pathlib import Path
 
 import numpy as np
 
-from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
-from hmt_ros.app.learn_motion import chosen_motions
+from hmt_ros.app.command_line import CommandParser, model_file, number, run_command, whole_number
+from hmt_ros.app.learn_motion import chosen_motions, data_card
 from hmt_ros.app.progress import show_progress, tell_user, with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.keypoint_training import WindowSettings, keypoint_tracks, training_windows
 from hmt_ros.experts.lifter import Lifter
-from hmt_ros.experts.lifter_learning import LearningSettings, learn_lifter, lifter_scores
-from hmt_ros.experts.training_set import RATE, PoseSequence, recorded_sequence
+from hmt_ros.experts.lifter_learning import (
+    LearningSettings,
+    check_tools,
+    learn_lifter,
+    lifter_scores,
+)
+from hmt_ros.experts.training_set import PoseSequence, recorded_sequence
 from msg_tools.files.error_line import error_line
 
 # Windows that a lifter is scored on.
@@ -81,17 +86,7 @@ def _parser() -> CommandParser:
         prog='learn-lifter',
         description='Learns to tell the depths of joints from windows of keypoints.',
     )
-    parser.add_argument(
-        'motions', nargs='+', type=Path, metavar='MOTION',
-        help='file (.bvh, or .amc beside its .asf), or folder of them with its subfolders',
-    )  # fmt: skip
-    parser.add_argument(
-        '-o', '--output', type=Path, required=True, metavar='FILE.npz', help='file to write'
-    )
-    parser.add_argument(
-        '--without', nargs='+', default=[], metavar='NAME',
-        help='motions to leave out, names of files without suffix',
-    )  # fmt: skip
+    parser.add_motions()
     parser.add_argument(
         '--test', type=Path, metavar='DIR', help='motions of other people to score on'
     )
@@ -103,9 +98,6 @@ def _parser() -> CommandParser:
         '--alike-share', type=number(0.0, 1.0), default=0.35, metavar='SHARE',
         help='factor on how often these are drawn (0.35)',
     )  # fmt: skip
-    parser.add_argument(
-        '--body', default='human37', help='body model: a name or a YAML file (human37)'
-    )
     parser.add_argument(
         '--steps',
         type=whole_number(1),
@@ -126,25 +118,15 @@ def _parser() -> CommandParser:
         '--resume', action='store_true',
         help='go on with a training that was broken off, marked beside FILE as FILE.resume',
     )  # fmt: skip
-    parser.add_argument(
-        '--acknowledgement', default='', metavar='TEXT', help='what the file says of the sources'
-    )
-    parser.add_argument('--overwrite', action='store_true', help='replace an existing file')
-    parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
     return parser
 
 
 def _learn(options: LifterOptions) -> int:
-    output, quiet = options.output, options.quiet
-    if output.suffix != '.npz':
-        output = output.with_name(output.name + '.npz')
-    if output.exists() and not options.overwrite:
-        raise ValueError(f'{output} exists: --overwrite replaces it')
-    if not output.parent.is_dir():
-        raise ValueError(f'there is no folder {output.parent} for {output.name}')
+    output, quiet = model_file(options.output, overwrite=options.overwrite), options.quiet
     mark = output.with_suffix('.resume')
     if mark.exists() and not options.resume:
         raise ValueError(f'{mark} marks a training that was broken off: --resume, or remove it')
+    check_tools()
     body = load_body(options.body)
     learned = _read(chosen_motions(options.motions, options.without), options.body, quiet=quiet)
     if not learned:
@@ -165,8 +147,9 @@ def _learn(options: LifterOptions) -> int:
     with show_progress('placing', quiet=quiet):
         tracks = keypoint_tracks(body, learned, shares, seed=options.seed)
     notes = {
-        'card': _card(learned, tested, options.acknowledgement),
-        'learning': asdict(settings), 'windows': asdict(windows),
+        'card': data_card(learned, options.acknowledgement),
+        'scored on': sorted(one.name for one in tested), 'learning': asdict(settings),
+        'windows': asdict(windows),
     }  # fmt: skip
     with show_progress('learning', 'steps', options.steps, quiet=quiet) as bar:
         done = 0
@@ -232,15 +215,6 @@ def _scores(
             f'{s.log_density:.2f} nats, {100 * s.within:.0f} % within 90'
         )
     return result
-
-
-def _card(learned: list[PoseSequence], tested: list[PoseSequence], acknowledgement: str) -> str:
-    """What the file says of its motions."""
-    seconds = sum(len(one.poses) for one in learned) / RATE
-    names = ', '.join(sorted(one.name for one in learned))
-    said = f'{acknowledgement.strip()}\n' if acknowledgement.strip() else ''
-    scored = f' Scored on {", ".join(sorted(one.name for one in tested))}.' if tested else ''
-    return f'{said}Learned from {len(learned)} motions, {seconds:.0f} s: {names}.{scored}'
 
 
 if __name__ == '__main__':

@@ -12,7 +12,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from hmt_ros.app.command_line import CommandParser, run_command
+from hmt_ros.app.command_line import CommandParser, model_file, run_command
 from hmt_ros.app.progress import show_progress, tell_user, with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.model_file import write_arrays
@@ -65,36 +65,12 @@ def _parser() -> CommandParser:
     parser = CommandParser(
         prog='learn-motion', description='Learns how the poses of a body move, from motions.'
     )
-    parser.add_argument(
-        'motions', nargs='+', type=Path, metavar='MOTION',
-        help='file (.bvh, or .amc beside its .asf), or folder of them with its subfolders',
-    )  # fmt: skip
-    parser.add_argument(
-        '-o', '--output', type=Path, required=True, metavar='FILE.npz', help='file to write'
-    )
-    parser.add_argument(
-        '--without', nargs='+', default=[], metavar='NAME',
-        help='motions to leave out, names of files without suffix',
-    )  # fmt: skip
-    parser.add_argument(
-        '--body', default='human37', help='body model: a name or a YAML file (human37)'
-    )
-    parser.add_argument(
-        '--acknowledgement', default='', metavar='TEXT', help='what the file says of the sources'
-    )
-    parser.add_argument('--overwrite', action='store_true', help='replace an existing file')
-    parser.add_argument('--quiet', action='store_true', help='no progress, no summary')
+    parser.add_motions()
     return parser
 
 
 def _learn(options: LearningOptions) -> int:
-    output = options.output
-    if output.suffix != '.npz':
-        output = output.with_name(output.name + '.npz')
-    if output.exists() and not options.overwrite:
-        raise ValueError(f'{output} exists: --overwrite replaces it')
-    if not output.parent.is_dir():
-        raise ValueError(f'there is no folder {output.parent} for {output.name}')
+    output = model_file(options.output, overwrite=options.overwrite)
     body = load_body(options.body)
     paths = chosen_motions(options.motions, options.without)
     quiet = options.quiet
@@ -103,7 +79,7 @@ def _learn(options: LearningOptions) -> int:
     sequences = [one for one in read if one is not None]
     if not sequences:
         raise ValueError(f'none of the {len(paths)} motions can be used')
-    card = _card(sequences, options.acknowledgement)
+    card = data_card(sequences, options.acknowledgement)
     with show_progress('learning', quiet=quiet):
         model = learned_motion(body, [one.poses for one in sequences], RATE, card)
     write_arrays(output, model.arrays())
@@ -119,7 +95,7 @@ def chosen_motions(motions: list[Path], without: list[str]) -> list[Path]:
     """Motion files, and those in folders, but some names of files without suffix.
 
     Raises:
-        ValueError: a file that is no motion, a folder without any, or a name that there is not.
+        ValueError: a file that is no motion, a folder without any, or a name of none of them.
     """
     found: list[Path] = []
     for path in motions:
@@ -149,7 +125,7 @@ def _sequence(path: Path, body: Body) -> PoseSequence | None:
         return None
 
 
-def _card(sequences: list[PoseSequence], acknowledgement: str) -> str:
+def data_card(sequences: list[PoseSequence], acknowledgement: str) -> str:
     """What the file says of its motions."""
     seconds = sum(len(one.poses) for one in sequences) / RATE
     names = ', '.join(sorted(one.name for one in sequences))

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hmt_ros.app.command_line import CommandParser, run_command, whole_number
+from hmt_ros.app.command_line import CommandParser, model_file, run_command, whole_number
 from hmt_ros.app.progress import tell_user, with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.model_file import write_arrays
@@ -86,13 +86,7 @@ def _parser() -> CommandParser:
 
 
 def _learn(arguments: argparse.Namespace) -> int:
-    output: Path = arguments.output
-    if output.suffix != '.npz':
-        output = output.with_name(output.name + '.npz')
-    if output.exists() and not arguments.overwrite:
-        raise ValueError(f'{output} exists: --overwrite replaces it')
-    if not output.parent.is_dir():
-        raise ValueError(f'there is no folder {output.parent} for {output.name}')
+    output = model_file(arguments.output, overwrite=arguments.overwrite)
     settings = replace(
         PriorSettings(),
         components=tuple(arguments.components), folds=arguments.folds, seed=arguments.seed,

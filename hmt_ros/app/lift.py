@@ -14,8 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from hmt_ros.app.command_line import CommandParser, number, run_command, whole_number
-from hmt_ros.app.import_video.camera_file import camera_of_view, read_camera
+from hmt_ros.app.command_line import (
+    CommandParser,
+    gravity_of,
+    number,
+    run_command,
+    whole_number,
+)
+from hmt_ros.app.import_video.command import add_camera_arguments, camera_of, person_choice
 from hmt_ros.app.import_video.frames import Frame, FrameSource, Selection
 from hmt_ros.app.import_video.keypoint_files import FoundPersons, read_keypoints
 from hmt_ros.app.import_video.persons import Choice, Chooser
@@ -27,14 +33,14 @@ from hmt_ros.experts.lifted_fit import lift_poses
 from hmt_ros.experts.lifter import SHIPPED, load_lifter
 from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.image.terms.keypoints import Keypoints
-from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.sessions.bme_session import PREDICTION
+from hmt_ros.sessions.camera_frames import unit_vector
 from hmt_ros.sessions.camera_session import CAMERA_INFO, FRAME_ID
 from hmt_ros.tracking import read_subject
 from hmt_ros.tracking.initialisation import start_from_keypoints
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.headers import SECOND_NS
 from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, pose_mixture_message
 
@@ -69,19 +75,7 @@ def _parser() -> CommandParser:
     )
     parser.add_argument('keypoints', type=Path, metavar='KEYPOINTS', help='file or folder')
     parser.add_output('DIR', 'result', 'folder for the bag and the report')
-    camera = parser.add_argument_group('camera, one of these')
-    camera = camera.add_mutually_exclusive_group(required=True)
-    angle = number(1, 150, what='an angle', unit=' degrees')
-    camera.add_argument(
-        '--fov', type=angle, metavar='DEGREES', help='horizontal field of view of the image'
-    )
-    camera.add_argument(
-        '--vertical-fov', type=angle, metavar='DEGREES', help='field of view from top to bottom'
-    )
-    camera.add_argument(
-        '--camera', type=Path, metavar='FILE',
-        help='calibration file of OpenCV (YAML, XML, JSON) or of ROS (camera_info YAML)',
-    )  # fmt: skip
+    add_camera_arguments(parser)
     parser.add_argument(
         '--size', type=_size, metavar='WxH',
         help='width and height of the images, px; not needed where the file tells it',
@@ -98,7 +92,7 @@ def _parser() -> CommandParser:
         help='number of the first image (default: 0)',
     )  # fmt: skip
     parser.add_argument(
-        '--person', type=Choice.parse, default=Choice(), metavar='WHICH',
+        '--person', type=person_choice, default=Choice(), metavar='WHICH',
         help='person among several, see import-video (default: nearest)',
     )  # fmt: skip
     person = parser.add_mutually_exclusive_group()
@@ -109,15 +103,7 @@ def _parser() -> CommandParser:
         '--subject', type=Path, metavar='FILE',
         help='subject file with joints and lengths of the person, see subject',
     )  # fmt: skip
-    tilt = parser.add_mutually_exclusive_group()
-    tilt.add_argument(
-        '--level', action='store_true', help='the camera is level: gravity is down in the image'
-    )
-    tilt.add_argument(
-        '--gravity', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
-        help='direction of gravity, of any length; x to the right of the image, y down, z forward '
-        '(default: not known)',
-    )  # fmt: skip
+    parser.add_gravity()
     parser.add_argument(
         '--causal', action='store_true', help='as a camera sees it: later images do not count'
     )
@@ -157,14 +143,17 @@ def _lift(arguments: argparse.Namespace) -> int:
     lifter = load_lifter(arguments.lifter)
     source = _NoFrames(arguments.keypoints, (), arguments.first_number)
     found = read_keypoints(arguments.keypoints, source, arguments.first_stamp)
-    camera = _camera(arguments, found)
+    size = arguments.size or found.size
+    if size is None:
+        raise ValueError('the size of the images is unknown: --size WxH')
+    camera = camera_of(arguments, size)
     times, seen = _chosen(found, arguments.person, arguments.fps)
     stamps = [arguments.first_stamp + time for time in times]
     if not any(len(one.names) for one in seen):
         raise ValueError(f'{arguments.keypoints}: no keypoints of the chosen person; see --person')
-    up = _up(arguments)
-    body = _body(camera, arguments)
-    ups = None if up is None else np.tile(up, (len(stamps), 1))
+    gravity, body, ups = gravity_of(arguments), _body(camera, arguments), None
+    if gravity is not None:
+        ups = np.tile(-unit_vector(gravity, '--gravity'), (len(stamps), 1))
     with show_progress('lifting', quiet=quiet):
         mixtures = lift_poses(
             lifter, body, camera, 1e-9 * np.array(times, dtype=np.float64), seen, ups,
@@ -189,22 +178,9 @@ def _lift(arguments: argparse.Namespace) -> int:
     )  # fmt: skip
     _, written = write_report(options)
     if not quiet:
-        print(f'{folder / LIFTED}: {_summary(mixtures)}\n{written}')
+        posed = sum(one is not None for one in mixtures)
+        print(f'{folder / LIFTED}: {len(mixtures)} images, {posed} with a pose\n{written}')
     return 0
-
-
-def _summary(mixtures: list[GaussianMixture | None]) -> str:
-    found = sum(one is not None for one in mixtures)
-    return f'{len(mixtures)} images, {found} with a pose'
-
-
-def _camera(arguments: argparse.Namespace, found: FoundPersons) -> Camera:
-    size = arguments.size or found.size
-    if size is None:
-        raise ValueError('the size of the images is unknown: --size WxH')
-    if arguments.camera is not None:
-        return read_camera(arguments.camera, size)
-    return camera_of_view(size, arguments.fov, arguments.vertical_fov)
 
 
 def _chosen(found: FoundPersons, choice: Choice, fps: float) -> tuple[list[int], list[Keypoints]]:
@@ -221,11 +197,8 @@ def _chosen(found: FoundPersons, choice: Choice, fps: float) -> tuple[list[int],
     seen = []
     for i, those in enumerate(persons):
         chosen = chooser.of(i, those)
-        seen.append(NOBODY if chosen is None else chosen.keypoints)
+        seen.append(NO_KEYPOINTS if chosen is None else chosen.keypoints)
     return times, seen
-
-
-NOBODY = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 
 
 def _body(camera: Camera, arguments: argparse.Namespace) -> Body:
@@ -235,18 +208,6 @@ def _body(camera: Camera, arguments: argparse.Namespace) -> Body:
         subject = read_subject(arguments.subject, body)
         return start_from_keypoints(body, camera, subject).body
     return body if arguments.stature is None else body.with_stature(arguments.stature)
-
-
-def _up(arguments: argparse.Namespace) -> Array | None:
-    """(3,) unit vector against gravity; None: it is not known."""
-    gravity = (0.0, 1.0, 0.0) if arguments.level else arguments.gravity
-    if gravity is None:
-        return None
-    down = np.array(gravity, dtype=np.float64)
-    length = float(np.linalg.norm(down))
-    if not (np.isfinite(length) and length > 0):
-        raise ValueError(f'--gravity: wanted a direction, saw {gravity}')
-    return np.asarray(-down / length)
 
 
 if __name__ == '__main__':

@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from hmt_ros.app.command_line import CommandParser, number, run_command
+from hmt_ros.app.command_line import CommandParser, gravity_of, number, run_command
 from hmt_ros.app.import_video.command import ImportOptions, add_video_arguments, import_video
 from hmt_ros.app.progress import tell_user
 from hmt_ros.app.replay.one_bag import replay_bag
@@ -62,15 +62,7 @@ def _parser() -> CommandParser:
     parser.add_argument(
         '--background', type=Path, metavar='FILE', help='image of the empty scene, see replay'
     )
-    tilt = parser.add_mutually_exclusive_group()
-    tilt.add_argument(
-        '--level', action='store_true', help='the camera is level: gravity is down in the image'
-    )
-    tilt.add_argument(
-        '--gravity', type=float, nargs=3, metavar=('X', 'Y', 'Z'),
-        help='direction of gravity, of any length; x to the right of the image, y down, z forward '
-        '(default: not known)',
-    )  # fmt: skip
+    parser.add_gravity()
     parser.add_argument('--seed', type=int, metavar='N', help='seed of all random numbers')
     parser.add_argument(
         '--set', action='append', default=[], dest='settings', metavar='NAME=VALUE',
@@ -125,7 +117,7 @@ def _track(arguments: argparse.Namespace) -> int:
 
 def _of_gravity(arguments: argparse.Namespace) -> list[str]:
     """The setting of the tracker that tells how the camera is tilted, if it is known."""
-    gravity = [0.0, 1.0, 0.0] if arguments.level else arguments.gravity
+    gravity = gravity_of(arguments)
     return [] if gravity is None else [f'gravity={gravity}']
 
 

@@ -17,7 +17,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from hmt_ros.app.command_line import CommandParser, run_command, whole_number
+from hmt_ros.app.command_line import CommandParser, model_file, run_command, whole_number
 from hmt_ros.app.progress import show_progress, tell_user, with_progress
 from hmt_ros.app.training_report import write_report
 from hmt_ros.body import Body, load_body
@@ -129,13 +129,7 @@ def _parser() -> CommandParser:
 
 
 def _train(options: TrainingOptions) -> int:
-    output = options.output
-    if output.suffix != '.npz':
-        output = output.with_name(output.name + '.npz')
-    if output.exists() and not options.overwrite:
-        raise ValueError(f'{output} exists: --overwrite replaces it')
-    if not output.parent.is_dir():
-        raise ValueError(f'there is no folder {output.parent} for {output.name}')
+    output = model_file(options.output, overwrite=options.overwrite)
     body = load_body(options.body)
     if not body.shapes:
         raise ValueError(f'body {options.body} has no flesh: wanted one such as human37')

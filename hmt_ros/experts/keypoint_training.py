@@ -350,7 +350,6 @@ def with_errors(
     times: Array,
     rng: np.random.Generator,
     amount: float = 1.0,
-    errors: DetectorErrors | None = None,
 ) -> tuple[Floats, Floats]:
     """Rays (N, S, L, 2) and confidences (N, S, L) as a detector would see them.
 
@@ -361,9 +360,8 @@ def with_errors(
         times: (N, S) of the images, s; the same order in all windows.
         rng: source of randomness.
         amount: factor on the deviations.
-        errors: of the detector; None: those that were learned.
     """
-    e = errors or detector_errors()
+    e = detector_errors()
     n, s, count = confidences.shape
     f32 = np.float32
 

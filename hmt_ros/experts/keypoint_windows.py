@@ -26,7 +26,6 @@ from hmt_ros.inference.arrays import Array
 # Times of a window relative to now, s, and how far an image may be from each.
 TIMES = np.array([0.0, -0.067, -0.15, -0.3, -0.5, -0.8, 0.067, 0.15, 0.3, 0.5, 0.8])
 NEAR = np.array([0.02, *([0.045, 0.06, 0.09, 0.12, 0.17] * 2)])
-LATER = TIMES > 0
 
 _SIDED = ('shoulder', 'elbow', 'wrist', 'hip', 'knee', 'ankle', 'heel', 'toe')
 LANDMARKS = (

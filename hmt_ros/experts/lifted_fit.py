@@ -21,13 +21,13 @@ from hmt_ros.body.camera import Camera
 from hmt_ros.body.kinematics import forward, point_energy
 from hmt_ros.body.pose_prior import LEARNED, pose_prior
 from hmt_ros.experts.keypoint_windows import landmark_offsets
-from hmt_ros.experts.lifter import Lifter, landmark_rays, lift_sequence
+from hmt_ros.experts.lifter import Lifter, landmark_rays
 from hmt_ros.image.keypoint_schemes import AUTO, noise_of
 from hmt_ros.image.lifted_poses import HIPS, WHOLE, LiftedPoses
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import minimise
-from hmt_ros.inference.energy import EnergyFunction
+from hmt_ros.inference.energy import Energy, EnergyFunction, add_energies
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.motion.limb_angles import limb_angles
 
@@ -39,7 +39,7 @@ ITERATIONS, TOLERANCE = 12, 0.05
 # Factor on deviations across the line of sight, which the keypoints themselves show, and scale of
 # the robust kernel of these, in standard deviations.
 ACROSS, KERNEL = 4.0, 4.0
-# Deviation of a landmark from its keypoint, m at the person.
+# Deviation of a landmark from its keypoint, m at the person, for the place of the person.
 SEEN = 0.03
 # Factor on covariances: keypoints and joints err together. Chosen on clips, so that regions of 90 %
 # of single joints hold 88 %.
@@ -81,18 +81,16 @@ def lift_poses(
     Raises:
         ValueError: there is no such scheme, or the body lacks joints.
     """
-    lifted = lift_sequence(
-        lifter, camera, stamps, keypoints, ups, body.segment_lengths if lengths_known else None,
-        causal=causal, scheme=scheme,
-    )  # fmt: skip
+    seen = [landmark_rays(camera, one, scheme) for one in keypoints]
+    rays, confidences = (np.array([one[i] for one in seen]) for i in range(2))
+    person = lifter.proportions(body) if lengths_known else None
+    lifted = lifter.lift(stamps, rays, confidences, stamps, ups, person, causal=causal)
     rows = [i for i, one in enumerate(lifted) if one is not None]
-    seen = [landmark_rays(camera, keypoints[i], scheme) for i in rows]
-    result: list[GaussianMixture | None] = [None] * len(lifted)
-    spread = KNOWN_SIZE if lengths_known else UNKNOWN_SIZE
     found = poses_of(
-        body, [one for one in lifted if one is not None],
-        np.array([rays for rays, _ in seen]), np.array([sure for _, sure in seen]), spread,
+        body, [one for one in lifted if one is not None], rays[rows], confidences[rows],
+        KNOWN_SIZE if lengths_known else UNKNOWN_SIZE,
     )  # fmt: skip
+    result: list[GaussianMixture | None] = [None] * len(lifted)
     for row, mixture in zip(rows, found, strict=True):
         result[row] = mixture
     return result
@@ -173,23 +171,16 @@ def _fitted(
 
     def energy(x: Array, rows: Index) -> tuple[Array, Array, Array]:
         frames = forward(skeleton, x)
-        known = prior.energy(frames, rows)
-        terms = (
-            (known.value, *known.derivatives()),
-            point_energy(
-                frames, skeleton.joint_segments[which], skeleton.joint_offsets[which],
-                means[rows].transpose(1, 2, 0), ones[:, rows], whiten[..., rows],
-            ),
-            point_energy(
-                frames, segments, local, nothing[..., rows], precision[:, rows], across[..., rows]
-            ),
+        placed = point_energy(
+            frames, skeleton.joint_segments[which], skeleton.joint_offsets[which],
+            means[rows].transpose(1, 2, 0), ones[:, rows], whiten[..., rows],
         )  # fmt: skip
-        first, second, third = terms
-        return (
-            first[0] + second[0] + third[0],
-            first[1] + second[1] + third[1],
-            first[2] + second[2] + third[2],
+        marks = point_energy(
+            frames, segments, local, nothing[..., rows], precision[:, rows], across[..., rows]
         )
+        known = prior.energy(frames, rows)
+        total = add_energies([Energy(*placed), Energy(*marks), known])
+        return total.value, *total.derivatives()
 
     found = minimise(
         EnergyFunction(energy), poses, body.lower, body.upper,

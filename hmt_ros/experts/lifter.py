@@ -10,9 +10,9 @@ by cameras and a detector that errs as real ones do (`keypoint_training`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from hmt_ros.experts.keypoint_windows import (
     NEAR,
     PROPORTIONED,
     TIMES,
-    WindowInputs,
     filled,
     places_of,
     proportions,
@@ -139,13 +138,39 @@ class Lifter:
         known = lengths.keys() >= {*PROPORTIONED}
         return proportions(self.usual, lengths) if known else None
 
-    def of_inputs(self, inputs: WindowInputs) -> list[LiftedPoses | None]:
-        """The mixtures of N windows; None where nobody is seen."""
-        result: list[LiftedPoses | None] = [None] * len(inputs.known)
-        rows = np.flatnonzero(inputs.known)
-        if len(rows):
-            gates, means, deviations = self.network(inputs.values[rows])
-            for i, row in enumerate(rows):
+    def lift(
+        self,
+        stamps: Array,
+        rays: Array,
+        confidences: Array,
+        at: Array,
+        ups: Array | None = None,
+        person: Array | None = None,
+        *,
+        causal: bool,
+    ) -> list[LiftedPoses | None]:
+        """The mixtures at N times; None where nobody is seen.
+
+        Args:
+            stamps: (T,) times of the images, increasing, s.
+            rays, confidences: (T, L, 2), (T, L) of the landmarks, see `landmark_rays`.
+            at: (N,) times of images, s.
+            ups: (N, 3) unit vectors against gravity, camera frame; None: unknown.
+            person: proportions of the person; None: unknown.
+            causal: whether images after those times do not count.
+        """
+        rows, there, times = filled(stamps, at, causal=causal)
+        n = len(at)
+        inputs = window_inputs(
+            rays[rows], confidences[rows] * there[..., None], times,
+            np.zeros((n, 3)) if ups is None else ups,
+            np.zeros((n, len(PROPORTIONED))) if person is None else np.tile(person, (n, 1)),
+        )  # fmt: skip
+        result: list[LiftedPoses | None] = [None] * n
+        seen = np.flatnonzero(inputs.known)
+        if len(seen):
+            gates, means, deviations = self.network(inputs.values[seen])
+            for i, row in enumerate(seen):
                 result[row] = LiftedPoses(
                     self.joints, gates[i], means[i], deviations[i], inputs.axes[row], self.lengths
                 )
@@ -191,16 +216,21 @@ class Lifter:
 _NETWORK = tuple(Network.__dataclass_fields__)
 
 
-@cache
 def load_lifter(model: str = SHIPPED) -> Lifter:
-    """A lifter that ships, by its name, or one from a file.
+    """The lifter that ships, by its name, or one from a file.
 
     Raises:
-        FileNotFoundError: there is neither such a name nor such a file.
+        FileNotFoundError: it is not the name, and there is no such file.
         ValueError: the file is no lifter, or one of another version.
     """
-    shipped = FOLDER / f'{model}.npz'
-    return Lifter.load(shipped if model == SHIPPED else model)
+    path = FOLDER / f'{SHIPPED}.npz' if model == SHIPPED else Path(model)
+    return _loaded(path, path.stat().st_mtime_ns)
+
+
+# Every track of several people takes one.
+@lru_cache(maxsize=4)
+def _loaded(path: Path, _changed_ns: int) -> Lifter:
+    return Lifter.load(path)
 
 
 class KeypointHistory:
@@ -216,8 +246,8 @@ class KeypointHistory:
         self._rays: list[Array] = []
         self._confidences: list[Array] = []
 
-    def add(self, keypoints: Keypoints, stamp: float) -> None:
-        """Takes the keypoints of the next image.
+    def add(self, keypoints: Keypoints, stamp: float) -> tuple[Array, Array]:
+        """Takes the keypoints of the next image; returns their `landmark_rays`.
 
         Args:
             keypoints: of the person.
@@ -230,6 +260,7 @@ class KeypointHistory:
         self._stamps.append(stamp)
         self._rays.append(rays)
         self._confidences.append(confidences)
+        return rays, confidences
 
     def carry(self, rotation: Array) -> None:
         """Takes what is known into the frame (rotation (3, 3)) of a camera that has turned."""
@@ -237,60 +268,19 @@ class KeypointHistory:
             turned = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) @ rotation.T
             self._rays[i] = turned[:, :2] / np.maximum(turned[:, 2:], BEFORE)
 
-    def inputs(self, up: Array | None, person: Array | None) -> WindowInputs:
-        """Inputs of the window at the last image.
+    def lift(
+        self, lifter: Lifter, up: Array | None = None, person: Array | None = None
+    ) -> LiftedPoses | None:
+        """The mixture at the last image; None: nobody is seen.
 
         Args:
+            lifter: that has learned.
             up: (3,) unit vector against gravity, camera frame; None: unknown.
             person: proportions of the person; None: unknown.
         """
-        stamps = np.array(self._stamps)
-        rows, there, times = filled(stamps, stamps[-1:], causal=True)
-        rays, confidences = np.array(self._rays)[rows], np.array(self._confidences)[rows]
-        return window_inputs(
-            rays, confidences * there[..., None], times,
-            np.zeros((1, 3)) if up is None else np.asarray(up)[None],
-            np.zeros((1, len(PROPORTIONED))) if person is None else person[None],
-        )  # fmt: skip
-
-
-def lift_sequence(
-    lifter: Lifter,
-    camera: Camera,
-    stamps: Array,
-    keypoints: Sequence[Keypoints],
-    ups: Array | None = None,
-    lengths: Mapping[str, float] | None = None,
-    *,
-    causal: bool = False,
-    scheme: str = AUTO,
-) -> list[LiftedPoses | None]:
-    """The mixtures of all images of a sequence; None where nobody is seen.
-
-    Args:
-        lifter: that has learned.
-        camera: that saw the keypoints, and stood still.
-        stamps: (T,) times of the images, increasing, s.
-        keypoints: T sets of keypoints of one person.
-        ups: (T, 3) unit vectors against gravity, camera frame; None: unknown.
-        lengths: of the person by name, m; None: unknown.
-        causal: whether images after each do not count.
-        scheme: of the names.
-
-    Raises:
-        ValueError: there is no such scheme.
-    """
-    seen = [landmark_rays(camera, one, scheme) for one in keypoints]
-    rays, confidences = (np.array([one[i] for one in seen]) for i in range(2))
-    rows, there, times = filled(stamps, stamps, causal=causal)
-    person = np.zeros(len(PROPORTIONED))
-    if lengths is not None:
-        person = proportions(lifter.usual, lengths)
-    inputs = window_inputs(
-        rays[rows], confidences[rows] * there[..., None], times,
-        np.zeros((len(stamps), 3)) if ups is None else ups, np.tile(person, (len(stamps), 1)),
-    )  # fmt: skip
-    return lifter.of_inputs(inputs)
+        stamps, ups = np.array(self._stamps), None if up is None else np.asarray(up)[None]
+        seen = np.array(self._rays), np.array(self._confidences)
+        return lifter.lift(stamps, *seen, stamps[-1:], ups, person, causal=True)[0]
 
 
 def landmark_rays(camera: Camera, keypoints: Keypoints, scheme: str = AUTO) -> tuple[Array, Array]:

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ PELVIS = JOINTS.index('pelvis')
 RISING, MARK = 300, 500
 # Least scale of an input.
 LEAST_SCALE = 0.1
-NEEDED = "training needs JAX and Optax: pip install 'jax' 'optax', or see docs/experts.md"
+NEEDED = 'training needs JAX and Optax, which are missing: pip install jax optax'
 
 
 @dataclass(frozen=True)
@@ -88,15 +89,13 @@ def learn_lifter(
         resume: file in which the training is marked now and then, and taken up if it is there.
 
     Raises:
-        ImportError: JAX or Optax is missing.
-        ValueError: the file to take up is of another training.
+        ValueError: JAX or Optax is missing, or the file to take up is of another training.
     """
-    try:
-        import jax
-        import jax.numpy as jnp
-        import optax
-    except ImportError as error:
-        raise ImportError(NEEDED) from error
+    check_tools()
+    import jax
+    import jax.numpy as jnp
+    import optax
+
     s = settings
 
     def drawn(step: int) -> tuple[Any, Any]:
@@ -123,10 +122,10 @@ def learn_lifter(
         gates, means, spreads = network(p, x)
         off = means - y[:, None]
         density = -(0.5 * (off * jnp.exp(-spreads)) ** 2 + spreads).sum((2, 3))
-        told = jax.scipy.special.logsumexp(gates + density, axis=1)
+        mass = jax.scipy.special.logsumexp(gates + density, axis=1)
         answer = jax.lax.stop_gradient(jax.nn.softmax(gates + s.sharpness * density, axis=1))
         distance = jnp.sqrt((off * off).sum(3) + 1e-6).mean(2)
-        return (-told / (3 * j) + s.distance_weight * (answer * distance).sum(1)).mean()
+        return (-mass / (3 * j) + s.distance_weight * (answer * distance).sum(1)).mean()
 
     rise = optax.linear_schedule(0.0, s.rate, RISING)
     fall = optax.cosine_decay_schedule(s.rate, max(s.steps - RISING, 1), 0.005)
@@ -156,6 +155,12 @@ def learn_lifter(
             _mark(resume, number + 1, jax.tree.leaves((parameters, state)), s)
     found = {name: np.asarray(value) for name, value in parameters.items()}
     return Lifter(Network(mean, scale, middle=middle, **found), JOINTS, body, notes)
+
+
+def check_tools() -> None:
+    """Raises ValueError where JAX or Optax is missing."""
+    if any(find_spec(name) is None for name in ('jax', 'optax')):
+        raise ValueError(NEEDED)
 
 
 def _first(inputs: int, s: LearningSettings) -> dict[str, Any]:

@@ -136,7 +136,8 @@ def from_positions(
     """The one pose that a network guesses; None: it has no hips, or nothing else.
 
     Args:
-        joints: (n,) names of joints; of several of one name the first counts.
+        joints: (n,) names of joints; of several of one name the first counts. One whose other side
+            is unknown does not: exchanged, it would be the other.
         positions: (n, 3) m, along the axes of the camera from any origin; NaN: unknown.
         axes: (3, 3) of the person's view, in rows, camera frame.
         deviations: of the depths of joints, by their kind, m.
@@ -145,9 +146,9 @@ def from_positions(
     for name, position in zip(joints, positions, strict=True):
         if np.isfinite(position).all() and name.rpartition('_')[2] in deviations:
             known.setdefault(name, position)
-    if not known.keys() >= {*HIPS} or len(known) <= len(HIPS):
+    names = tuple(name for name in known if other_side(name) in known)
+    if not {*names} >= {*HIPS} or len(names) <= len(HIPS):
         return None
-    names = tuple(known)
     middle = np.mean([known[name] for name in HIPS], axis=0)
     places = np.array([known[name] - middle for name in names])
     lengths = np.empty(len(names))

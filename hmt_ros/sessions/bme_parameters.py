@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from hmt_ros.experts.lifter import SHIPPED as LIFTER
 from hmt_ros.image.background import BackgroundSettings
-from hmt_ros.image.keypoint_schemes import AUTO, JOINTS, schemes
+from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.sessions.declared_parameters import (
     AT_ONCE,
     NEXT_CONFIGURE,
@@ -20,7 +20,7 @@ from hmt_ros.sessions.declared_parameters import (
     nested_parameters,
     parameter_field,
 )
-from hmt_ros.sessions.filter_parameters import BACKGROUND
+from hmt_ros.sessions.filter_parameters import BACKGROUND, check_keypoint_scheme
 from hmt_ros.sessions.parameter_file import parameter_file_text
 
 
@@ -70,11 +70,9 @@ class BmeParameters(CameraNodeParameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        known = (AUTO, JOINTS, *schemes())
-        if self.keypoint_scheme not in known:
-            raise ValueError(
-                f'keypoint_scheme must be one of {known}, saw {self.keypoint_scheme!r}'
-            )
+        check_keypoint_scheme(self.keypoint_scheme)
+        if self.use_keypoints and not self.lifter:
+            raise ValueError("use_keypoints needs a lifter, saw ''")
 
 
 if __name__ == '__main__':

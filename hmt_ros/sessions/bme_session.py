@@ -39,7 +39,7 @@ from hmt_ros.body import Camera
 from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
 from hmt_ros.experts.lifted_fit import KNOWN_SIZE, UNKNOWN_SIZE, poses_of
-from hmt_ros.experts.lifter import KeypointHistory, Lifter, landmark_rays, load_lifter
+from hmt_ros.experts.lifter import KeypointHistory
 from hmt_ros.experts.pose_predictor import SHIPPED, PosePredictor, Prediction, load_predictor
 from hmt_ros.experts.root_placement import SIZE_SPREAD
 from hmt_ros.experts.training_set import RATE
@@ -59,7 +59,7 @@ from hmt_ros.sessions.camera_session import (
     read_picture,
 )
 from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.keypoint_inputs import KEYPOINTS
+from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, known_lifter
 from hmt_ros.sessions.session import (
     NeededInput,
     Order,
@@ -172,7 +172,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._tracked: int | None = None
         self._height, self._support = 0, math.nan
         self._masked = False
-        self._lifter = _lifter_of(parameters)
+        self._lifter = known_lifter(parameters.lifter) if parameters.use_keypoints else None
         self._history: KeypointHistory | None = None
         self.state = self._present_state()
 
@@ -243,15 +243,14 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def _lifted(self, content: Keypoints, stamp: int, camera: Camera) -> GaussianMixture | None:
         """The prediction from keypoints; None: too few are seen."""
-        if self._history is None:
-            self._history = KeypointHistory(camera)
+        assert self._lifter is not None
+        history = self._history = self._history or KeypointHistory(camera)
         body, scheme = self._predictor.body, self.parameters.keypoint_scheme
         known, _ = content.named_for(body, scheme)
-        self._history.add(known, 1e-9 * stamp)
-        (lifted,) = self._lifter.of_inputs(self._history.inputs(None, None))
+        rays, confidences = history.add(known, stamp / SECOND_NS)
+        lifted = history.lift(self._lifter)
         if lifted is None:
             return None
-        rays, confidences = landmark_rays(camera, known)
         spread = KNOWN_SIZE if self.parameters.stature else UNKNOWN_SIZE
         (found,) = poses_of(body, [lifted], rays[None], confidences[None], spread)
         return found[: self.parameters.max_hypotheses].normalised()
@@ -449,13 +448,6 @@ def _predictor_of(parameters: BmeParameters) -> tuple[PosePredictor, float]:
         return predictor, SIZE_SPREAD
     body = predictor.body.with_stature(parameters.stature)
     return predictor.with_body(body), _MEASURED_SPREAD
-
-
-def _lifter_of(parameters: BmeParameters) -> Lifter:
-    try:
-        return load_lifter(parameters.lifter)
-    except OSError as error:
-        raise ValueError(error_line(error)) from error
 
 
 def _height(mask: Mask) -> int:

@@ -43,6 +43,13 @@ _TRACKER = {
 BACKGROUND = {'method': None}
 
 
+def check_keypoint_scheme(scheme: str) -> None:
+    """Raises ValueError where there is no such scheme."""
+    known = (AUTO, JOINTS, *schemes())
+    if scheme not in known:
+        raise ValueError(f'keypoint_scheme must be one of {known}, saw {scheme!r}')
+
+
 @dataclass(frozen=True)
 class FilterParameters(CameraNodeParameters):
     """All parameters of the filter node.
@@ -126,11 +133,7 @@ class FilterParameters(CameraNodeParameters):
         super().__post_init__()
         if not self.body_model:
             raise ValueError("body_model must be a name or a file, saw ''")
-        known = (AUTO, JOINTS, *schemes())
-        if self.keypoint_scheme not in known:
-            raise ValueError(
-                f'keypoint_scheme must be one of {known}, saw {self.keypoint_scheme!r}'
-            )
+        check_keypoint_scheme(self.keypoint_scheme)
         if self.use_keypoints_3d and not self.use_keypoints:
             raise ValueError('use_keypoints_3d needs use_keypoints, which is false')
         if self.gravity and unit_vector(self.gravity, 'gravity')[1] < UPSIDE_DOWN:

@@ -98,7 +98,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
     TOPICS = TOPICS
     DONE = 'tracked'
     ESTIMATE = 'the track'
-    CHECKED = ('subject_file', 'background_file', 'body_model')
+    CHECKED = ('subject_file', 'background_file', 'body_model', 'lifter')
 
     def __init__(
         self,

@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body
+from hmt_ros.experts.lifter import Lifter, load_lifter
 from hmt_ros.image.keypoint_schemes import AUTO, JOINTS
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.camera_session import StampedInputs
 from hmt_ros.sessions.filter_parameters import FilterParameters
 from hmt_ros.sessions.handled import Fault, HandlingLog
 from msg_tools import MessageError
+from msg_tools.files.error_line import error_line
 from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.keypoints import Positions, keypoints_of, positions_of
 
@@ -24,6 +26,18 @@ KEYPOINTS, KEYPOINTS_3D = 'keypoints', 'keypoints_3d'
 
 # Sets of unknown names that are warned of, each once; a detector has one.
 _MOST_WARNINGS = 20
+
+
+def known_lifter(model: str) -> Lifter | None:
+    """The experts that a parameter `lifter` names; None: it is empty.
+
+    Raises:
+        ValueError: there is no such file, or it is no lifter; one line.
+    """
+    try:
+        return load_lifter(model) if model else None
+    except OSError as error:
+        raise ValueError(f'lifter {model}: {error_line(error)}') from error
 
 
 class KeypointInputs:

@@ -107,7 +107,7 @@ class PeopleSession(CameraSession[PeopleParameters, PeopleState]):
     }
     DONE = 'tracked'
     ESTIMATE = 'every track'
-    CHECKED = ('background_file', 'body_model')
+    CHECKED = ('background_file', 'body_model', 'lifter')
 
     def __init__(
         self,

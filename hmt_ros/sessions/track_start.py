@@ -14,6 +14,7 @@ from hmt_ros.image.observation import Box
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.sessions.camera_session import read_picture
 from hmt_ros.sessions.filter_parameters import FilterParameters
+from hmt_ros.sessions.keypoint_inputs import known_lifter
 from hmt_ros.tracking import Subject, Tracker, read_subject
 from hmt_ros.tracking.ground import KnownGround
 from msg_tools.files.error_line import error_line
@@ -121,6 +122,7 @@ def prepare_start(
         ValueError: a file or a mixture that can not be used; one line that says why.
     """
     body = _body(parameters.body_model)
+    known_lifter(parameters.tracker.lifter)  # a tracker takes it once the camera is known
     background = read_picture(parameters.background_file) if parameters.background_file else None
     initial: Subject | GaussianMixture | None = None
     if mixture is not None and len(mixture.components):

@@ -378,7 +378,7 @@ class Tracker:
             self._seen.add(keypoints, seconds(stamp))
             begun = self._track.begun
             person = self._lifter.proportions(self.body) if begun else None
-            opinions += self._lifter.of_inputs(self._seen.inputs(self.vertical, person))
+            opinions.append(self._seen.lift(self._lifter, self.vertical, person))
         if keypoints.positions is not None:
             opinions.append(lifted_positions(self.camera, keypoints))
         said = [one for one in opinions if one is not None]

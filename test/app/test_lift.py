@@ -117,7 +117,10 @@ def test_the_same_input_gives_the_same_bytes(tmp_path):
         ([*USUAL, '--lifter', 'none.npz'], 'none.npz'),
         ([*USUAL, '--person', 'index:3'], 'no keypoints of the chosen person'),
         ([*USUAL, '--scheme', 'none'], "there is no keypoint scheme 'none'"),
-        ([*USUAL, '--gravity', '0', '0', '0'], '--gravity: wanted a direction'),
+        (
+            [*USUAL, '--gravity', '0', '0', '0'],
+            '--gravity must be three finite numbers, not all zero',
+        ),
     ],
 )
 def test_bad_input_is_one_line(tmp_path, capsys, arguments, said):

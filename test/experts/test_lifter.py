@@ -34,7 +34,6 @@ from hmt_ros.experts.lifter import (
     Lifter,
     Network,
     landmark_rays,
-    lift_sequence,
     load_lifter,
 )
 from hmt_ros.experts.lifter_learning import LearningSettings, learn_lifter, lifter_scores
@@ -76,6 +75,13 @@ def detected(poses: np.ndarray, scheme: str = 'mediapipe33', body=BODY) -> list[
         unknown = np.full((len(names), 2, 2), np.nan)
         result.append(Keypoints(names, pixels, unknown, sure))
     return result
+
+
+def lifted_in(lifter, stamps, keypoints, camera=CAMERA, *, causal=False):
+    """The mixtures of all images of a sequence."""
+    seen = [landmark_rays(camera, one) for one in keypoints]
+    rays, sure = (np.array([one[i] for one in seen]) for i in range(2))
+    return lifter.lift(stamps, rays, sure, stamps, causal=causal)
 
 
 def network(seed: int = 0, experts: int = 3, units: int = 8) -> Network:
@@ -185,13 +191,13 @@ def test_landmarks_have_one_place_whatever_the_scheme():
 def test_history_sees_what_a_causal_sequence_sees(lifter):
     poses = walking(30)
     seen, stamps = detected(poses), np.arange(30) / 30.0
-    whole = lift_sequence(lifter, CAMERA, stamps, seen, causal=True)
+    whole = lifted_in(lifter, stamps, seen, causal=True)
     history = KeypointHistory(CAMERA)
     for stamp, one in zip(stamps, seen):
         history.add(one, stamp)
-        (last,) = lifter.of_inputs(history.inputs(None, None))
+        last = history.lift(lifter)
     np.testing.assert_allclose(last.means, whole[-1].means, atol=1e-5)
-    later = lift_sequence(lifter, CAMERA, stamps, seen)
+    later = lifted_in(lifter, stamps, seen)
     assert not np.allclose(later[5].means, whole[5].means, atol=1e-5)
     np.testing.assert_allclose(later[-1].means, whole[-1].means, atol=1e-5)
 
@@ -212,7 +218,7 @@ def test_too_few_keypoints_are_nobody(lifter):
     sure = one.confidences.copy()
     sure[4:] = 0.0
     few = Keypoints(one.names, one.pixels, one.covariances, sure)
-    assert lift_sequence(lifter, CAMERA, np.zeros(1), [few]) == [None]
+    assert lifted_in(lifter, np.zeros(1), [few]) == [None]
     none = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
     assert lift_poses(lifter, BODY, CAMERA, np.zeros(1), [none]) == [None]
 
@@ -272,7 +278,10 @@ def test_one_guess_has_the_depths_of_its_joints():
     assert from_positions(JOINTS[:3], joints[:3], axes, kinds) is None
     lost = joints[which].copy()
     lost[JOINTS.index('left_knee')] = np.nan
-    assert 'left_knee' not in from_positions(JOINTS, lost, axes, kinds).joints
+    other = from_positions(JOINTS, lost, axes, kinds)
+    # Exchanged, the right knee would be the left one.
+    assert not {'left_knee', 'right_knee'} & {*other.joints}
+    assert other.exchanged().joints == other.joints
 
 
 def test_opinions_are_pooled():
@@ -421,7 +430,7 @@ def test_no_confident_wrong_pose(name):
     seen = [more.get('edit', lambda x: x)(one) for one in detected(poses, body=body)]
     stamps = np.arange(len(seen)) / more.get('rate', 30.0)
     camera = more.get('camera', CAMERA)
-    found = lift_sequence(load_lifter(), camera, stamps, seen, causal=True)
+    found = lifted_in(load_lifter(), stamps, seen, camera, causal=True)
     errors, ratios = [], []
     for true, one in zip(truly_lifted(poses, body), found):
         assert one is not None
@@ -437,7 +446,7 @@ def test_no_confident_wrong_pose(name):
 
 def test_without_confidence_there_is_no_pose():
     seen = [only(())(one) for one in detected(walking(2))]
-    assert lift_sequence(load_lifter(), CAMERA, np.arange(2) / 30.0, seen) == [None, None]
+    assert lifted_in(load_lifter(), np.arange(2) / 30.0, seen) == [None, None]
 
 
 def test_two_people_mixed_are_wide():
@@ -448,6 +457,6 @@ def test_two_people_mixed_are_wide():
         replace(a, pixels=np.where(rng.random((len(a.names), 1)) < 0.5, a.pixels, b.pixels))
         for a, b in pairs
     ]
-    usual = lift_sequence(load_lifter(), CAMERA, np.arange(10) / 30.0, detected(poses))
-    mixed = lift_sequence(load_lifter(), CAMERA, np.arange(10) / 30.0, seen)
+    usual = lifted_in(load_lifter(), np.arange(10) / 30.0, detected(poses))
+    mixed = lifted_in(load_lifter(), np.arange(10) / 30.0, seen)
     assert mixed[-1].deviations[..., 2].mean() > 2.0 * usual[-1].deviations[..., 2].mean()

@@ -120,3 +120,10 @@ def test_mixtures_go_before_the_subject(subject_file, body):
 def test_mixtures_of_other_bodies(body, changes, message):
     with pytest.raises(ValueError, match=message):
         prepare_start(FilterParameters(), mixture(body, **changes))
+
+
+def test_a_lifter_that_is_not_there_is_told():
+    """At once, and not when the camera is known."""
+    with pytest.raises(ValueError, match=r'lifter none\.npz: .*[Nn]o such file'):
+        prepare_start(parameters(lifter='none.npz'))
+    assert prepare_start(parameters(lifter='')).parameters.tracker.lifter == ''

@@ -30,6 +30,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference.arrays import Mask
 from msg_tools import BagWriter, RosbagsMessages
 from msg_tools.messages.camera_info import camera_info_message
+from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.images import encode_jpeg, image_message, jpeg_message
 from msg_tools.messages.keypoints import keypoints_message, positions_message
 
@@ -138,11 +139,8 @@ def _parser() -> CommandParser:
     return parser
 
 
-def add_video_arguments(parser: CommandParser) -> None:
-    """Adds the arguments that say what to import."""
-    parser.add_argument(
-        'source', type=Path, metavar='SOURCE', help='video file, or folder of images'
-    )
+def add_camera_arguments(parser: CommandParser) -> None:
+    """Adds the arguments that say what the camera is, for `camera_of`."""
     camera = parser.add_argument_group('camera, one of these')
     camera = camera.add_mutually_exclusive_group(required=True)
     angle = number(1, 150, what='an angle', unit=' degrees')
@@ -157,6 +155,14 @@ def add_video_arguments(parser: CommandParser) -> None:
         '--camera', type=Path, metavar='FILE',
         help='calibration file of OpenCV (YAML, XML, JSON) or of ROS (camera_info YAML)',
     )  # fmt: skip
+
+
+def add_video_arguments(parser: CommandParser) -> None:
+    """Adds the arguments that say what to import."""
+    parser.add_argument(
+        'source', type=Path, metavar='SOURCE', help='video file, or folder of images'
+    )
+    add_camera_arguments(parser)
     frames = parser.add_argument_group('frames')
     frames.add_argument(
         '--fps', type=number(0.01, 1000),
@@ -190,7 +196,7 @@ def add_video_arguments(parser: CommandParser) -> None:
         help='find keypoints with MediaPipe Pose, where it is installed',
     )  # fmt: skip
     person.add_argument(
-        '--person', type=_choice, default=Choice(), metavar='WHICH',
+        '--person', type=person_choice, default=Choice(), metavar='WHICH',
         help='person to import if there are several: largest in each frame; nearest to the one '
         'before, from the largest on; index:N, the N-th in the list of each frame, from 0; or '
         'id:NAME, as the detector tracks them (default: nearest)',
@@ -208,7 +214,8 @@ def add_video_arguments(parser: CommandParser) -> None:
     )  # fmt: skip
 
 
-def _choice(text: str) -> Choice:
+def person_choice(text: str) -> Choice:
+    """Reads --person."""
     try:
         return Choice.parse(text)
     except ValueError as error:
@@ -318,7 +325,8 @@ def _same_size(source: FrameSource, selection: Selection) -> Generator[Frame, No
         yield frame
 
 
-def _camera(options: ImportOptions, size: tuple[int, int]) -> Camera:
+def camera_of(options: ImportOptions | argparse.Namespace, size: tuple[int, int]) -> Camera:
+    """The camera that options describe, with images of a size."""
     if options.camera is not None:
         return read_camera(options.camera, size)
     return camera_of_view(size, options.fov, options.vertical_fov)
@@ -339,7 +347,7 @@ def _write(
         result.with_masks = 0
     for frame in frames:
         height, width = frame.image.shape[:2]
-        camera = camera or _camera(options, (width, height))
+        camera = camera or camera_of(options, (width, height))
         stamp = options.first_stamp + frame.time_ns
         jpeg = frame.jpeg or encode_jpeg(frame.image, options.jpeg_quality)
         bag.write(IMAGE, stamp, jpeg_message(messages, jpeg, stamp, FRAME_ID))
@@ -347,7 +355,7 @@ def _write(
         keypoints, mask = see(frame, stamp)
         if result.with_keypoints is not None:
             result.with_keypoints += keypoints is not None
-            content = keypoints or _NOBODY
+            content = keypoints or NO_KEYPOINTS
             message = keypoints_message(messages, content, stamp, FRAME_ID)
             bag.write(KEYPOINTS, stamp, message)
             if lifts:
@@ -362,9 +370,6 @@ def _write(
             bag.write(MASK, stamp, image_message(messages, picture, stamp, FRAME_ID))
         result.images += 1
     return result
-
-
-_NOBODY = Keypoints((), np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0))
 
 
 def _are_near(pixels: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -261,7 +261,7 @@ def list_keypoints(  # type: ignore[no-untyped-def]
     group_energies(points, lens, scale, columns, origins, energies)
     lifted = np.zeros(2)
     if inputs.lifted.weight > 0.0:
-        behind, shares, joints = _lifted_room(inputs.lifted)
+        behind, joints, shares = lifted_room(inputs.lifted)
         lifted_energies(inputs.lifted, columns, origins, behind, joints, shares, lifted)
         lifted *= inputs.lifted.weight
     exchange_log_posterior(
@@ -293,10 +293,10 @@ def list_keypoints(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _lifted_room(lifted):  # type: ignore[no-untyped-def]
+def lifted_room(lifted):  # type: ignore[no-untyped-def]
     """Room for `lifted_energies` of one pose."""
     joints = len(lifted.segments)
-    return np.empty(joints), np.empty((2, len(lifted.log_weights))), np.empty((1 + joints, 3))
+    return np.empty(joints), np.empty((1 + joints, 3)), np.empty((2, len(lifted.log_weights)))
 
 
 @njit(cache=True, nogil=True)
@@ -361,7 +361,7 @@ def add_keypoints(  # type: ignore[no-untyped-def]
     pixels, projections, place = np.empty((1, 2)), np.empty((1, 2, 3)), np.empty(3)
     segments, offsets, seen, whiteners, point_groups = points
     whole, readings = np.zeros(2), np.empty(2)
-    behind, components, joints = _lifted_room(lifted)
+    behind, joints, components = lifted_room(lifted)
     for n in range(len(value)):
         group_energies(points, lens, scale, columns[n], origins[n], energies)
         if lifted.weight > 0.0:

@@ -39,6 +39,7 @@ from hmt_ros.image.terms.keypoint_kernel import (
     group_energies,
     keypoint_errors,
     lifted_energies,
+    lifted_room,
     record_keypoints,
 )
 from hmt_ros.image.terms.residuals import RECORDED, tree_of
@@ -249,8 +250,7 @@ class KeypointTerm:
         result = np.empty(priors.shape)
         energies = np.empty((exchanged.shape[1], 2))
         lifted = self._lifted()
-        count = len(lifted.segments)
-        room = np.empty(count), np.empty((1 + count, 3)), np.empty((2, len(lifted.log_weights)))
+        behind, joints, shares = lifted_room(lifted)
         columns, origins = frames.by_pose()
         for n in range(frames.count):
             group_energies(
@@ -259,7 +259,7 @@ class KeypointTerm:
             )  # fmt: skip
             whole = np.zeros(2)
             if lifted.weight > 0:
-                lifted_energies(lifted, columns[n], origins[n], *room, whole)
+                lifted_energies(lifted, columns[n], origins[n], behind, joints, shares, whole)
             exchange_log_posterior(
                 energies, lifted.weight * whole, self.weights, exchanged,
                 lifted.readings[: len(exchanged)], priors[n], result[n],
