@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks import experts_clips, experts_motion, experts_start, experts_toy
-from benchmarks.clips import table
+from benchmarks import experts_clips, experts_figures, experts_motion, experts_start, experts_toy
+from benchmarks.clips import ROOT, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.experts_motion import BEST_OF, COLUMNS, Learned, SeenMotion
 from benchmarks.machine import best_time
 from hmt_ros.body import Camera, load_body
+from hmt_ros.experts.predictor_learning import kinds
 from hmt_ros.experts.training_set import procedural_sequence
 from hmt_ros.rendering.renderer import render_silhouettes
 
-STAGES = ('toy', 'oracle', 'learning', 'motion', 'clips', 'start', 'speed')
+STAGES = ('toy', 'oracle', 'learning', 'motion', 'clips', 'start', 'speed', 'figures')
 SAMPLES = 6000
+FIGURES = ROOT / 'build' / 'benchmarks' / 'experts'
 PROPAGATED = tuple(COLUMNS)
 MILLISECONDS = {'descriptor': 5.0, 'prediction': 1.0}
 
@@ -30,13 +33,24 @@ def main(argv: list[str]) -> int:
         '--propagate', nargs='*', choices=COLUMNS, default=PROPAGATED, metavar='MODEL',
         help=f'models that also learn dynamics (minutes for experts): {", ".join(COLUMNS)}',
     )  # fmt: skip
+    parser.add_argument(
+        '--figures', type=Path, default=FIGURES, metavar='DIR',
+        help='folder of the figures of the paper (build/benchmarks/experts)',
+    )  # fmt: skip
     options = parser.parse_args(argv)
-    result = measure(quick=options.quick, only=options.only, propagated=options.propagate)
+    result = measure(
+        quick=options.quick, only=options.only, propagated=options.propagate,
+        figures=options.figures,
+    )  # fmt: skip
     return show(result, as_text, as_json=options.json)
 
 
 def measure(
-    *, quick: bool = False, only: Sequence[str] = STAGES, propagated: Sequence[str] = PROPAGATED
+    *,
+    quick: bool = False,
+    only: Sequence[str] = STAGES,
+    propagated: Sequence[str] = PROPAGATED,
+    figures: Path | None = None,
 ) -> dict[str, Any]:
     """Runs the stages asked for."""
     stages: dict[str, Callable[[], Any]] = {
@@ -47,9 +61,10 @@ def measure(
             'peer': experts_toy.regression_peer(*((200, 4) if quick else ())),
         },
         'motion': lambda: motion(quick, propagated),
-        'clips': lambda: experts_clips.clips(samples=300 if quick else SAMPLES, quick=quick),
-        'start': lambda: experts_start.starts(samples=300 if quick else SAMPLES, quick=quick),
+        'clips': lambda: experts_clips.clips(quick=quick),
+        'start': lambda: experts_start.starts(quick=quick),
         'speed': lambda: speed(0.0 if quick else 1.0, 96 if quick else 3000),
+        'figures': lambda: experts_figures.draw(figures or FIGURES, quick=quick),
     }
     return run_stages('experts', stages, only)
 
@@ -85,7 +100,7 @@ def speed(seconds: float, samples: int) -> dict[str, Any]:
     camera = Camera(580.0, 580.0, 319.5, 239.5, 640, 480)
     mask = render_silhouettes(body, poses, camera)[0].view(np.uint8)
     result: dict[str, Any] = {'samples': samples, 'pixels': int(mask.sum()), 'prediction_ms': {}}
-    for name in COLUMNS:
+    for name in (x for x in COLUMNS if x in kinds()):
         predictor, _ = experts_motion.predictor_of(learned, name, dynamics=False)
         row = predictor.describe(mask, camera)[None]
         model = predictor.model
@@ -116,22 +131,19 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     rows = _summary_rows(result)
     if len(rows) > 1:
         parts.append(table(rows, markdown=markdown))
-    for name in ('motion', 'clips', 'start'):
+    for name in ('motion', 'clips', 'start', 'figures'):
         found = result.get(name)
         if isinstance(found, str):
             parts.append(f'{name}: {found}')
+    if isinstance(result.get('figures'), list) and not markdown:
+        parts.append(f'figures: {", ".join(result["figures"])}')
     if isinstance(result.get('motion'), dict):
         parts += _motion_tables(result['motion'], markdown)
     if isinstance(result.get('clips'), dict):
         found = result['clips']
-        parts.append(table(experts_clips.as_rows(found), left=3, markdown=markdown))
-        wanted = [
-            {**one, 'what': f'{what}: {one["what"]}'}
-            for what in ('all motions', 'without the clips')
-            for one in found[what]['wanted']
-        ]
-        if wanted:
-            parts.append(table(_verdict_rows(wanted), markdown=markdown))
+        parts.append(table(experts_clips.as_rows(found), left=2, markdown=markdown))
+        if found['wanted']:
+            parts.append(table(_verdict_rows(found['wanted']), markdown=markdown))
     if isinstance(result.get('start'), dict):
         found = result['start']
         parts.append(table(experts_start.as_rows(found), left=2, markdown=markdown))
@@ -209,7 +221,8 @@ def _motion_tables(found: dict[str, Any], markdown: bool) -> list[str]:
         for how, given in (
             ('alone', 'r'),
             ('not_propagated', 'r, one view'),
-            ('propagated', 'x before, r, one view'),
+            ('propagated', 'x before, r, one view: rule (1)'),
+            ('by_dynamics', 'x before, r, one view: rule (9)'),
         ):
             if how not in found[name]:
                 continue

@@ -23,11 +23,18 @@ from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN, joint_mixtures, score
 from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
 from hmt_ros.experts.pose_encoding import PoseEncoding
-from hmt_ros.experts.pose_predictor import JITTER, PosePredictor
+from hmt_ros.experts.pose_predictor import (
+    ALONE,
+    BY_DYNAMICS,
+    BY_EXPERTS,
+    JITTER,
+    PosePredictor,
+)
 from hmt_ros.experts.predictor_learning import (
     KINDS,
     Described,
     described,
+    kinds,
     learned_predictor,
     new_model,
     target_basis,
@@ -49,6 +56,7 @@ from hmt_ros.inference.clustering import k_means, squared_distances
 Array = NDArray[np.float64]
 
 COLUMNS = {
+    'network': 'network',
     'nearest': 'nearest neighbours',
     'relevance-vector': 'one regression',
     'conditional': 'conditional experts',
@@ -143,11 +151,14 @@ def predictor_of(
 
 
 def seen_motions(
-    learned: Learned, sequences: Sequence[PoseSequence], frames: int = FRAMES, seed: int = 5
+    learned: Learned | PosePredictor,
+    sequences: Sequence[PoseSequence],
+    frames: int = FRAMES,
+    seed: int = 5,
 ) -> list[SeenMotion]:
     """Test motions from all views, with persons of random build and uneven outlines."""
     rng = np.random.default_rng(seed)
-    descriptor = learned.training.descriptor
+    descriptor = learned.training.descriptor if isinstance(learned, Learned) else learned.descriptor
     result = []
     for sequence in sequences:
         count = min(frames, len(sequence.poses))
@@ -188,11 +199,19 @@ def two_groups(states: Array) -> bool:
 def compared(
     learned: Learned,
     motions: Sequence[SeenMotion],
-    names: Sequence[str] = tuple(COLUMNS),
+    names: Sequence[str] | None = None,
     *,
     propagated: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Scores of models by activity, of some also propagated, and verdicts."""
+    """Scores of models by activity, of some also propagated, and verdicts.
+
+    Args:
+        learned: what they learn from.
+        motions: of other people.
+        names: of models; None: all that can learn here.
+        propagated: of those that learn dynamics, too.
+    """
+    names = [x for x in COLUMNS if x in kinds()] if names is None else names
     shares = ambiguous_share(learned, motions)
     result: dict[str, Any] = {
         'samples': len(learned.training.targets),
@@ -204,11 +223,12 @@ def compared(
     for name in names:
         predictor, seconds = predictor_of(learned, name, dynamics=name in propagated)
         entry: dict[str, Any] = {'learning_s': seconds}
-        entry['alone'] = scores(predictor, motions, propagated=False)
+        entry['alone'] = scores(predictor, motions)
+        followed = followed_views(motions)
+        entry['not_propagated'] = scores(predictor, followed)
         if name in propagated:
-            followed = followed_views(motions)
-            entry['not_propagated'] = scores(predictor, followed, propagated=False)
-            entry['propagated'] = scores(predictor, followed, propagated=True)
+            entry['propagated'] = scores(predictor, followed, BY_EXPERTS)
+        entry['by_dynamics'] = scores(predictor, followed, BY_DYNAMICS)
         result[name] = entry
     result['wanted'] = verdicts(result, [name for name in names if name not in BASELINES])
     return result
@@ -221,28 +241,29 @@ def followed_views(motions: Sequence[SeenMotion]) -> list[SeenMotion]:
 
 
 def scores(
-    predictor: PosePredictor, motions: Sequence[SeenMotion], *, propagated: bool
+    predictor: PosePredictor, motions: Sequence[SeenMotion], propagation: str = ALONE
 ) -> dict[str, Any]:
     """Errors and calibration by activity, and over all frames ('all')."""
     rows: dict[str, list[dict[str, Array]]] = {}
     for motion in motions:
-        mixtures = sequence_mixtures(predictor, motion, propagated=propagated)
+        mixtures = sequence_mixtures(predictor, motion, propagation)
         rows.setdefault(motion.activity, []).append(frame_scores(predictor.body, mixtures, motion))
     rows['all'] = [one for parts in list(rows.values()) for one in parts]
     return {activity: summary(parts) for activity, parts in rows.items()}
 
 
 def sequence_mixtures(
-    predictor: PosePredictor, motion: SeenMotion, *, propagated: bool
-) -> list[GaussianMixture]:
-    """Mixtures over poses (d,) with at most BEST_OF components; the root is the true one."""
+    predictor: PosePredictor, motion: SeenMotion, propagation: str = ALONE,
+    components: int = BEST_OF,
+) -> list[GaussianMixture]:  # fmt: skip
+    """Mixtures over poses (d,) with at most so many components; the root is the true one."""
     encoding = predictor.encoding
     inputs = motion.descriptors[:, : predictor.descriptor.size]
     found: list[GaussianMixture] = []
-    before: GaussianMixture | None = None
     for pose, row in zip(motion.poses, inputs, strict=True):
-        targets = predictor.targets_after(row, before if propagated else None, BEST_OF)
-        before = targets
+        targets = predictor.targets_after(
+            row, found[-1] if found else None, propagation=propagation, max_components=components
+        )
         roots = np.repeat(pose[None, :3], len(targets), axis=0)
         by_target, _ = encoding.jacobians(targets.means, roots)
         covariances = by_target @ targets.covariances @ by_target.transpose(0, 2, 1)

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.clips import Clip, find_clips, read_clip
-from benchmarks.experts_motion import BEST_OF, learn_from, predictor_of, recorded
+from benchmarks.experts_motion import BEST_OF
 from benchmarks.runs import follow, new_tracker
 from benchmarks.smoothing_clips import NAMES
 from benchmarks.tracking_scores import scores_of
 from hmt_ros.body import load_body
-from hmt_ros.experts.pose_predictor import PosePredictor
+from hmt_ros.experts.pose_predictor import PosePredictor, load_predictor
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings
 
@@ -25,17 +25,13 @@ WANTED = 1.20  # ratio to the error of the track from a subject file
 SHOWN = ('best_mm', 'heaviest_mm', 'kept', 'coverage_90', 'joint_coverage_90')
 
 
-def starts(
-    name: str = 'local', samples: int = 6000, *, quick: bool = False
-) -> dict[str, Any] | str:
+def starts(*, quick: bool = False) -> dict[str, Any] | str:
     """Scores by clip of both kinds of start, or the reason why there are none."""
     try:
         folders = [folder for folder in find_clips(None)[0] if folder.name in NAMES]
-        sequences = recorded('train')
     except ValueError as error:
         return f'skipped: {error}'
-    predictor, _ = predictor_of(learn_from(sequences, samples), name, dynamics=False)
-    body, settings = load_body('human37'), TrackerSettings()
+    predictor, body, settings = load_predictor(), load_body('human37'), TrackerSettings()
     result: dict[str, Any] = {'clips': {}}
     for folder in folders[:1] if quick else folders:
         clip = read_clip(folder, 6 if quick else None)

@@ -33,7 +33,7 @@ from hmt_ros.experts.keypoint_training import (
 from hmt_ros.experts.lifted_fit import UNKNOWN_SIZE, lift_poses, poses_of
 from hmt_ros.experts.lifter import SHIPPED, KeypointHistory, load_lifter
 from hmt_ros.experts.lifter_learning import PELVIS, SCORED, lifter_scores
-from hmt_ros.experts.predictor_learning import KINDS, new_model
+from hmt_ros.experts.predictor_learning import kinds, new_model
 from hmt_ros.experts.training_set import motion_files, recorded_sequence
 from hmt_ros.tracking import read_subject
 from hmt_ros.tracking.initialisation import start_from_keypoints
@@ -130,8 +130,8 @@ def contenders(mocap: Path, model: str, *, quick: bool = False) -> list[dict[str
     learned, tested = (((x - mean) / scale @ axes).astype(np.float64) for x in (inputs, seen))
     targets = joints.reshape(len(joints), -1).astype(np.float64)
     found = lifter_scores(lifter, seen, true)
-    rows = [{'model': 'mixture density network', **asdict(found)}]
-    for name in told('lifting: contenders', KINDS):
+    rows = [{'model': 'what ships', **asdict(found)}]
+    for name in told('lifting: contenders', kinds()):
         one = new_model(name, None, 0, len(learned)).fit(learned, targets)
         weights, means, _ = one.predict_arrays(tested)
         density = one.log_density(tested, true.reshape(len(true), -1)) / targets.shape[1]

@@ -5,10 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks import experts, experts_clips, experts_motion
-from benchmarks.clips import find_clips, read_clip, rounded
+from benchmarks import experts, experts_clips, experts_figures, experts_motion
+from benchmarks.clips import find_clips, rounded
 from benchmarks.experts_motion import COLUMNS, SeenMotion
+from benchmarks.tracking_means import OF_CHOSEN
 from hmt_ros.experts.pose_encoding import PoseEncoding
+from hmt_ros.experts.pose_predictor import ALONE, BY_DYNAMICS, BY_EXPERTS
 from hmt_ros.inference import GaussianMixture
 
 NAMES = ('nearest', 'relevance-vector', 'joint')
@@ -65,11 +67,12 @@ def test_a_truth_that_is_known_has_no_error(made_up):
     assert scores['degrees'] == pytest.approx(np.degrees(0.1) / 34)
 
 
-def test_propagation_goes_from_frame_to_frame(made_up):
+@pytest.mark.parametrize('rule', [BY_EXPERTS, BY_DYNAMICS])
+def test_propagation_goes_from_frame_to_frame(made_up, rule):
     learned, motions = made_up
     predictor, _ = experts_motion.predictor_of(learned, 'local')
     alone, after = (
-        experts_motion.sequence_mixtures(predictor, motions[0], propagated=x) for x in (False, True)
+        experts_motion.sequence_mixtures(predictor, motions[0], x) for x in (ALONE, rule)
     )
     np.testing.assert_array_equal(alone[0].means, after[0].means)
     assert max(len(mixture) for mixture in after) <= experts_motion.BEST_OF
@@ -97,24 +100,20 @@ def test_neighbours_of_both_kinds_make_an_activity_ambiguous(made_up):
     assert isinstance(motions[0], SeenMotion)
 
 
-def test_clips_of_the_repository(made_up, monkeypatch, tmp_path):
-    learned, _ = made_up
+def test_clips_of_the_repository(monkeypatch, tmp_path):
     monkeypatch.setenv('HMT_SHARED', str(tmp_path))
     folders, _ = find_clips(None)
-    clip = read_clip(next(folder for folder in folders if folder.name == 'reach'), 4)
-    predictor, _ = experts_motion.predictor_of(learned, 'nearest', dynamics=False)
-    scores = experts_clips.of_predictor(predictor, [clip])
-    entry = scores['clips']['reach']['subtracted']
-    assert 0 < entry['best_mm'] <= entry['heaviest_mm']
-    assert entry['depth_error'] < 0.5
-    # This bag's truth holds no masks: nothing is said of them.
-    assert ('true' in scores['clips']['reach']) == bool(scores['true'])
+    found = experts_clips.of_clip((next(x for x in folders if x.name == 'reach'), 4))
+    assert set(found) == {'true', 'subtracted'}
+    for entry in found.values():
+        assert 0 < entry['best_mm'] <= entry['heaviest_mm']
+        assert entry['depth_error'] < 0.5
 
 
 def test_without_development_data_the_reason_is_said(monkeypatch, tmp_path):
     monkeypatch.setenv('HMT_SHARED', str(tmp_path))
     assert 'is absent' in experts.motion(quick=True)
-    assert experts_clips.clips(quick=True).startswith('skipped: ')
+    assert experts_figures.draw(tmp_path / 'figures').startswith('skipped: ')
 
 
 def test_reports(found):
@@ -124,14 +123,15 @@ def test_reports(found):
     )  # fmt: skip
     clip = dict.fromkeys(keys, 1.0)
     masks = {'true': clip, 'subtracted': {**clip, 'best_mm': 1.5}}
-    rows = {'clips': {'walk': masks}, **masks}
-    rows['wanted'] = experts_clips.wanted(rows)
+    rows = {'clips': {'walk': masks}, 'means': {OF_CHOSEN: masks}}
+    rows['wanted'] = experts_clips.wanted(rows['means'])
     assert [one['met'] for one in rows['wanted']] == [True, False]
     result = {
         'machine': {'cores': 2},
         'oracle': 'absent: scikit-learn is not installed',
         'motion': found,
-        'clips': {'all motions': rows, 'without the clips': rows},
+        'clips': rows,
+        'figures': ['walk.png'],
         'speed': {
             'descriptor_ms': 2.0, 'whole_ms': 9.0,
             'prediction_ms': dict.fromkeys(COLUMNS, 0.5),
@@ -141,5 +141,6 @@ def test_reports(found):
     assert 'absent: scikit-learn' in text
     assert 'missed' in text
     markdown = experts.as_text(result, markdown=True).splitlines()
-    assert sum(line.startswith('| without the clips | walk') for line in markdown) == 2
+    assert sum(line.startswith(f'| {OF_CHOSEN}') for line in markdown) == 4
+    assert 'figures: walk.png' in text
     assert 'motion: skipped: no' in experts.as_text({'motion': 'skipped: no', 'clips': 'skipped'})

@@ -77,7 +77,7 @@ def _kinds() -> list[_Kind]:
         found = load_body(str(path))
         return found.joint_positions(found.prior_mean[None])
 
-    model = (models / 'procedural.npz').read_bytes()
+    model = (models / 'silhouettes.npz').read_bytes()
     return [
         _Kind('parameter files', '.yaml', config, _damaged_text, parameters),
         _Kind('subject files', '.yaml', subject, _damaged_text, lambda x: read_subject(x, body)),

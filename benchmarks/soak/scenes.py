@@ -167,7 +167,7 @@ def _bme() -> Scene:
         (
             {},
             {'image_transport': 'raw', 'reset_on_time_jump': True},
-            {'propagate': True, 'reset_on_time_jump': True},
+            {'propagation': 'dynamics', 'reset_on_time_jump': True},
             {'background_file': '', 'background_images': 2},
         ),
     )

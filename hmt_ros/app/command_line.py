@@ -65,16 +65,9 @@ class CommandParser(argparse.ArgumentParser):
             '-o', '--output', type=Path, required=True, metavar='FILE.npz', help='file to write'
         )
         self.add_argument(
-            '--without', nargs='+', default=[], metavar='NAME',
-            help='motions to leave out, names of files without suffix',
-        )  # fmt: skip
-        self.add_argument(
             '--body', default='human37', help='body model: a name or a YAML file (human37)'
         )
-        self.add_argument(
-            '--acknowledgement', default='', metavar='TEXT',
-            help='what the file says of the sources',
-        )  # fmt: skip
+        add_sources(self)
         self.add_argument('--overwrite', action='store_true', help='replace an existing file')
         self.add_argument('--quiet', action='store_true', help='no progress, no summary')
 
@@ -108,6 +101,32 @@ class CommandParser(argparse.ArgumentParser):
             help='body model of the poses: a name or a YAML file (default: the model that OUT '
             'names)',
         )
+
+
+def add_sources(parser: argparse._ActionsContainer) -> None:
+    """Adds --without and --acknowledgement of a command that learns from recorded motions."""
+    parser.add_argument(
+        '--without', nargs='+', default=[], metavar='NAME',
+        help='motions to leave out, names of files without suffix; * stands for any letters',
+    )  # fmt: skip
+    parser.add_argument(
+        '--acknowledgement', default='', metavar='TEXT', help='what the file says of the sources'
+    )
+
+
+def add_people(parser: argparse._ActionsContainer) -> None:
+    """Adds --test, --alike and --alike-share of a command that learns what people do."""
+    parser.add_argument(
+        '--test', type=Path, metavar='DIR', help='motions of other people to score on'
+    )
+    parser.add_argument(
+        '--alike', default='', metavar='PREFIX',
+        help='motions whose names start with it are few exercises, each done many times',
+    )  # fmt: skip
+    parser.add_argument(
+        '--alike-share', type=number(0.0, 1.0), default=0.35, metavar='SHARE',
+        help='factor on how often these are drawn (0.35)',
+    )  # fmt: skip
 
 
 def gravity_of(arguments: argparse.Namespace) -> list[float] | None:

@@ -17,18 +17,20 @@ from pathlib import Path
 
 import numpy as np
 
-from hmt_ros.app.command_line import CommandParser, model_file, number, run_command, whole_number
-from hmt_ros.app.learn_motion import chosen_motions, data_card
+from hmt_ros.app.command_line import (
+    CommandParser,
+    add_people,
+    model_file,
+    run_command,
+    whole_number,
+)
+from hmt_ros.app.learn_motion import chosen_motions, data_card, shares_of
 from hmt_ros.app.progress import show_progress, tell_user, with_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.keypoint_training import WindowSettings, keypoint_tracks, training_windows
 from hmt_ros.experts.lifter import Lifter
-from hmt_ros.experts.lifter_learning import (
-    LearningSettings,
-    check_tools,
-    learn_lifter,
-    lifter_scores,
-)
+from hmt_ros.experts.lifter_learning import LearningSettings, learn_lifter, lifter_scores
+from hmt_ros.experts.network_learning import check_tools
 from hmt_ros.experts.training_set import PoseSequence, recorded_sequence
 from msg_tools.files.error_line import error_line
 
@@ -87,17 +89,7 @@ def _parser() -> CommandParser:
         description='Learns to tell the depths of joints from windows of keypoints.',
     )
     parser.add_motions()
-    parser.add_argument(
-        '--test', type=Path, metavar='DIR', help='motions of other people to score on'
-    )
-    parser.add_argument(
-        '--alike', default='', metavar='PREFIX',
-        help='motions whose names start with it are few exercises, each done many times',
-    )  # fmt: skip
-    parser.add_argument(
-        '--alike-share', type=number(0.0, 1.0), default=0.35, metavar='SHARE',
-        help='factor on how often these are drawn (0.35)',
-    )  # fmt: skip
+    add_people(parser)
     parser.add_argument(
         '--steps',
         type=whole_number(1),
@@ -136,10 +128,7 @@ def _learn(options: LifterOptions) -> int:
         if options.test is None
         else _read(chosen_motions([options.test], []), options.body, quiet=quiet)
     )
-    shares = [
-        options.alike_share if options.alike and one.name.startswith(options.alike) else 1.0
-        for one in learned
-    ]
+    shares = shares_of(learned, options.alike, options.alike_share)
     settings = LearningSettings(
         experts=options.experts, steps=options.steps, batch=options.batch, seed=options.seed
     )

@@ -8,6 +8,7 @@ file, in `hmt_ros/body/models`, as BODY_motion.npz.
 
 from __future__ import annotations
 
+import fnmatch
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +93,7 @@ def _learn(options: LearningOptions) -> int:
 
 
 def chosen_motions(motions: list[Path], without: list[str]) -> list[Path]:
-    """Motion files, and those in folders, but some names of files without suffix.
+    """Motion files, and those in folders, but some names of files without suffix (cmu_02_*).
 
     Raises:
         ValueError: a file that is no motion, a folder without any, or a name of none of them.
@@ -105,11 +106,14 @@ def chosen_motions(motions: list[Path], without: list[str]) -> list[Path]:
             found.append(path)
         else:
             raise ValueError(f'{path}: wanted a folder or a motion ({", ".join(MOTION_SUFFIXES)})')
-    names = {path.stem for path in found}
-    unknown = [name for name in without if name not in names]
-    if unknown:
-        raise ValueError(f'--without: there is no motion {unknown[0]!r}')
-    return [path for path in found if path.stem not in without]
+    names = [path.stem for path in found]
+    left_out: set[str] = set()
+    for pattern in without:
+        meant = fnmatch.filter(names, pattern)
+        if not meant:
+            raise ValueError(f'--without: there is no motion {pattern!r}')
+        left_out |= set(meant)
+    return [path for path in found if path.stem not in left_out]
 
 
 def _sequence(path: Path, body: Body) -> PoseSequence | None:
@@ -123,6 +127,11 @@ def _sequence(path: Path, body: Body) -> PoseSequence | None:
     except (ValueError, OSError, ArithmeticError) as error:
         tell_user('learn-motion', f'skipped {path.name}: {error_line(error)}')
         return None
+
+
+def shares_of(sequences: list[PoseSequence], alike: str, share: float) -> list[float]:
+    """How often each motion is drawn: those whose names start with `alike` less often."""
+    return [share if alike and one.name.startswith(alike) else 1.0 for one in sequences]
 
 
 def data_card(sequences: list[PoseSequence], acknowledgement: str) -> str:

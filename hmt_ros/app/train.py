@@ -1,7 +1,7 @@
 """train: learns to predict poses from silhouettes of recorded or procedural motions.
 
-    train --mocap DIR -o MODEL.npz
-    train --motions procedural -o MODEL.npz
+    train --mocap DIR DIR ... --test PEOPLE_LEFT_OUT -o MODEL.npz
+    train --motions procedural --model local -o MODEL.npz
 
 A report beside the model shows affinities, multimodality and silhouettes of the training set.
 """
@@ -17,15 +17,31 @@ from typing import TypeVar
 
 import numpy as np
 
-from hmt_ros.app.command_line import CommandParser, model_file, run_command, whole_number
+from hmt_ros.app.command_line import (
+    CommandParser,
+    add_people,
+    add_sources,
+    model_file,
+    run_command,
+    whole_number,
+)
+from hmt_ros.app.learn_motion import chosen_motions, data_card, shares_of
 from hmt_ros.app.progress import show_progress, tell_user, with_progress
 from hmt_ros.app.training_report import write_report
 from hmt_ros.body import Body, load_body
-from hmt_ros.experts.predictor_learning import KINDS, described, learned_predictor, new_model
+from hmt_ros.experts.network_learning import check_tools
+from hmt_ros.experts.pose_predictor import PosePredictor
+from hmt_ros.experts.predictor_learning import (
+    KINDS,
+    SCORED_COMPONENTS,
+    described,
+    learned_predictor,
+    new_model,
+    silhouette_scores,
+)
 from hmt_ros.experts.training_set import (
     PoseSequence,
     TrainingSettings,
-    motion_files,
     procedural_sequence,
     recorded_sequence,
     training_set,
@@ -37,6 +53,8 @@ from msg_tools.files.error_line import error_line
 Item = TypeVar('Item')
 
 PROCEDURAL_SEEDS, PROCEDURAL_SECONDS = 5, 12.0
+# Silhouettes that a predictor is scored on.
+TESTED = 1000
 
 
 @dataclass(frozen=True)
@@ -49,7 +67,12 @@ class TrainingOptions:
         quiet: Whether progress and summary are suppressed.
         seed: Seed of all random choices.
         report: Folder of the figures; None takes MODEL_report.
-        mocap: Folder of recorded motions, or None.
+        mocap: Files or folders of recorded motions.
+        without: Names of motions that are left out, without suffix.
+        alike: Names that start with it are of few motions, each done many times.
+        alike_share: Share of the poses of these that are taken.
+        test: Folder of motions of other people to score on, or None.
+        acknowledgement: What to say of the sources in the file.
         motions: 'procedural' for all procedural motions, names with commas, or None.
         body: Body model: a name or a YAML file.
         model: Name of the model that learns.
@@ -63,7 +86,12 @@ class TrainingOptions:
     quiet: bool
     seed: int
     report: Path | None
-    mocap: Path | None
+    mocap: list[Path]
+    without: list[str]
+    alike: str
+    alike_share: float
+    test: Path | None
+    acknowledgement: str
     motions: str | None
     body: str
     model: str
@@ -97,9 +125,11 @@ def _parser() -> CommandParser:
 
     motion = parser.add_argument_group('motions')
     motion.add_argument(
-        '--mocap', type=Path, metavar='DIR',
-        help='folder of recorded motions (.bvh, or .amc beside its .asf) with its subfolders',
+        '--mocap', nargs='+', type=Path, default=[], metavar='DIR',
+        help='folders of recorded motions (.bvh, or .amc beside its .asf) with their subfolders',
     )  # fmt: skip
+    add_sources(motion)
+    add_people(motion)
     motion.add_argument(
         '--motions', metavar='NAMES',
         help=f'"procedural" for all, or names with commas ({", ".join(PROCEDURAL_MOTIONS)})',
@@ -110,7 +140,10 @@ def _parser() -> CommandParser:
 
     learning = parser.add_argument_group('learning')
     learning.add_argument(
-        '--model', choices=sorted(KINDS), default='local', help='model that learns (local)'
+        '--model',
+        choices=sorted(KINDS),
+        default='network',
+        help='model that learns; network, the default, needs jax and optax',
     )
     learning.add_argument(
         '--experts',
@@ -119,17 +152,19 @@ def _parser() -> CommandParser:
     )
     learning.add_argument(
         '--samples', type=whole_number(50, 1_000_000), default=6000,
-        help='number of silhouettes (6000)',
+        help='number of silhouettes (6000); a network can use ten times as many',
     )  # fmt: skip
     learning.add_argument(
-        '--dynamics', action=argparse.BooleanOptionalAction, default=True,
-        help='learn p(x_t | x_t-1, r_t) as well (yes)',
+        '--dynamics', action=argparse.BooleanOptionalAction, default=False,
+        help='learn p(x_t | x_t-1, r_t) as well, for rule (1) (no)',
     )  # fmt: skip
     return parser
 
 
 def _train(options: TrainingOptions) -> int:
     output = model_file(options.output, overwrite=options.overwrite)
+    if options.model == 'network':
+        check_tools()
     body = load_body(options.body)
     if not body.shapes:
         raise ValueError(f'body {options.body} has no flesh: wanted one such as human37')
@@ -137,7 +172,8 @@ def _train(options: TrainingOptions) -> int:
     body = typical_body(body, sequences)
     settings = TrainingSettings(samples=options.samples, seed=options.seed)
     bar = _bars(options.quiet)
-    pairs = training_set(body, sequences, settings, bar('rendering', GROUPS))
+    shares = shares_of(sequences, options.alike, options.alike_share)
+    pairs = training_set(body, sequences, settings, bar('rendering', GROUPS), shares)
     training = described(body, pairs, progress=bar('describing', SILHOUETTES))
     kind, count = KINDS[options.model], len(pairs)
     model = new_model(options.model, options.experts, options.seed, count)
@@ -151,11 +187,15 @@ def _train(options: TrainingOptions) -> int:
         'samples': len(pairs),
         'motions': len(sequences),
         'seed': options.seed,
-        'activities': sorted(set(pairs.activities)),
+        'card': data_card(sequences, options.acknowledgement),
     }
     _say(options, f'learning {options.model} from {len(pairs)} silhouettes')
     with show_progress('learning', quiet=options.quiet):
         predictor = learned_predictor(body, seen, model, dynamics, notes, options.seed)
+    if options.test is not None:
+        tested = _read(chosen_motions([options.test], []), body, quiet=options.quiet)
+        with show_progress('scoring', quiet=options.quiet):
+            _score(predictor, tested)
     predictor.save(output)
     report = options.report or output.with_name(f'{output.stem}_report')
     report.mkdir(parents=True, exist_ok=True)
@@ -165,6 +205,8 @@ def _train(options: TrainingOptions) -> int:
     _say(
         options, f'{output}: {len(sequences)} motions{skips}, {output.stat().st_size / 1e6:.1f} MB'
     )
+    if 'scores' in predictor.notes:
+        _say(options, f'  other people: {predictor.notes["scores"]}')
     for path, what in figures:
         _say(options, f'  {path}: {what}')
     return 0
@@ -190,27 +232,37 @@ def _say(options: TrainingOptions, text: str) -> None:
 
 def _sequences(options: TrainingOptions, body: Body) -> tuple[list[PoseSequence], int]:
     """Motions to learn from, and the number of files that cannot be used."""
-    if options.mocap is None and options.motions is None:
+    if not options.mocap and options.motions is None:
         raise ValueError('nothing to learn from: give --mocap DIR or --motions procedural')
     sequences: list[PoseSequence] = []
-    skipped = 0
     if options.motions is not None:
         for name in _procedural_names(options.motions):
             sequences += [
                 procedural_sequence(name, body, PROCEDURAL_SECONDS, options.seed + i)
                 for i in range(PROCEDURAL_SEEDS)
             ]
-    if options.mocap is not None:
-        files = motion_files(options.mocap)
-        for path in with_progress(files, 'reading', 'motions', len(files), quiet=options.quiet):
-            sequence = _sequence_or_warning(path, body)
-            if sequence is None:
-                skipped += 1
-            else:
-                sequences.append(sequence)
-        if skipped == len(files):
-            raise ValueError(f'none of the {skipped} motions in {options.mocap} can be used')
-    return sequences, skipped
+    files = chosen_motions(options.mocap, options.without)
+    read = _read(files, body, quiet=options.quiet)
+    if files and not read:
+        raise ValueError(f'none of the {len(files)} motions in {options.mocap[0]} can be used')
+    return [*sequences, *read], len(files) - len(read)
+
+
+def _read(files: list[Path], body: Body, *, quiet: bool) -> list[PoseSequence]:
+    """The motions that can be used."""
+    bar = with_progress(files, 'reading', 'motions', len(files), quiet=quiet)
+    found = (_sequence_or_warning(path, body) for path in bar)
+    return [one for one in found if one is not None]
+
+
+def _score(predictor: PosePredictor, tested: list[PoseSequence]) -> None:
+    """Notes scores on motions of other people."""
+    found = silhouette_scores(predictor, tested, TESTED, 0)
+    predictor.notes['scored on'] = sorted(one.name for one in tested)
+    predictor.notes['scores'] = (
+        f'{1e3 * found.heaviest:.0f} mm heaviest, {1e3 * found.best:.0f} best of '
+        f'{SCORED_COMPONENTS}, {found.log_density:.2f} nats a number'
+    )
 
 
 def _sequence_or_warning(path: Path, body: Body) -> PoseSequence | None:

@@ -18,6 +18,8 @@ The M^2 components are reduced to M (`hmt_ros.inference.reduction`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
@@ -66,50 +68,61 @@ def propagate(
                 f'wanted {model.n_outputs_} as the model predicts'
             )
         trusted = model.support(inputs) >= least_support
+    lost = float(previous.weights[~trusted].sum())
     parts = []
     if trusted.any():
-        parts.append(linearised_products(model, previous[trusted], observation))
-    lost = float(previous.weights[~trusted].sum())
+        followed = linearised_products(model, previous[trusted], observation)
+        parts.append((1.0 - lost, followed))
     if without_past is not None and lost > 0:
-        rest = without_past.normalised()
-        parts.append(GaussianMixture(lost * rest.weights, rest.means, rest.covariances))
-    whole = GaussianMixture(
-        np.concatenate([one.weights for one in parts]),
-        np.concatenate([one.means for one in parts]),
-        np.concatenate([one.covariances for one in parts]),
-    )
+        parts.append((lost, without_past))
+    whole = joined(parts)
     return reduced(whole, n_components or _experts(model, inputs)).sorted()
 
 
 def propagate_by_dynamics(
-    dynamics: ConditionalDensity,
-    previous: GaussianMixture,
+    prior: GaussianMixture,
     predicted: GaussianMixture,
     equilibrium: GaussianMixture,
     *,
+    share: float = 1.0,
+    forgotten: float = 0.0,
     n_components: int | None = None,
 ) -> GaussianMixture:
     """p(x_t | R_t) by rule (9).
 
     Args:
-        dynamics: Model of p(x_t | x_{t-1}).
-        previous: p(x_{t-1} | R_{t-1}).
+        prior: the integral of rule (9), p(x_t | R_{t-1}): of a model of the dynamics by
+            `linearised_products`, or of a motion prior.
         predicted: p(x_t | r_t).
         equilibrium: p(x_t). The division by a single Gaussian is exact where that is wider than the
             product; else each product is weighted by 1 / p at its mean.
+        share: of what the observation tells that observations before have not told: the ratio
+            p(x_t | r_t) / p(x_t) counts to this power (`inference.error_model`).
+        forgotten: probability that the past tells nothing, so that a wrong one is left.
         n_components: Number of components of the result; None takes that of `predicted`.
 
     Raises:
         ValueError: dimensions do not fit.
     """
-    count = n_components or len(predicted)
-    prior = reduced(linearised_products(dynamics, previous, np.zeros(0)), count)
     for name, one in (('predicted', predicted), ('equilibrium', equilibrium)):
         if one.dimension != prior.dimension:
             raise ValueError(
-                f'{name} has dimension {one.dimension}, wanted {prior.dimension} as the dynamics'
+                f'{name} has dimension {one.dimension}, wanted {prior.dimension} as the prior'
             )
-    return reduced(divided_product(predicted, prior, equilibrium), count).sorted()
+    if forgotten > 0.0:
+        prior = joined([(1.0 - forgotten, prior), (forgotten, equilibrium)])
+    whole = divided_product(predicted, prior, equilibrium, share)
+    return reduced(whole, n_components or len(predicted)).sorted()
+
+
+def joined(parts: Sequence[tuple[float, GaussianMixture]]) -> GaussianMixture:
+    """One mixture of all components, each mixture with its share of the weight."""
+    mixtures = [one for _, one in parts]
+    return GaussianMixture(
+        np.concatenate([share * one.normalised().weights for share, one in parts]),
+        np.concatenate([one.means for one in mixtures]),
+        np.concatenate([one.covariances for one in mixtures]),
+    )
 
 
 def linearised_products(
@@ -135,11 +148,14 @@ def linearised_products(
 
 
 def divided_product(
-    a: GaussianMixture, b: GaussianMixture, divisor: GaussianMixture
+    a: GaussianMixture, b: GaussianMixture, divisor: GaussianMixture, share: float = 1.0
 ) -> GaussianMixture:
-    """a(x) b(x) / divisor(x), normalised, one component for each pair."""
+    """(a(x) / divisor(x))^share b(x), normalised, one component for each pair.
+
+    The power of a mixture is taken of each component by itself, as if they were apart.
+    """
     d = a.dimension
-    precision_a, shift_a, constant_a = _canonical(a)
+    precision_a, shift_a, constant_a = (share * x for x in _canonical(a))
     precision_b, shift_b, constant_b = _canonical(b)
     precision = (precision_a[:, None] + precision_b).reshape(-1, d, d)
     shift = (shift_a[:, None] + shift_b).reshape(-1, d)
@@ -147,7 +163,7 @@ def divided_product(
     exact = np.zeros(len(shift), dtype=bool)
     if len(divisor) == 1:
         divisor = divisor.normalised()
-        precision_d, shift_d, constant_d = _canonical(divisor)
+        precision_d, shift_d, constant_d = (share * x for x in _canonical(divisor))
         less = precision - precision_d
         # A divisor that is nearly as narrow as the product leaves no proper Gaussian.
         exact = np.linalg.eigvalsh(less)[:, 0] > 1e-3 * np.linalg.eigvalsh(precision)[:, 0]
@@ -161,7 +177,7 @@ def divided_product(
     log = constant + 0.5 * ((shift * means).sum(1) + log_det)
     # Without exact division, one factor (2 pi)^(d/2) more is in the denominator.
     at_mean = 0.5 * d * np.log(2.0 * np.pi) + divisor.log_density(means)
-    log = np.where(exact, log, log - at_mean)
+    log = np.where(exact, log, log - share * at_mean)
     return GaussianMixture(np.exp(log - logsumexp(log)), means, covariances)
 
 

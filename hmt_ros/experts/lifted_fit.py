@@ -41,9 +41,9 @@ ITERATIONS, TOLERANCE = 12, 0.05
 ACROSS, KERNEL = 4.0, 4.0
 # Deviation of a landmark from its keypoint, m at the person, for the place of the person.
 SEEN = 0.03
-# Factor on covariances: keypoints and joints err together. Chosen on clips, so that regions of 90 %
-# of single joints hold 88 %.
-TOGETHER = 4.0
+# Factors on covariances: keypoints and joints err together, and so do joints of a person of other
+# lengths. Chosen on clips, so that regions of 90 % of single joints hold 88 %.
+TOGETHER, OF_LENGTHS = 4.0, 1.6
 # Relative standard deviation of the size of a person.
 KNOWN_SIZE, UNKNOWN_SIZE = 0.02, 0.06
 # A person is at least this far away, m.
@@ -126,6 +126,7 @@ def poses_of(
     rays, confidences = np.repeat(rays, k, axis=0), np.repeat(confidences, k, axis=0)
     poses, shifts = _placed(body, _postures(body, lifted), rays, confidences)
     poses, covariances = _fitted(body, poses, lifted, rays, confidences)
+    covariances *= TOGETHER if size_spread <= KNOWN_SIZE else TOGETHER * OF_LENGTHS
     size = (size_spread * poses[:, :3, None]) * (size_spread * poses[:, None, :3])
     covariances[:, :3] = covariances[:, :, :3] = 0.0
     covariances[:, :3, :3] = shifts + size
@@ -188,7 +189,7 @@ def _fitted(
         max_iterations=ITERATIONS, tolerance=TOLERANCE,
     )  # fmt: skip
     covariances = np.linalg.inv(found.hessian + 1e-6 * np.eye(skeleton.dimension))
-    return found.x, np.asarray(0.5 * TOGETHER * (covariances + covariances.transpose(0, 2, 1)))
+    return found.x, np.asarray(0.5 * (covariances + covariances.transpose(0, 2, 1)))
 
 
 def _placed(body: Body, poses: Array, rays: Array, confidences: Array) -> tuple[Array, Array]:

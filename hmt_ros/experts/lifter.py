@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
 from hmt_ros.body.camera import Camera
@@ -41,6 +40,7 @@ from hmt_ros.experts.model_file import (
     read_arrays,
     write_arrays,
 )
+from hmt_ros.experts.network_layers import Floats, Layers
 from hmt_ros.experts.pose_encoding import ray_rotations
 from hmt_ros.image.keypoint_schemes import AUTO, position_deviations
 from hmt_ros.image.lifted_poses import LiftedPoses, bone_lengths, from_positions
@@ -50,36 +50,26 @@ from hmt_ros.inference.arrays import Array
 FOLDER = Path(__file__).resolve().parent / 'models'
 SHIPPED = 'keypoints'
 KIND = 'lifter'
-LEAK = 0.1  # slope of a layer's units below 0
 
 # Earliest time of a window, s. Least z of a ray: one from beside the camera says little.
 EARLIEST, BEFORE = float((TIMES - NEAR).min()), 0.1
 # Standard deviation with which a keypoint is not looked at, m at the person.
 ANYWHERE = 0.15
 
-Floats = NDArray[np.float32]
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Network(Layers):
+    """What gates, means and deviations share.
 
-@dataclass(frozen=True, eq=False)
-class Network:
-    """What gates, means and deviations share: layers of units that leak, each added to the last.
+    The numbers after the layers are those of K + 6 J K: gates, means and log deviations.
 
     Attributes:
         mean, scale: (p,) of the inputs.
-        first, first_bias: (p, H), (H,).
-        hidden, hidden_biases: (M, H, H), (M, H).
-        last, last_bias: (H, K + 6 J K), gates, means and log deviations.
         middle: (J, 3) what means are relative to, m.
     """
 
     mean: Floats
     scale: Floats
-    first: Floats
-    first_bias: Floats
-    hidden: Floats
-    hidden_biases: Floats
-    last: Floats
-    last_bias: Floats
     middle: Floats
 
     @property
@@ -90,10 +80,7 @@ class Network:
     def __call__(self, inputs: Floats) -> tuple[Array, Array, Array]:
         """Log gates (N, K), means (N, K, J, 3) and deviations (N, K, J, 3), m, of inputs (N, p)."""
         whitened: Floats = (inputs - self.mean) / self.scale
-        units = _leaky(whitened @ self.first + self.first_bias)
-        for weights, bias in zip(self.hidden, self.hidden_biases, strict=True):
-            units = units + _leaky(units @ weights + bias)
-        out = (units @ self.last + self.last_bias).astype(np.float64)
+        out = self.outputs(whitened).astype(np.float64)
         n, k, j = len(inputs), self.experts, len(self.middle)
         gates, means = out[:, :k], out[:, k : k * (1 + 3 * j)].reshape(n, k, j, 3)
         spreads = out[:, k * (1 + 3 * j) :].reshape(n, k, j, 3)
@@ -104,11 +91,6 @@ class Network:
 
 # Scale of the means, m; log of the usual deviation, and its limits, log m.
 MEANS, SPREAD, SPREADS = 0.3, -2.5, (-5.0, 1.0)
-
-
-def _leaky(x: Floats) -> Floats:
-    result: Floats = np.maximum(x, np.float32(LEAK) * x)
-    return result
 
 
 class Lifter:
@@ -178,15 +160,11 @@ class Lifter:
 
     def save(self, path: str | Path) -> Path:
         """Writes the lifter into an .npz file, with half precision, and returns its path."""
-        arrays = {
-            name: np.asarray(value, dtype=np.float16 if value.ndim > 1 else np.float32)
-            for name, value in vars(self.network).items()
-        }
         parameters = {
             'joints': list(self.joints), 'landmarks': list(LANDMARKS), 'times': TIMES.tolist(),
             'body': self.usual.name, 'notes': self.notes,
         }  # fmt: skip
-        return write_arrays(path, header(KIND, parameters) | arrays)
+        return write_arrays(path, header(KIND, parameters) | self.network.to_arrays())
 
     @classmethod
     def load(cls, path: str | Path) -> Lifter:
@@ -202,18 +180,13 @@ class Lifter:
             parameters = parameters_of(arrays)
             if parameters['landmarks'] != list(LANDMARKS) or parameters['times'] != TIMES.tolist():
                 raise ValueError(f'{path}: learned for other windows: train it anew')
-            network = Network(
-                **{name: np.asarray(arrays[name], dtype=np.float32) for name in _NETWORK}
-            )
+            network = Network.from_arrays(arrays)
             usual = load_body(parameters['body'])
             made = cls(network, parameters['joints'], usual, parameters['notes'])
             network(np.zeros((1, len(network.mean)), dtype=np.float32))
         except FAULTS as fault:
             raise damaged(str(path), fault) from fault
         return made
-
-
-_NETWORK = tuple(Network.__dataclass_fields__)
 
 
 def load_lifter(model: str = SHIPPED) -> Lifter:

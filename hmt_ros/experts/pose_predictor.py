@@ -3,12 +3,14 @@
     mask -> centred view -> descriptor -> experts -> mixture over targets
     mask -> bounding box -> root of each component -> mixture over poses
 
-One object and one file hold everything that is learned. With dynamics, a model of
-p(x_t | x_t-1, r_t), the mixture is also propagated over time (BME 2.1).
+One object and one file hold everything that is learned. The mixture of the image before can be
+propagated (BME 2.1): by rule (9), with the motion prior of the body over any interval, or by
+rule (1), with a model of p(x_t | x_t-1, r_t) that has learned for one step.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hmt_ros.body import Body, Camera, load_body
+from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.experts.conditional_density import ConditionalDensity, stored_model
-from hmt_ros.experts.density_propagation import propagate
+from hmt_ros.experts.density_propagation import joined, propagate, propagate_by_dynamics
 from hmt_ros.experts.descriptor.centred_view import centred_view
 from hmt_ros.experts.descriptor.contour import PersonBlob, person_blob
 from hmt_ros.experts.descriptor.silhouette_descriptor import SilhouetteDescriptor, silhouette_parts
@@ -34,27 +37,38 @@ from hmt_ros.experts.model_file import (
     read_arrays,
     write_arrays,
 )
-from hmt_ros.experts.pose_encoding import PoseEncoding
+from hmt_ros.experts.pose_encoding import AXES, PoseEncoding
 from hmt_ros.experts.root_placement import (
     SIZE_SPREAD,
     RootPlacement,
     place_roots,
     placed_gaussians,
 )
+from hmt_ros.experts.training_set import RATE
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.error_model import share_of_time
 from hmt_ros.inference.reduction import reduced
 
 FOLDER = Path(__file__).resolve().parent / 'models'
-# Trained from procedural motions: `train --motions procedural`.
-SHIPPED = 'procedural'
+# Learned from motion capture: its card is in its notes.
+SHIPPED = 'silhouettes'
 
 KIND = 'pose_predictor'
 MAX_COMPONENTS = 8
 LIGHTEST = 1e-3  # weight below which a component is dropped
+# Of the sequences that rule (1) learns from, s.
+STEP = 1.0 / RATE
 JITTER = 1e-9  # variance that is added to poses, m^2 and rad^2
-# Share of p(x_t | r_t) in a propagated mixture, from which a lost track recovers.
-ANEW = 0.5
+# How a mixture is propagated: by rule (9), by rule (1), or not at all.
+BY_DYNAMICS, BY_EXPERTS, ALONE = 'dynamics', 'experts', 'none'
+PROPAGATIONS = (BY_DYNAMICS, BY_EXPERTS, ALONE)
+# Rate at which a past turns out to be wrong, per second: a track that is lost recovers. How long
+# what silhouettes get wrong stays wrong, s. Chosen.
+FORGETTING, LASTING = 5.0, 0.02
+# Axes of unit length have no spread along themselves, and those that are predicted have no unit
+# length: variance that is added to both.
+OF_AXES = 0.5**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +96,7 @@ class PosePredictor:
         descriptor: Descriptor that has learned.
         model: Model of p(z | descriptor) that has learned.
         target_basis: (D, D) B; models learn z = B' x of a target x.
+        equilibrium: p(x) of targets: a mixture of one component.
         dynamics: Model of p(z | previous z, descriptor) that has learned, or None.
         notes: Origin of the model, for its file; JSON must be able to hold it.
 
@@ -95,12 +110,14 @@ class PosePredictor:
         descriptor: SilhouetteDescriptor,
         model: ConditionalDensity,
         target_basis: Array,
+        equilibrium: GaussianMixture,
         dynamics: ConditionalDensity | None = None,
         notes: Mapping[str, Any] | None = None,
     ) -> None:
         self.encoding = PoseEncoding(body)
         self.descriptor = descriptor
         self.model = model
+        self.equilibrium = equilibrium
         self.dynamics = dynamics
         self.notes = dict(notes or {})
         size = self.encoding.size
@@ -112,6 +129,8 @@ class PosePredictor:
             raise ValueError(
                 f'target_basis must be finite and ({size}, {size}), saw {target_basis.shape}'
             )
+        if (len(equilibrium), equilibrium.dimension) != (1, size):
+            raise ValueError(f'equilibrium must be one component over {size} numbers')
         self._from_basis = np.asarray(np.linalg.inv(target_basis), dtype=np.float64)
 
     @property
@@ -127,8 +146,9 @@ class PosePredictor:
         """
         _check_body(body, self.body.dof_names, f'this predictor, of {self.body.name}')
         return PosePredictor(
-            body, self.descriptor, self.model, self.target_basis, self.dynamics, self.notes
-        )
+            body, self.descriptor, self.model, self.target_basis, self.equilibrium, self.dynamics,
+            self.notes,
+        )  # fmt: skip
 
     def predict(self, mask: ArrayLike, camera: Camera) -> GaussianMixture:
         """Mixture over poses of the person in a mask (H, W); see `observe`."""
@@ -139,7 +159,9 @@ class PosePredictor:
         mask: ArrayLike,
         camera: Camera,
         previous: GaussianMixture | None = None,
+        interval: float = STEP,
         *,
+        propagation: str = BY_DYNAMICS,
         max_components: int = MAX_COMPONENTS,
         size_spread: float = SIZE_SPREAD,
     ) -> Prediction:
@@ -148,8 +170,9 @@ class PosePredictor:
         Args:
             mask: (H, W), not zero in the foreground.
             camera: Camera of the mask.
-            previous: Mixture over poses one step before, which the dynamics propagate (BME 2.1,
-                rule 1). Without dynamics it is ignored.
+            previous: Mixture over poses before, which is propagated; None: the image counts alone.
+            interval: s, since then.
+            propagation: one of `PROPAGATIONS`.
             max_components: Maximum number of components of the mixture; the heaviest stay.
             size_spread: Relative standard deviation of the person's size; 0 if the body has the
                 lengths of the person.
@@ -167,8 +190,9 @@ class PosePredictor:
         blob = person_blob(seen)
         descriptor = self._described(blob, camera)
         support = float(self.model.support(descriptor[None])[0])
-        before = None if previous is None else self._to_targets(previous)
-        targets = self.targets_after(descriptor, before, max_components)
+        targets = self.targets_after(
+            descriptor, previous, interval, propagation=propagation, max_components=max_components
+        )
         placement = place_roots(
             self.encoding, camera, blob, targets.means, targets.covariances,
             size_spread=size_spread,
@@ -193,26 +217,70 @@ class PosePredictor:
         self,
         descriptor: ArrayLike,
         previous: GaussianMixture | None = None,
+        interval: float = STEP,
+        *,
+        propagation: str = BY_DYNAMICS,
         max_components: int = MAX_COMPONENTS,
     ) -> GaussianMixture:
         """Mixture over targets (D,) for one descriptor, heaviest component first.
 
         Args:
             descriptor: (p,).
-            previous: Mixture over targets one step before; ignored without dynamics.
-            max_components: Maximum number of components of the mixture; the heaviest stay.
+            previous, interval, propagation, max_components: see `observe`.
+
+        Raises:
+            ValueError: there is no such propagation, or no model for it.
         """
         row = np.asarray(descriptor, dtype=np.float64)
         found = _heaviest(self.model.predict(row[None])[0], max_components)
-        if previous is not None and self.dynamics is not None:
-            after = propagate(
-                self.dynamics, _transformed(previous, self.target_basis), row, without_past=found,
-                n_components=max_components,
+        if previous is None or propagation == ALONE:
+            return _transformed(found, self._from_basis)
+        forgotten = -math.expm1(-FORGETTING * interval)
+        if propagation == BY_DYNAMICS:
+            return self._by_dynamics(
+                _transformed(found, self._from_basis), previous, interval, forgotten,
+                max_components,
             )  # fmt: skip
-            # Rule (1) alone never recovers from a wrong past.
-            whole = _blended(after, found, ANEW)
-            found = _heaviest(reduced(whole, max_components), max_components)
-        return _transformed(found, self._from_basis)
+        if propagation != BY_EXPERTS:
+            raise ValueError(f'no propagation {propagation!r}, wanted one of {PROPAGATIONS}')
+        if self.dynamics is None:
+            raise ValueError('the predictor has no model for rule (1): train it with --dynamics')
+        # By what exceeds the step that the model has learned, poses change as the body may.
+        before = self._to_targets(self._expected(previous, max(interval - STEP, 0.0)))
+        after = propagate(
+            self.dynamics, _transformed(before, self.target_basis), row, without_past=found,
+            n_components=max_components,
+        )  # fmt: skip
+        whole = joined([(1.0 - forgotten, after), (forgotten, found)])
+        whole = _heaviest(reduced(whole, max_components), max_components)
+        return _transformed(whole, self._from_basis)
+
+    def _by_dynamics(
+        self, found: GaussianMixture, previous: GaussianMixture, interval: float,
+        forgotten: float, count: int,
+    ) -> GaussianMixture:  # fmt: skip
+        """Rule (9), over targets."""
+        prior = self._to_targets(self._expected(previous, interval))
+        wider = np.zeros(self.encoding.size)
+        wider[:AXES] = OF_AXES
+        prior, found = (
+            GaussianMixture(x.weights, x.means, x.covariances + np.diag(wider))
+            for x in (prior, found)
+        )
+        result = propagate_by_dynamics(
+            prior, found, self.equilibrium, share=share_of_time(interval, LASTING),
+            forgotten=forgotten, n_components=count,
+        )  # fmt: skip
+        return _heaviest(result, count)
+
+    def _expected(self, poses: GaussianMixture, interval: float) -> GaussianMixture:
+        """The mixture over poses after an interval, s, by the motion prior of the body."""
+        if interval <= 0.0:
+            return poses
+        prior = motion_prior(self.body)
+        return GaussianMixture(
+            poses.weights, *prior.predict_poses(poses.means, poses.covariances, interval)
+        )
 
     def _to_targets(self, poses: GaussianMixture) -> GaussianMixture:
         """The mixture over targets of a mixture over poses."""
@@ -238,6 +306,8 @@ class PosePredictor:
         if self.dynamics is not None:
             arrays |= nested('dynamics', self.dynamics.to_arrays())
         arrays['target_basis'] = self.target_basis
+        arrays['equilibrium_mean'] = self.equilibrium.means[0]
+        arrays['equilibrium_covariance'] = self.equilibrium.covariances[0]
         return write_arrays(path, arrays)
 
     @classmethod
@@ -269,9 +339,12 @@ class PosePredictor:
             )
             model = stored_model(part('model', arrays), where)
             dynamics = part('dynamics', arrays)
+            equilibrium = GaussianMixture(
+                np.ones(1), arrays['equilibrium_mean'][None], arrays['equilibrium_covariance'][None]
+            )
             return cls(
                 body, descriptor, model, np.asarray(arrays['target_basis'], dtype=np.float64),
-                stored_model(dynamics, where) if dynamics else None,
+                equilibrium, stored_model(dynamics, where) if dynamics else None,
                 parameters['notes'],
             )  # fmt: skip
         except _WrongBodyError as fault:
@@ -326,16 +399,6 @@ def _heaviest(mixture: GaussianMixture, count: int) -> GaussianMixture:
     ordered = mixture.normalised().sorted()
     kept = max(int((ordered.weights >= LIGHTEST).sum()), 1)
     return ordered[: min(kept, count)].normalised()
-
-
-def _blended(a: GaussianMixture, b: GaussianMixture, share: float) -> GaussianMixture:
-    """The components of a and b, with this share of the weight for those of b."""
-    weights = (1.0 - share) * a.normalised().weights, share * b.normalised().weights
-    return GaussianMixture(
-        np.concatenate(weights),
-        np.concatenate([a.means, b.means]),
-        np.concatenate([a.covariances, b.covariances]),
-    )
 
 
 def _transformed(mixture: GaussianMixture, basis: Array) -> GaussianMixture:

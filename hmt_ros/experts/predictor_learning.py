@@ -9,14 +9,16 @@ was chosen on motions of other people, so numbers on those motions are optimisti
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from itertools import islice
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body import Body
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN
 from hmt_ros.experts.calibrated_experts import CalibratedExperts
 from hmt_ros.experts.conditional_density import ConditionalDensity
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
@@ -29,13 +31,22 @@ from hmt_ros.experts.expert_mixture import (
     RelevanceVectorRegression,
 )
 from hmt_ros.experts.neighbour_models import LocalExperts, NearestNeighbours
+from hmt_ros.experts.network_experts import NetworkExperts
+from hmt_ros.experts.network_learning import tools_are_there
 from hmt_ros.experts.pose_encoding import PoseEncoding
-from hmt_ros.experts.pose_predictor import PosePredictor
+from hmt_ros.experts.pose_predictor import JITTER, PosePredictor
 from hmt_ros.experts.training_pairs import finite_matrix
-from hmt_ros.experts.training_set import TrainingSet
+from hmt_ros.experts.training_set import (
+    PoseSequence,
+    TrainingSet,
+    TrainingSettings,
+    training_set,
+)
+from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.clustering import k_means, squared_distances
 
+Item = TypeVar('Item')
 Bytes = NDArray[np.uint8]
 Progress = Callable[[Iterable[Bytes], int], Iterable[Bytes]]
 
@@ -44,7 +55,9 @@ NEIGHBOURS = 40  # of the local model
 WIDTH = 3.0  # of the kernels of the conditional model, in standard deviations of an input
 
 FOR_DESCRIPTOR = 3000  # maximum number of silhouettes that the descriptor learns from
+DESCRIBED = 500  # silhouettes that are described together
 FOR_BASIS = 600  # maximum number of poses that the metric of targets is averaged over
+SCORED_COMPONENTS = 5
 AWAY = 5.0  # depth of the poses in that average, m
 SMALLEST = 3e-3  # metric of a number that moves no joint, m per radian
 # Standard deviation of the noise that is added to previous states for the learning of dynamics, in
@@ -94,7 +107,12 @@ def _joint(experts: int, seed: int, _: int | None) -> ConditionalDensity:
     )
 
 
+def _network(experts: int, seed: int, _: int | None) -> ConditionalDensity:
+    return NetworkExperts(experts, seed=seed)
+
+
 KINDS = {
+    'network': ModelKind(_network, 5, folds=2),
     'local': ModelKind(_local, 5),
     'conditional': ModelKind(_conditional, 16, 20, 6, few=True, folds=2),
     'joint': ModelKind(_joint, 120, 20, 40, few=True, folds=2),
@@ -103,6 +121,11 @@ KINDS = {
     ),
     'nearest': ModelKind(lambda experts, _, __: NearestNeighbours(experts, scaling='common'), 5),
 }
+
+
+def kinds() -> tuple[str, ...]:
+    """Names of the models that can learn here: a network needs JAX and Optax."""
+    return tuple(name for name in KINDS if name != 'network' or tools_are_there())
 
 
 def new_model(
@@ -173,17 +196,26 @@ def described(
         progress: Iterates over the silhouettes, given their number.
     """
     descriptor = descriptor or SilhouetteDescriptor()
+    # Shape contexts of all silhouettes would fill the memory.
+    some = np.random.default_rng(descriptor.seed).permutation(len(pairs))[:FOR_DESCRIPTOR]
+    descriptor.fit([silhouette_parts(pairs.mask(i), descriptor.points) for i in np.sort(some)])
     masks: Iterable[Bytes] = pairs.masks()
     if progress is not None:
         masks = progress(masks, len(pairs))
-    parts = [silhouette_parts(mask, descriptor.points) for mask in masks]
-    some = np.random.default_rng(descriptor.seed).permutation(len(parts))[:FOR_DESCRIPTOR]
-    descriptor.fit([parts[i] for i in np.sort(some)])
+    parts = (silhouette_parts(mask, descriptor.points) for mask in masks)
+    rows = [descriptor.describe(few) for few in batched(parts, DESCRIBED)]
     encoding = PoseEncoding(body)
     return Described(
-        descriptor, descriptor.describe(parts), encoding.encode(pairs.poses),
+        descriptor, np.concatenate(rows), encoding.encode(pairs.poses),
         encoding.encode(pairs.previous), pairs.sequences,
     )  # fmt: skip
+
+
+def batched(items: Iterable[Item], count: int) -> Iterator[list[Item]]:
+    """Lists of at most so many items."""
+    left = iter(items)
+    while few := list(islice(left, count)):
+        yield few
 
 
 def learned_predictor(
@@ -211,8 +243,8 @@ def learned_predictor(
         finite_matrix(getattr(training, name), name, '(N, ...)')
     basis = target_basis(PoseEncoding(body), training.targets)
     # States and descriptors get the same variance: dynamics measure distances over both.
-    spread = float((training.targets @ basis).var(0).sum())
-    basis = basis * np.sqrt(training.descriptors.var(0).sum() / max(spread, 1e-12))
+    width = float((training.targets @ basis).var(0).sum())
+    basis = basis * np.sqrt(training.descriptors.var(0).sum() / max(width, 1e-12))
     states = training.targets @ basis
     _learn(model, training.descriptors, states, training.motions)
     if dynamics is not None:
@@ -221,7 +253,11 @@ def learned_predictor(
         before = before + STATE_NOISE * before.std(0) * noise
         inputs = np.hstack([before, training.descriptors])
         _learn(dynamics, inputs, states, training.motions)
-    return PosePredictor(body, training.descriptor, model, basis, dynamics, notes)
+    mean, spread = training.targets.mean(0), np.cov(training.targets.T)
+    equilibrium = GaussianMixture(
+        np.ones(1), mean[None], (spread + JITTER * np.eye(len(mean)))[None]
+    )
+    return PosePredictor(body, training.descriptor, model, basis, equilibrium, dynamics, notes)
 
 
 def _learn(model: ConditionalDensity, inputs: Array, targets: Array, motions: Index) -> None:
@@ -250,6 +286,57 @@ def target_basis(encoding: PoseEncoding, targets: Array) -> Array:
     metric /= len(chosen) * (len(body.joint_names) - 1)
     factor: Array = np.linalg.cholesky(metric + SMALLEST**2 * np.eye(encoding.size))
     return factor
+
+
+@dataclass(frozen=True)
+class SilhouetteScores:
+    """Scores of a predictor on silhouettes.
+
+    Attributes:
+        heaviest, best: Mean distance of the scored joints from the truth, from the pelvis, m, of
+            the heaviest component and of the best one.
+        log_density: Mean log density of the true targets, nats a number.
+    """
+
+    heaviest: float
+    best: float
+    log_density: float
+
+
+def silhouette_scores(
+    predictor: PosePredictor, sequences: Sequence[PoseSequence], samples: int, seed: int
+) -> SilhouetteScores:
+    """Scores on silhouettes of motions, seen as those that a predictor learns from.
+
+    Args:
+        predictor: that has learned.
+        sequences: motions.
+        samples: number of silhouettes.
+        seed: of all random choices.
+    """
+    body = predictor.body
+    pairs = training_set(body, sequences, TrainingSettings(samples=samples, seed=seed))
+    points = predictor.descriptor.points
+    rows = predictor.descriptor.describe([silhouette_parts(x, points) for x in pairs.masks()])
+    density = predictor.model.log_density(
+        rows, predictor.encoding.encode(pairs.poses) @ predictor.target_basis
+    )
+    scored, pelvis = (body.skeleton.joint_index(x) for x in (EVALUATED_JOINTS, (ORIGIN,)))
+    true = body.joint_positions(pairs.poses)
+    true = true[:, scored] - true[:, pelvis]
+    heaviest, best = [], []
+    for row, pose, joints in zip(rows, pairs.poses, true, strict=True):
+        targets = predictor.targets_after(row, max_components=SCORED_COMPONENTS)
+        roots = np.repeat(pose[None, :3], len(targets), axis=0)
+        found = body.joint_positions(predictor.encoding.decode(targets.means, roots))
+        off = found[:, scored] - found[:, pelvis] - joints
+        distances = np.linalg.norm(off, axis=2).mean(1)
+        heaviest.append(distances[0])
+        best.append(distances.min())
+    return SilhouetteScores(
+        float(np.mean(heaviest)), float(np.mean(best)),
+        float(density.mean() / predictor.encoding.size),
+    )  # fmt: skip
 
 
 def affinities(vectors: Array) -> Array:

@@ -67,15 +67,15 @@ class TrainingSettings:
     """
 
     samples: int = 6000
-    novelty: float = 0.03
+    novelty: float = 0.02
     mirrored: float = 0.5
-    mixed: float = 0.0
+    mixed: float = 0.3
     elevation: float = 8.0
-    elevation_spread: float = 10.0
-    roll_spread: float = 2.0
-    distances: tuple[float, float] = (2.5, 8.0)
-    length_spread: float = 0.05
-    width_range: tuple[float, float] = (0.85, 1.3)
+    elevation_spread: float = 14.0
+    roll_spread: float = 3.0
+    distances: tuple[float, float] = (1.8, 9.0)
+    length_spread: float = 0.08
+    width_range: tuple[float, float] = (0.82, 1.4)
     width_spread: float = 0.12
     boundary_noise: float = 1.0
     seed: int = 0
@@ -207,6 +207,7 @@ def training_set(
     sequences: Sequence[PoseSequence],
     settings: TrainingSettings | None = None,
     progress: Progress[Index] | None = None,
+    shares: Sequence[float] | None = None,
 ) -> TrainingSet:
     """Pairs of silhouettes and poses from motions.
 
@@ -215,6 +216,7 @@ def training_set(
         sequences: Motions.
         settings: Settings; None takes the defaults.
         progress: Iterates over groups of silhouettes, given their number.
+        shares: Share of the poses of each motion that are taken; None: all.
 
     Raises:
         ValueError: there are no motions, or the body has no flesh or another root.
@@ -225,6 +227,9 @@ def training_set(
     PoseEncoding(body)  # checks the root
     rng = np.random.default_rng(s.seed)
     pool = [novel_frames(body, sequence.poses, s.novelty) for sequence in sequences]
+    if shares is not None:
+        # Always some of them, at even intervals.
+        pool = [x[:: round(1.0 / max(y, 1e-3))] for x, y in zip(pool, shares, strict=True)]
     which = np.repeat(np.arange(len(pool)), [len(x) for x in pool])
     frames = np.concatenate(pool)
     chosen = _drawn(len(which), s.samples, rng)

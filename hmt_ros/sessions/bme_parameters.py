@@ -11,6 +11,7 @@ import sys
 from dataclasses import dataclass, field
 
 from hmt_ros.experts.lifter import SHIPPED as LIFTER
+from hmt_ros.experts.pose_predictor import ALONE, PROPAGATIONS
 from hmt_ros.image.background import BackgroundSettings
 from hmt_ros.image.keypoint_schemes import AUTO
 from hmt_ros.sessions.declared_parameters import (
@@ -42,7 +43,9 @@ class BmeParameters(CameraNodeParameters):
         keypoint_scheme: What the names of keypoints mean, as for filter_node.
         lifter: Experts that predict from keypoints, 'keypoints', which ships, or a file that
             learn-lifter wrote.
-        propagate: If true, a prediction also depends on the poses in the image before.
+        propagation: How a prediction depends on that of the image before, 'none', 'dynamics' by
+            rule (9) of the paper with the motion prior of the body, or 'experts' by rule (1) with a
+            model that was trained with --dynamics.
         longest_interval: Maximum interval without a person after which the images before are still
             taken into account, s.
         max_hypotheses: Maximum number of components of a prediction.
@@ -59,7 +62,7 @@ class BmeParameters(CameraNodeParameters):
     use_keypoints: bool = parameter_field(False, NEXT_CONFIGURE)
     keypoint_scheme: str = parameter_field(AUTO, NEXT_CONFIGURE)
     lifter: str = parameter_field(LIFTER, NEXT_CONFIGURE)
-    propagate: bool = parameter_field(False, AT_ONCE)
+    propagation: str = parameter_field(ALONE, NEXT_CONFIGURE)
     longest_interval: float = parameter_field(0.5, AT_ONCE, (0.0, 60.0))
     max_hypotheses: int = parameter_field(5, AT_ONCE, (1, 64))
     tracked_interval: float = parameter_field(0.0, NEXT_CONFIGURE, (0.0, 3600.0))
@@ -71,6 +74,10 @@ class BmeParameters(CameraNodeParameters):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_keypoint_scheme(self.keypoint_scheme)
+        if self.propagation not in PROPAGATIONS:
+            raise ValueError(
+                f'propagation is {self.propagation!r}, wanted one of {", ".join(PROPAGATIONS)}'
+            )
         if self.use_keypoints and not self.lifter:
             raise ValueError("use_keypoints needs a lifter, saw ''")
 

@@ -16,7 +16,7 @@ order give the same bytes. The rules, besides those of `CameraSession`:
   one, too. With `use_mask` there is none besides the mask.
 - An image that is not younger than the one before is skipped, or is the first of a new sequence
   with `reset_on_time_jump`.
-- With `propagate` a prediction takes the one before into account, unless this is older than
+- With `propagation` a prediction takes the one before into account, unless this is older than
   `longest_interval`, comes from another calibration, or from before a jump in time.
 - With `use_keypoints` every message of keypoints gets one prediction, from them and those of the
   last second (`experts.lifter`), in place of the images; without components where fewer than five
@@ -36,13 +36,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body import Camera
-from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
 from hmt_ros.experts.lifted_fit import KNOWN_SIZE, UNKNOWN_SIZE, poses_of
 from hmt_ros.experts.lifter import KeypointHistory
-from hmt_ros.experts.pose_predictor import SHIPPED, PosePredictor, Prediction, load_predictor
+from hmt_ros.experts.pose_predictor import (
+    ALONE,
+    BY_EXPERTS,
+    SHIPPED,
+    STEP,
+    PosePredictor,
+    Prediction,
+    load_predictor,
+)
 from hmt_ros.experts.root_placement import SIZE_SPREAD
-from hmt_ros.experts.training_set import RATE
 from hmt_ros.image.background import BackgroundModel, one_person
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
@@ -324,7 +330,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         if self._height < p.least_height:
             return None
         try:
-            found = self._seen(mask, camera, self._one_step_before(waiting.stamp_ns))
+            found = self._seen(mask, camera, *self._known_before(waiting.stamp_ns))
         except NoSilhouetteError:
             return None
         self._support = found.support
@@ -336,24 +342,24 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         with self._background_in_use:
             self._look_at_scene(waiting, self._background, 'configure the node anew')
 
-    def _one_step_before(self, stamp_ns: int) -> GaussianMixture | None:
-        """The poses one step of the dynamics before an image, as far as they are known."""
+    def _known_before(self, stamp_ns: int) -> tuple[GaussianMixture | None, float]:
+        """The poses of the prediction before an image, as far as they count; s since then."""
         p, previous = self.parameters, self._previous
-        if not p.propagate or previous is None:
-            return None
+        if p.propagation == ALONE or previous is None:
+            return None, STEP
         interval = (stamp_ns - previous.stamp_ns) / SECOND_NS
-        if interval > p.longest_interval:
-            return None
-        # By what exceeds the step that dynamics were learned for, poses change as the body may.
-        m, beyond = previous.mixture, max(interval - 1.0 / RATE, 0.0)
-        dynamics = motion_prior(self._predictor.body)
-        return GaussianMixture(m.weights, *dynamics.predict_poses(m.means, m.covariances, beyond))
+        return (None, STEP) if interval > p.longest_interval else (previous.mixture, interval)
 
-    def _seen(self, mask: Mask, camera: Camera, previous: GaussianMixture | None) -> Prediction:
+    def _seen(
+        self, mask: Mask, camera: Camera, previous: GaussianMixture | None = None,
+        interval: float = STEP,
+    ) -> Prediction:  # fmt: skip
         return self._predictor.observe(
             mask,
             camera,
             previous,
+            interval,
+            propagation=self.parameters.propagation,
             max_components=self.parameters.max_hypotheses,
             size_spread=self._size_spread,
         )
@@ -412,7 +418,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 f'nobody is seen: the silhouette is {_height(mask)} px high, wanted at least '
                 f'{p.least_height}'
             )
-        mixture = self._seen(mask, camera, None).mixture
+        mixture = self._seen(mask, camera).mixture
         return self._message(mixture, time_ns(message.header.stamp), str(message.header.frame_id))
 
     def _images_to_learn(self) -> int:
@@ -444,6 +450,11 @@ def _predictor_of(parameters: BmeParameters) -> tuple[PosePredictor, float]:
         predictor = load_predictor(parameters.model_file or SHIPPED)
     except OSError as error:
         raise ValueError(error_line(error)) from error
+    if parameters.propagation == BY_EXPERTS and predictor.dynamics is None:
+        raise ValueError(
+            f"propagation 'experts' needs a model that was trained with --dynamics, which "
+            f'{parameters.model_file or SHIPPED} was not'
+        )
     if not parameters.stature:
         return predictor, SIZE_SPREAD
     body = predictor.body.with_stature(parameters.stature)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -36,13 +37,14 @@ def test_procedural_motions_give_a_model_and_figures(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / 'model.npz'
-    arguments = ['--motions', 'reach', '--samples', '120', '--seed', '3']
+    arguments = ['--motions', 'reach', '--model', 'local', '--samples', '120', '--seed', '3']
+    arguments += ['--dynamics', '--acknowledgement', 'Thanks.']
     assert train.main([*arguments, '-o', str(output)]) == 0
     predictor = PosePredictor.load(output)
     assert predictor.body.name == 'human37'
     assert predictor.dynamics is not None
     assert predictor.notes['samples'] == 120
-    assert predictor.notes['activities'] == ['reach']
+    assert predictor.notes['card'] == 'Thanks.\nLearned from 2 motions, 5 s: reach 3, reach 4.'
     figures = sorted(x.name for x in (tmp_path / 'model_report').iterdir())
     assert figures == ['affinities.png', 'multimodality.png', 'silhouettes.png']
     for name in figures:
@@ -74,13 +76,20 @@ def test_broken_motions_are_skipped_and_counted(
     (folder / 'unknown.bvh').write_text(BVH)
     (folder / 'alone.amc').write_text(':DEGREES\n1\nroot 0 0 0 0 0 0\n')
     output = tmp_path / 'model.npz'
-    arguments = ['--mocap', str(folder), '-o', str(output), '--samples', '60', '--no-dynamics']
+    arguments = ['--mocap', str(folder), '-o', str(output), '--samples', '60', '--model', 'local']
     assert train.main(arguments) == 0
     captured = capsys.readouterr()
     warnings = [x for x in captured.err.splitlines() if x.startswith('train: skipped')]
     assert sorted(x.split()[2] for x in warnings) == ['alone.amc:', 'broken.bvh:', 'unknown.bvh:']
     assert '1 motions, 3 skipped' in captured.out
-    assert PosePredictor.load(output).notes['activities'] == ['walk']
+    assert 'Learned from 1 motions' in PosePredictor.load(output).notes['card']
+    # People are left out by their names, and others are what it is scored on.
+    more = ['--without', 'broke*', '--test', str(folder / 'deeper'), '--overwrite']
+    assert train.main([*arguments, *more]) == 0
+    assert '1 motions, 2 skipped' in capsys.readouterr().out
+    notes = PosePredictor.load(output).notes
+    assert notes['scored on'] == ['fine_walk']
+    assert re.match(r'\d+ mm heaviest, \d+ best of 5, ', notes['scores'])
 
 
 @pytest.fixture(scope='module')
@@ -96,7 +105,7 @@ def mocap_walk() -> Path:
 
 
 def _fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    assert train.main(arguments) == 1
+    assert train.main([*arguments, '--model', 'local']) == 1
     error = capsys.readouterr().err.strip().splitlines()
     assert error[-1].startswith('train: ')
     return error[-1]
@@ -109,7 +118,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     cases = [
         (['-o', output], 'nothing to learn from'),
         (['-o', output, '--mocap', str(empty)], 'has no motion'),
-        (['-o', output, '--mocap', str(tmp_path / 'absent')], 'no folder'),
+        (['-o', output, '--mocap', str(tmp_path / 'absent')], 'wanted a folder or a motion'),
         (['-o', output, '--motions', 'swim'], "no motion 'swim'"),
         (['-o', str(tmp_path / 'x' / 'm.npz'), '--motions', 'walk'], 'no folder'),
         (['-o', output, '--motions', 'walk', '--samples', '3'], 'from 50'),
@@ -119,8 +128,18 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     for arguments, wanted in cases:
         assert wanted in _fails(arguments, capsys)
     (empty / 'broken.bvh').write_text('nothing')
-    assert 'none of the 1 motions' in _fails(['-o', output, '--mocap', str(empty)], capsys)
+    given = ['-o', output, '--mocap', str(empty)]
+    assert 'none of the 1 motions' in _fails(given, capsys)
+    assert "there is no motion 'x*'" in _fails([*given, '--without', 'x*'], capsys)
     assert not Path(output).exists()
+
+
+def test_a_network_needs_what_learns_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr('hmt_ros.experts.network_learning.find_spec', lambda _: None)
+    assert train.main(['-o', str(tmp_path / 'm.npz'), '--motions', 'walk']) == 1
+    assert 'pip install jax optax' in capsys.readouterr().err
 
 
 def test_a_model_that_is_there_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

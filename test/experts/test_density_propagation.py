@@ -176,10 +176,34 @@ def test_rule_nine_on_a_grid(kernel_model):
     previous = GaussianMixture([1.0], [[0.2]], [[[1e-4]]])
     predicted = GaussianMixture([0.5, 0.5], [[1.3], [-0.7]], [[[0.3]], [[0.3]]])
     equilibrium = GaussianMixture([1.0], [[0.0]], [[[1.6]]])
-    found = propagate_by_dynamics(kernel_model, previous, predicted, equilibrium, n_components=4)
     prior = linearised_products(kernel_model, previous, np.zeros(0))
+    found = propagate_by_dynamics(prior, predicted, equilibrium, n_components=4)
     a, b, c = on_grid(prior, predicted, equilibrium)
     with np.errstate(divide='ignore', invalid='ignore'):
         expected = np.where(a * b > 1e-250, a * b / c, 0.0)
     expected /= expected.sum() * STEP
     assert STEP * np.abs(on_grid(found)[0] - expected).sum() < 1e-3
+
+
+def test_rule_nine_leaves_a_wrong_past():
+    """Far from the past an observation is believed with the odds that the past is wrong."""
+    prior = GaussianMixture([1.0], [[-4.0]], [[[0.04]]])
+    predicted = GaussianMixture([1.0], [[4.0]], [[[0.1]]])
+    equilibrium = GaussianMixture([1.0], [[0.0]], [[[9.0]]])
+    stays = propagate_by_dynamics(prior, predicted, equilibrium, n_components=2)
+    assert abs(stays.means[0, 0] - 4.0) > 1.0
+    leaves = propagate_by_dynamics(prior, predicted, equilibrium, forgotten=1e-3, n_components=2)
+    assert leaves.means[0, 0] == pytest.approx(4.0, abs=0.05)
+    assert leaves.weights[0] > 0.99
+
+
+def test_a_repeated_observation_tells_its_share():
+    prior = GaussianMixture([1.0], [[0.0]], [[[1.0]]])
+    predicted = GaussianMixture([1.0], [[1.0]], [[[0.5]]])
+    equilibrium = GaussianMixture([1.0], [[0.0]], [[[4.0]]])
+    nothing = propagate_by_dynamics(prior, predicted, equilibrium, share=0.0)
+    np.testing.assert_allclose(nothing.means, prior.means)
+    np.testing.assert_allclose(nothing.covariances, prior.covariances)
+    half = propagate_by_dynamics(prior, predicted, equilibrium, share=0.5)
+    assert half.covariances[0, 0, 0] == pytest.approx(1.0 / (1.0 + 0.5 * (2.0 - 0.25)))
+    assert half.means[0, 0] == pytest.approx(half.covariances[0, 0, 0] * 0.5 * 2.0)

@@ -91,9 +91,11 @@ def network(seed: int = 0, experts: int = 3, units: int = 8) -> Network:
         return (0.1 * rng.standard_normal(shape)).astype(np.float32)
 
     return Network(
-        normal(INPUTS), np.ones(INPUTS, np.float32), normal(INPUTS, units), normal(units),
-        normal(1, units, units), normal(1, units), normal(units, experts * (1 + 6 * len(JOINTS))),
-        normal(experts * (1 + 6 * len(JOINTS))), normal(len(JOINTS), 3),
+        mean=normal(INPUTS), scale=np.ones(INPUTS, np.float32),
+        first=normal(INPUTS, units), first_bias=normal(units),
+        hidden=normal(1, units, units), hidden_biases=normal(1, units),
+        last=normal(units, experts * (1 + 6 * len(JOINTS))),
+        last_bias=normal(experts * (1 + 6 * len(JOINTS))), middle=normal(len(JOINTS), 3),
     )  # fmt: skip
 
 

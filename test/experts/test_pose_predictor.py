@@ -12,7 +12,7 @@ from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS
 from hmt_ros.experts import LocalExperts, NearestNeighbours
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
 from hmt_ros.experts.descriptor.silhouette_descriptor import SilhouetteDescriptor
-from hmt_ros.experts.pose_predictor import PosePredictor
+from hmt_ros.experts.pose_predictor import ALONE, BY_EXPERTS, PosePredictor
 from hmt_ros.experts.predictor_learning import Described, described, learned_predictor
 from hmt_ros.experts.training_set import TrainingSettings, procedural_sequence, training_set
 from hmt_ros.rendering.renderer import render_silhouettes
@@ -86,13 +86,25 @@ def test_propagation_keeps_what_was_known(
     assert weighted[1] < weighted[0]
 
 
-def test_without_dynamics_propagation_predicts(
+def test_rule_one_needs_a_model_and_rule_nine_does_not(
     body: Body, training: Described, clip: tuple[np.ndarray, np.ndarray]
 ) -> None:
     plain = learned_predictor(body, training, NearestNeighbours(5, 'common'))
     mask = clip[1][3]
-    mixture = plain.predict(mask, CAMERA)
-    assert plain.observe(mask, CAMERA, mixture).mixture == mixture
+    alone = plain.predict(mask, CAMERA)
+    assert plain.observe(mask, CAMERA, alone, propagation=ALONE).mixture == alone
+    with pytest.raises(ValueError, match='train it with --dynamics'):
+        plain.observe(mask, CAMERA, alone, propagation=BY_EXPERTS)
+    with pytest.raises(ValueError, match="no propagation 'rule'"):
+        plain.observe(mask, CAMERA, alone, propagation='rule')
+    # After an hour nothing is left of the past; after a moment the past is told again.
+    later = plain.observe(mask, CAMERA, alone, 3600.0).mixture
+    assert later.weights.max() == pytest.approx(alone.weights.max(), abs=0.05)
+    first = alone[:1].normalised()
+    soon = plain.observe(mask, CAMERA, first, 1e-3).mixture
+    joints = body.joint_positions(np.concatenate([first.means, soon.means[:1]]))
+    relative = joints - joints[:, :1]
+    assert np.linalg.norm(relative[1] - relative[0], axis=1).mean() < 0.05
 
 
 def test_a_file_brings_it_back(

@@ -11,9 +11,7 @@ from hmt_ros.body.kinematics import forward
 from hmt_ros.image.keypoint_schemes import usual_exchanges
 from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, bone_lengths, carrier_of
 from hmt_ros.image.terms.keypoints import (
-    ANY_DEPTH,
-    ANYHOW,
-    LIFTED_SIGMA,
+    LIFTED_SCALE,
     LIFTED_WEIGHT,
     NOT_EXCHANGED,
     Keypoints,
@@ -60,23 +58,14 @@ def energy(poses: LiftedPoses, x: np.ndarray, exchanges: np.ndarray | None) -> f
 
 
 def density(poses: LiftedPoses, x: np.ndarray) -> float:
-    """Minus the log density of depths, as the formula of the module says it."""
+    """Minus the log density of depths, as the formula of the page says it."""
     joints = BODY.joint_positions(x[None])[0]
     hips = joints[BODY.skeleton.joint_index(HIPS)].mean(0)
     depth = (joints[BODY.skeleton.joint_index(poses.joints)] - hips) @ poses.axes[2]
-    mean, sigma = poses.sized(BODY.skeleton)[:, :, 2], LIFTED_SIGMA * poses.deviations[:, :, 2]
-    each = poses.log_weights - (0.5 * ((depth - mean) / sigma) ** 2 + np.log(sigma)).sum(1)
-    reach = {}
-    lengths = dict(zip(poses.joints, bone_lengths(BODY.skeleton, poses.joints)))
-    for name in poses.joints:
-        at, total = name, 0.0
-        while at:
-            total += lengths[at]
-            at = carrier_of(at, poses.joints)
-        reach[name] = total
-    wide = np.maximum(ANY_DEPTH * np.array([reach[name] for name in poses.joints]), 0.02)
-    flat = np.log(ANYHOW) - (0.5 * (depth / wide) ** 2 + np.log(wide)).sum()
-    return -float(logsumexp(np.append(each + np.log1p(-ANYHOW), flat)))
+    mean, sigma = poses.sized(BODY.skeleton)[:, :, 2], poses.deviations[:, :, 2]
+    square = ((depth - mean) / sigma) ** 2
+    kernel = 0.5 * square / (1.0 + square / LIFTED_SCALE**2)
+    return -float(logsumexp(poses.log_weights - (kernel + np.log(sigma)).sum(1)))
 
 
 def test_energy_is_the_log_density_of_depths() -> None:
@@ -85,6 +74,14 @@ def test_energy_is_the_log_density_of_depths() -> None:
     found = [energy(poses, pose(i), NOT_EXCHANGED) for i in range(4)]
     wanted = [LIFTED_WEIGHT * density(poses, pose(i)) for i in range(4)]
     assert np.ptp(np.array(found) - wanted) < 1e-8
+
+
+def test_a_limb_that_is_elsewhere_costs_so_much_at_most() -> None:
+    poses, x = lifted(components=1), pose()
+    bent = x.copy()
+    bent[[i for i, name in enumerate(BODY.dof_names) if name.startswith('left_elbow')]] += 1.5
+    change = energy(poses, bent, NOT_EXCHANGED) - energy(poses, x, NOT_EXCHANGED)
+    assert abs(change) < 2 * 0.5 * LIFTED_WEIGHT * LIFTED_SCALE**2  # wrist and hand
 
 
 def test_exchanged_sides_read_the_poses_the_other_way_round() -> None:

@@ -268,16 +268,22 @@ class StubPredictor:
 
     body = load_body('human37')
     asked: list[tuple[Any, GaussianMixture | None, float]] = []  # noqa: RUF012
+    intervals: list[float] = []  # noqa: RUF012
+    dynamics = None
     fault: Exception | None = None
 
     def with_body(self, body):
         assert body is not self.body
         return self
 
-    def observe(self, mask, camera, previous=None, *, max_components=8, size_spread=0.06):
+    def observe(
+        self, mask, camera, previous=None, interval=1 / 30, *, propagation='dynamics',
+        max_components=8, size_spread=0.06,
+    ):  # fmt: skip
         if self.fault is not None:
             raise self.fault
         StubPredictor.asked.append((mask, previous, size_spread))
+        StubPredictor.intervals.append(interval)
         means = np.tile(self.body.prior_mean, (2, 1))
         means[:, 2] = [4.0, 4.5]
         covariances = np.tile(1e-2 * np.eye(self.body.dimension), (2, 1, 1))
@@ -292,6 +298,7 @@ class StubPredictor:
 def stub_predictor(monkeypatch):
     monkeypatch.setattr(bme_session, 'load_predictor', lambda path: StubPredictor())
     monkeypatch.setattr(StubPredictor, 'asked', [])
+    monkeypatch.setattr(StubPredictor, 'intervals', [])
     monkeypatch.setattr(StubPredictor, 'fault', None)
     return StubPredictor
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hmt_ros.body import Camera, load_body
-from hmt_ros.body.motion_prior import motion_prior
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.sessions.bme_parameters import BmeParameters
 from hmt_ros.sessions.bme_session import CAMERA_INFO, IMAGE, SILHOUETTE, TOPICS, TRACK, BmeSession
@@ -127,24 +126,27 @@ def test_masks_are_the_silhouettes(session, outputs, somebody, stub_predictor):
 
 
 def test_predictions_take_those_before_into_account(session, somebody, stub_predictor):
-    one = session(propagate=True, longest_interval=0.25)
+    one = session(propagation='dynamics', longest_interval=0.25)
     one.take(CAMERA_INFO, somebody.info())
     for index in (0, 1, 4):
         one.take(IMAGE, somebody.image(index))
     (_, first, _), (_, second, _), (_, third, _) = stub_predictor.asked
     assert first is None
     assert len(second) == 2
-    # The dynamics were learned for a step of 1/30 s; of the rest little is known.
-    dynamics = motion_prior(stub_predictor.body)
-    known = 1e-2 * np.eye(37)[None]
-    _, wanted = dynamics.predict_poses(np.zeros((1, 37)), known, 2 / 30)
-    assert np.allclose(second.covariances[0], wanted[0])
+    assert stub_predictor.intervals[1] == pytest.approx(0.1)
     assert third is None
     alone = session()
     alone.take(CAMERA_INFO, somebody.info())
     for index in (0, 1):
         alone.take(IMAGE, somebody.image(index))
     assert [previous for _, previous, _ in stub_predictor.asked[3:]] == [None, None]
+
+
+def test_rule_one_needs_a_model_of_it(session, stub_predictor):
+    with pytest.raises(ValueError, match='trained with --dynamics'):
+        session(propagation='experts')
+    with pytest.raises(ValueError, match="propagation is 'rule', wanted one of dynamics"):
+        session(propagation='rule')
 
 
 def test_at_most_so_many_components(session, outputs, somebody):

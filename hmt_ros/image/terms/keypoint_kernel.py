@@ -56,6 +56,7 @@ class Lifted(NamedTuple):
         precisions: (2, C, J) square roots, 1/m.
         readings: (E,) 0 or 1: how an exchange of sides reads the mixture.
         weight: factor on the energy; 0: there is no mixture.
+        scale: of the kernel, in standard deviations: a joint that is elsewhere costs no more.
     """
 
     segments: Ints
@@ -67,6 +68,7 @@ class Lifted(NamedTuple):
     precisions: Array
     readings: Ints
     weight: float
+    scale: float
 
 
 class KeypointInputs(NamedTuple):
@@ -155,7 +157,7 @@ def lifted_energies(lifted, columns, origins, behind, places, shares, result):  
             total = lifted.log_weights[c]
             for k in range(len(segments)):
                 residual = lifted.precisions[e, c, k] * (behind[k] - lifted.depths[e, c, k])
-                total -= 0.5 * residual * residual
+                total -= geman_mcclure(residual, lifted.scale, 1.0)[0]
             shares[e, c] = total
             top = max(top, total)
         mass = 0.0
@@ -196,10 +198,12 @@ def add_lifted(  # type: ignore[no-untyped-def]
         pull, curvature = 0.0, 0.0
         for e in range(2):
             for c in range(len(lifted.log_weights)):
+                precision = lifted.precisions[e, c, k]
                 share = lifted.weight * readings[e] * shares[e, c]
-                share *= lifted.precisions[e, c, k] ** 2
-                pull += share * (behind[k] - lifted.depths[e, c, k])
-                curvature += share
+                residual = precision * (behind[k] - lifted.depths[e, c, k])
+                _, slope, bend = geman_mcclure(residual, lifted.scale, share)
+                pull += precision * slope
+                curvature += precision * precision * bend
         add_residual(
             wrenches, stiffnesses, lifted.segments[k], places[1 + k, 0], places[1 + k, 1],
             places[1 + k, 2], ray[0], ray[1], ray[2], pull, curvature,

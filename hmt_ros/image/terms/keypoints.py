@@ -27,7 +27,7 @@ from hmt_ros.image.keypoint_schemes import (
     noise_of,
     scheme_of,
 )
-from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, bone_lengths, middle_of_hips, ordered
+from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, middle_of_hips
 from hmt_ros.image.surface import lens_of
 from hmt_ros.image.terms.image_term import TermSettings
 from hmt_ros.image.terms.keypoint_kernel import (
@@ -53,11 +53,10 @@ USUAL_EXTENT = 1.4
 USUAL_STATURE = 1.7
 # Least standard deviation of a keypoint whose noise is learned, px.
 SMALLEST_SIGMA = 1.5
-# Probability that a pose is none of those that were lifted, whatever its depths; the standard
-# deviation of these, as a share of how far a joint can be; the share of the mixture that is
-# independent, because joints err together; and by how much depths from a real detector's keypoints
-# err more than those that were learned from. Chosen, with the time of `ERRORS['lifted']`.
-ANYHOW, ANY_DEPTH, LIFTED_WEIGHT, LIFTED_SIGMA = 0.02, 0.6, 0.08, 1.8
+# The share of a mixture over lifted poses that is independent, because joints err together; and the
+# scale of its kernel, in standard deviations: one limb, or all, may be elsewhere. Chosen, with the
+# time of `ERRORS['lifted']`.
+LIFTED_WEIGHT, LIFTED_SCALE = 0.2, 3.0
 # Groups of landmarks that are exchanged together, and which of them (E, G) an exchange exchanges:
 # nothing, all, arms, legs.
 CENTRE, ARMS, LEGS = range(3)
@@ -373,13 +372,13 @@ def _whitened(keypoints: Keypoints, sigma: float, magnification: float) -> tuple
 
 NOT_LIFTED = Lifted(
     np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(1),
-    np.zeros((2, 1, 0)), np.zeros((2, 1, 0)), np.zeros(len(EXCHANGED), np.int64), 0.0,
+    np.zeros((2, 1, 0)), np.zeros((2, 1, 0)), np.zeros(len(EXCHANGED), np.int64), 0.0, 1.0,
 )  # fmt: skip
 
 
 @lru_cache(maxsize=16)
 def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lifted:
-    """A mixture over whole poses as compiled code reads it, with a component of any depths."""
+    """A mixture over whole poses as compiled code reads it."""
     known = set(skeleton.joint_names)
     if poses is None or not known.issuperset(HIPS):
         return NOT_LIFTED
@@ -387,26 +386,13 @@ def _lifted(skeleton: Skeleton, poses: LiftedPoses | None, sigma: float) -> Lift
     joints = skeleton.joint_index(poses.joints)
     both = poses, poses.exchanged()
     depths = np.stack([x.sized(skeleton)[:, :, 2] for x in both])
-    deviations = LIFTED_SIGMA * sigma * np.stack([x.deviations[:, :, 2] for x in both])
-    lengths = bone_lengths(skeleton, poses.joints)
-    anywhere = np.tile(np.maximum(ANY_DEPTH * _reach(poses.joints, lengths), 0.02), (2, 1, 1))
-    depths = np.concatenate([depths, np.zeros_like(anywhere)], axis=1)
-    deviations = np.concatenate([deviations, anywhere], axis=1)
-    log_weights = np.append(poses.log_weights + np.log1p(-ANYHOW), np.log(ANYHOW))
+    deviations = sigma * np.stack([x.deviations[:, :, 2] for x in both])
     return Lifted(
         skeleton.joint_segments[joints].astype(np.int64), skeleton.joint_offsets[joints],
         middle_of_hips(skeleton), poses.axes[2],
-        log_weights - np.log(deviations[0]).sum(1), np.ascontiguousarray(depths),
-        1.0 / deviations, EXCHANGED.min(1), LIFTED_WEIGHT,
+        poses.log_weights - np.log(deviations[0]).sum(1), np.ascontiguousarray(depths),
+        1.0 / deviations, EXCHANGED.min(1), LIFTED_WEIGHT, LIFTED_SCALE,
     )  # fmt: skip
-
-
-def _reach(joints: tuple[str, ...], lengths: Array) -> Array:
-    """How far joints (J,) can be from the middle of the hips, m."""
-    result = np.zeros(len(joints))
-    for j, carrier in ordered(joints):
-        result[j] = lengths[j] + (0.0 if carrier < 0 else result[carrier])
-    return result
 
 
 def group_of(skeleton: Skeleton, segment: int) -> int:
