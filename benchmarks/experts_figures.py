@@ -46,10 +46,11 @@ from hmt_ros.inference.arrays import Array
 
 # Motions of people left out that stand for those of the paper; heading, degrees.
 WALK, RUN, TURNS = 'cmu_06_01_walk', 'cmu_run_c', 'cmu_06_10_turns'
-SHOWN = {WALK: 60.0, RUN: 60.0, TURNS: 20.0}
+SHOWN = {'walk': (WALK, 60.0), 'run': (RUN, 60.0), 'turns': (TURNS, 20.0)}
 TALKS = 'cmu_signals_b'
-FRAMES, COLUMNS, SAMPLES = 90, 6, 4000
-ANGLE = 'right_knee'
+FRAMES, COLUMNS, SAMPLES = 90, 6, 2000
+# The joint of an angle that changes, and the heading.
+BENDING = {TURNS: ('right_knee', 20.0), TALKS: ('right_elbow', 0.0)}
 COLOURS = {'truth': '#000000', 'first expert': '#d55e00', 'second expert': '#e69f00',
            'nearest neighbours': '#009e73', 'one regression': '#0072b2'}  # fmt: skip
 
@@ -66,9 +67,8 @@ def draw(folder: Path, *, quick: bool = False) -> list[str] | str:
     pairs = training_set(predictor.body, train, TrainingSettings(samples=samples))
     training = described(predictor.body, pairs)
     write_report(folder, predictor.body, [test[x] for x in (WALK, TURNS, TALKS)], pairs, training)
-    for name, heading in SHOWN.items():
-        figure = _sequence_figure(predictor, test[name], heading)
-        figure.savefig(folder / f'{name.rpartition("_")[2]}.png')
+    for title, (name, heading) in SHOWN.items():
+        _sequence_figure(predictor, test[name], heading).savefig(folder / f'{title}.png')
     learned = learn_from(train, samples)
     baselines = {
         what: predictor_of(learned, name, dynamics=False)[0]
@@ -146,7 +146,7 @@ def _angle_figure(
     with mpl.rc_context(STYLE):
         figure = Figure((9.0, 6.0), dpi=110)
         axes = figure.subplots(2, 2, squeeze=False)
-        for column, (name, heading) in enumerate(((TURNS, 20.0), (TALKS, 0.0))):
+        for column, (name, (joint, heading)) in enumerate(BENDING.items()):
             motion, _ = seen(predictor, test[name], heading)
             found = sequence_mixtures(predictor, motion)
             lines = {
@@ -157,7 +157,7 @@ def _angle_figure(
             for what, one in baselines.items():
                 again, _ = seen(one, test[name], heading)
                 lines[what] = np.array([x.mean() for x in sequence_mixtures(one, again)])
-            dof = _bending(predictor.body, ANGLE)
+            dof = _bending(predictor.body, joint)
             times = np.arange(len(motion.poses)) / 30.0
             for what, poses in lines.items():
                 dots = {'marker': '.', 'linestyle': ''} if 'expert' in what else {}
@@ -166,8 +166,8 @@ def _angle_figure(
                     axes[row, column].plot(times, value, color=COLOURS[what], label=what, **dots)
             axes[0, column].set_title(name)
             axes[1, column].set_xlabel('s')
+            axes[1, column].set_ylabel(f'{joint.replace("_", " ")}, degrees')
         axes[0, 0].set_ylabel('heading, degrees')
-        axes[1, 0].set_ylabel(f'{ANGLE.replace("_", " ")}, degrees')
         axes[0, 0].legend(fontsize=7.0)
         figure.tight_layout()
     return figure
@@ -181,7 +181,8 @@ def _bending(body: Body, joint: str) -> int:
 def _hypotheses_figure(predictor: PosePredictor, test: dict[str, PoseSequence]) -> Figure:
     with mpl.rc_context(STYLE):
         figure = Figure((9.0, 5.0), dpi=110)
-        for one, (name, heading) in zip(figure.subplots(len(SHOWN), 1), SHOWN.items(), strict=True):
+        grid = figure.subplots(len(SHOWN), 1)
+        for one, (title, (name, heading)) in zip(grid, SHOWN.items(), strict=True):
             motion, _ = seen(predictor, test[name], heading)
             for components, propagation, style in (
                 (1, BY_DYNAMICS, ':'), (BEST_OF, BY_DYNAMICS, '-'), (BEST_OF, ALONE, '--'),
@@ -191,7 +192,7 @@ def _hypotheses_figure(predictor: PosePredictor, test: dict[str, PoseSequence]) 
                 how = 'rule (9)' if propagation == BY_DYNAMICS else 'each image alone'
                 label = f'best of {components}, {how}: {best.mean():.0f} mm'
                 one.plot(np.arange(len(best)) / 30.0, best, style, label=label)
-            one.set_ylabel(f'{name.rpartition("_")[2]}, mm')
+            one.set_ylabel(f'{title}, mm')
             one.legend(fontsize=6.5)
         figure.axes[-1].set_xlabel('s')
         figure.tight_layout()

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -29,15 +29,15 @@ from hmt_ros.app.learn_motion import chosen_motions, data_card, shares_of
 from hmt_ros.app.progress import show_progress, tell_user, with_progress
 from hmt_ros.app.training_report import write_report
 from hmt_ros.body import Body, load_body
+from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN
+from hmt_ros.experts.descriptor.silhouette_descriptor import silhouette_parts
 from hmt_ros.experts.network_learning import check_tools
 from hmt_ros.experts.pose_predictor import PosePredictor
 from hmt_ros.experts.predictor_learning import (
     KINDS,
-    SCORED_COMPONENTS,
     described,
     learned_predictor,
     new_model,
-    silhouette_scores,
 )
 from hmt_ros.experts.training_set import (
     PoseSequence,
@@ -53,8 +53,8 @@ from msg_tools.files.error_line import error_line
 Item = TypeVar('Item')
 
 PROCEDURAL_SEEDS, PROCEDURAL_SECONDS = 5, 12.0
-# Silhouettes that a predictor is scored on.
-TESTED = 1000
+# Silhouettes that a predictor is scored on, and components of a prediction.
+TESTED, BEST_OF = 1000, 5
 
 
 @dataclass(frozen=True)
@@ -255,13 +255,64 @@ def _read(files: list[Path], body: Body, *, quiet: bool) -> list[PoseSequence]:
     return [one for one in found if one is not None]
 
 
+@dataclass(frozen=True)
+class SilhouetteScores:
+    """Scores of a predictor on silhouettes.
+
+    Attributes:
+        heaviest, best: Mean distance of the scored joints from the truth, from the pelvis, m, of
+            the heaviest component and of the best one.
+        log_density: Mean log density of the true targets, nats a number.
+    """
+
+    heaviest: float
+    best: float
+    log_density: float
+
+
+def silhouette_scores(
+    predictor: PosePredictor, sequences: Sequence[PoseSequence], samples: int, seed: int
+) -> SilhouetteScores:
+    """Scores on silhouettes of motions, seen as those that a predictor learns from.
+
+    Args:
+        predictor: that has learned.
+        sequences: motions.
+        samples: number of silhouettes.
+        seed: of all random choices.
+    """
+    body = predictor.body
+    pairs = training_set(body, sequences, TrainingSettings(samples=samples, seed=seed))
+    points = predictor.descriptor.points
+    rows = predictor.descriptor.describe([silhouette_parts(x, points) for x in pairs.masks()])
+    density = predictor.model.log_density(
+        rows, predictor.encoding.encode(pairs.poses) @ predictor.target_basis
+    )
+    scored, pelvis = (body.skeleton.joint_index(x) for x in (EVALUATED_JOINTS, (ORIGIN,)))
+    true = body.joint_positions(pairs.poses)
+    true = true[:, scored] - true[:, pelvis]
+    heaviest, best = [], []
+    for row, pose, joints in zip(rows, pairs.poses, true, strict=True):
+        targets = predictor.targets_after(row, max_components=BEST_OF)
+        roots = np.repeat(pose[None, :3], len(targets), axis=0)
+        found = body.joint_positions(predictor.encoding.decode(targets.means, roots))
+        off = found[:, scored] - found[:, pelvis] - joints
+        distances = np.linalg.norm(off, axis=2).mean(1)
+        heaviest.append(distances[0])
+        best.append(distances.min())
+    return SilhouetteScores(
+        float(np.mean(heaviest)), float(np.mean(best)),
+        float(density.mean() / predictor.encoding.size),
+    )  # fmt: skip
+
+
 def _score(predictor: PosePredictor, tested: list[PoseSequence]) -> None:
     """Notes scores on motions of other people."""
     found = silhouette_scores(predictor, tested, TESTED, 0)
     predictor.notes['scored on'] = sorted(one.name for one in tested)
     predictor.notes['scores'] = (
         f'{1e3 * found.heaviest:.0f} mm heaviest, {1e3 * found.best:.0f} best of '
-        f'{SCORED_COMPONENTS}, {found.log_density:.2f} nats a number'
+        f'{BEST_OF}, {found.log_density:.2f} nats a number'
     )
 
 

@@ -9,7 +9,7 @@ was chosen on motions of other people, so numbers on those motions are optimisti
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, TypeVar
@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body import Body
-from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN
 from hmt_ros.experts.calibrated_experts import CalibratedExperts
 from hmt_ros.experts.conditional_density import ConditionalDensity
 from hmt_ros.experts.descriptor.silhouette_descriptor import (
@@ -36,12 +35,7 @@ from hmt_ros.experts.network_learning import tools_are_there
 from hmt_ros.experts.pose_encoding import PoseEncoding
 from hmt_ros.experts.pose_predictor import JITTER, PosePredictor
 from hmt_ros.experts.training_pairs import finite_matrix
-from hmt_ros.experts.training_set import (
-    PoseSequence,
-    TrainingSet,
-    TrainingSettings,
-    training_set,
-)
+from hmt_ros.experts.training_set import TrainingSet
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.clustering import k_means, squared_distances
@@ -57,7 +51,6 @@ WIDTH = 3.0  # of the kernels of the conditional model, in standard deviations o
 FOR_DESCRIPTOR = 3000  # maximum number of silhouettes that the descriptor learns from
 DESCRIBED = 500  # silhouettes that are described together
 FOR_BASIS = 600  # maximum number of poses that the metric of targets is averaged over
-SCORED_COMPONENTS = 5
 AWAY = 5.0  # depth of the poses in that average, m
 SMALLEST = 3e-3  # metric of a number that moves no joint, m per radian
 # Standard deviation of the noise that is added to previous states for the learning of dynamics, in
@@ -286,57 +279,6 @@ def target_basis(encoding: PoseEncoding, targets: Array) -> Array:
     metric /= len(chosen) * (len(body.joint_names) - 1)
     factor: Array = np.linalg.cholesky(metric + SMALLEST**2 * np.eye(encoding.size))
     return factor
-
-
-@dataclass(frozen=True)
-class SilhouetteScores:
-    """Scores of a predictor on silhouettes.
-
-    Attributes:
-        heaviest, best: Mean distance of the scored joints from the truth, from the pelvis, m, of
-            the heaviest component and of the best one.
-        log_density: Mean log density of the true targets, nats a number.
-    """
-
-    heaviest: float
-    best: float
-    log_density: float
-
-
-def silhouette_scores(
-    predictor: PosePredictor, sequences: Sequence[PoseSequence], samples: int, seed: int
-) -> SilhouetteScores:
-    """Scores on silhouettes of motions, seen as those that a predictor learns from.
-
-    Args:
-        predictor: that has learned.
-        sequences: motions.
-        samples: number of silhouettes.
-        seed: of all random choices.
-    """
-    body = predictor.body
-    pairs = training_set(body, sequences, TrainingSettings(samples=samples, seed=seed))
-    points = predictor.descriptor.points
-    rows = predictor.descriptor.describe([silhouette_parts(x, points) for x in pairs.masks()])
-    density = predictor.model.log_density(
-        rows, predictor.encoding.encode(pairs.poses) @ predictor.target_basis
-    )
-    scored, pelvis = (body.skeleton.joint_index(x) for x in (EVALUATED_JOINTS, (ORIGIN,)))
-    true = body.joint_positions(pairs.poses)
-    true = true[:, scored] - true[:, pelvis]
-    heaviest, best = [], []
-    for row, pose, joints in zip(rows, pairs.poses, true, strict=True):
-        targets = predictor.targets_after(row, max_components=SCORED_COMPONENTS)
-        roots = np.repeat(pose[None, :3], len(targets), axis=0)
-        found = body.joint_positions(predictor.encoding.decode(targets.means, roots))
-        off = found[:, scored] - found[:, pelvis] - joints
-        distances = np.linalg.norm(off, axis=2).mean(1)
-        heaviest.append(distances[0])
-        best.append(distances.min())
-    return SilhouetteScores(
-        float(np.mean(heaviest)), float(np.mean(best)),
-        float(density.mean() / predictor.encoding.size),
-    )  # fmt: skip
 
 
 def affinities(vectors: Array) -> Array:

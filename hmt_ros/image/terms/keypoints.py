@@ -56,7 +56,7 @@ SMALLEST_SIGMA = 1.5
 # The share of a mixture over lifted poses that is independent, because joints err together; and the
 # scale of its kernel, in standard deviations: one limb, or all, may be elsewhere. Chosen, with the
 # time of `ERRORS['lifted']`.
-LIFTED_WEIGHT, LIFTED_SCALE = 0.2, 3.0
+LIFTED_WEIGHT, LIFTED_SCALE = 0.1, 3.0
 # Groups of landmarks that are exchanged together, and which of them (E, G) an exchange exchanges:
 # nothing, all, arms, legs.
 CENTRE, ARMS, LEGS = range(3)
