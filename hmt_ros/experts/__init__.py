@@ -11,6 +11,7 @@ from hmt_ros.experts.expert_mixture import (
 from hmt_ros.experts.lifted_fit import lift_poses
 from hmt_ros.experts.lifter import Lifter, load_lifter
 from hmt_ros.experts.neighbour_models import LocalExperts, NearestNeighbours
+from hmt_ros.experts.network_experts import NetworkExperts
 from hmt_ros.experts.pose_predictor import PosePredictor, load_predictor
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     'Lifter',
     'LocalExperts',
     'NearestNeighbours',
+    'NetworkExperts',
     'PosePredictor',
     'RelevanceVectorRegression',
     'lift_poses',
