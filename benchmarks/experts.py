@@ -50,7 +50,7 @@ def measure(
     quick: bool = False,
     only: Sequence[str] = STAGES,
     propagated: Sequence[str] = PROPAGATED,
-    figures: Path | None = None,
+    figures: Path = FIGURES,
 ) -> dict[str, Any]:
     """Runs the stages asked for."""
     stages: dict[str, Callable[[], Any]] = {
@@ -64,7 +64,7 @@ def measure(
         'clips': lambda: experts_clips.clips(quick=quick),
         'start': lambda: experts_start.starts(quick=quick),
         'speed': lambda: speed(0.0 if quick else 1.0, 96 if quick else 3000),
-        'figures': lambda: experts_figures.draw(figures or FIGURES, quick=quick),
+        'figures': lambda: experts_figures.draw(figures, quick=quick),
     }
     return run_stages('experts', stages, only)
 

@@ -151,14 +151,11 @@ def predictor_of(
 
 
 def seen_motions(
-    learned: Learned | PosePredictor,
-    sequences: Sequence[PoseSequence],
-    frames: int = FRAMES,
-    seed: int = 5,
+    learned: Learned, sequences: Sequence[PoseSequence], frames: int = FRAMES, seed: int = 5
 ) -> list[SeenMotion]:
     """Test motions from all views, with persons of random build and uneven outlines."""
     rng = np.random.default_rng(seed)
-    descriptor = learned.training.descriptor if isinstance(learned, Learned) else learned.descriptor
+    descriptor = learned.training.descriptor
     result = []
     for sequence in sequences:
         count = min(frames, len(sequence.poses))

@@ -34,9 +34,8 @@ learn contour_noise benchmarks contour_noise
 learn error_model benchmarks error_model
 learn joint_errors benchmarks joint_errors
 if python -c 'import jax, optax' 2>/dev/null; then
-  # People of the clips that experts are scored on, besides the mirrored motions.
-  others=('cmu_02_*' 'cmu_07_*' 'cmu_10_*' 'cmu_13_*' cmu_12_0x_walk cmu_signals_a1 cmu_signals_a2 cmu_run_a
-    prmd_s08_m10x_shscaption)
+  # People of the clips that experts are scored on; what ships did not have the last motion either.
+  others=('cmu_02_*' 'cmu_07_*' 'cmu_10_*' 'cmu_13_*' "${mirrored[@]}" prmd_s08_m10x_shscaption)
   folders=("$mocap"/train "$mocap"/train_more "$mocap"/train_wide)
   learn experts hmt_ros train --mocap "${folders[@]}" --without "${others[@]}" --alike prmd --test "$mocap"/dev \
     --samples 80000 --acknowledgement "$source $thanks $prmd" -o "$out/silhouettes.npz" --overwrite

@@ -8,9 +8,7 @@ its path.
 
 from __future__ import annotations
 
-import os
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,15 +22,14 @@ from hmt_ros.app.command_line import (
     run_command,
     whole_number,
 )
-from hmt_ros.app.learn_motion import chosen_motions, data_card, shares_of
-from hmt_ros.app.progress import show_progress, tell_user, with_progress
+from hmt_ros.app.learn_motion import chosen_motions, data_card, read_motions, shares_of
+from hmt_ros.app.progress import show_progress
 from hmt_ros.body import Body, load_body
 from hmt_ros.experts.keypoint_training import WindowSettings, keypoint_tracks, training_windows
 from hmt_ros.experts.lifter import Lifter
 from hmt_ros.experts.lifter_learning import LearningSettings, learn_lifter, lifter_scores
 from hmt_ros.experts.network_learning import check_tools
-from hmt_ros.experts.training_set import PoseSequence, recorded_sequence
-from msg_tools.files.error_line import error_line
+from hmt_ros.experts.training_set import PoseSequence
 
 # Windows that a lifter is scored on.
 SCORED_WINDOWS = 2000
@@ -120,14 +117,11 @@ def _learn(options: LifterOptions) -> int:
         raise ValueError(f'{mark} marks a training that was broken off: --resume, or remove it')
     check_tools()
     body = load_body(options.body)
-    learned = _read(chosen_motions(options.motions, options.without), options.body, quiet=quiet)
+    read = partial(read_motions, 'learn-lifter', body=options.body, quiet=quiet)
+    learned = read(chosen_motions(options.motions, options.without))
     if not learned:
         raise ValueError('none of the motions can be used')
-    tested = (
-        []
-        if options.test is None
-        else _read(chosen_motions([options.test], []), options.body, quiet=quiet)
-    )
+    tested = [] if options.test is None else read(chosen_motions([options.test], []))
     shares = shares_of(learned, options.alike, options.alike_share)
     settings = LearningSettings(
         experts=options.experts, steps=options.steps, batch=options.batch, seed=options.seed
@@ -159,26 +153,6 @@ def _learn(options: LifterOptions) -> int:
         for name, value in lifter.notes.get('scores', {}).items():
             print(f'  {name}: {value}', flush=True)
     return 0
-
-
-def _read(paths: list[Path], body: str, *, quiet: bool) -> list[PoseSequence]:
-    """The motions that can be used."""
-    with ProcessPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
-        found = pool.map(partial(_sequence, body=body), paths, chunksize=2)
-        return [
-            one
-            for one in with_progress(found, 'reading', 'motions', len(paths), quiet=quiet)
-            if one is not None
-        ]
-
-
-def _sequence(path: Path, body: str) -> PoseSequence | None:
-    """The motion of a file; None, with one line on stderr, if the file cannot be used."""
-    try:
-        return recorded_sequence(path, load_body(body))
-    except (ValueError, OSError, ArithmeticError) as error:
-        tell_user('learn-lifter', f'skipped {path.name}: {error_line(error)}')
-        return None
 
 
 def _scores(

@@ -9,9 +9,14 @@ file, in `hmt_ros/body/models`, as BODY_motion.npz.
 from __future__ import annotations
 
 import fnmatch
+import os
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from hmt_ros.app.command_line import CommandParser, model_file, run_command
 from hmt_ros.app.progress import show_progress, tell_user, with_progress
@@ -111,7 +116,7 @@ def chosen_motions(motions: list[Path], without: list[str]) -> list[Path]:
     for pattern in without:
         meant = fnmatch.filter(names, pattern)
         if not meant:
-            raise ValueError(f'--without: there is no motion {pattern!r}')
+            raise ValueError(f'--without: no motion is called {pattern!r}')
         left_out |= set(meant)
     return [path for path in found if path.stem not in left_out]
 
@@ -127,6 +132,36 @@ def _sequence(path: Path, body: Body) -> PoseSequence | None:
     except (ValueError, OSError, ArithmeticError) as error:
         tell_user('learn-motion', f'skipped {path.name}: {error_line(error)}')
         return None
+
+
+def read_motions(command: str, paths: list[Path], body: str, *, quiet: bool) -> list[PoseSequence]:
+    """The motions that can be used, as poses of a body; a line on stderr for each other one.
+
+    Args:
+        command: that reads them, for that line.
+        paths: of motions.
+        body: name or file of the body.
+        quiet: no progress.
+    """
+    sequences = []
+    with ProcessPoolExecutor(min(os.cpu_count() or 1, 8)) as pool:
+        found = pool.map(partial(_recorded, body=body), paths, chunksize=2)
+        for path, one in zip(
+            paths, with_progress(found, 'reading', 'motions', len(paths), quiet=quiet), strict=True
+        ):
+            if isinstance(one, str):
+                tell_user(command, f'skipped {path.name}: {one}')
+            else:
+                sequences.append(one)
+    return sequences
+
+
+def _recorded(path: Path, body: str) -> PoseSequence | str:
+    """The motion of a file, or why it can not be used."""
+    try:
+        return recorded_sequence(path, load_body(body))
+    except (ValueError, OSError, ArithmeticError, np.linalg.LinAlgError) as error:
+        return error_line(error)
 
 
 def shares_of(sequences: list[PoseSequence], alike: str, share: float) -> list[float]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -25,8 +25,8 @@ from hmt_ros.app.command_line import (
     run_command,
     whole_number,
 )
-from hmt_ros.app.learn_motion import chosen_motions, data_card, shares_of
-from hmt_ros.app.progress import show_progress, tell_user, with_progress
+from hmt_ros.app.learn_motion import chosen_motions, data_card, read_motions, shares_of
+from hmt_ros.app.progress import show_progress, with_progress
 from hmt_ros.app.training_report import write_report
 from hmt_ros.body import Body, load_body
 from hmt_ros.evaluation.pose_scores import EVALUATED_JOINTS, ORIGIN
@@ -43,12 +43,10 @@ from hmt_ros.experts.training_set import (
     PoseSequence,
     TrainingSettings,
     procedural_sequence,
-    recorded_sequence,
     training_set,
     typical_body,
 )
 from hmt_ros.motion.procedural_motion import PROCEDURAL_MOTIONS
-from msg_tools.files.error_line import error_line
 
 Item = TypeVar('Item')
 
@@ -193,9 +191,11 @@ def _train(options: TrainingOptions) -> int:
     with show_progress('learning', quiet=options.quiet):
         predictor = learned_predictor(body, seen, model, dynamics, notes, options.seed)
     if options.test is not None:
-        tested = _read(chosen_motions([options.test], []), body, quiet=options.quiet)
+        files = chosen_motions([options.test], [])
+        tested = read_motions('train', files, options.body, quiet=options.quiet)
+        predictor.notes['scored on'] = sorted(one.name for one in tested)
         with show_progress('scoring', quiet=options.quiet):
-            _score(predictor, tested)
+            predictor.notes['scores'] = _scores(predictor, tested)
     predictor.save(output)
     report = options.report or output.with_name(f'{output.stem}_report')
     report.mkdir(parents=True, exist_ok=True)
@@ -242,87 +242,34 @@ def _sequences(options: TrainingOptions, body: Body) -> tuple[list[PoseSequence]
                 for i in range(PROCEDURAL_SEEDS)
             ]
     files = chosen_motions(options.mocap, options.without)
-    read = _read(files, body, quiet=options.quiet)
+    read = read_motions('train', files, options.body, quiet=options.quiet)
     if files and not read:
         raise ValueError(f'none of the {len(files)} motions in {options.mocap[0]} can be used')
     return [*sequences, *read], len(files) - len(read)
 
 
-def _read(files: list[Path], body: Body, *, quiet: bool) -> list[PoseSequence]:
-    """The motions that can be used."""
-    bar = with_progress(files, 'reading', 'motions', len(files), quiet=quiet)
-    found = (_sequence_or_warning(path, body) for path in bar)
-    return [one for one in found if one is not None]
-
-
-@dataclass(frozen=True)
-class SilhouetteScores:
-    """Scores of a predictor on silhouettes.
-
-    Attributes:
-        heaviest, best: Mean distance of the scored joints from the truth, from the pelvis, m, of
-            the heaviest component and of the best one.
-        log_density: Mean log density of the true targets, nats a number.
-    """
-
-    heaviest: float
-    best: float
-    log_density: float
-
-
-def silhouette_scores(
-    predictor: PosePredictor, sequences: Sequence[PoseSequence], samples: int, seed: int
-) -> SilhouetteScores:
-    """Scores on silhouettes of motions, seen as those that a predictor learns from.
-
-    Args:
-        predictor: that has learned.
-        sequences: motions.
-        samples: number of silhouettes.
-        seed: of all random choices.
-    """
-    body = predictor.body
-    pairs = training_set(body, sequences, TrainingSettings(samples=samples, seed=seed))
-    points = predictor.descriptor.points
-    rows = predictor.descriptor.describe([silhouette_parts(x, points) for x in pairs.masks()])
-    density = predictor.model.log_density(
-        rows, predictor.encoding.encode(pairs.poses) @ predictor.target_basis
-    )
+def _scores(predictor: PosePredictor, tested: list[PoseSequence]) -> str:
+    """Scores on silhouettes of other people, seen as those that were learned from, as text."""
+    body, descriptor = predictor.body, predictor.descriptor
+    pairs = training_set(body, tested, TrainingSettings(samples=TESTED))
+    rows = descriptor.describe([silhouette_parts(x, descriptor.points) for x in pairs.masks()])
     scored, pelvis = (body.skeleton.joint_index(x) for x in (EVALUATED_JOINTS, (ORIGIN,)))
-    true = body.joint_positions(pairs.poses)
-    true = true[:, scored] - true[:, pelvis]
     heaviest, best = [], []
-    for row, pose, joints in zip(rows, pairs.poses, true, strict=True):
+    for row, pose in zip(rows, pairs.poses, strict=True):
         targets = predictor.targets_after(row, max_components=BEST_OF)
         roots = np.repeat(pose[None, :3], len(targets), axis=0)
-        found = body.joint_positions(predictor.encoding.decode(targets.means, roots))
-        off = found[:, scored] - found[:, pelvis] - joints
-        distances = np.linalg.norm(off, axis=2).mean(1)
+        found = predictor.encoding.decode(targets.means, roots)
+        joints = body.joint_positions(np.concatenate([pose[None], found]))
+        relative = joints[:, scored] - joints[:, pelvis]
+        distances = np.linalg.norm(relative[1:] - relative[0], axis=2).mean(1)
         heaviest.append(distances[0])
         best.append(distances.min())
-    return SilhouetteScores(
-        float(np.mean(heaviest)), float(np.mean(best)),
-        float(density.mean() / predictor.encoding.size),
-    )  # fmt: skip
-
-
-def _score(predictor: PosePredictor, tested: list[PoseSequence]) -> None:
-    """Notes scores on motions of other people."""
-    found = silhouette_scores(predictor, tested, TESTED, 0)
-    predictor.notes['scored on'] = sorted(one.name for one in tested)
-    predictor.notes['scores'] = (
-        f'{1e3 * found.heaviest:.0f} mm heaviest, {1e3 * found.best:.0f} best of '
-        f'{BEST_OF}, {found.log_density:.2f} nats a number'
+    states = predictor.encoding.encode(pairs.poses) @ predictor.target_basis
+    density = predictor.model.log_density(rows, states) / states.shape[1]
+    return (
+        f'{1e3 * np.mean(heaviest):.0f} mm heaviest, {1e3 * np.mean(best):.0f} best of {BEST_OF}, '
+        f'{density.mean():.2f} nats a number'
     )
-
-
-def _sequence_or_warning(path: Path, body: Body) -> PoseSequence | None:
-    """The motion of a file; None, with one line on stderr, if the file cannot be used."""
-    try:
-        return recorded_sequence(path, body)
-    except (ValueError, OSError, np.linalg.LinAlgError) as error:
-        tell_user('train', f'skipped {path.name}: {error_line(error)}')
-        return None
 
 
 def _procedural_names(text: str) -> list[str]:

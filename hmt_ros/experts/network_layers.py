@@ -38,20 +38,20 @@ class Layers:
 
     def outputs(self, inputs: Floats) -> Floats:
         """The numbers (N, O) at inputs (N, p) that are whitened."""
-        units = leaky(inputs @ self.first + self.first_bias)
+        units = _leaky(inputs @ self.first + self.first_bias)
         for weights, bias in zip(self.hidden, self.hidden_biases, strict=True):
-            units = units + leaky(units @ weights + bias)
+            units = units + _leaky(units @ weights + bias)
         result: Floats = units @ self.last + self.last_bias
         return result
 
     def jacobians(self, inputs: Floats, which: slice | Index) -> Floats:
         """Derivatives (N, o, p) of some of the numbers by inputs (N, p) that are whitened."""
         before = inputs @ self.first + self.first_bias
-        units = leaky(before)
+        units = _leaky(before)
         slopes = _slopes(before)[:, :, None] * self.first.T
         for weights, bias in zip(self.hidden, self.hidden_biases, strict=True):
             before = units @ weights + bias
-            units = units + leaky(before)
+            units = units + _leaky(before)
             slopes = slopes + _slopes(before)[:, :, None] * (weights.T @ slopes)
         result: Floats = self.last[:, which].T @ slopes
         return result
@@ -74,7 +74,7 @@ class Layers:
         return cls(**{name: np.asarray(arrays[name], dtype=np.float32) for name in names})
 
 
-def leaky(x: Floats) -> Floats:
+def _leaky(x: Floats) -> Floats:
     """What units say."""
     result: Floats = np.maximum(x, np.float32(LEAK) * x)
     return result

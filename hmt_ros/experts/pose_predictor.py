@@ -229,7 +229,7 @@ class PosePredictor:
             previous, interval, propagation, max_components: see `observe`.
 
         Raises:
-            ValueError: there is no such propagation, or no model for it.
+            ValueError: the propagation is another one, or its model is missing.
         """
         row = np.asarray(descriptor, dtype=np.float64)
         found = _heaviest(self.model.predict(row[None])[0], max_components)

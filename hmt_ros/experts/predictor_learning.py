@@ -9,10 +9,9 @@ was chosen on motions of other people, so numbers on those motions are optimisti
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from itertools import islice
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +39,6 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.clustering import k_means, squared_distances
 
-Item = TypeVar('Item')
 Bytes = NDArray[np.uint8]
 Progress = Callable[[Iterable[Bytes], int], Iterable[Bytes]]
 
@@ -49,7 +47,6 @@ NEIGHBOURS = 40  # of the local model
 WIDTH = 3.0  # of the kernels of the conditional model, in standard deviations of an input
 
 FOR_DESCRIPTOR = 3000  # maximum number of silhouettes that the descriptor learns from
-DESCRIBED = 500  # silhouettes that are described together
 FOR_BASIS = 600  # maximum number of poses that the metric of targets is averaged over
 AWAY = 5.0  # depth of the poses in that average, m
 SMALLEST = 3e-3  # metric of a number that moves no joint, m per radian
@@ -195,20 +192,12 @@ def described(
     masks: Iterable[Bytes] = pairs.masks()
     if progress is not None:
         masks = progress(masks, len(pairs))
-    parts = (silhouette_parts(mask, descriptor.points) for mask in masks)
-    rows = [descriptor.describe(few) for few in batched(parts, DESCRIBED)]
+    rows = [descriptor.describe([silhouette_parts(mask, descriptor.points)])[0] for mask in masks]
     encoding = PoseEncoding(body)
     return Described(
-        descriptor, np.concatenate(rows), encoding.encode(pairs.poses),
+        descriptor, np.array(rows), encoding.encode(pairs.poses),
         encoding.encode(pairs.previous), pairs.sequences,
     )  # fmt: skip
-
-
-def batched(items: Iterable[Item], count: int) -> Iterator[list[Item]]:
-    """Lists of at most so many items."""
-    left = iter(items)
-    while few := list(islice(left, count)):
-        yield few
 
 
 def learned_predictor(

@@ -90,7 +90,7 @@ def test_motions_give_a_motion_prior(tmp_path, capsys):
         (['empty'], 'has no motion'),
         (['absent.bvh'], 'none of the 1 motions can be used'),
         (['short.bvh'], 'give more of them'),
-        (['short.bvh', '--without', 'long'], "there is no motion 'long'"),
+        (['short.bvh', '--without', 'long'], "no motion is called 'long'"),
         (['short.bvh', '-o', 'there.npz'], 'there.npz exists: --overwrite'),
         (['short.bvh', '-o', 'nowhere/file.npz'], 'there is no folder nowhere'),
     ],

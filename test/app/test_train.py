@@ -130,7 +130,7 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     (empty / 'broken.bvh').write_text('nothing')
     given = ['-o', output, '--mocap', str(empty)]
     assert 'none of the 1 motions' in _fails(given, capsys)
-    assert "there is no motion 'x*'" in _fails([*given, '--without', 'x*'], capsys)
+    assert "no motion is called 'x*'" in _fails([*given, '--without', 'x*'], capsys)
     assert not Path(output).exists()
 
 

@@ -97,7 +97,7 @@ def test_rule_one_needs_a_model_and_rule_nine_does_not(
         plain.observe(mask, CAMERA, alone, propagation=BY_EXPERTS)
     with pytest.raises(ValueError, match="no propagation 'rule'"):
         plain.observe(mask, CAMERA, alone, propagation='rule')
-    # After an hour nothing is left of the past; after a moment the past is told again.
+    # After an hour the past does not count; after a moment it is the prediction.
     later = plain.observe(mask, CAMERA, alone, 3600.0).mixture
     assert later.weights.max() == pytest.approx(alone.weights.max(), abs=0.05)
     first = alone[:1].normalised()
