@@ -19,7 +19,7 @@ from hmt_ros.experts import load_predictor
 from hmt_ros.experts.model_file import read_arrays, write_arrays
 from msg_tools import BagReader
 
-_MODEL = ROOT / 'hmt_ros' / 'experts' / 'models' / 'procedural.npz'
+_MODEL = ROOT / 'hmt_ros' / 'experts' / 'models' / 'silhouettes.npz'
 _CHEAP = (
     '--set', 'max_hypotheses=1', '--set', 'evaluation_budget=20',
     '--set', 'overlay_modes=0',

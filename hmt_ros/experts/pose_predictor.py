@@ -247,6 +247,10 @@ class PosePredictor:
             raise ValueError('the predictor has no model for rule (1): train it with --dynamics')
         # By what exceeds the step that the model has learned, poses change as the body may.
         before = self._to_targets(self._expected(previous, max(interval - STEP, 0.0)))
+        # Where experts are steep, what is uncertain would grow from step to step without end: it is
+        # no wider than p(x).
+        known = np.linalg.inv(before.covariances) + np.linalg.inv(self.equilibrium.covariances)
+        before = GaussianMixture(before.weights, before.means, np.linalg.inv(known))
         after = propagate(
             self.dynamics, _transformed(before, self.target_basis), row, without_past=found,
             n_components=max_components,

@@ -201,12 +201,14 @@ def test_minima_are_those_of_the_solver_step_by_step(terms, poses, body, name, i
     counts = []
     own = PoseEnergy(likelihood, some, expected, counted=counts.append)
     found = own.minimise(poses, max_iterations=iterations, **SOLVER)
+    reference = plain(likelihood, some, expected)
     wanted = minimise(
-        plain(likelihood, some, expected), poses, body.lower, body.upper,
-        max_iterations=iterations, **SOLVER,
+        reference, poses, body.lower, body.upper, max_iterations=iterations, **SOLVER
     )  # fmt: skip
     np.testing.assert_allclose(found.x, wanted.x, atol=1e-7)
-    check_same((found.value, found.gradient), (wanted.value, wanted.gradient))
+    # At the same poses: where energies are steep, gradients tell of the last digits of poses.
+    value, gradient, _ = reference.energy(found.x, np.arange(COUNT))
+    check_same((found.value, found.gradient), (value, gradient))
     for part in ('free', 'status', 'iterations'):
         assert np.array_equal(getattr(found, part), getattr(wanted, part))
     assert counts == [COUNT + int(wanted.iterations.sum())]

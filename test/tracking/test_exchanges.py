@@ -80,7 +80,8 @@ def test_who_contradicts_the_track_knows_nothing_of_the_detector():
 def test_what_is_known_of_the_detector_counts_whole_beside_energies_that_last():
     pose = standing()[None]
     posterior = Posterior(BODY, CAMERA, TrackerSettings(likelihood=LIKELIHOOD))
-    turned = Observation(keypoints=exchanged(seen(standing()), LIMBS))
+    # Positions would say that nothing is exchanged.
+    turned = Observation(keypoints=exchanged(seen(standing(), lifted=False), LIMBS))
     sure = np.log(np.array([[1e-3, 1.0 - 3e-3, 1e-3, 1e-3]]))
     unsure = np.log(np.array([[1.0 - 3e-3, 1e-3, 1e-3, 1e-3]]))
     dt = 1.0 / 30.0
