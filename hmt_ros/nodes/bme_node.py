@@ -19,7 +19,7 @@ from hmt_ros.nodes.subscribed_topic import (
     SubscribedTopic,
     image_topic,
 )
-from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.bme_parameters import FROM_KEYPOINTS, FROM_SILHOUETTES, BmeParameters
 from hmt_ros.sessions.bme_session import TRACK, BmeSession
 from hmt_ros.sessions.keypoint_inputs import KEYPOINTS
 from msg_tools.files.error_line import error_line
@@ -42,8 +42,9 @@ class BmeNode(SessionNode[BmeSession, BmeParameters]):
         yield CAMERA_INFO_TOPIC
         if self._settings.tracked_interval > 0:
             yield SubscribedTopic(TRACK, TRACK, 'hmt_msgs/msg/PoseMixture', RELIABLE)
-        if self._settings.use_keypoints:
+        if self._settings.predict_from != FROM_SILHOUETTES:
             yield SubscribedTopic(KEYPOINTS, KEYPOINTS, KEYPOINTS_2D)
+        if self._settings.predict_from == FROM_KEYPOINTS:
             return
         yield from MASK_TOPICS
         yield image_topic(self._settings.image_transport)

@@ -24,6 +24,10 @@ from hmt_ros.sessions.declared_parameters import (
 from hmt_ros.sessions.filter_parameters import BACKGROUND, check_keypoint_scheme
 from hmt_ros.sessions.parameter_file import parameter_file_text
 
+# What a prediction is from.
+FROM_SILHOUETTES, FROM_KEYPOINTS, FROM_BOTH = 'silhouettes', 'keypoints', 'both'
+CUES = (FROM_SILHOUETTES, FROM_KEYPOINTS, FROM_BOTH)
+
 
 @dataclass(frozen=True)
 class BmeParameters(CameraNodeParameters):
@@ -38,8 +42,9 @@ class BmeParameters(CameraNodeParameters):
             where there is no background_file.
         stature: Height of the person, m; 0 selects that of the model.
         least_height: Minimum height of a silhouette that counts as a person, px.
-        use_keypoints: If true, poses are predicted from the keypoints of a detector (topic
-            keypoints) instead of silhouettes: no image is needed.
+        predict_from: What poses are predicted from, 'silhouettes', 'keypoints' of a detector (topic
+            keypoints; no image is needed), or 'both', keypoints where they show a person and
+            silhouettes elsewhere; an image then waits for the keypoints of its stamp.
         keypoint_scheme: What the names of keypoints mean, as for filter_node.
         lifter: Experts that predict from keypoints, 'keypoints', which ships, or a file that
             learn-lifter wrote.
@@ -59,7 +64,7 @@ class BmeParameters(CameraNodeParameters):
     background_images: int = parameter_field(30, AT_ONCE, (1, 10_000))
     stature: float = parameter_field(0.0, NEXT_CONFIGURE, (0.0, 3.0))
     least_height: int = parameter_field(40, AT_ONCE, (1, 10_000))
-    use_keypoints: bool = parameter_field(False, NEXT_CONFIGURE)
+    predict_from: str = parameter_field(FROM_SILHOUETTES, NEXT_CONFIGURE)
     keypoint_scheme: str = parameter_field(AUTO, NEXT_CONFIGURE)
     lifter: str = parameter_field(LIFTER, NEXT_CONFIGURE)
     propagation: str = parameter_field(ALONE, NEXT_CONFIGURE)
@@ -78,8 +83,12 @@ class BmeParameters(CameraNodeParameters):
             raise ValueError(
                 f'propagation is {self.propagation!r}, wanted one of {", ".join(PROPAGATIONS)}'
             )
-        if self.use_keypoints and not self.lifter:
-            raise ValueError("use_keypoints needs a lifter, saw ''")
+        if self.predict_from not in CUES:
+            raise ValueError(
+                f'predict_from is {self.predict_from!r}, wanted one of {", ".join(CUES)}'
+            )
+        if self.predict_from != FROM_SILHOUETTES and not self.lifter:
+            raise ValueError(f"predict_from {self.predict_from!r} needs a lifter, saw ''")
 
 
 if __name__ == '__main__':

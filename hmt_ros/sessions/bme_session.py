@@ -18,9 +18,11 @@ order give the same bytes. The rules, besides those of `CameraSession`:
   with `reset_on_time_jump`.
 - With `propagation` a prediction takes the one before into account, unless this is older than
   `longest_interval`, comes from another calibration, or from before a jump in time.
-- With `use_keypoints` every message of keypoints gets one prediction, from them and those of the
-  last second (`experts.lifter`), in place of the images; without components where fewer than five
-  landmarks are seen.
+- With `predict_from` 'keypoints' every message of keypoints gets one prediction, from them and
+  those of the last second (`experts.lifter`), in place of the images; without components where
+  fewer than five landmarks are seen. With 'both' an image waits for the keypoints of exactly its
+  stamp, for those of a later stamp, or for an image that is `input_timeout` younger; its silhouette
+  counts where keypoints show nobody. (The product of both predictions errs as that from keypoints.)
 - What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
 
@@ -37,8 +39,7 @@ from numpy.typing import NDArray
 
 from hmt_ros.body import Camera
 from hmt_ros.experts.descriptor.contour import NoSilhouetteError
-from hmt_ros.experts.lifted_fit import KNOWN_SIZE, UNKNOWN_SIZE, poses_of
-from hmt_ros.experts.lifter import KeypointHistory
+from hmt_ros.experts.keypoint_predictor import KeypointPredictor
 from hmt_ros.experts.pose_predictor import (
     ALONE,
     BY_EXPERTS,
@@ -50,10 +51,14 @@ from hmt_ros.experts.pose_predictor import (
 )
 from hmt_ros.experts.root_placement import SIZE_SPREAD
 from hmt_ros.image.background import BackgroundModel, one_person
-from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Mask
-from hmt_ros.sessions.bme_parameters import BmeParameters
+from hmt_ros.sessions.bme_parameters import (
+    FROM_BOTH,
+    FROM_KEYPOINTS,
+    FROM_SILHOUETTES,
+    BmeParameters,
+)
 from hmt_ros.sessions.camera_session import (
     CAMERA_INFO,
     CAMERA_MOVED,
@@ -65,7 +70,7 @@ from hmt_ros.sessions.camera_session import (
     read_picture,
 )
 from hmt_ros.sessions.handled import Fault, Output
-from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, known_lifter
+from hmt_ros.sessions.keypoint_inputs import KEYPOINTS, KeypointInputs, known_lifter
 from hmt_ros.sessions.session import (
     NeededInput,
     Order,
@@ -74,12 +79,9 @@ from hmt_ros.sessions.session import (
     everything,
 )
 from hmt_ros.sessions.warm_up import film
-from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
-from msg_tools.messages.detections import NO_KEYPOINTS
 from msg_tools.messages.headers import SECOND_NS, time_ns
 from msg_tools.messages.images import decode_image, image_message
-from msg_tools.messages.keypoints import keypoints_of
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,
@@ -177,17 +179,23 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._looked: int | None = None
         self._tracked: int | None = None
         self._height, self._support = 0, math.nan
-        self._masked = False
-        self._lifter = known_lifter(parameters.lifter) if parameters.use_keypoints else None
-        self._history: KeypointHistory | None = None
+        # Whether the last prediction needed no background.
+        self._without_background = False
+        self._lifter = None
+        if parameters.predict_from != FROM_SILHOUETTES:
+            self._lifter = known_lifter(parameters.lifter)
+        self._keypoints = KeypointInputs(self._log)
+        self._by_keypoints: KeypointPredictor | None = None
         self.state = self._present_state()
 
     def prepare(self) -> None:
         """See `Session`."""
         shown, previous = film(), None
-        if self.parameters.use_keypoints:
-            self._lifted(shown.keypoints(0), 0, shown.camera)
-            self._history = None
+        if self._lifter is not None:
+            self._keypoints.plane.put(0, shown.keypoints(0))
+            self._lifted(0, shown.camera)
+            self._by_keypoints = None
+        if self.parameters.predict_from == FROM_KEYPOINTS:
             return
         for mask in shown.masks[:2]:
             previous = self._seen(mask, shown.camera, previous).mixture
@@ -196,29 +204,59 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         # What is known of the background stays.
         self._previous = None
         self._looked = self._tracked = None
-        self._history = None
+        self._by_keypoints = None
 
     def needed_inputs(self) -> list[NeededInput]:
         """See `Session`."""
-        needed = super().needed_inputs()
-        if not self.parameters.use_keypoints:
-            return needed
-        return [NeededInput((KEYPOINTS,)), *(x for x in needed if x.sources == (CAMERA_INFO,))]
+        needed, cue = super().needed_inputs(), self.parameters.predict_from
+        if cue == FROM_KEYPOINTS:
+            return [NeededInput((KEYPOINTS,)), *(x for x in needed if x.sources == (CAMERA_INFO,))]
+        return [*needed, NeededInput((KEYPOINTS,), with_each=True)] if cue == FROM_BOTH else needed
+
+    def _waits_for_inputs(self) -> bool:
+        return super()._waits_for_inputs() or self.parameters.predict_from == FROM_BOTH
+
+    def _is_ready(self, waiting: WaitingImage) -> bool:
+        return super()._is_ready(waiting) and self._has_keypoints(waiting.stamp_ns)
+
+    def _missing_input(self, stamp: int) -> Fault:
+        if not self._has_keypoints(stamp):
+            return Fault.NO_KEYPOINTS
+        return super()._missing_input(stamp)
+
+    def _has_keypoints(self, stamp: int) -> bool:
+        """Whether an image need not wait for keypoints."""
+        p = self.parameters
+        return p.predict_from != FROM_BOTH or self._has(
+            self._keypoints.plane, stamp, p.input_timeout
+        )
+
+    def _forget_inputs(self, stamp: int) -> None:
+        super()._forget_inputs(stamp)
+        self._keypoints.clear()
 
     def _take(self, source: str, message: Any, stamp: int) -> None:
+        cue = self.parameters.predict_from
         if source == KEYPOINTS:
-            if self.parameters.use_keypoints:
+            if cue == FROM_KEYPOINTS:
                 self._take_keypoints(message, stamp)
+            elif cue == FROM_BOTH:
+                read = self._keypoints.read(message, self._predictor.body, self._scheme)
+                self._keypoints.plane.put(stamp, read)
         elif source != TRACK:
             super()._take(source, message, stamp)
         elif self._tracked is None or stamp > self._tracked:
             tracked = message.state == TrackState.TRACKING and len(message.components)
             self._tracked = stamp if tracked else None
 
+    @property
+    def _scheme(self) -> str:
+        return self.parameters.keypoint_scheme
+
     def _take_keypoints(self, message: Any, stamp: int) -> None:
-        """Predicts from keypoints and those of the last second."""
+        """Predicts from keypoints and those of the last second, without an image."""
         self._log.counts['received'] += 1
-        frame_id = self._frame_id = str(message.header.frame_id)
+        self._frame_id = str(message.header.frame_id)
         order = self._order(stamp, self._newest)
         if order is Order.SKIPPED:
             return
@@ -231,38 +269,41 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 f'keypoints of {stamp} ns are left out: no calibrated camera_info has come',
             )
             return
-        self._newest = stamp
+        self._newest, self._without_background = stamp, True
+        content = self._keypoints.read(message, self._predictor.body, self._scheme)
+        if content is None:
+            self._log.counts['skipped'] += 1
+            return
+        self._keypoints.plane.put(stamp, content)
+        frame = self._frame_id or self._frame or FRAME_ID
         try:
-            content = NO_KEYPOINTS if len(message.names) == 0 else keypoints_of(message, 0.0)
-            mixture = self._lifted(content, stamp, camera)
-        except (MessageError, ValueError, ArithmeticError) as error:
+            mixture = self._lifted(stamp, camera)
+        except (ValueError, ArithmeticError) as error:
             text = f'no prediction from the keypoints of {stamp} ns: {error_line(error)}'
             self._log.skip(Fault.KEYPOINTS, text)
             return
-        self._log.counts['predicted'] += 1
-        if mixture is None:
-            self._log.counts['empty'] += 1
-        self._weights = np.empty(0) if mixture is None else mixture.weights
-        if self._wanted(PREDICTION):
-            made = self._message(mixture, stamp, frame_id or self._frame or FRAME_ID)
-            self._publish(PREDICTION, stamp, made)
+        self._tell(mixture, stamp, frame)
 
-    def _lifted(self, content: Keypoints, stamp: int, camera: Camera) -> GaussianMixture | None:
-        """The prediction from keypoints; None: too few are seen."""
+    def _lifted(self, stamp: int, camera: Camera) -> GaussianMixture | None:
+        """The prediction from the keypoints that have come; None: they show nobody at a stamp."""
         assert self._lifter is not None
-        history = self._history = self._history or KeypointHistory(camera)
-        body, scheme = self._predictor.body, self.parameters.keypoint_scheme
-        known, _ = content.named_for(body, scheme)
-        rays, confidences = history.add(known, stamp / SECOND_NS)
-        lifted = history.lift(self._lifter)
-        if lifted is None:
-            return None
-        spread = KNOWN_SIZE if self.parameters.stature else UNKNOWN_SIZE
-        (found,) = poses_of(body, [lifted], rays[None], confidences[None], spread)
-        return found[: self.parameters.max_hypotheses].normalised()
+        made = self._by_keypoints
+        if made is None:
+            made = self._by_keypoints = KeypointPredictor(
+                self._lifter, self._predictor.body, camera,
+                size_known=self.parameters.stature > 0,
+            )  # fmt: skip
+        taken = self._keypoints.plane.take_all(stamp)
+        for each, keypoints in taken.items():
+            # Some may come after those of a later image.
+            if keypoints is not None and each / SECOND_NS > made.newest:
+                known, _ = keypoints.named_for(self._predictor.body, self._scheme)
+                made.add(known, each / SECOND_NS)
+        found = made.predict() if taken.get(stamp) is not None else None
+        return None if found is None else found[: self.parameters.max_hypotheses].normalised()
 
     def _take_image(self, message: Any, stamp: int) -> None:
-        if self.parameters.use_keypoints:
+        if self.parameters.predict_from == FROM_KEYPOINTS:
             return
         in_turn = not self._waiting and self._newest is not None and stamp > self._newest
         if not in_turn or not self._is_left_to_track(stamp) or self._wanted(SILHOUETTE):
@@ -287,8 +328,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
 
     def _estimate(self, waiting: WaitingImage, camera: Camera) -> None:
         if self._is_left_to_track(waiting.stamp_ns):
-            if waiting.mask is None and not self._images_to_learn():
-                self._publish_silhouette(self._silhouette(waiting.image), waiting)
+            self._show_silhouette(waiting)
             self._leave_to_track(waiting.stamp_ns, waiting.frame_id)
             return
         self._looked = waiting.stamp_ns
@@ -299,21 +339,29 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             self._log.skip(Fault.ESTIMATE, text)
             self._previous = None
             return
+        if mixture is not None:
+            self._previous = _Previous(mixture, waiting.stamp_ns)
+        self._tell(mixture, waiting.stamp_ns, waiting.frame_id)
+
+    def _tell(self, mixture: GaussianMixture | None, stamp: int, frame_id: str) -> None:
+        """Counts and publishes a prediction; None: nobody is seen."""
         self._log.counts['predicted'] += 1
         if mixture is None:
             self._log.counts['empty'] += 1
-            self._weights = np.empty(0)
-        else:
-            self._previous = _Previous(mixture, waiting.stamp_ns)
-            self._weights = mixture.weights
+        self._weights = np.empty(0) if mixture is None else mixture.weights
         if self._wanted(PREDICTION):
-            message = self._message(mixture, waiting.stamp_ns, waiting.frame_id)
-            self._publish(PREDICTION, waiting.stamp_ns, message)
+            self._publish(PREDICTION, stamp, self._message(mixture, stamp, frame_id))
 
     def _mixture_of(self, waiting: WaitingImage, camera: Camera) -> GaussianMixture | None:
         """The prediction from an image; None if nobody is seen."""
         p, given = self.parameters, waiting.mask
-        self._masked = given is not None
+        if p.predict_from == FROM_BOTH:
+            lifted = self._lifted(waiting.stamp_ns, camera)
+            if lifted is not None:
+                self._without_background = True
+                self._show_silhouette(waiting)
+                return lifted
+        self._without_background = given is not None
         if self._images_to_learn() and (given is None or not given.any()):
             with self._background_in_use:
                 self._background.learn(waiting.image)
@@ -363,6 +411,12 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
             max_components=self.parameters.max_hypotheses,
             size_spread=self._size_spread,
         )
+
+    def _show_silhouette(self, waiting: WaitingImage) -> None:
+        """Publishes the silhouette of an image that is not predicted from."""
+        known = waiting.mask is None and not self._images_to_learn()
+        if known and self._wanted(SILHOUETTE):
+            self._publish_silhouette(self._silhouette(waiting.image), waiting)
 
     def _publish_silhouette(self, mask: Mask, of: WaitingImage) -> None:
         if self._wanted(SILHOUETTE):
@@ -438,8 +492,8 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         )
 
     def _status(self) -> tuple[str, str]:
-        missing = 0 if self.parameters.use_keypoints else self._images_to_learn()
-        if missing and not self._masked:
+        missing = self._images_to_learn()
+        if missing and not self._without_background:
             return 'learning', f'{missing} more images of the empty scene'
         return 'predicting' if len(self._weights) else 'nobody', ''
 

@@ -388,10 +388,12 @@ class StampedInputs(Generic[T]):
 
     def take(self, stamp_ns: int) -> T | None:
         """The input for an image, None where there is none; drops it and all that are older."""
-        result = self._content.get(stamp_ns)
-        for stamp in [stamp for stamp in self._content if stamp <= stamp_ns]:
-            del self._content[stamp]
-        return result
+        return self.take_all(stamp_ns).get(stamp_ns)
+
+    def take_all(self, stamp_ns: int) -> dict[int, T | None]:
+        """The inputs by stamp, in order, for an image and all that are older; drops them."""
+        taken = sorted(stamp for stamp in self._content if stamp <= stamp_ns)
+        return {stamp: self._content.pop(stamp) for stamp in taken}
 
     def clear(self) -> None:
         """Drops all inputs."""

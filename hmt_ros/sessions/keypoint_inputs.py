@@ -64,7 +64,8 @@ class KeypointInputs:
 
     def put(self, message: Any, stamp_ns: int, parameters: FilterParameters, body: Body) -> None:
         """Takes an hmt_msgs/Keypoints2D; one that can not be used counts as none."""
-        self.plane.put(stamp_ns, self._content(message, parameters, body))
+        p = parameters
+        self.plane.put(stamp_ns, self.read(message, body, p.keypoint_scheme, p.keypoint_sigma_px))
 
     def put_3d(self, message: Any, stamp_ns: int) -> None:
         """Takes an hmt_msgs/Keypoints3D; one that can not be used counts as none."""
@@ -97,17 +98,20 @@ class KeypointInputs:
         known, _ = found.named_for(body, parameters.keypoint_scheme)
         return known[np.flatnonzero(known.seen)] if known.names else None
 
-    def _content(self, message: Any, parameters: FilterParameters, body: Body) -> Keypoints | None:
+    def read(
+        self, message: Any, body: Body, scheme: str, sigma_px: float = 0.0
+    ) -> Keypoints | None:
+        """The keypoints in an hmt_msgs/Keypoints2D; None: it can not be used, which is reported."""
         if len(message.names) == 0:
             return NO_KEYPOINTS
         try:
-            content = keypoints_of(message, parameters.keypoint_sigma_px)
+            content = keypoints_of(message, sigma_px)
         except MessageError as error:
             self._log.fault(Fault.KEYPOINTS, str(error))
             return None
-        _, unknown = content.named_for(body, parameters.keypoint_scheme)
+        _, unknown = content.named_for(body, scheme)
         if unknown:
-            self._report(unknown, parameters.keypoint_scheme)
+            self._report(unknown, scheme)
         return content
 
     def _report(self, unknown: list[str], scheme: str) -> None:

@@ -438,7 +438,7 @@ def walker():
 
 
 def keypoint_session(outputs, **values):
-    values = {'use_keypoints': True, **values}
+    values = {'predict_from': 'keypoints', **values}
     return BmeSession(with_values(BmeParameters(), values), outputs.append)
 
 
@@ -485,3 +485,112 @@ def test_a_lifter_that_is_not_there_is_told(outputs):
         keypoint_session(outputs, lifter='none.npz')
     with pytest.raises(ValueError, match='keypoint_scheme must be one of'):
         keypoint_session(outputs, keypoint_scheme='none')
+
+
+@pytest.fixture
+def both(session, somebody):
+    """A session of both cues, and keypoints of the person in the images of `somebody`."""
+    body, camera = load_body('human37'), Camera(80.0, 80.0, 31.5, 23.5, 64, 48)
+    pose = body.prior_mean.copy()
+    pose[:3] = 0.0, 0.0, 4.0
+    pixels = camera.project(body.joint_positions(pose[None])[0])
+    n = len(pixels)
+    shown = Keypoints(body.joint_names, pixels, np.full((n, 2, 2), np.nan), np.ones(n))
+    messages = RosbagsMessages()
+
+    def keypoints(index, count=n):
+        return keypoints_message(messages, shown[np.arange(count)], somebody.stamp(index), 'lens')
+
+    def make(**values):
+        one = session(predict_from='both', **values)
+        one.take(CAMERA_INFO, somebody.info())
+        return one
+
+    return make, keypoints
+
+
+def test_an_image_waits_for_its_keypoints_and_is_predicted_from_them(
+    both, outputs, somebody, stub_predictor
+):
+    make, keypoints = both
+    one = make()
+    assert ('keypoints',) in [x.sources for x in one.needed_inputs()]
+    assert one.take(IMAGE, somebody.image(0)).published == ()
+    handled = one.take('keypoints', keypoints(0))
+    assert handled.published == (('pose_prediction', somebody.stamp(0)),)
+    assert stub_predictor.asked == []
+    alone = BmeSession(with_values(BmeParameters(), {'predict_from': 'keypoints'}), outputs.append)
+    alone.take(CAMERA_INFO, somebody.info())
+    alone.take('keypoints', keypoints(0))
+    assert outputs[0] == outputs[1]
+
+
+def test_silhouettes_count_where_keypoints_show_nobody(both, outputs, somebody, stub_predictor):
+    make, keypoints = both
+    one = make()
+    for index, count in enumerate((0, 3)):
+        one.take(IMAGE, somebody.image(index))
+        one.take('keypoints', keypoints(index, count))
+    assert [len(x.components) for x in predictions(outputs)] == [2, 2]
+    assert len(stub_predictor.asked) == 2
+    # Nor are those of the image before taken for those of an image without any.
+    one.take(IMAGE, somebody.image(2))
+    one.take('keypoints', keypoints(2))
+    one.take(IMAGE, somebody.image(3))
+    one.take(IMAGE, somebody.image(20))
+    assert len(predictions(outputs)) == 4
+    assert len(stub_predictor.asked) == 3
+
+
+def test_keypoints_that_come_late_are_left(both, outputs, somebody):
+    make, keypoints = both
+    one = make()
+    for index in (0, 1):
+        one.take(IMAGE, somebody.image(index))
+    # Those of the second image end the wait for those of the first.
+    one.take('keypoints', keypoints(1))
+    assert len(outputs) == 2
+    handled = one.take('keypoints', keypoints(0))
+    assert not handled.faults
+    one.take(IMAGE, somebody.image(2))
+    assert one.take('keypoints', keypoints(2)).published
+    twice = make()
+    for index in (0, 1, 2):
+        twice.take(IMAGE, somebody.image(index))
+        if index:
+            twice.take('keypoints', keypoints(index))
+    assert outputs[-1] == outputs[2]
+
+
+def test_the_background_is_learned_where_keypoints_show_nobody(both, outputs, somebody):
+    make, keypoints = both
+    one = make(background_file='', background_images=2)
+    one.take(IMAGE, somebody.image(0))
+    one.take('keypoints', keypoints(0))
+    assert one.state.status == 'predicting'
+    for index in (1, 2):
+        one.take(IMAGE, somebody.empty(index))
+        one.take('keypoints', keypoints(index, 0))
+        wanted = ('learning', '1 more images of the empty scene') if index == 1 else ('nobody', '')
+        assert (one.state.status, one.state.wants) == wanted
+    one.take(IMAGE, somebody.image(3))
+    one.take('keypoints', keypoints(3, 0))
+    assert [len(x.components) for x in predictions(outputs)][1:] == [0, 0, 2]
+
+
+def test_keypoints_that_can_not_be_used_are_told_and_count_as_none(both, outputs, somebody):
+    make, keypoints = both
+    one = make()
+    bad = keypoints(0)
+    bad.u = bad.u[:3]
+    one.take(IMAGE, somebody.image(0))
+    assert 'keypoints' in one.take('keypoints', bad).faults[0]
+    assert [len(x.components) for x in predictions(outputs)] == [2]
+    strange = keypoints(1, 2)
+    strange.names = ['antenna', 'wheel']
+    one.take(IMAGE, somebody.image(1))
+    assert 'antenna' in one.take('keypoints', strange).warnings[0]
+    with pytest.raises(ValueError, match="predict_from is 'all', wanted one of silhouettes"):
+        BmeParameters(predict_from='all')
+    with pytest.raises(ValueError, match="'both' needs a lifter"):
+        BmeParameters(predict_from='both', lifter='')

@@ -16,6 +16,7 @@ from hmt_ros.app.replay.inputs import COMPRESSED, GROUND_TRUTH, RecordedInput
 from hmt_ros.app.replay.options import NodeParameters, ReplayOptions, node_parameters
 from hmt_ros.app.replay.tracks import LiveTrack, OfflineTrack, PeopleTrack, PlayedTrack
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
+from hmt_ros.sessions.bme_parameters import FROM_SILHOUETTES
 from hmt_ros.sessions.camera_session import CAMERA_INFO, IMAGE, MASK
 from hmt_ros.sessions.declared_parameters import LONGEST_TIMEOUT
 from hmt_ros.sessions.filter_session import DEPTH, KEYPOINTS, KEYPOINTS_3D
@@ -141,7 +142,8 @@ def _used(recorded: RecordedInput, parameters: NodeParameters) -> RecordedInput:
     if isinstance(parameters.filter, PeopleParameters):
         return replace(recorded, keypoints=None, keypoints_3d=None, ground_truth=None)
     recorded = replace(recorded, detections=None)
-    if not parameters.filter.use_keypoints:
+    predicted = bme is not None and bme.predict_from != FROM_SILHOUETTES
+    if not parameters.filter.use_keypoints and not predicted:
         recorded = replace(recorded, keypoints=None)
     if not parameters.filter.use_keypoints_3d:
         recorded = replace(recorded, keypoints_3d=None)

@@ -17,6 +17,7 @@ from hmt_ros.app.replay.live_node import LiveNode
 from hmt_ros.app.replay.options import BME, FILTER, SMOOTHER, NodeParameters
 from hmt_ros.app.replay.player import Player
 from hmt_ros.sessions import bme_session, smoothed_messages, track_messages
+from hmt_ros.sessions.bme_parameters import FROM_KEYPOINTS, FROM_SILHOUETTES
 from hmt_ros.sessions.bme_session import TRACK, BmeSession
 from hmt_ros.sessions.camera_session import CAMERA_INFO, COMPRESSED_MASK, IMAGE, MASK, MASKS
 from hmt_ros.sessions.filter_session import (
@@ -36,8 +37,6 @@ from msg_tools.messages.cdr import deserialise
 
 # Topics of the filter that the smoother takes, as sources of the same names.
 HANDED_ON = (MIXTURE,)
-# Sources in the bag that the BME takes.
-SEEN_BY_BME = (CAMERA_INFO, IMAGE, *MASKS)
 
 Write = Callable[[str, int, bytes], None]
 
@@ -70,7 +69,7 @@ class OfflineTrack(PlayedTrack):
         self._bme = self._smoother = None
         if parameters.bme is not None:
             self._bme = BmeSession(parameters.bme, self._predict, bme_session.TOPICS.__contains__)
-        self._heard = _heard_by_bme(parameters)
+        self._seen, self._heard = _seen_by_bme(parameters), _heard_by_bme(parameters)
         self._filter = FilterSession(parameters.filter, self._filtered)
         if parameters.smoother is not None:
             self._smoother = SmootherSession(parameters.smoother, lambda output: write(*output))
@@ -81,7 +80,7 @@ class OfflineTrack(PlayedTrack):
     def take(self, source: str, message: Any) -> Handled:
         """See `PlayedTrack`."""
         result = None
-        if self._bme is not None and source in SEEN_BY_BME:
+        if self._bme is not None and source in self._seen:
             result = self._bme.take(source, message)
             predicted, self._predicted = self._predicted, []
             for topic, _, data in predicted:
@@ -165,7 +164,7 @@ class LiveTrack(PlayedTrack):
 
     def __init__(self, parameters: NodeParameters, write: Write) -> None:
         self._parameters, self._write = parameters, write
-        self._heard = _heard_by_bme(parameters)
+        self._seen, self._heard = _seen_by_bme(parameters), _heard_by_bme(parameters)
         self._bme: LiveNode | None = None
         self._smoother: LiveNode | None = None
 
@@ -207,7 +206,7 @@ class LiveTrack(PlayedTrack):
             if self._bme is not None:
                 self._bme.wait_until_active()
                 self._bme.wait_for_subscribers((PREDICTION,), 2)
-                self._filter.wait_until_heard(SEEN_BY_BME, 2)
+                self._filter.wait_until_heard(self._seen, 2)
                 self._filter.wait_for_subscribers(self._heard, 2)
             if self._smoother is not None:
                 self._smoother.wait_until_active()
@@ -230,7 +229,7 @@ class LiveTrack(PlayedTrack):
         """
         self._filter.publish(source, message)
         result = None
-        if self._bme is not None and source in SEEN_BY_BME:
+        if self._bme is not None and source in self._seen:
             result = self._bme.answer(source)
             # The filter gets the prediction as well, before or after its image.
             for topic, _ in result.published:
@@ -249,6 +248,15 @@ class LiveTrack(PlayedTrack):
             return Handled(FINISH, 0, (), (), ())
         self._smoother.deactivate()
         return self._smoother.answer(FINISH)
+
+
+def _seen_by_bme(parameters: NodeParameters) -> tuple[str, ...]:
+    """Sources in the bag that the BME takes."""
+    if parameters.bme is None:
+        return ()
+    cue = parameters.bme.predict_from
+    images = () if cue == FROM_KEYPOINTS else (IMAGE, *MASKS)
+    return (CAMERA_INFO, *images, *(() if cue == FROM_SILHOUETTES else (KEYPOINTS,)))
 
 
 def _heard_by_bme(parameters: NodeParameters) -> tuple[str, ...]:

@@ -397,6 +397,26 @@ def test_keypoints_of_the_bag_are_used(still, entries, tmp_path):
     assert still[-1].keypoints == [None] * IMAGES
 
 
+def test_predictions_from_the_keypoints_of_the_bag(still, entries, tmp_path):
+    """Also where the filter does not use them."""
+    stamps = [time for topic, time, _ in entries if topic == 'image/compressed']
+    names = [f'{side}_{x}' for x in ('shoulder', 'hip', 'knee') for side in ('left', 'right')]
+    seen = keypoints(stamps[0], names)
+    seen.u, seen.v = 100.0 + 10.0 * np.array([(0, 2) * 3, np.repeat((0, 4, 8), 2)])
+    entries = [*entries, ('/keypoints', stamps[0] + 1000, seen)]
+    bag = write(tmp_path / 'bag', sorted(entries, key=lambda entry: entry[1]))
+    options = [*SUBJECT, '--quiet', '--bme', '--set', 'use_keypoints=false']
+    counts = {'silhouettes': IMAGES, 'keypoints': 2, 'both': IMAGES}
+    for cue, count in counts.items():
+        out = tmp_path / cue
+        cues = ['--set', f'bme.predict_from={cue}', '--set', 'input_timeout=0.0']
+        assert main([str(bag), *options, *cues, '-o', str(out)]) == 0
+        found = [pose_mixture_of(x.message) for x in read(out)['/pose_prediction']]
+        # The keypoints at the end of the bag, which show nobody, have a prediction, too.
+        assert len(found) == count
+        assert (len(found[0].weights) > 0) == (cue != 'silhouettes')
+
+
 def keypoints_3d(stamp, names):
     return MESSAGES.create(
         'hmt_msgs/msg/Keypoints3D',

@@ -108,6 +108,27 @@ def test_same_without_a_subject(tmp_path, capsys):
     assert content(offline) == content(live)
 
 
+def test_same_predictions_from_keypoints_and_silhouettes(tmp_path, capsys):
+    entries = recorded(2)
+    stamp = next(time for topic, time, _ in entries if topic == 'image/compressed')
+    seen = MESSAGES.create(
+        'hmt_msgs/msg/Keypoints2D',
+        header=header_message(MESSAGES, stamp, ''),
+        names=[f'{side}_{x}' for x in ('shoulder', 'hip', 'knee') for side in ('left', 'right')],
+        u=150.0 + 10.0 * np.tile((0.0, 2.0), 3),
+        v=100.0 + 10.0 * np.repeat((0.0, 4.0, 8.0), 2),
+    )
+    bag = write(
+        tmp_path / 'bag', sorted([*entries, ('keypoints', stamp, seen)], key=lambda x: x[1])
+    )
+    options = ['--bme', '--set', 'bme.predict_from=both', '--set', 'use_keypoints=false']
+    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
+    assert one == other
+    assert one[0] == 0
+    assert len(messages(offline, 'pose_prediction')) == 2
+    assert content(offline) == content(live)
+
+
 def test_same_of_a_person_who_leaves_and_returns(tmp_path, capsys):
     """One mixture without components, once, and a new track."""
     entries, period = recorded(3), 10**9 // 15
