@@ -9,6 +9,7 @@ A report beside the model shows affinities, multimodality and silhouettes of the
 from __future__ import annotations
 
 import argparse
+import hashlib
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -39,6 +40,7 @@ from hmt_ros.experts.predictor_learning import (
     learned_predictor,
     new_model,
 )
+from hmt_ros.experts.rendering_mark import RenderingMark
 from hmt_ros.experts.training_set import (
     PoseSequence,
     TrainingSettings,
@@ -77,6 +79,7 @@ class TrainingOptions:
         experts: Number of experts; None takes the default of the model.
         samples: Number of silhouettes.
         dynamics: Whether p(x_t | x_t-1, r_t) is learned as well.
+        resume: Whether a training that was broken off goes on.
     """
 
     output: Path
@@ -96,6 +99,7 @@ class TrainingOptions:
     experts: int | None
     samples: int
     dynamics: bool
+    resume: bool
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -156,6 +160,10 @@ def _parser() -> CommandParser:
         '--dynamics', action=argparse.BooleanOptionalAction, default=False,
         help='learn p(x_t | x_t-1, r_t) as well, for rule (1) (no)',
     )  # fmt: skip
+    learning.add_argument(
+        '--resume', action='store_true',
+        help='go on with a training that was broken off; its silhouettes are kept beside MODEL',
+    )  # fmt: skip
     return parser
 
 
@@ -163,6 +171,9 @@ def _train(options: TrainingOptions) -> int:
     output = model_file(options.output, overwrite=options.overwrite)
     if options.model == 'network':
         check_tools()
+    kept = output.with_suffix('.silhouettes.npy')
+    if kept.exists() and not options.resume:
+        raise ValueError(f'{kept} is of a training that was broken off: --resume, or remove it')
     body = load_body(options.body)
     if not body.shapes:
         raise ValueError(f'body {options.body} has no flesh: wanted one such as human37')
@@ -171,7 +182,8 @@ def _train(options: TrainingOptions) -> int:
     settings = TrainingSettings(samples=options.samples, seed=options.seed)
     bar = _bars(options.quiet)
     shares = shares_of(sequences, options.alike, options.alike_share)
-    pairs = training_set(body, sequences, settings, bar('rendering', GROUPS), shares)
+    mark = RenderingMark(kept, f'{settings}, {_named(sequences, shares)}')
+    pairs = training_set(body, sequences, settings, bar('rendering', GROUPS), shares, mark)
     training = described(body, pairs, progress=bar('describing', SILHOUETTES))
     kind, count = KINDS[options.model], len(pairs)
     model = new_model(options.model, options.experts, options.seed, count)
@@ -201,6 +213,7 @@ def _train(options: TrainingOptions) -> int:
     report.mkdir(parents=True, exist_ok=True)
     with show_progress('drawing', quiet=options.quiet):
         figures = write_report(report, body, sequences, pairs, training)
+    mark.remove()
     skips = f', {skipped} skipped' if skipped else ''
     _say(
         options, f'{output}: {len(sequences)} motions{skips}, {output.stat().st_size / 1e6:.1f} MB'
@@ -246,6 +259,14 @@ def _sequences(options: TrainingOptions, body: Body) -> tuple[list[PoseSequence]
     if files and not read:
         raise ValueError(f'none of the {len(files)} motions in {options.mocap[0]} can be used')
     return [*sequences, *read], len(files) - len(read)
+
+
+def _named(sequences: list[PoseSequence], shares: list[float]) -> str:
+    """What tells some motions, and what is taken of them, from others."""
+    state = hashlib.sha256()
+    for one, share in zip(sequences, shares, strict=True):
+        state.update(f'{one.name} {share}'.encode() + one.poses.tobytes())
+    return f'{len(sequences)} motions {state.hexdigest()[:12]}'
 
 
 def _scores(predictor: PosePredictor, tested: list[PoseSequence]) -> str:

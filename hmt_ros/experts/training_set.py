@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from hmt_ros.body import Body, Camera
 from hmt_ros.body.mirror import mirror, root_angles, root_rotations
 from hmt_ros.experts.pose_encoding import AXES, PoseEncoding
+from hmt_ros.experts.rendering_mark import RenderingMark
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.motion.motion_file import read_motion
 from hmt_ros.motion.procedural_motion import procedural_motion
@@ -208,6 +209,7 @@ def training_set(
     settings: TrainingSettings | None = None,
     progress: Progress[Index] | None = None,
     shares: Sequence[float] | None = None,
+    mark: RenderingMark | None = None,
 ) -> TrainingSet:
     """Pairs of silhouettes and poses from motions.
 
@@ -217,9 +219,11 @@ def training_set(
         settings: Settings; None takes the defaults.
         progress: Iterates over groups of silhouettes, given their number.
         shares: Share of the poses of each motion that are taken; None: all.
+        mark: Takes what has been rendered, and gives it where a rendering was broken off.
 
     Raises:
-        ValueError: there are no motions, or the body has no flesh or another root.
+        ValueError: there are no motions, the body has no flesh or another root, or the mark is of
+            another training set.
     """
     s = settings or TrainingSettings()
     if not sequences:
@@ -244,13 +248,20 @@ def training_set(
     groups = [np.arange(i, min(i + GROUP, len(poses))) for i in range(0, len(poses), GROUP)]
     distances = np.repeat(rng.uniform(*s.distances, len(groups)), GROUP)[: len(poses)]
     poses, previous = _seen(body, poses, previous, view, distances)
-    packed = np.empty((len(poses), SIDE, SIDE // 8), dtype=np.uint8)
-    for rows in groups if progress is None else progress(groups, len(groups)):
+    shape = (len(poses), SIDE, SIDE // 8)
+    packed, done = np.empty(shape, dtype=np.uint8), 0
+    if mark is not None:
+        packed, done = mark.begin(shape, rng)
+    left: Iterable[Index] = groups[done:]
+    for rows in left if progress is None else progress(left, len(groups) - done):
         person = random_build(body, s, rng)
         masks = render_silhouettes(person, poses[rows], _fitting_camera(person, poses[rows]))
         for row, mask in zip(rows, masks, strict=True):
             noisy = _uneven(mask.view(np.uint8), s.boundary_noise, rng)
             packed[row] = np.packbits(noisy, axis=1)
+        done += 1
+        if mark is not None:
+            mark.keep(done, rng)
     activities = tuple(sequences[i].activity for i in which.tolist())
     return TrainingSet(poses, previous, packed, activities, which, frames)
 
