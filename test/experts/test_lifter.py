@@ -34,6 +34,7 @@ from hmt_ros.experts.lifter import (
     Lifter,
     Network,
     landmark_rays,
+    lifted_positions,
     load_lifter,
 )
 from hmt_ros.experts.lifter_learning import LearningSettings, learn_lifter, lifter_scores
@@ -41,7 +42,7 @@ from hmt_ros.experts.pose_encoding import ray_rotations
 from hmt_ros.experts.training_set import procedural_sequence
 from hmt_ros.image.keypoint_schemes import schemes
 from hmt_ros.image.lifted_poses import HIPS, LiftedPoses, bone_lengths, from_positions, pooled
-from hmt_ros.image.terms.keypoints import Keypoints
+from hmt_ros.image.terms.keypoints import USUAL_STATURE, Keypoints
 
 BODY = load_body('human37')
 CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)
@@ -462,3 +463,33 @@ def test_two_people_mixed_are_wide():
     usual = lifted_in(load_lifter(), np.arange(10) / 30.0, detected(poses))
     mixed = lifted_in(load_lifter(), np.arange(10) / 30.0, seen)
     assert mixed[-1].deviations[..., 2].mean() > 2.0 * usual[-1].deviations[..., 2].mean()
+
+
+@pytest.mark.parametrize('scheme', sorted(schemes()))
+def test_any_networks_pose_is_a_guess_of_the_whole(scheme: str) -> None:
+    """Where a joint lacks positions, as the neck of COCO, the depths of the others are there."""
+    pose = BODY.prior_mean.copy()
+    pose[:3] = 0.2, 0.0, 4.0
+    frames = forward(BODY.skeleton, pose[None])
+    known = schemes()[scheme]
+    marks = [x for x in known.landmarks if x.joint]
+    names = [n for n, x in zip(known.names, known.landmarks, strict=True) if x.joint]
+    which = BODY.skeleton.joint_index(tuple(x.joint for x in marks))
+    offsets = np.array([x.offset for x in marks]) * BODY.stature / USUAL_STATURE
+    places = frames.points(
+        BODY.skeleton.joint_segments[which], BODY.skeleton.joint_offsets[which] + offsets
+    )[..., 0]
+    seen = Keypoints(
+        tuple(names), CAMERA.project(places), np.full((len(names), 2, 2), np.nan),
+        np.ones(len(names)), positions=places - places.mean(0),
+    )  # fmt: skip
+    found = lifted_positions(CAMERA, seen.named_for(BODY, scheme)[0])
+    assert found is not None
+    limbs = {f'{s}_{x}' for s in ('left', 'right') for x in ('elbow', 'wrist', 'knee', 'ankle')}
+    assert {*found.joints} >= limbs
+    joints = BODY.joint_positions(pose[None])[0]
+    middle = joints[BODY.skeleton.joint_index(HIPS)].mean(0)
+    true = (joints[BODY.skeleton.joint_index(found.joints)] - middle) @ found.axes.T
+    off = np.abs(found.means[0, :, 2] - true[:, 2])
+    # Landmarks lie on the skin, those of the wrist farthest from their joint.
+    assert off[[found.joints.index(x) for x in sorted(limbs)]].max() < 0.08

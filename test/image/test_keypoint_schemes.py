@@ -20,7 +20,7 @@ from hmt_ros.image.terms.keypoints import Keypoints
 
 COUNTS = {
     'coco17': 17, 'halpe26': 26, 'body25': 25, 'mediapipe33': 33, 'h36m17': 17, 'skeleton2d': 18,
-    'smpl24': 24,
+    'smpl24': 24, 'mhr70': 70,
 }  # fmt: skip
 
 

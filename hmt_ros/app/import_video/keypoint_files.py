@@ -36,7 +36,7 @@ LARGEST_FILE = 2**30  # bytes
 # Schemes of lists without names, by their number of keypoints.
 _BY_COUNT = {
     len(schemes()[name].names): name
-    for name in ('coco17', 'skeleton2d', 'body25', 'halpe26', 'mediapipe33')
+    for name in ('coco17', 'skeleton2d', 'body25', 'halpe26', 'mediapipe33', 'mhr70')
 }
 _MATCHING_NS = 10_000_000  # between the time of a row and that of its frame
 _FRACTION = 2.0  # px; what lies all within is given as fractions of the image

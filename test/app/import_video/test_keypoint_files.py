@@ -40,7 +40,14 @@ def write(path, content):
 
 @pytest.mark.parametrize(
     ('n', 'scheme'),
-    [(17, 'coco17'), (18, 'skeleton2d'), (25, 'body25'), (26, 'halpe26'), (33, 'mediapipe33')],
+    [
+        (17, 'coco17'),
+        (18, 'skeleton2d'),
+        (25, 'body25'),
+        (26, 'halpe26'),
+        (33, 'mediapipe33'),
+        (70, 'mhr70'),
+    ],
 )
 def test_coco_results(n, scheme, tmp_path):
     entries = [
