@@ -1,7 +1,8 @@
-"""Where compiled kernels are kept: by the state of all sources, and not by that of one file alone.
+"""Where compiled kernels are kept: by the state of many sources, and not by that of one file alone.
 
 numba compiles a kernel anew when its own file changes. A kernel holds code of other files, too, and
-names types of them: what was compiled before one of these changed must not be loaded.
+names types of them: what was compiled before one of these changed must not be loaded. All of them
+lie in `FOLDERS`, so that other changes compile nothing.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from threading import Event, Thread
 from typing import Any
 
 VARIABLE = 'NUMBA_CACHE_DIR'
+# Folders of a package in which kernels, and all that they import, lie.
+FOLDERS = ('body', 'flips', 'image', 'inference', 'smoothing', 'tracking')
 _PREFIX = 'compiled-'
 # Code of other states is kept for so long, s: a process that still runs may be using it.
 KEPT = 24 * 3600.0
@@ -55,7 +58,7 @@ def keep_compiled_code_apart(package: Path) -> None:
 def folder_of(package: Path) -> Path:
     """The folder for the code that is compiled from the present sources of a package."""
     state = hashlib.sha256()
-    for path in sorted(package.rglob('*.py')):
+    for path in sorted(x for folder in FOLDERS for x in (package / folder).rglob('*.py')):
         found = path.stat()
         state.update(f'{path.relative_to(package)} {found.st_size} {found.st_mtime_ns}\n'.encode())
     parent = package / '__pycache__'
