@@ -4,7 +4,8 @@ The mixtures of `experts.lifter` on a real detector's keypoints, with later imag
 gravity given and not, lengths usual or measured:
 distances of the heaviest and of the best pose, of the heaviest after the similarity that fits best,
 slanted limbs whose slope has the wrong sign, and regions of single joints. The detector's own 3D
-stands beside. Clips that settings were chosen on, and the others, apart.
+stands beside. Clips that settings were chosen on, and the others, apart. With motion capture of
+other people: the models that could be in its place, and how it does on poses that are rare.
 """
 
 from __future__ import annotations
@@ -14,27 +15,33 @@ import time
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from benchmarks.clips import SCHEME, find_clips, read_clip, read_detections, table
 from benchmarks.command import benchmark_parser, show, told
+from benchmarks.experts_motion import mocap_folder
 from benchmarks.machine import description
 from benchmarks.runs import GIVEN, UNKNOWN, in_processes, recorded
 from benchmarks.tracking_means import GROUPS, group_of
 from benchmarks.tracking_scores import detector_scores, scores_of
 from hmt_ros.body import load_body
 from hmt_ros.experts.keypoint_training import (
+    JOINTS,
+    VARIANTS,
+    KeypointTracks,
     WindowSettings,
     keypoint_tracks,
     training_windows,
 )
 from hmt_ros.experts.lifted_fit import UNKNOWN_SIZE, lift_poses, poses_of
-from hmt_ros.experts.lifter import SHIPPED, KeypointHistory, load_lifter
+from hmt_ros.experts.lifter import SHIPPED, KeypointHistory, Lifter, load_lifter
 from hmt_ros.experts.lifter_learning import PELVIS, SCORED, lifter_scores
 from hmt_ros.experts.predictor_learning import kinds, new_model
 from hmt_ros.experts.training_set import motion_files, recorded_sequence
+from hmt_ros.image.lifted_poses import HIPS
 from hmt_ros.tracking import read_subject
 from hmt_ros.tracking.initialisation import start_from_keypoints
 
@@ -47,8 +54,20 @@ IMAGES, LENGTHS = ('all images', 'causal'), ('usual', 'known')
 CONDITIONS = tuple(product(IMAGES, (UNKNOWN, GIVEN), LENGTHS))
 # Images that the cost is the median of.
 TIMED = 60
-# Windows that contenders learn from, and are tested on; principal components of their inputs.
-WINDOWS, TESTED, COMPONENTS = 4000, 1000, 64
+# Windows that contenders learn from by name, and are tested on; principal components of inputs.
+WINDOWS = {
+    'network': 40_000, 'local': 40_000, 'nearest': 40_000, 'conditional': 4000, 'joint': 4000,
+    'relevance-vector': 4000,
+}  # fmt: skip
+TESTED, COMPONENTS = 1000, 64
+# Windows whose poses are rare or not; poses that were learned from; groups by rarity.
+RARE, KNOWN, QUARTERS = 4000, 40_000, 4
+CERTAIN = WindowSettings(
+    cut=0.0, causal=1.0, gravity_spread=0.0, gravity=1.0, lengths_spread=0.0, lengths=1.0
+)
+LEARNED = ('train', 'train_more', 'train_wide')
+# Motions that are few exercises, each done many times, and how often these are drawn.
+ALIKE, ALIKE_SHARE = 'prmd', 0.35
 
 
 def lifted(work: tuple[Path, str, tuple[str, str, str]]) -> dict[str, float]:
@@ -101,38 +120,54 @@ def cost(folder: Path, model: str) -> dict[str, float]:
     }
 
 
-def contenders(mocap: Path, model: str, *, quick: bool = False) -> list[dict[str, Any]]:
+class Motions(NamedTuple):
+    """Tracks of the motions that a lifter learned from, and of other people's."""
+
+    learned: KeypointTracks
+    others: KeypointTracks
+
+
+def read_motions(mocap: Path, lifter: Lifter, *, quick: bool = False) -> Motions:
+    """The motions in the card of a lifter, and those of `dev`, under a folder of motion capture."""
+    body = lifter.usual
+    # The card ends with the names of the motions.
+    names = set(str(lifter.notes.get('card', '')).rpartition(' s: ')[2].rstrip('.').split(', '))
+    found = []
+    for parts, variants in ((LEARNED, VARIANTS), (('dev',), 1)):
+        files = [x for part in parts if (mocap / part).is_dir() for x in motion_files(mocap / part)]
+        files = [x for x in files if parts != LEARNED or x.stem in names]
+        files = files[: 3 if quick else None]
+        read = [recorded_sequence(path, body) for path in told('lifting: motions', files)]
+        shares = [ALIKE_SHARE if x.name.startswith(ALIKE) else 1.0 for x in read]
+        found.append(keypoint_tracks(body, read, shares, variants=variants))
+    return Motions(*found)
+
+
+def contenders(motions: Motions, lifter: Lifter, *, quick: bool = False) -> list[dict[str, Any]]:
     """Scores of models on windows of other people: the same motions, inputs and errors.
 
-    Models of kernels and neighbours learn from as many windows as they can take; their inputs are
-    principal components, as those of silhouettes are.
+    Models of kernels learn from as many windows as they can take; the inputs of all are principal
+    components, as those of silhouettes are.
 
     Args:
-        mocap: folder with `train`, to learn from, and `dev`, of other people.
-        model: lifter.
+        motions: to learn from, and of other people.
+        lifter: what ships.
         quick: few windows.
     """
-    lifter = load_lifter(model)
-    body, settings = lifter.usual, WindowSettings()
-    drawn = []
-    for part, count in (('train', WINDOWS), ('dev', TESTED)):
-        motions = motion_files(mocap / part)[: 3 if quick else None]
-        read = [recorded_sequence(path, body) for path in told(f'lifting: {part}', motions)]
-        tracks = keypoint_tracks(
-            body, read, [1.0] * len(read), variants=2 if part == 'train' else 1
-        )
-        rng = np.random.default_rng(0)
-        drawn.append(training_windows(tracks, count // (10 if quick else 1), rng, settings))
-    (inputs, joints), (seen, true) = drawn
+    settings, size = WindowSettings(), 10 if quick else 1
+    rng = np.random.default_rng(0)
+    inputs, joints = training_windows(motions.learned, max(WINDOWS.values()) // size, rng, settings)
+    seen, true = training_windows(motions.others, TESTED // size, rng, settings)
     mean, scale = inputs.mean(0), inputs.std(0) + 0.1
-    _, _, axes = np.linalg.svd((inputs - mean) / scale, full_matrices=False)
-    axes = axes[:COMPONENTS].T
+    some = (inputs[: WINDOWS['conditional']] - mean) / scale
+    axes = np.linalg.svd(some, full_matrices=False)[2][:COMPONENTS].T
     learned, tested = (((x - mean) / scale @ axes).astype(np.float64) for x in (inputs, seen))
     targets = joints.reshape(len(joints), -1).astype(np.float64)
     found = lifter_scores(lifter, seen, true)
-    rows = [{'model': 'what ships', **asdict(found)}]
+    rows: list[dict[str, Any]] = [{'model': 'what ships', 'windows': 0, **asdict(found)}]
     for name in told('lifting: contenders', kinds()):
-        one = new_model(name, None, 0, len(learned)).fit(learned, targets)
+        count = WINDOWS[name] // size
+        one = new_model(name, None, 0, count).fit(learned[:count], targets[:count])
         weights, means, _ = one.predict_arrays(tested)
         density = one.log_density(tested, true.reshape(len(true), -1)) / targets.shape[1]
         places = means.reshape(*means.shape[:2], -1, 3)
@@ -142,12 +177,44 @@ def contenders(mocap: Path, model: str, *, quick: bool = False) -> list[dict[str
         heaviest = distance[np.arange(len(distance)), weights.argmax(1)]
         rows.append(
             {
-                'model': name, 'heaviest': float(heaviest.mean()),
+                'model': name, 'windows': count, 'heaviest': float(heaviest.mean()),
                 'best': float(np.where(weights > 1e-3, distance, np.inf).min(1).mean()),
                 'log_density': float(density.mean()), 'within': float('nan'),
             }
         )  # fmt: skip
     return rows
+
+
+def by_rarity(motions: Motions, lifter: Lifter, *, quick: bool = False) -> list[dict[str, float]]:
+    """Scores on other people's windows, by how far the nearest pose is that was learned from.
+
+    Args:
+        motions: that were learned from, and of other people.
+        lifter: what ships.
+        quick: few windows.
+    """
+    rng, size = np.random.default_rng(0), 20 if quick else 1
+    _, learned = training_windows(motions.learned, KNOWN // size, rng, CERTAIN)
+    inputs, joints = training_windows(motions.others, RARE // size, rng, CERTAIN)
+    away, _ = cKDTree(_turned(learned)).query(_turned(joints))
+    away = away / np.sqrt(len(JOINTS))
+    rows = []
+    for quarter in np.array_split(np.argsort(away), QUARTERS):
+        found = lifter_scores(lifter, inputs[quarter], joints[quarter])
+        rows.append({'nearest': float(np.median(away[quarter])), **asdict(found)})
+    return rows
+
+
+def _turned(joints: Any) -> Any:
+    """Joints (N, 3 J) of persons who are turned until their hips are level and across."""
+    left, right = (joints[:, JOINTS.index(name)] for name in HIPS)
+    neck = joints[:, JOINTS.index('neck')]
+    x = left - right
+    x = x / np.linalg.norm(x, axis=1, keepdims=True)
+    z = np.cross(x, neck)
+    z = z / np.linalg.norm(z, axis=1, keepdims=True)
+    frame = np.stack([x, np.cross(z, x), z], axis=1)
+    return np.einsum('nij,nkj->nki', frame, joints).reshape(len(joints), -1)
 
 
 def measure(
@@ -162,8 +229,8 @@ def measure(
     Args:
         clips: folder of the clips; None: the development clips.
         model: lifter.
-        mocap: folder of motion capture, for the contenders; None: they are left out.
-        quick: two clips.
+        mocap: folder of motion capture, for the contenders; None: the shared one, if there is one.
+        quick: two clips, and no contenders unless `mocap` is given.
     """
     folders, source = find_clips(clips, moving=True)
     folders = [x for x in folders if (x / 'keypoints_mediapipe.npz').exists()]
@@ -192,11 +259,26 @@ def measure(
         {'clip': folder.name, 'kind': list(kind), **scores[folder, model, kind]}
         for kind in CONDITIONS for folder in folders
     ]  # fmt: skip
+    against: dict[str, Any] = {'contenders': [], 'rarity': []}
+    if (mocap := mocap or (None if quick else shared_mocap())) is not None:
+        lifter = load_lifter(model)
+        motions = read_motions(mocap, lifter, quick=quick)
+        against = {
+            'contenders': contenders(motions, lifter, quick=quick),
+            'rarity': by_rarity(motions, lifter, quick=quick),
+        }
     return {
         'machine': description(), 'model': model, 'means': entries, 'clips': by_clip,
-        'cost': cost(folders[0], model), 'source': source,
-        'contenders': [] if mocap is None else contenders(mocap, model, quick=quick),
+        'cost': cost(folders[0], model), 'source': source, **against,
     }  # fmt: skip
+
+
+def shared_mocap() -> Path | None:
+    """The folder of motion capture, if there is one."""
+    try:
+        return mocap_folder('dev').parent
+    except ValueError:
+        return None
 
 
 def _cells(entry: dict[str, Any]) -> list[str]:
@@ -221,13 +303,23 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
     rows += [[x['clip'], *_cells(x)] for x in result['clips'] if x['kind'] == chosen]
     parts.append(table(rows, markdown=markdown))
     if result['contenders']:
-        rows = [['on motions of other people', 'heaviest', 'best', 'nats a number']]
+        rows = [['on motions of other people', 'windows', 'heaviest', 'best', 'nats a number']]
         rows += [
             [
-                x['model'], f'{1e3 * x["heaviest"]:.0f}', f'{1e3 * x["best"]:.0f}',
-                f'{x["log_density"]:.2f}',
+                x['model'], str(x['windows'] or 'all'), f'{1e3 * x["heaviest"]:.0f}',
+                f'{1e3 * x["best"]:.0f}', f'{x["log_density"]:.2f}',
             ]
             for x in result['contenders']
+        ]  # fmt: skip
+        parts.append(table(rows, markdown=markdown))
+    if result['rarity']:
+        rows = [['nearest pose learned from, mm', 'heaviest', 'best', 'nats', '90 % marginals, %']]
+        rows += [
+            [
+                f'{1e3 * x["nearest"]:.0f}', f'{1e3 * x["heaviest"]:.0f}', f'{1e3 * x["best"]:.0f}',
+                f'{x["log_density"]:.2f}', f'{100 * x["within"]:.0f}',
+            ]
+            for x in result['rarity']
         ]  # fmt: skip
         parts.append(table(rows, markdown=markdown))
     spent = result['cost']

@@ -18,6 +18,8 @@ same order give the same bytes. The rules:
 - Errors of images last: an image counts with a share of its evidence, by the error model that its
   likelihood carries and the time since the image before (`error_model`). A likelihood without an
   error model, as in bags of earlier versions, and a forecast, which is no evidence, are skipped.
+- Angles that go round are taken from mixture to mixture without whole turns, each mode from the
+  nearest one before: to the dynamics a turn more would be a jump.
 - The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
 - What can not be used is skipped. The first fault of each kind is logged; all are counted.
 """
@@ -33,6 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
+from hmt_ros.body.whole_turns import endless, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import CueErrors
@@ -222,6 +225,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._end_window()
             self._first_identity = 1
         self._begin_track(of)
+        evidence = self._without_turns(evidence, of.body)
         p = self.parameters
         if self._newest is not None:
             interval = (stamp - self._newest) / SECOND_NS
@@ -259,6 +263,16 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         )
         for pose in update.final:
             self._publish_final(pose, of)
+
+    def _without_turns(self, evidence: Evidence, body: Body) -> Evidence:
+        """The evidence with angles that go on from those of the mixture before."""
+        mixture, kept = evidence.mixture, self.kept.items
+        heaviest = mixture.means[[int(np.argmax(mixture.weights))]]
+        before = kept[-1].mixture.means if self._newest is not None and kept else heaviest
+        means = without_turns(body, mixture.means, before)
+        return evidence._replace(
+            mixture=GaussianMixture(mixture.weights, means, mixture.covariances)
+        )
 
     def _take_nobody(self, stamp: int, existence: float) -> None:
         """Ends the window: the person is no longer in view."""
@@ -455,10 +469,10 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
 
 
 def _limits(body: Body) -> tuple[Array, Array]:
-    """Limits (d,) of poses in any frame: the place of the root has none."""
-    lower, upper = body.lower.copy(), body.upper.copy()
-    lower[:3], upper[:3] = -np.inf, np.inf
-    return lower, upper
+    """Limits (d,) of poses in any frame: the place and the turns of the root have none."""
+    free = endless(body)
+    free[:3] = True
+    return np.where(free, -np.inf, body.lower), np.where(free, np.inf, body.upper)
 
 
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:

@@ -565,3 +565,30 @@ def test_body_in_a_message_leads_to_no_file(session, likelihoods, tmp_path):
     assert one.state.status == 'waiting'
     trusting = session(body_model=str(path))
     assert trusting.take(MIXTURE, message).faults == ()
+
+
+def test_whole_turns_of_the_heading_are_none(session, outputs, likelihoods):
+    """As of a person who turns about, or of modes that were found in different ways."""
+    body = likelihoods.body
+    yaw, turns = body.dof_names.index('root_z'), [0, 1, 1, -2, 0, 9]
+
+    def turning(index, shift):
+        mixture = likelihoods.mixture(index)
+        means = mixture.means.copy()
+        means[:, yaw] += 3.0 + 0.1 * index
+        means[1:, yaw] += 2.0 * np.pi * shift
+        means[:1, yaw] -= 2.0 * np.pi * shift
+        return replace(mixture, means=means)
+
+    for shifted in (False, True):
+        one = session()
+        for index, shift in enumerate(turns):
+            mixture = turning(index, shift * shifted)
+            one.take(MIXTURE, likelihoods.message(index, mixture=mixture))
+        one.finish()
+    found = [pose_mixture_of(x) for x in read(outputs, 'smoothed_pose_mixture')]
+    plain, cut = found[: len(turns)], found[len(turns) :]
+    for a, b in zip(plain, cut, strict=True):
+        np.testing.assert_allclose(a.weights, b.weights, atol=1e-9)
+        np.testing.assert_allclose(a.means, b.means, atol=1e-9)
+        assert 2.9 < a.means[0, yaw] < 3.6
