@@ -59,8 +59,9 @@ def main(argv: list[str]) -> int:
         sys.stderr.write(f'generate.py: wanted some of {", ".join(PAGES)}\n')
         return 1
     for name in argv:
-        path = DOCS / PAGES[name]
-        path.write_text(with_part(path.read_text('utf-8'), name, part(name)), 'utf-8')
+        path, content = DOCS / PAGES[name], part(name)
+        # Read when it is written: a page may have been edited while a benchmark ran.
+        path.write_text(with_part(path.read_text('utf-8'), name, content), 'utf-8')
     return 0
 
 

@@ -99,3 +99,9 @@ ERRORS: Mapping[str, CueErrors] = MappingProxyType(
         'shape': CueErrors(0.35, 0.053),
     }
 )
+# Factor on what experts say where it is counted as keypoints are: the ratio of what both tell in a
+# second of many images.
+LIFTED_AS_KEYPOINTS = (
+    ERRORS['lifted'].independent / ERRORS['lifted'].time
+    * ERRORS['keypoints'].time / ERRORS['keypoints'].independent
+)  # fmt: skip

@@ -21,7 +21,12 @@ import numpy as np
 
 from hmt_ros.image.observation import Observation
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.error_model import TOGETHER, CueErrors, errors_of_cues
+from hmt_ros.inference.error_model import (
+    LIFTED_AS_KEYPOINTS,
+    TOGETHER,
+    CueErrors,
+    errors_of_cues,
+)
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
 from hmt_ros.inference.mixture import GaussianMixture
 from hmt_ros.tracking.hypotheses import Modes, Optimised
@@ -116,7 +121,8 @@ def likelihood_modes(modes: Modes, posterior: Posterior, observation: Observatio
 
     Around each mode of the posterior the energy of the image and of the body's prior is a
     parabola; its minimum and curvature make a component, its depth the weight, of at least
-    `LEAST_LOG_WEIGHT`. Nothing of it is discounted.
+    `LEAST_LOG_WEIGHT`. Nothing of it is discounted, but that one pair (s, tau) stands for keypoints
+    and experts: what these tell in a second counts as much as it does in the filter.
 
     Args:
         modes: of the posterior, K.
@@ -124,7 +130,7 @@ def likelihood_modes(modes: Modes, posterior: Posterior, observation: Observatio
         observation: of the image.
     """
     body, poses = posterior.body, modes.poses
-    fit = posterior.fit(poses, observation)
+    fit = posterior.fit(poses, observation, LIFTED_AS_KEYPOINTS)
     covariances = fit.covariances
     gradient = np.where(fit.free, fit.energy.derivatives()[0], 0.0)
     step = -np.einsum('kij,kj->ki', covariances, gradient)

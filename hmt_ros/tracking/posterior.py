@@ -98,7 +98,7 @@ class Posterior:
         self._ground_term: GroundTerm | None = None
         self.evaluations = 0
         self._step_scale = step_scale(body)
-        self._last_fit: tuple[Array, Observation, ImageFit] | None = None
+        self._last_fit: tuple[Array, Observation, float, ImageFit] | None = None
 
     @cached_property
     def likelihood(self) -> ImageLikelihood:
@@ -170,13 +170,17 @@ class Posterior:
             tolerance=TOLERANCE,
         )  # fmt: skip
 
-    def fit(self, poses: Array, observation: Observation) -> ImageFit:
-        """How poses (K, d) explain an image."""
+    def fit(self, poses: Array, observation: Observation, lifted_share: float = 1.0) -> ImageFit:
+        """How poses (K, d) explain an image; `lifted_share` as for `keypoint_term`."""
+        seen = observation.keypoints
+        share = 1.0 if seen is None or seen.lifted is None else lifted_share
         last = self._last_fit
-        if last is not None and last[0] is poses and last[1] is observation:
-            return last[2]
-        seen = self.likelihood.seen(observation)
-        terms = (*seen, *self.likelihood.priors, *self.known)
+        if last is not None and last[0] is poses and last[1] is observation and last[2] == share:
+            return last[3]
+        image, *keypoints = self.likelihood.seen(observation)
+        if keypoints:
+            keypoints = [self.likelihood.keypoint_term(observation, None, lifted_share=share)]
+        terms = (image, *keypoints, *self.likelihood.priors, *self.known)
         found = PoseEnergy(self.likelihood, terms).by_cue(poses)
         gradient, hessian = found.energy.derivatives()
         free = ~resting(poses, gradient, self.body.lower, self.body.upper)
@@ -184,7 +188,7 @@ class Posterior:
             found.energy, found.values[:, :2].sum(1), found.hessians[:, 0], found.hessians[:, 1],
             found.outline_costs, free, free_covariances(hessian, free),
         )  # fmt: skip
-        self._last_fit = (poses, observation, fit)
+        self._last_fit = (poses, observation, share, fit)
         return fit
 
     def log_likelihoods(self, poses: Array, observation: Observation) -> Array:
