@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from benchmarks.clips import Clip, find_clips, read_clip
 from benchmarks.experts_motion import BEST_OF
 from benchmarks.runs import follow, new_tracker
-from benchmarks.smoothing_clips import NAMES
 from benchmarks.tracking_scores import scores_of
 from hmt_ros.body import load_body
 from hmt_ros.experts.pose_predictor import PosePredictor, load_predictor
 from hmt_ros.image.background import BackgroundModel
 from hmt_ros.tracking import PosePrediction, Tracker, TrackerSettings
 
+NAMES = ('walk', 'exercise', 'charleston')  # of the clips
 WANTED = 1.20  # ratio to the error of the track from a subject file
 SHOWN = ('best_mm', 'heaviest_mm', 'kept', 'coverage_90', 'joint_coverage_90')
 

@@ -1,200 +1,231 @@
-"""What smoothing makes of the mixtures that the tracker finds in clips with known truth.
+"""What the smoother of the node makes of clips with known truth, live and offline.
 
-Windows of images are smoothed offline, of each the middle is taken. Errors are those of `evaluate`:
-joints relative to the pelvis, the best of K and the heaviest; smoothed marginals have a component
-for every trajectory and are reduced to K by the tracker's own rule, so that no more guesses count.
-Coverage is that of the whole marginals.
+The tracker follows every clip with images, with keypoints as well, and with keypoints alone,
+gravity given and not. What it says of each image goes through a `SmootherSession` with the defaults
+of the node, live, and with a window over the whole clip. Beside it stand the filter and the
+simplest smoother: the joints of the heaviest mode of the filter, averaged over time with the
+Gaussian kernel that is best in the mean over the clips.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from benchmarks.clips import Clip, find_clips, read_clip
-from benchmarks.runs import GIVEN, GRAVITIES, UNKNOWN, new_tracker
-from hmt_ros.body import Body, load_body
-from hmt_ros.evaluation.pose_scores import (
-    EVALUATED_JOINTS,
-    ORIGIN,
-    JointMixture,
-    joint_mixtures,
-    score,
+from benchmarks.clips import Clip, find_clips, read_clip, read_detections
+from benchmarks.runs import (
+    GIVEN,
+    GRAVITIES,
+    IMAGES,
+    INPUTS,
+    KEYPOINTS,
+    Record,
+    in_processes,
+    keypoints_only,
+    new_tracker,
+    recorded,
 )
+from benchmarks.tracking_means import GROUPS, group_of
+from benchmarks.tracking_scores import heaviest_joints, scores_of
+from hmt_ros.body import Body, load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
-from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother
-from hmt_ros.smoothing.likelihood import counted
+from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.handled import Output
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
+from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.tracking import TrackerSettings
-from hmt_ros.tracking.selection import choose_hypotheses
+from msg_tools import RosbagsMessages
+from msg_tools.messages.cdr import deserialise
+from msg_tools.messages.pose_mixtures import (
+    MixtureKind,
+    PoseMixture,
+    TrackState,
+    pose_mixture_message,
+    pose_mixture_of,
+)
 
 Array = NDArray[np.float64]
 
-NAMES = ('walk', 'exercise', 'charleston')
-# Images that are smoothed together, and how many of them, in the middle, are taken.
-WINDOW, TAKEN = 16, 8
-TRAJECTORIES = 48
-# Kernels, in images, that the modes nearest to the truth are smoothed with.
-KERNELS = (1.0, 2.0, 4.0)
+FILTER, LIVE, OFFLINE, AVERAGED = 'filter', 'live', 'offline', 'filter, averaged'
+# Parameters of the node, by the way of smoothing.
+WAYS: dict[str, dict[str, Any]] = {LIVE: {}, OFFLINE: {'fixed_lag': 1000, 'longest_lag': 0.0}}
+# Standard deviations of the kernels that the heaviest mode is averaged with, images.
+KERNELS = (1.0, 2.0, 3.0, 4.0, 6.0)
+SCORES = (
+    'heaviest_mm', 'best_mm', 'acceleration', 'feet', 'root_percent', 'joint_coverage_90',
+    'absolute_coverage_90',
+)  # fmt: skip
+SMOOTHED = 'smoothed_pose_mixture'
+
+
+class Seen(NamedTuple):
+    """What the tracker says of an image."""
+
+    stamp: int
+    body: Body
+    posterior: GaussianMixture
+    likelihood: GaussianMixture
+    errors: CueErrors
+
+
+Work = tuple[Path, str, str, int | None]
 
 
 def clips(quick: bool = False) -> dict[str, Any] | str:
-    """Scores of the filter and of the smoother by clip and gravity, or why there are none."""
+    """Scores by clip, and their means over groups of clips, or why there are none."""
     try:
-        folders, source = find_clips(None)
+        folders, source = find_clips(None, moving=True)
     except ValueError as error:
         return f'skipped: {error}'
-    folders = [folder for folder in folders if folder.name in NAMES]
+    folders = [x for x in folders if (x / 'keypoints_mediapipe.npz').exists()]
     if not folders:
-        return f'skipped: {source} has none of {", ".join(NAMES)}'
+        return f'skipped: {source} has no keypoints_mediapipe.npz'
+    inputs, gravities, limit = INPUTS, GRAVITIES, None
     if quick:
-        folders = folders[:1]
-    found: dict[str, Any] = {}
-    for folder in folders:
-        clip = read_clip(folder, 12 if quick else None)
-        known = GRAVITIES if clip.ups else (UNKNOWN,)
-        found[folder.name] = {gravity: of_clip(clip, gravity) for gravity in known}
-    return found
-
-
-def of_clip(clip: Clip, gravity: str = UNKNOWN) -> dict[str, Any]:
-    """Scores of one clip: filter, and smoothed likelihoods; gravity is one of `GRAVITIES`."""
-    tracker = new_tracker(clip, load_body('human37'), TrackerSettings(), 0)
-    posteriors, likelihoods, errors = [], [], []
-    for stamp, image in zip(clip.stamps, clip.images, strict=True):
-        if gravity == GIVEN:
-            tracker.set_gravity(clip.ups[stamp])
-        posterior, likelihood = tracker.step(image, stamp)
-        if posterior is None or likelihood is None:
-            raise ValueError(f'{clip.folder.name}: nobody at {stamp} ns')
-        posteriors.append(posterior)
-        likelihoods.append(likelihood)
-        errors.append(tracker.likelihood_errors)
-    truth = true_joints(clip)
-    return compared(tracker.body, clip.stamps, posteriors, likelihoods, errors, truth)
-
-
-def compared(
-    body: Body,
-    stamps: Sequence[int],
-    posteriors: Sequence[GaussianMixture],
-    likelihoods: Sequence[GaussianMixture],
-    errors: Sequence[CueErrors],
-    truth: Array,
-) -> dict[str, Any]:
-    """Scores of the filter, of what smoothing makes of it, and how much averaging could gain."""
-    count = max(len(mixture) for mixture in posteriors)
-    filtered = joint_mixtures(body, posteriors)
-    found = smoothed_marginals(body, stamps, likelihoods, errors)
-    few = [reduced(body, mixture, count) for mixture in found]
-    return {
-        'filter': scores(filtered, filtered, truth),
-        'likelihoods': scores(joint_mixtures(body, few), joint_mixtures(body, found), truth),
-        'oracle': oracle(filtered, truth),
-    }
-
-
-def scores(few: list[JointMixture], whole: list[JointMixture], truth: Array) -> dict[str, float]:
-    """Errors of reduced mixtures in mm, coverage of whole ones."""
-    error, density = score(few, truth, samples=2).summary(), score(whole, truth).summary()
-    return {
-        **{key: error[key] for key in ('best_mm', 'heaviest_mm', 'expected_mm', 'modes')},
-        **{key: density[key] for key in ('coverage_90', 'joint_coverage_90')},
-        'negative_log_likelihood': density['negative_log_likelihood'],
-    }
-
-
-def smoothed_marginals(
-    body: Body,
-    stamps: Sequence[int],
-    likelihoods: Sequence[GaussianMixture],
-    errors: Sequence[CueErrors],
-) -> list[GaussianMixture]:
-    """Marginals at all times, from overlapping windows; the motion as the tracker expects it."""
-    smoother = MixtureSmoother(
-        LinearGaussianDynamics.random_walk(body.rates), body.lower, body.upper,
-        max_trajectories=TRAJECTORIES, adapt=(), through_modes=True,
-    )  # fmt: skip
-    intervals = np.diff(stamps, prepend=-np.inf) * 1e-9
-    mixtures = [
-        counted(likelihood, one.share(dt))
-        for likelihood, one, dt in zip(likelihoods, errors, intervals, strict=True)
+        folders, inputs, gravities, limit = folders[:1], (IMAGES,), (GIVEN,), 12
+    work = [(x, given, known, limit) for given in inputs for known in gravities for x in folders]
+    found = in_processes(of_clip, work, 0, 'smoothing: clips')
+    entries = [
+        {'clip': folder.name, 'inputs': given, 'gravity': known, 'scores': scores}
+        for (folder, given, known, _), scores in zip(work, found, strict=True)
     ]
-    margin = (WINDOW - TAKEN) // 2
-    result: list[GaussianMixture] = []
-    for first in range(0, len(mixtures), TAKEN):
-        low, high = max(first - margin, 0), min(first + TAKEN + margin, len(mixtures))
-        found = smoother.smooth(mixtures[low:high], stamps_ns=stamps[low:high])
-        last = min(first + TAKEN, len(mixtures))
-        result += [found.marginal(t - low) for t in range(first, last)]
+    means = []
+    for group in GROUPS:
+        for given in inputs:
+            for known in gravities:
+                own = [
+                    x['scores'] for x in entries
+                    if (group_of(x['clip']), x['inputs'], x['gravity']) == (group, given, known)
+                ]  # fmt: skip
+                if own:
+                    means.append(
+                        {'clips': group, 'inputs': given, 'gravity': known, 'scores': mean(own)}
+                    )
+    return {'clips': entries, 'means': means}
+
+
+def mean(scores: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+    """Means over clips by way; of the kernels the one that is best in the mean."""
+    result = {
+        way: {name: _known_mean([x[way][name] for x in scores]) for name in scores[0][way]}
+        for way in scores[0]
+    }
+    kernels = [way for way in result if way.startswith(AVERAGED)]
+    best = min(kernels, key=lambda way: result[way]['heaviest_mm'])
+    return {way: found for way, found in result.items() if way == best or way not in kernels}
+
+
+def _known_mean(values: Sequence[float]) -> float:
+    """The mean of the values that are known; NaN: none is."""
+    known = [x for x in values if np.isfinite(x)]
+    return float(np.mean(known)) if known else float('nan')
+
+
+def of_clip(work: Work) -> dict[str, dict[str, float]]:
+    """Scores of one clip by way: folder, inputs, gravity, number of images (None: all)."""
+    folder, inputs, gravity, limit = work
+    clip = read_clip(folder, limit)
+    seen = tracked(clip, inputs, gravity)
+    mixtures = {FILTER: {x.stamp: x.posterior for x in seen}}
+    mixtures |= {way: smoothed(seen, values) for way, values in WAYS.items()}
+    records = {way: record_of(clip, seen, found) for way, found in mixtures.items()}
+    result = {}
+    for way, record in records.items():
+        scores = scores_of(record)
+        result[way] = {name: float(scores[name]) for name in SCORES}
+    heaviest = heaviest_joints(records[FILTER])
+    for width in KERNELS:
+        joints = gaussian_filter1d(heaviest, width, axis=0)
+        record = replace(
+            records[FILTER], joints=joints[:, None], weights=np.ones((len(joints), 1)), point=joints
+        )
+        scores = scores_of(record)
+        result[f'{AVERAGED} over {width:g} images'] = {
+            name: float(scores[name]) if 'coverage' not in name else np.nan for name in SCORES
+        }
     return result
 
 
-def reduced(body: Body, mixture: GaussianMixture, count: int) -> GaussianMixture:
-    """At most `count` components that stand for all, as the tracker chooses its modes."""
-    mixture = mixture[mixture.weights > 0].normalised()
-    joints = body.joint_positions(mixture.means)
-    same = TrackerSettings().hypothesis_merge_distance
-    kept = choose_hypotheses(joints - joints[:, :1], np.log(mixture.weights), count, same=same)
-    weights = np.exp(kept.log_weights - np.logaddexp.reduce(kept.log_weights))
-    return GaussianMixture(weights, mixture.means[kept.chosen], mixture.covariances[kept.chosen])
+def tracked(clip: Clip, inputs: str, gravity: str) -> list[Seen]:
+    """What the tracker says of the images of a clip; `inputs` and `gravity` as of a `Run`."""
+    settings = TrackerSettings()
+    if inputs == KEYPOINTS:
+        settings = keypoints_only(settings)
+    found = {} if inputs == IMAGES else read_detections(clip.folder).keypoints
+    tracker = new_tracker(clip, load_body('human37'), settings, 0)
+    result = []
+    for stamp, image in zip(clip.stamps, clip.images, strict=True):
+        if stamp in clip.views:
+            rotation, position = clip.views[stamp]
+            tracker.set_camera(position, rotation)
+        if gravity == GIVEN and stamp in clip.ups:
+            tracker.set_gravity(clip.ups[stamp])
+        posterior, likelihood = tracker.step(image, stamp, found.get(stamp))
+        if posterior is not None and likelihood is not None:
+            result.append(
+                Seen(stamp, tracker.body, posterior, likelihood, tracker.likelihood_errors)
+            )
+    return result
 
 
-def oracle(filtered: list[JointMixture], truth: Array) -> dict[str, Any]:
-    """How far averaging over time may come at best.
+def smoothed(seen: Sequence[Seen], values: dict[str, Any]) -> dict[int, GaussianMixture]:
+    """What the smoother publishes, by stamp, with some parameters of the node."""
+    outputs: list[Output] = []
+    messages = RosbagsMessages()
+    parameters = with_values(SmootherParameters(), values)
+    session = SmootherSession(parameters, outputs.append, SMOOTHED.__eq__)
+    for one in seen:
+        content = PoseMixture.of_body(
+            one.body, one.likelihood, MixtureKind.LIKELIHOOD, one.stamp, 'camera',
+            state=TrackState.TRACKING, track_id=1, error_share=one.errors.independent,
+            error_time=one.errors.time,
+        )  # fmt: skip
+        handled = session.take(MIXTURE, pose_mixture_message(messages, content))
+        if handled.faults:
+            raise ValueError(handled.faults[0])
+    session.finish()
+    found = [pose_mixture_of(deserialise(x.data, 'hmt_msgs/msg/PoseMixture')) for x in outputs]
+    return {x.stamp_ns: x.mixture for x in found}
 
-    The mode nearest to the truth is taken in every image, which no smoother knows, and its joints
-    are averaged with the Gaussian kernel that helps most; and the autocorrelation of its errors.
-    """
-    near = np.array(
-        [
-            mixture.joints[np.linalg.norm(mixture.joints - true, axis=2).mean(1).argmin()]
-            for mixture, true in zip(filtered, truth, strict=True)
-        ]
+
+def record_of(clip: Clip, seen: Sequence[Seen], mixtures: dict[int, GaussianMixture]) -> Record:
+    """Mixtures by stamp, with the truth; their point estimate is the heaviest mode."""
+    rows = [x for x in seen if x.stamp in mixtures and x.stamp in clip.truth.joints]
+    found = [mixtures[x.stamp] for x in rows]
+    points = [one.means[one.weights.argmax()] for one in found]
+    nothing = [0.0] * len(rows)
+    return recorded(
+        clip, [x.body for x in rows], found, points, [x.stamp for x in rows], nothing, nothing, 0
     )
-
-    def mean_error(joints: Array) -> float:
-        return float(1e3 * np.linalg.norm(joints - truth, axis=2).mean())
-
-    error = near - truth - (near - truth).mean(0)
-    power = (error * error).mean()
-    lags = [lag for lag in (1, 3, 6, 12) if lag < len(truth)]
-    return {
-        'best_mm': mean_error(near),
-        'averaged_mm': min(mean_error(gaussian_filter1d(near, s, axis=0)) for s in KERNELS),
-        'constant_mm': float(1e3 * np.linalg.norm((near - truth).mean(0), axis=1).mean()),
-        'autocorrelation': {
-            str(lag): float((error[:-lag] * error[lag:]).mean() / power) for lag in lags
-        },
-    }
-
-
-def true_joints(clip: Clip) -> Array:
-    """Relative to the pelvis, (T, J, 3) m."""
-    names = [clip.truth.joint_names.index(name) for name in (ORIGIN, *EVALUATED_JOINTS)]
-    joints = np.array([clip.truth.joints[stamp][names] for stamp in clip.stamps])
-    return np.asarray(joints[:, 1:] - joints[:, :1], dtype=np.float64)
 
 
 def as_rows(result: dict[str, Any]) -> list[list[str]]:
-    """A table for people."""
-    head = ['clip', 'gravity', '', 'best of 8, mm', 'heaviest, mm', '90 %', 'joint 90 %', '-log p']
-    rows = [head]
-    entries = [(name, gravity, x) for name, mine in result.items() for gravity, x in mine.items()]
-    for name, gravity, entry in entries:
-        for what, label in (('filter', 'filter'), ('likelihoods', 'smoothed')):
-            s = entry[what]
-            rows.append(
-                [
-                    name, gravity, label, f'{s["best_mm"]:.0f}', f'{s["heaviest_mm"]:.0f}',
-                    f'{100 * s["coverage_90"]:.0f} %', f'{100 * s["joint_coverage_90"]:.0f} %',
-                    f'{s["negative_log_likelihood"]:.1f}',
+    """A table for people: means over groups of clips."""
+    rows = [
+        [
+            'inputs', 'gravity', '', 'heaviest, mm', 'best of 8', 'acceleration', 'feet, m/s',
+            'root, %', 'joint 90 %', 'in the camera',
+        ]
+    ]  # fmt: skip
+    for group in dict.fromkeys(x['clips'] for x in result['means']):
+        rows.append([group, *[''] * (len(rows[0]) - 1)])
+        for entry in result['means']:
+            if entry['clips'] != group:
+                continue
+            for way, s in entry['scores'].items():
+                cells = [
+                    f'{s["heaviest_mm"]:.1f}', f'{s["best_mm"]:.1f}', f'{s["acceleration"]:.1f}',
+                    f'{s["feet"]:.2f}', f'{s["root_percent"]:.1f}',
+                ]  # fmt: skip
+                cells += [
+                    '-' if np.isnan(s[name]) else f'{100 * s[name]:.0f} %' for name in SCORES[-2:]
                 ]
-            )  # fmt: skip
-        averaged = f'{entry["oracle"]["averaged_mm"]:.0f}'
-        rows.append([name, gravity, 'nearest mode, averaged', averaged, '-', '-', '-', '-'])
+                rows.append([entry['inputs'], entry['gravity'], way, *cells])
     return rows

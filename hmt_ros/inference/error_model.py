@@ -8,6 +8,9 @@ An error that lasts for tau is an AR(1) process: between two measurements dt apa
 is rho. n measurements in a row tell as much of a constant as a(dt) n independent ones (n large), so
 that each counts with the share a(dt) [Bartlett 1946]. For small dt the share is dt / (2 tau): what
 is told in a second does not depend on the rate of the measurements. For large dt it is 1.
+
+What lasts moves along: how a pose changes from one measurement to the next they tell better, by the
+new part of the error alone, 1 - rho^2 of its variance.
 """
 
 from __future__ import annotations
@@ -53,6 +56,19 @@ class CueErrors:
     def share(self, dt: float) -> float:
         """Share of the energy, or of its curvature, that an image adds dt s after the last one."""
         return self.independent * share_of_time(dt, self.time)
+
+    def of_changes(self, dt: float) -> float:
+        """Share of the curvature by which an image tells how a pose has changed in dt s.
+
+        An error that lasts has not changed: s / (1 - rho^2), the variance of what is new of it.
+        """
+        return (
+            self.independent / -math.expm1(-2.0 * dt / self.time) if self.time else self.share(dt)
+        )
+
+    def lasting(self, dt: float) -> float:
+        """Ratio of both shares, 1 / (1 - rho)^2: variance that stays, over that of changes."""
+        return self.of_changes(dt) / self.share(dt)
 
 
 def errors_of_cues(amounts: Mapping[str, float]) -> CueErrors:

@@ -125,8 +125,15 @@ class Evidence(NamedTuple):
 
     def since(self, before: int | None) -> GaussianMixture:
         """What counts of it after an image at the stamp `before`; None: there is none."""
-        dt = math.inf if before is None else (self.stamp - before) / SECOND_NS
-        return counted(self.mixture, self.errors.share(dt))
+        dt = self._interval(before)
+        return counted(self.mixture, self.errors.share(dt), self.errors.of_changes(dt))
+
+    def lasting(self, before: int | None) -> float:
+        """Factor on the variance that is left after it, because its errors last."""
+        return self.errors.lasting(self._interval(before))
+
+    def _interval(self, before: int | None) -> float:
+        return math.inf if before is None else (self.stamp - before) / SECOND_NS
 
 
 class KeptMixtures(NamedTuple):
@@ -242,7 +249,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         if p.merge_distance > 0:
             used = evidence._replace(mixture=merged_if_close(evidence.mixture, p.merge_distance))
         try:
-            update = self._window.step(stamp, used.since(self._newest))
+            update = self._window.step(stamp, used.since(self._newest), used.lasting(self._newest))
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
             self._log.skip(Fault.ESTIMATE, f'mixture of {stamp} ns can not be smoothed: {text}')
@@ -401,9 +408,12 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 kept = f'those from {items[0].stamp} to {items[-1].stamp} ns are kept'
             raise ValueError(f'no mixture from {from_ns} to {to_ns} ns: {kept}')
         stamps = [item.stamp for item in chosen]
-        mixtures = [item.since(before) for before, item in zip([None, *stamps], chosen)]
+        pairs = list(zip([None, *stamps], chosen))
+        mixtures = [item.since(before) for before, item in pairs]
         smoother = self._smoother(of.body, MixtureSmoother)
         found = smoother.smooth(mixtures, self.parameters.random_seed, stamps_ns=stamps)
+        lasting = [item.lasting(before) for before, item in pairs]
+        found = found.widened(sum(lasting) / len(lasting))
         content = trajectory_content(found, of, covariances=True)
         return trajectory_mixture_message(self._messages, content)
 

@@ -249,27 +249,35 @@ class LikelihoodPart:
         return self.whole.energy(x, rows + self.first, derivatives=derivatives)
 
 
-def counted(mixture: GaussianMixture, share: float) -> GaussianMixture:
+def counted(
+    mixture: GaussianMixture, share: float, of_changes: float | None = None
+) -> GaussianMixture:
     """The likelihood of an observation of which a share is told that is new.
 
-        sum_k w_k^a N(m_k, S_k / a) / sum_k w_k^a
+        sum_k w_k^a N(m_k, S_k / b) / sum_k w_k^a
 
     Where errors last, each observation repeats a part of what those before have told, and counts
-    with the share a (`inference.error_model`): log weights and precisions are a times as large.
+    with the share a (`inference.error_model`): log weights are a times as large, and so are
+    precisions, b = a. Between poses that move, what lasts of an error does no harm: with b of
+    changes (`CueErrors.of_changes`) they are followed as closely as observations tell, and the
+    covariances of the result are to be made b / a times as large (`SlidingWindow.step`).
 
     Args:
         mixture: the whole evidence; modes without weight are left out.
         share: a.
+        of_changes: b; None: a.
 
     Raises:
-        ValueError: a share that is not in (0, 1].
+        ValueError: a share that is not in (0, 1], or of changes that is not positive.
     """
     if not 0.0 < share <= 1.0:
         raise ValueError(f'the share of the evidence must lie in (0, 1], saw {share}')
+    if of_changes is not None and not 0.0 < of_changes < np.inf:
+        raise ValueError(f'the share of changes must be positive, saw {of_changes}')
     some = mixture[mixture.weights > 0]
     log_weights = share * np.log(some.weights)
     weights = np.exp(log_weights - logsumexp(log_weights))
-    return GaussianMixture(weights, some.means, some.covariances / share)
+    return GaussianMixture(weights, some.means, some.covariances / (of_changes or share))
 
 
 def check_mixtures(mixtures: Sequence[GaussianMixture], *, factorise: bool = True) -> None:

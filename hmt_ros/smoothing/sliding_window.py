@@ -123,6 +123,7 @@ class SlidingWindow:
         self._mixtures: list[GaussianMixture] = []
         # The same of each mixture, and the network of all of them: they stay while it moves on.
         self._likelihoods: list[MixtureLikelihood] = []
+        self._lasting: list[float] = []
         self._network: EmbeddedNetwork | None = None
         self._first: GaussianMixture | None = None
         self._last: TrajectoryMixture | None = None
@@ -134,12 +135,14 @@ class SlidingWindow:
         """Times of the poses in the window."""
         return tuple(self._stamps)
 
-    def step(self, stamp_ns: int, mixture: GaussianMixture) -> WindowUpdate:
+    def step(self, stamp_ns: int, mixture: GaussianMixture, lasting: float = 1.0) -> WindowUpdate:
         """Takes the likelihood of the next pose.
 
         Args:
             stamp_ns: its time, after that of the one before.
             mixture: its likelihood; weights need not sum to 1.
+            lasting: factor on the covariances of the result, because errors last, see `counted`;
+                of the poses of a window the mean counts.
 
         Raises:
             ValueError: a mixture that can not be smoothed, or a stamp that does not increase; the
@@ -169,6 +172,7 @@ class SlidingWindow:
         self._stamps.append(int(stamp_ns))
         self._mixtures.append(mixture)
         self._likelihoods.append(likelihood)
+        self._lasting.append(lasting)
         for number in range(1, self._final + 1):
             self._advance(number)
         found = self._smooth()
@@ -219,7 +223,7 @@ class SlidingWindow:
             self.smoother.max_trajectories,
             followed,
         )
-        del self._stamps[0], self._mixtures[0], self._likelihoods[0]
+        del self._stamps[0], self._mixtures[0], self._likelihoods[0], self._lasting[0]
         self._network = self._network.later()
 
     def _smooth(self) -> TrajectoryMixture:
@@ -235,6 +239,7 @@ class SlidingWindow:
         mixtures = tuple(self._mixtures[1:])
         sequence = ModeSequence(mixtures, dynamics, intervals, self._first, known)
         found = smoother.smooth_sequence(sequence, self.seed, self._stamps)
+        found = found.widened(sum(self._lasting) / len(self._lasting))
         return replace(found, identities=self._identities(found))
 
     def _identities(self, found: TrajectoryMixture) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ velocities, they are integrated out of everything that is returned.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -96,6 +96,10 @@ class TrajectoryMixture:
 
     def __len__(self) -> int:
         return len(self.weights)
+
+    def widened(self, factor: float) -> TrajectoryMixture:
+        """The same with covariances that are a factor as large."""
+        return replace(self, inflation=np.sqrt(factor) * self.inflation)
 
     @property
     def times(self) -> int:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from scipy.linalg import toeplitz
+from scipy.signal import lfilter
 
 from hmt_ros.inference import error_model
 from hmt_ros.inference.error_model import ERRORS, CueErrors, errors_of_cues, share_of_time
@@ -98,3 +99,27 @@ def test_cues_with_one_pair_have_it_together(monkeypatch):
     assert (found.independent, found.time) == pytest.approx((0.35, 0.053))
     monkeypatch.setattr(error_model, 'ERRORS', {'a': CueErrors(1.0, 0.0), 'b': CueErrors(0.5, 1.0)})
     assert errors_of_cues({'a': 1.0, 'b': 1.0}) == CueErrors(0.75, 0.0)
+
+
+@pytest.mark.parametrize('rho', [0.01, 0.3, 0.8])
+def test_changes_of_what_lasts_are_told_by_what_is_new_of_it(rho):
+    """Against an autoregressive error, simulated."""
+    tau, s = 0.1, 0.5
+    dt = -tau * np.log(rho)
+    errors = CueErrors(s, tau)
+    rng = np.random.default_rng(0)
+    new = np.sqrt((1.0 - rho**2) / s) * rng.normal(size=200_000)
+    error = lfilter([1.0], [1.0, -rho], new)
+    # Of the next error, what those before do not tell.
+    unknown = np.var(error[1:] - rho * error[:-1])
+    assert unknown == pytest.approx(1.0 / errors.of_changes(dt), rel=0.02)
+    # Of the mean of n, what there is in n images that count with their share.
+    means = error[: 200_000 // 500 * 500].reshape(-1, 500).mean(1)
+    assert 500 * np.var(means) == pytest.approx(1.0 / errors.share(dt), rel=0.15)
+    assert errors.lasting(dt) == pytest.approx(1.0 / (1.0 - rho) ** 2)
+
+
+def test_what_does_not_last_is_told_once():
+    for errors, dt in ((CueErrors(0.5, 0.0), 0.1), (CueErrors(0.5, 0.1), np.inf)):
+        assert errors.of_changes(dt) == errors.share(dt) == 0.5
+        assert errors.lasting(dt) == 1.0

@@ -103,21 +103,24 @@ def test_errors_that_last_are_discounted_once(session, outputs, likelihoods, met
         means.append(mixture.means[0])
         message = likelihoods.message(index, errors=errors, mixture=mixture)
         assert one.take(MIXTURE, message).faults == ()
-    # What counts of each image, and the random walk between the poses.
-    shares = 0.5 * np.array([1.0, np.tanh(0.5), np.tanh(1.0)])
+    # How closely each image is followed, and the random walk between the poses.
+    kept = np.exp([-np.inf, -1.0, -2.0])
+    shares = 0.5 / (1.0 - kept**2)
     links = 1.0 / (body.rates[:, None] * [0.1, 0.2])
     precisions = np.zeros((body.dimension, 3, 3))
     precisions[:, range(3), range(3)] = shares / 1e-3
     for i in range(2):
         precisions[:, i : i + 2, i : i + 2] += links[:, i, None, None] * [[1, -1], [-1, 1]]
     covariances = np.linalg.inv(precisions)
+    lasting = np.mean(1.0 / (1.0 - kept) ** 2)
     pulls = shares[:, None] / 1e-3 * np.array(means)
     wanted = np.einsum('dij,jd->id', covariances, pulls)
     (first,) = (pose_mixture_of(m).mixture for m in read(outputs, 'smoothed_pose_mixture'))
     exact = method == 'paths'
     np.testing.assert_allclose(first.means[0], wanted[0], atol=1e-6 if exact else 0.01)
     found = np.diagonal(first.covariances[0])
-    np.testing.assert_allclose(found, covariances[:, 0, 0], rtol=1e-6 if exact else 0.3)
+    wide = lasting * covariances[:, 0, 0]
+    np.testing.assert_allclose(found, wide, rtol=1e-6 if exact else 0.3)
 
 
 def test_likelihoods_without_an_error_model_are_refused(session, outputs, likelihoods):
@@ -161,12 +164,15 @@ def test_a_span_is_discounted_from_its_first_image_on(session, likelihoods):
         one.take(MIXTURE, likelihoods.message(index, errors=errors))
     first, last = likelihoods.stamp(1), likelihoods.stamp(3)
     found = trajectory_mixture_of(one.smooth_span(first, last))
-    share = 0.5 * np.tanh(0.5)
-    mixtures = [counted(likelihoods.mixture(i), 0.5 if i == 1 else share) for i in (1, 2, 3)]
+    share, changes = 0.5 * np.tanh(0.5), 0.5 / (1.0 - np.exp(-2.0))
+    mixtures = [counted(likelihoods.mixture(1), 0.5)]
+    mixtures += [counted(likelihoods.mixture(i), share, changes) for i in (2, 3)]
     smoother = one._smoother(likelihoods.body, MixtureSmoother)
     wanted = smoother.smooth(mixtures, stamps_ns=[likelihoods.stamp(i) for i in (1, 2, 3)])
     np.testing.assert_allclose(found.means, wanted.means, atol=1e-9)
     np.testing.assert_allclose(found.weights, wanted.weights, atol=1e-9)
+    factor = (1.0 + 2.0 * changes / share) / 3.0
+    np.testing.assert_allclose(found.inflation, np.sqrt(factor) * wanted.inflation)
     # Another run of the same span would number them otherwise.
     assert not found.identities.any()
 
