@@ -2,9 +2,9 @@
 
 The tracker follows every clip with images, with keypoints as well, and with keypoints alone,
 gravity given and not. What it says of each image goes through a `SmootherSession` with the defaults
-of the node, live, and with a window over the whole clip. Beside it stand the filter and the
-simplest smoother: the joints of the heaviest mode of the filter, averaged over time with the
-Gaussian kernel that is best in the mean over the clips.
+of the node, live, and through its smoother once, over the whole clip. Beside it stand the filter
+and the simplest smoother: the joints of the heaviest mode of the filter, averaged over time with
+the Gaussian kernel that is best in the mean over the clips.
 """
 
 from __future__ import annotations
@@ -36,10 +36,12 @@ from benchmarks.tracking_scores import heaviest_joints, scores_of
 from hmt_ros.body import Body, load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
+from hmt_ros.inference.reduction import merged_pairwise
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Output
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
+from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from hmt_ros.tracking import TrackerSettings
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
@@ -54,8 +56,8 @@ from msg_tools.messages.pose_mixtures import (
 Array = NDArray[np.float64]
 
 FILTER, LIVE, OFFLINE, AVERAGED = 'filter', 'live', 'offline', 'filter, averaged'
-# Parameters of the node, by the way of smoothing.
-WAYS: dict[str, dict[str, Any]] = {LIVE: {}, OFFLINE: {'fixed_lag': 1000, 'longest_lag': 0.0}}
+# Mixtures that are kept for smoothing over the whole clip, and components of a smoothed pose.
+KEPT, COMPONENTS = 10_000, 8
 # Standard deviations of the kernels that the heaviest mode is averaged with, images.
 KERNELS = (1.0, 2.0, 3.0, 4.0, 6.0)
 SCORES = (
@@ -134,7 +136,7 @@ def of_clip(work: Work) -> dict[str, dict[str, float]]:
     clip = read_clip(folder, limit)
     seen = tracked(clip, inputs, gravity)
     mixtures = {FILTER: {x.stamp: x.posterior for x in seen}}
-    mixtures |= {way: smoothed(seen, values) for way, values in WAYS.items()}
+    mixtures[LIVE], mixtures[OFFLINE] = smoothed(seen)
     records = {way: record_of(clip, seen, found) for way, found in mixtures.items()}
     result = {}
     for way, record in records.items():
@@ -175,11 +177,13 @@ def tracked(clip: Clip, inputs: str, gravity: str) -> list[Seen]:
     return result
 
 
-def smoothed(seen: Sequence[Seen], values: dict[str, Any]) -> dict[int, GaussianMixture]:
-    """What the smoother publishes, by stamp, with some parameters of the node."""
+def smoothed(
+    seen: Sequence[Seen],
+) -> tuple[dict[int, GaussianMixture], dict[int, GaussianMixture]]:
+    """What the node publishes, and what it makes of all images together, by stamp."""
     outputs: list[Output] = []
     messages = RosbagsMessages()
-    parameters = with_values(SmootherParameters(), values)
+    parameters = with_values(SmootherParameters(), {'window_length': KEPT})
     session = SmootherSession(parameters, outputs.append, SMOOTHED.__eq__)
     for one in seen:
         content = PoseMixture.of_body(
@@ -190,9 +194,15 @@ def smoothed(seen: Sequence[Seen], values: dict[str, Any]) -> dict[int, Gaussian
         handled = session.take(MIXTURE, pose_mixture_message(messages, content))
         if handled.faults:
             raise ValueError(handled.faults[0])
+    whole, _ = session.smoothed_span(PathSmoother)
+    assert whole.stamps_ns is not None
+    offline = {
+        stamp: merged_pairwise(whole.marginal(t), COMPONENTS).normalised()
+        for t, stamp in enumerate(whole.stamps_ns)
+    }
     session.finish()
     found = [pose_mixture_of(deserialise(x.data, 'hmt_msgs/msg/PoseMixture')) for x in outputs]
-    return {x.stamp_ns: x.mixture for x in found}
+    return {x.stamp_ns: x.mixture for x in found}, offline
 
 
 def record_of(clip: Clip, seen: Sequence[Seen], mixtures: dict[int, GaussianMixture]) -> Record:

@@ -52,7 +52,7 @@ from hmt_ros.sessions.smoothed_messages import (
 )
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.warm_up import likelihoods
-from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow
+from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow, TrajectoryMixture
 from hmt_ros.smoothing.likelihood import counted
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from msg_tools import MessageError
@@ -398,6 +398,19 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         Raises:
             ValueError: there is none in the span, or they can not be smoothed.
         """
+        found, of = self.smoothed_span(MixtureSmoother, from_ns, to_ns)
+        content = trajectory_content(found, of, covariances=True)
+        return trajectory_mixture_message(self._messages, content)
+
+    def smoothed_span(
+        self, closed_form: type[MixtureSmoother], from_ns: int = 0, to_ns: int = 0
+    ) -> tuple[TrajectoryMixture, SmoothedBody]:
+        """The trajectories of a span of time, and whose; see `smooth_span`.
+
+        Args:
+            closed_form: smoother with the method 'paths'.
+            from_ns, to_ns: as there.
+        """
         of, items = self.kept
         chosen = [
             item for item in items if from_ns <= item.stamp and (to_ns == 0 or item.stamp <= to_ns)
@@ -410,12 +423,10 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         stamps = [item.stamp for item in chosen]
         pairs = list(zip([None, *stamps], chosen))
         mixtures = [item.since(before) for before, item in pairs]
-        smoother = self._smoother(of.body, MixtureSmoother)
+        smoother = self._smoother(of.body, closed_form)
         found = smoother.smooth(mixtures, self.parameters.random_seed, stamps_ns=stamps)
         lasting = [item.lasting(before) for before, item in pairs]
-        found = found.widened(sum(lasting) / len(lasting))
-        content = trajectory_content(found, of, covariances=True)
-        return trajectory_mixture_message(self._messages, content)
+        return found.widened(sum(lasting) / len(lasting)), of
 
     # State.
 

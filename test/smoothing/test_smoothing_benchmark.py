@@ -85,33 +85,46 @@ def test_report(monkeypatch, capsys):
 
 
 def test_clips_are_skipped_where_they_are_absent(monkeypatch, tmp_path):
-    def absent(folder):
+    def absent(folder, *, moving):
         raise ValueError('no clips here')
 
     monkeypatch.setattr(smoothing_clips, 'find_clips', absent)
     assert smoothing_clips.clips() == 'skipped: no clips here'
 
 
-def test_mixtures_of_a_clip_are_compared():
+def test_likelihoods_are_smoothed_live_and_together():
+    """Independent errors of still poses average out, of later ones most."""
     body = load_body('human37')
     rng = np.random.default_rng(0)
-    poses = np.clip(np.tile(body.prior_mean, (5, 1)), body.lower, body.upper)
-    mixtures = [
-        GaussianMixture(
-            np.array([0.6, 0.4]),
-            np.clip(pose + 0.1 * rng.normal(size=(2, body.dimension)), body.lower, body.upper),
-            np.tile(0.01 * np.eye(body.dimension), (2, 1, 1)),
+    pose, spread = body.prior_mean, 0.05
+    seen = []
+    for t in range(12):
+        near = pose + spread * rng.normal(size=(2, body.dimension))
+        mixture = GaussianMixture(
+            np.array([0.6, 0.4]), near, np.tile(spread**2 * np.eye(body.dimension), (2, 1, 1))
         )
-        for pose in poses
-    ]
-    joints = body.joint_positions(poses)
-    names = (smoothing_clips.ORIGIN, *smoothing_clips.EVALUATED_JOINTS)
-    at = body.skeleton.joint_index(names)
-    truth = joints[:, at[1:]] - joints[:, at[:1]]
-    stamps = [33_000_000 * t for t in range(5)]
-    errors = [CueErrors(0.5, 0.05)] * 5
-    found = smoothing_clips.compared(body, stamps, mixtures, mixtures, errors, truth)
-    # Independent errors of still poses average out.
-    assert found['likelihoods']['heaviest_mm'] < found['filter']['heaviest_mm']
-    assert found['likelihoods']['modes'] <= 2
-    assert len(smoothing_clips.as_rows({'still': {'unknown': found}})) == 4
+        stamp = 33_000_000 * (t + 1)
+        seen.append(smoothing_clips.Seen(stamp, body, mixture, mixture, CueErrors(1.0, 0.0)))
+    live, offline = smoothing_clips.smoothed(seen)
+    assert list(live) == list(offline) == [x.stamp for x in seen]
+    first = seen[0].stamp
+
+    def error(mixture):
+        return np.abs(mixture.means[mixture.weights.argmax()] - pose).mean()
+
+    assert error(offline[first]) < error(seen[0].likelihood)
+    assert error(live[first]) < error(seen[0].likelihood)
+    assert all(len(x) <= smoothing_clips.COMPONENTS for x in offline.values())
+
+
+def test_the_kernel_that_is_best_in_the_mean_is_shown():
+    names = [f'{smoothing_clips.AVERAGED} over {width} images' for width in (1, 2)]
+    numbers = dict.fromkeys(smoothing_clips.SCORES, 1.0)
+    one = {'filter': numbers, names[0]: numbers | {'heaviest_mm': 5.0}, names[1]: numbers}
+    other = {'filter': numbers, names[0]: numbers, names[1]: numbers | {'heaviest_mm': 4.0}}
+    found = smoothing_clips.mean([one, other])
+    assert list(found) == ['filter', names[1]]
+    assert found[names[1]]['heaviest_mm'] == 2.5
+    entry = {'clips': 'all', 'inputs': 'images', 'gravity': 'given', 'scores': found}
+    rows = smoothing_clips.as_rows({'means': [entry]})
+    assert [len(row) for row in rows] == [10] * 4
