@@ -15,7 +15,7 @@ Bytes = NDArray[np.uint8]
 
 
 class RenderingMark:
-    """The silhouettes that have been rendered, in a file, and beside it how many they are.
+    """Keeps rendered silhouettes in a file, and their number beside it.
 
     Args:
         path: file (.npy) of the silhouettes; the other one is `path` with the suffix .json.
