@@ -14,7 +14,6 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.flips.interpretation_tree import enumerate_flips
 from hmt_ros.inference.arrays import Array
-from hmt_ros.tracking.hypotheses import relative_joints
 
 VOTES = ('trace', 'uniform', 'minima')
 
@@ -81,10 +80,10 @@ def shares_of_new_minima(body: Body, poses: Array, chain: str, known: Array | No
         known: (M, d); None: none but the pose itself.
     """
     leaves, parents = enumerate_flips(body, poses, chain)
-    joints, before = (relative_joints(body, x) for x in (leaves, poses))
+    joints, before = (body.relative_joints(x) for x in (leaves, poses))
     new = np.linalg.norm(joints - before[parents], axis=2).max(1) > APART
     if known is not None and len(known):
-        gaps = joints[:, None] - relative_joints(body, known)[None]
+        gaps = joints[:, None] - body.relative_joints(known)[None]
         new &= (np.linalg.norm(gaps, axis=3).max(2) > APART).all(1)
     count = np.bincount(parents, weights=new, minlength=len(poses))
     share: Array = count / np.bincount(parents, minlength=len(poses))

@@ -27,6 +27,7 @@ from benchmarks.machine import description
 from benchmarks.runs import GIVEN, UNKNOWN, in_processes, recorded
 from benchmarks.tracking_means import GROUPS, group_of
 from benchmarks.tracking_scores import detector_scores, scores_of
+from hmt_ros.app.learn_motion import read_motions, shares_of
 from hmt_ros.body import load_body
 from hmt_ros.experts.keypoint_training import (
     JOINTS,
@@ -40,7 +41,7 @@ from hmt_ros.experts.lifted_fit import UNKNOWN_SIZE, lift_poses, poses_of
 from hmt_ros.experts.lifter import SHIPPED, KeypointHistory, Lifter, load_lifter
 from hmt_ros.experts.lifter_learning import PELVIS, SCORED, lifter_scores
 from hmt_ros.experts.predictor_learning import kinds, new_model
-from hmt_ros.experts.training_set import motion_files, recorded_sequence
+from hmt_ros.experts.training_set import motion_files
 from hmt_ros.image.lifted_poses import HIPS
 from hmt_ros.tracking import read_subject
 from hmt_ros.tracking.initialisation import start_from_keypoints
@@ -127,9 +128,8 @@ class Motions(NamedTuple):
     others: KeypointTracks
 
 
-def read_motions(mocap: Path, lifter: Lifter, *, quick: bool = False) -> Motions:
+def motions_of(lifter: Lifter, mocap: Path, *, quick: bool = False) -> Motions:
     """The motions in the card of a lifter, and those of `dev`, under a folder of motion capture."""
-    body = lifter.usual
     # The card ends with the names of the motions.
     names = set(str(lifter.notes.get('card', '')).rpartition(' s: ')[2].rstrip('.').split(', '))
     found = []
@@ -137,9 +137,9 @@ def read_motions(mocap: Path, lifter: Lifter, *, quick: bool = False) -> Motions
         files = [x for part in parts if (mocap / part).is_dir() for x in motion_files(mocap / part)]
         files = [x for x in files if parts != LEARNED or x.stem in names]
         files = files[: 3 if quick else None]
-        read = [recorded_sequence(path, body) for path in told('lifting: motions', files)]
-        shares = [ALIKE_SHARE if x.name.startswith(ALIKE) else 1.0 for x in read]
-        found.append(keypoint_tracks(body, read, shares, variants=variants))
+        read = read_motions('lifting', files, lifter.usual.name, quiet=False)
+        shares = shares_of(read, ALIKE, ALIKE_SHARE)
+        found.append(keypoint_tracks(lifter.usual, read, shares, variants=variants))
     return Motions(*found)
 
 
@@ -262,7 +262,7 @@ def measure(
     against: dict[str, Any] = {'contenders': [], 'rarity': []}
     if (mocap := mocap or (None if quick else shared_mocap())) is not None:
         lifter = load_lifter(model)
-        motions = read_motions(mocap, lifter, quick=quick)
+        motions = motions_of(lifter, mocap, quick=quick)
         against = {
             'contenders': contenders(motions, lifter, quick=quick),
             'rarity': by_rarity(motions, lifter, quick=quick),

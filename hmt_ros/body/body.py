@@ -242,6 +242,11 @@ class Body:
         """Joint positions (N, J, 3) of poses (N, d), camera frame, m."""
         return kinematics.joint_positions(self.skeleton, poses)
 
+    def relative_joints(self, poses: ArrayLike) -> Array:
+        """Joints (N, J, 3) of poses (N, d) relative to the first, m: what poses are compared by."""
+        joints = self.joint_positions(poses)
+        return joints - joints[:, :1]
+
     def joint_jacobians(self, poses: ArrayLike) -> Array:
         """Derivatives (N, J, 3, d) of the joint positions with respect to the poses (N, d)."""
         frames = kinematics.forward(self.skeleton, poses)

@@ -20,17 +20,12 @@ def endless(body: Body) -> Mask:
 
 
 def without_turns(body: Body, poses: Array, before: Array) -> Array:
-    """Poses (K, d) whose angles are those of the nearest pose before (L, d) but for half a turn.
+    """Poses (K, d) whose angles are within half a turn of the nearest pose before (L, d).
 
-    The nearest one is that whose joints, relative to the root, are nearest in the mean: joints do
+    The nearest one is that whose joints, relative to the first, are nearest in the mean: joints do
     not change with whole turns.
     """
-    joints, known = (_relative_joints(body, x) for x in (poses, before))
+    joints, known = (body.relative_joints(x) for x in (poses, before))
     nearest = np.linalg.norm(joints[:, None] - known, axis=3).mean(2).argmin(1)
     turns = np.round((before[nearest] - poses) / TURN)
     return np.asarray(poses + TURN * np.where(endless(body), turns, 0.0))
-
-
-def _relative_joints(body: Body, poses: Array) -> Array:
-    joints = body.joint_positions(poses)
-    return joints[:, 1:] - joints[:, :1]

@@ -249,9 +249,7 @@ def training_set(
     distances = np.repeat(rng.uniform(*s.distances, len(groups)), GROUP)[: len(poses)]
     poses, previous = _seen(body, poses, previous, view, distances)
     shape = (len(poses), SIDE, SIDE // 8)
-    packed, done = np.empty(shape, dtype=np.uint8), 0
-    if mark is not None:
-        packed, done = mark.begin(shape, rng)
+    packed, done = (np.empty(shape, np.uint8), 0) if mark is None else mark.begin(shape, rng)
     left: Iterable[Index] = groups[done:]
     for rows in left if progress is None else progress(left, len(groups) - done):
         person = random_build(body, s, rng)

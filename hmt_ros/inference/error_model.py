@@ -62,9 +62,8 @@ class CueErrors:
 
         An error that lasts has not changed: s / (1 - rho^2), the variance of what is new of it.
         """
-        return (
-            self.independent / -math.expm1(-2.0 * dt / self.time) if self.time else self.share(dt)
-        )
+        new = -math.expm1(-2.0 * dt / self.time) if self.time > 0.0 else 1.0
+        return self.independent / new
 
     def lasting(self, dt: float) -> float:
         """Ratio of both shares, 1 / (1 - rho)^2: variance that stays, over that of changes."""

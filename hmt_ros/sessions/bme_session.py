@@ -180,7 +180,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
         self._tracked: int | None = None
         self._height, self._support = 0, math.nan
         # Whether the last prediction needed no background.
-        self._without_background = False
+        self._without_background = parameters.predict_from == FROM_KEYPOINTS
         self._lifter = None
         if parameters.predict_from != FROM_SILHOUETTES:
             self._lifter = known_lifter(parameters.lifter)
@@ -269,7 +269,7 @@ class BmeSession(CameraSession[BmeParameters, BmeState]):
                 f'keypoints of {stamp} ns are left out: no calibrated camera_info has come',
             )
             return
-        self._newest, self._without_background = stamp, True
+        self._newest = stamp
         content = self._keypoints.read(message, self._predictor.body, self._scheme)
         if content is None:
             self._log.counts['skipped'] += 1

@@ -66,8 +66,7 @@ class FilterParameters(CameraNodeParameters):
             subject_file, and an image waits for the keypoints of its stamp.
         keypoint_scheme: What the names of keypoints mean, 'auto' (recognised by the names),
             'joints' (the joints of the body themselves), or a scheme of detectors: 'coco17',
-            'halpe26', 'body25', 'mediapipe33', 'h36m17',
-            'skeleton2d', 'smpl24' or 'mhr70'.
+            'halpe26', 'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24' or 'mhr70'.
         use_keypoints_3d: If true, positions of the same landmarks in space (topic keypoints_3d) are
             weak evidence of depth, and an image waits for those of its stamp.
         keypoint_sigma_px: Standard deviation of keypoints that come without a covariance, px; 0

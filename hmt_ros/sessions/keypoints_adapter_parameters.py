@@ -33,8 +33,7 @@ class KeypointsAdapterParameters(NodeParameters):
         source: Type of the messages on the topic detections, 'skeleton2d' (hri_msgs/Skeleton2D),
             'yolo' (yolo_msgs/DetectionArray) or 'floats' (std_msgs/Float32MultiArray).
         scheme: Scheme whose order the keypoints of 'yolo' and 'floats' follow: 'coco17', 'halpe26',
-            'body25', 'mediapipe33', 'h36m17',
-            'skeleton2d', 'smpl24' or 'mhr70'.
+            'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24' or 'mhr70'.
         person_id: Identity that the detector gives the person who is tracked; if empty, it is the
             largest person at first, and then the one nearest to where this person was last.
         longest_absence: Time without the person after which the largest one is chosen anew, by the

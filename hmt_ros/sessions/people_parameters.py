@@ -31,8 +31,7 @@ class PeopleParameters(FilterParameters):
             (yolo_msgs/DetectionArray), 'boxes' (vision_msgs/Detection2DArray) or 'floats'
             (std_msgs/Float32MultiArray).
         scheme: Scheme whose order the keypoints of 'yolo' and 'floats' follow: 'coco17', 'halpe26',
-            'body25', 'mediapipe33', 'h36m17',
-            'skeleton2d', 'smpl24' or 'mhr70'.
+            'body25', 'mediapipe33', 'h36m17', 'skeleton2d', 'smpl24' or 'mhr70'.
         max_people: Maximum number of people who are followed at the same time; of those who come at
             the same time the largest in the image are taken.
         use_keypoints: If true, keypoints of the detections are a measurement and start tracks; if

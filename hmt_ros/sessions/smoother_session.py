@@ -29,7 +29,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -275,7 +274,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         """The evidence with angles that go on from those of the mixture before."""
         mixture, kept = evidence.mixture, self.kept.items
         heaviest = mixture.means[[int(np.argmax(mixture.weights))]]
-        before = kept[-1].mixture.means if self._newest is not None and kept else heaviest
+        before = kept[-1].mixture.means if kept else heaviest
         means = without_turns(body, mixture.means, before)
         return evidence._replace(
             mixture=GaussianMixture(mixture.weights, means, mixture.covariances)
@@ -345,7 +344,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             p.fixed_lag,
             p.random_seed,
             longest_lag=p.longest_lag or math.inf,
-            points=partial(_relative_joints, body),
+            points=body.relative_joints,
             first_identity=self._first_identity,
         )
 
@@ -468,12 +467,6 @@ def _evidence(content: PoseMixture) -> Evidence:
             )
         share, time = 1.0, 0.0
     return Evidence(content.stamp_ns, mixture, CueErrors(share, time))
-
-
-def _relative_joints(body: Body, poses: Array) -> Array:
-    """Joints (N, J, 3) of poses (N, d) relative to the pelvis, the first of them."""
-    joints = body.joint_positions(poses)
-    return joints - joints[:, :1]
 
 
 def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:

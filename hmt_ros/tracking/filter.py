@@ -36,7 +36,6 @@ from hmt_ros.tracking.hypotheses import (
     Modes,
     Optimised,
     new_hypotheses,
-    relative_joints,
 )
 from hmt_ros.tracking.laplace_approximation import (
     Likelihood,
@@ -327,7 +326,7 @@ class MixtureFilter:
 
     def _distinct(self, optimised: Optimised, log_weights: Array) -> Index:
         """Hypotheses that have come to optima of their own; see `distinct_hypotheses`."""
-        joints = relative_joints(self.body, optimised.minima.x)
+        joints = self.body.relative_joints(optimised.minima.x)
         return distinct_hypotheses(joints, log_weights, self.settings.hypothesis_merge_distance)
 
     def _weigh(self, search: Search, optimised: Optimised) -> tuple[Optimised, Array, Array]:
@@ -374,7 +373,7 @@ class MixtureFilter:
         """
         s = self.settings
         poses = optimised.minima.x
-        joints = relative_joints(self.body, poses)
+        joints = self.body.relative_joints(poses)
         kept = choose_hypotheses(
             joints,
             log_weights,

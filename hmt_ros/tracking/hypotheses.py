@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hmt_ros.body.body import Body
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.mixture import GaussianMixture
@@ -161,9 +160,3 @@ def new_hypotheses(poses: Array, log_weights: Array) -> Hypotheses:
     everyone = np.arange(len(poses))
     still = np.zeros(poses.shape, dtype=np.bool_)
     return Hypotheses(poses, log_weights, everyone, poses, still)
-
-
-def relative_joints(body: Body, poses: Array) -> Array:
-    """Joints (N, J, 3) of poses relative to the first, m: what hypotheses are compared by."""
-    joints = body.joint_positions(poses)
-    return joints - joints[:, :1]

@@ -25,7 +25,6 @@ import numpy as np
 
 from hmt_ros.body.body import Body
 from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.tracking.hypotheses import relative_joints
 
 # Mean squared distance q by which joints leave their prediction, m^2/s, and the degrees of freedom
 # nu of its tails: modes tremble, and limbs are found where they were not looked for.
@@ -52,11 +51,11 @@ class Continuity:
 
     @cached_property
     def _joints(self) -> Array:
-        return relative_joints(self.body, self.predicted)
+        return self.body.relative_joints(self.predicted)
 
     def log_transitions(self, poses: Array) -> Array:
         """log t(x_n, x_k), (K, N), of poses (N, d), equation (3)."""
-        joints = relative_joints(self.body, poses)
+        joints = self.body.relative_joints(poses)
         a, b = (x.reshape(len(x), -1) for x in (self._joints, joints))
         squares = (a * a).sum(1)[:, None] + (b * b).sum(1) - 2.0 * a @ b.T
         ratio = np.maximum(squares, 0.0) / (joints.shape[1] * SPREAD * self.dt)

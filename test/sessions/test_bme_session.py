@@ -449,6 +449,7 @@ def test_keypoints_have_predictions_without_images(outputs, walker):
     early = one.take('keypoints', keypoints_message(messages, seen, 5, 'lens'))
     assert 'no calibrated camera_info' in early.faults[0]
     one.take(CAMERA_INFO, camera_info_message(messages, camera, 10, 'lens'))
+    assert (one.state.status, one.state.wants) == ('nobody', '')
     for t in range(3):
         stamp = 10 + t * FRAME_NS
         handled = one.take('keypoints', keypoints_message(messages, seen, stamp, 'lens'))

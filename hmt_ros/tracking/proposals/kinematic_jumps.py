@@ -19,7 +19,7 @@ from hmt_ros.image.terms.keypoints import group_of
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.bounded_newton import Minimum
 from hmt_ros.inference.error_model import ERRORS
-from hmt_ros.tracking.hypotheses import LIKELY, Hypotheses, relative_joints
+from hmt_ros.tracking.hypotheses import LIKELY, Hypotheses
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.proposals.limb_search import LimbSearch
@@ -78,7 +78,7 @@ class KinematicJumps:
             np.concatenate([part[i] for part in everything]) for i in range(3)
         )
         kept = choose_hypotheses(
-            relative_joints(self.posterior.body, poses),
+            self.posterior.body.relative_joints(poses),
             search.rated(poses, energies),
             plan.candidates,
             same=s.hypothesis_merge_distance,

@@ -14,7 +14,7 @@ import numpy as np
 from hmt_ros.body.body import Body
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.bounded_newton import Minimum
-from hmt_ros.tracking.hypotheses import Hypotheses, relative_joints
+from hmt_ros.tracking.hypotheses import Hypotheses
 from hmt_ros.tracking.optimisation import Search
 from hmt_ros.tracking.posterior import Posterior
 from hmt_ros.tracking.selection import choose_hypotheses
@@ -86,7 +86,7 @@ class CovarianceScaledSamples:
         rows = np.concatenate([np.arange(k), np.repeat(np.arange(k), each)])
         energies = self.posterior.values(poses, observation)
         kept = choose_hypotheses(
-            relative_joints(body, poses),
+            body.relative_joints(poses),
             search.rated(poses, energies),
             search.plan.candidates,
             same=s.hypothesis_merge_distance,
