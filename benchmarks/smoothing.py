@@ -20,8 +20,7 @@ from benchmarks.exact_smoothing import (
     particle_marginals,
 )
 from benchmarks.machine import best_time, peak_memory_apart
-from benchmarks.smoothing_clips import as_rows as rows_of_clips
-from benchmarks.smoothing_clips import clips
+from benchmarks.smoothing_clips import clips, error_rows, motion_rows
 from benchmarks.smoothing_peers import (
     RobustSequence,
     gtsam_missing,
@@ -288,5 +287,6 @@ def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
         if isinstance(found, str):
             parts.append(f'clips: {found}')
         else:
-            parts.append(table(rows_of_clips(found), left=3, markdown=markdown))
+            parts.append(table(error_rows(found), left=2, markdown=markdown))
+            parts.append(table(motion_rows(found), left=3, markdown=markdown))
     return '\n\n'.join(parts)

@@ -1,10 +1,17 @@
 """What the smoother of the node makes of clips with known truth, live and offline.
 
 The tracker follows every clip with images, with keypoints as well, and with keypoints alone,
-gravity given and not. What it says of each image goes through a `SmootherSession` with the defaults
-of the node, live, and through its smoother once, over the whole clip. Beside it stand the filter
-and the simplest smoother: the joints of the heaviest mode of the filter, averaged over time with
-the Gaussian kernel that is best in the mean over the clips.
+gravity given and not, at the rate of the clip and at lower ones. What it says of each image goes
+through a `SmootherSession` with the defaults of the node, live, and through its smoother once, over
+the whole clip. Beside it stand
+
+- the filter, and its point estimate;
+- the simplest smoothers: the joints of the filter's heaviest mode, or their mean over its modes,
+  averaged over time with the Gaussian kernel that is best in the mean over the clips;
+- the path through the modes of the filter that is best by weights and distances (Viterbi);
+- one Gaussian smoothed along the best path of the smoother (RTS);
+- the limit of what any choice of modes can bring: at each time the mode of the filter that is
+  nearest to the truth, averaged in the same way. It knows the truth; no method does.
 """
 
 from __future__ import annotations
@@ -18,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from benchmarks.clips import Clip, find_clips, read_clip, read_detections
+from benchmarks.clips import Clip, at_rate, find_clips, read_clip, read_detections
 from benchmarks.runs import (
     GIVEN,
     GRAVITIES,
@@ -36,12 +43,13 @@ from benchmarks.tracking_scores import heaviest_joints, scores_of
 from hmt_ros.body import Body, load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
-from hmt_ros.inference.reduction import merged_pairwise
+from hmt_ros.inference.reduction import leaders, led
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Output
+from hmt_ros.sessions.smoothed_messages import SmoothedBody
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
-from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
-from hmt_ros.smoothing.mixture_smoother import PathSmoother
+from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession, wider
+from hmt_ros.smoothing.mixture_smoother import SAME_MOTION, PathSmoother
 from hmt_ros.tracking import TrackerSettings
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
@@ -55,15 +63,25 @@ from msg_tools.messages.pose_mixtures import (
 
 Array = NDArray[np.float64]
 
-FILTER, LIVE, OFFLINE, AVERAGED = 'filter', 'live', 'offline', 'filter, averaged'
+FILTER, LIVE, OFFLINE = 'filter', 'live', 'offline'
+RTS = 'one path, smoothed'
+POINT, VITERBI = 'point estimate', 'Viterbi path'
+AVERAGED, MEAN, NEAREST = 'filter, averaged', 'mean of modes, averaged', 'nearest modes, averaged'
+# Images a second; 0: all of a clip.
+RATES = (0.0, 8.0, 3.0)
 # Mixtures that are kept for smoothing over the whole clip, and components of a smoothed pose.
 KEPT, COMPONENTS = 10_000, 8
-# Standard deviations of the kernels that the heaviest mode is averaged with, images.
+# Distance that joints move from image to image in Viterbi's costs, m.
+VITERBI_STEP = 0.05
+# Distance of the joints of two modes, in the mean, from which on they are counted apart, m.
+APART = 0.03
+# Standard deviations of the kernels that joints are averaged with, images.
 KERNELS = (1.0, 2.0, 3.0, 4.0, 6.0)
 SCORES = (
     'heaviest_mm', 'best_mm', 'acceleration', 'feet', 'root_percent', 'joint_coverage_90',
     'absolute_coverage_90',
 )  # fmt: skip
+MODES = 'modes'
 SMOOTHED = 'smoothed_pose_mixture'
 
 
@@ -75,9 +93,17 @@ class Seen(NamedTuple):
     posterior: GaussianMixture
     likelihood: GaussianMixture
     errors: CueErrors
+    shape_covariance: Array
 
 
-Work = tuple[Path, str, str, int | None]
+class Work(NamedTuple):
+    """A clip, and how it is seen: see `Run`; `limit` images at most, None: all."""
+
+    folder: Path
+    inputs: str
+    gravity: str
+    rate: float
+    limit: int | None
 
 
 def clips(quick: bool = False) -> dict[str, Any] | str:
@@ -89,39 +115,49 @@ def clips(quick: bool = False) -> dict[str, Any] | str:
     folders = [x for x in folders if (x / 'keypoints_mediapipe.npz').exists()]
     if not folders:
         return f'skipped: {source} has no keypoints_mediapipe.npz'
-    inputs, gravities, limit = INPUTS, GRAVITIES, None
+    inputs, gravities, rates, limit = INPUTS, GRAVITIES, RATES, None
     if quick:
-        folders, inputs, gravities, limit = folders[:1], (IMAGES,), (GIVEN,), 12
-    work = [(x, given, known, limit) for given in inputs for known in gravities for x in folders]
+        folders, inputs, gravities, rates, limit = folders[:1], (IMAGES,), (GIVEN,), (0.0,), 12
+    work = [
+        Work(folder, given, known, rate, limit)
+        for rate in rates for given in inputs for known in gravities for folder in folders
+    ]  # fmt: skip
     found = in_processes(of_clip, work, 0, 'smoothing: clips')
     entries = [
-        {'clip': folder.name, 'inputs': given, 'gravity': known, 'scores': scores}
-        for (folder, given, known, _), scores in zip(work, found, strict=True)
-    ]
+        {
+            'clip': one.folder.name, 'inputs': one.inputs, 'gravity': one.gravity,
+            'rate': one.rate, 'scores': scores,
+        }
+        for one, scores in zip(work, found, strict=True)
+    ]  # fmt: skip
     means = []
-    for group in GROUPS:
-        for given in inputs:
-            for known in gravities:
-                own = [
-                    x['scores'] for x in entries
-                    if (group_of(x['clip']), x['inputs'], x['gravity']) == (group, given, known)
-                ]  # fmt: skip
-                if own:
-                    means.append(
-                        {'clips': group, 'inputs': given, 'gravity': known, 'scores': mean(own)}
-                    )
+    for rate in rates:
+        for group in GROUPS:
+            for given in inputs:
+                for known in gravities:
+                    kind = {'inputs': given, 'gravity': known, 'rate': rate}
+                    own = [
+                        x['scores'] for x in entries
+                        if group_of(x['clip']) == group and kind.items() <= x.items()
+                    ]  # fmt: skip
+                    if own:
+                        means.append({'clips': group, **kind, 'scores': mean(own)})
     return {'clips': entries, 'means': means}
 
 
 def mean(scores: Sequence[dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
-    """Means over clips by way; of the kernels the one that is best in the mean."""
+    """Means over clips by way; of kernels the one that is best in the mean."""
     result = {
         way: {name: _known_mean([x[way][name] for x in scores]) for name in scores[0][way]}
         for way in scores[0]
     }
-    kernels = [way for way in result if way.startswith(AVERAGED)]
-    best = min(kernels, key=lambda way: result[way]['heaviest_mm'])
-    return {way: found for way, found in result.items() if way == best or way not in kernels}
+    for way in (AVERAGED, MEAN, NEAREST):
+        kernels = [name for name in result if name.startswith(way)]
+        best = min(kernels, key=lambda name: result[name]['heaviest_mm'])
+        for name in kernels:
+            if name != best:
+                del result[name]
+    return result
 
 
 def _known_mean(values: Sequence[float]) -> float:
@@ -131,28 +167,79 @@ def _known_mean(values: Sequence[float]) -> float:
 
 
 def of_clip(work: Work) -> dict[str, dict[str, float]]:
-    """Scores of one clip by way: folder, inputs, gravity, number of images (None: all)."""
-    folder, inputs, gravity, limit = work
-    clip = read_clip(folder, limit)
-    seen = tracked(clip, inputs, gravity)
+    """Scores of one clip by way."""
+    clip = at_rate(read_clip(work.folder, work.limit), work.rate)
+    seen = tracked(clip, work.inputs, work.gravity)
     mixtures = {FILTER: {x.stamp: x.posterior for x in seen}}
-    mixtures[LIVE], mixtures[OFFLINE] = smoothed(seen)
+    mixtures |= smoothed(seen)
     records = {way: record_of(clip, seen, found) for way, found in mixtures.items()}
     result = {}
     for way, record in records.items():
         scores = scores_of(record)
         result[way] = {name: float(scores[name]) for name in SCORES}
-    heaviest = heaviest_joints(records[FILTER])
-    for width in KERNELS:
-        joints = gaussian_filter1d(heaviest, width, axis=0)
-        record = replace(
-            records[FILTER], joints=joints[:, None], weights=np.ones((len(joints), 1)), point=joints
-        )
-        scores = scores_of(record)
-        result[f'{AVERAGED} over {width:g} images'] = {
-            name: float(scores[name]) if 'coverage' not in name else np.nan for name in SCORES
-        }
+        result[way][MODES] = modes_apart(record)
+    own = records[FILTER]
+    result[POINT] = _scores_of_joints(own, own.point)
+    result[VITERBI] = _scores_of_joints(own, viterbi_joints(own))
+    weights = own.weights / own.weights.sum(1, keepdims=True)
+    every = np.nan_to_num(own.joints)
+    plain = {
+        AVERAGED: heaviest_joints(own),
+        MEAN: np.einsum('tk,tkjc->tjc', weights, every),
+        NEAREST: nearest_joints(own),
+    }
+    for way, joints in plain.items():
+        for width in KERNELS:
+            smooth = gaussian_filter1d(joints, width, axis=0)
+            result[f'{way} over {width:g} images'] = _scores_of_joints(own, smooth)
     return result
+
+
+def _scores_of_joints(record: Record, joints: Array) -> dict[str, float]:
+    """Scores of joints (T, J, 3) in the place of what a record has; of regions NaN."""
+    one = replace(record, joints=joints[:, None], weights=np.ones((len(joints), 1)), point=joints)
+    scores = scores_of(one)
+    result = {name: float('nan' if 'coverage' in name else scores[name]) for name in SCORES}
+    return {**result, MODES: 1.0}
+
+
+def modes_apart(record: Record) -> float:
+    """How many modes of an image are apart by `APART`, in the mean over images."""
+    relative = record.joints - record.joints[:, :, :1]
+    counts = []
+    for joints, weights in zip(relative, record.weights, strict=True):
+        some = joints[weights > 0]
+
+        def distances(i: int, some: Array = some) -> Array:
+            return np.asarray(np.nanmean(np.linalg.norm(some - some[i], axis=2), axis=1))
+
+        counts.append(len(leaders(weights[weights > 0], distances, APART)))
+    return float(np.mean(counts))
+
+
+def nearest_joints(record: Record) -> Array:
+    """Joints (T, J, 3) of the modes that are nearest to the truth."""
+    away = (record.joints - record.joints[:, :, :1]) - (record.true - record.true[:, :1])[:, None]
+    errors = np.nanmean(np.linalg.norm(away, axis=3), axis=2)
+    nearest = np.where(record.weights > 0, errors, np.inf).argmin(1)
+    return np.asarray(record.joints[np.arange(len(nearest)), nearest])
+
+
+def viterbi_joints(record: Record) -> Array:
+    """Joints (T, J, 3) along the path that costs least: -log weight, and motion between images."""
+    with np.errstate(divide='ignore'):
+        own = -np.log(record.weights)
+    relative = np.nan_to_num(record.joints - record.joints[:, :, :1])
+    cost, back = own[0], []
+    for before, joints, here in zip(relative, relative[1:], own[1:]):
+        moved = np.square(joints[:, None] - before).sum(3).mean(2) / (2.0 * VITERBI_STEP**2)
+        each = cost + moved
+        back.append(each.argmin(1))
+        cost = each.min(1) + here
+    path = [int(cost.argmin())]
+    for one in back[::-1]:
+        path.append(int(one[path[-1]]))
+    return np.asarray(record.joints[np.arange(len(path)), path[::-1]])
 
 
 def tracked(clip: Clip, inputs: str, gravity: str) -> list[Seen]:
@@ -172,15 +259,20 @@ def tracked(clip: Clip, inputs: str, gravity: str) -> list[Seen]:
         posterior, likelihood = tracker.step(image, stamp, found.get(stamp))
         if posterior is not None and likelihood is not None:
             result.append(
-                Seen(stamp, tracker.body, posterior, likelihood, tracker.likelihood_errors)
+                Seen(
+                    stamp,
+                    tracker.body,
+                    posterior,
+                    likelihood,
+                    tracker.likelihood_errors,
+                    tracker.shape_covariance,
+                )
             )
     return result
 
 
-def smoothed(
-    seen: Sequence[Seen],
-) -> tuple[dict[int, GaussianMixture], dict[int, GaussianMixture]]:
-    """What the node publishes, and what it makes of all images together, by stamp."""
+def smoothed(seen: Sequence[Seen]) -> dict[str, dict[int, GaussianMixture]]:
+    """What the node publishes, and what it makes of all images together, by way and stamp."""
     outputs: list[Output] = []
     messages = RosbagsMessages()
     parameters = with_values(SmootherParameters(), {'window_length': KEPT})
@@ -189,20 +281,30 @@ def smoothed(
         content = PoseMixture.of_body(
             one.body, one.likelihood, MixtureKind.LIKELIHOOD, one.stamp, 'camera',
             state=TrackState.TRACKING, track_id=1, error_share=one.errors.independent,
-            error_time=one.errors.time,
+            error_time=one.errors.time, shape_covariance=one.shape_covariance,
         )  # fmt: skip
         handled = session.take(MIXTURE, pose_mixture_message(messages, content))
         if handled.faults:
             raise ValueError(handled.faults[0])
-    whole, _ = session.smoothed_span(PathSmoother)
-    assert whole.stamps_ns is not None
-    offline = {
-        stamp: merged_pairwise(whole.marginal(t), COMPONENTS).normalised()
-        for t, stamp in enumerate(whole.stamps_ns)
-    }
+    shapes = {x.stamp: x.shape_covariance for x in seen}
+    result = {}
+    for way, most in ((OFFLINE, parameters.max_trajectories), (RTS, 1)):
+        session.parameters = with_values(parameters, {'max_trajectories': most})
+        whole, of = session.smoothed_span(PathSmoother)
+        assert whole.stamps_ns is not None
+        result[way] = {
+            stamp: _published(whole.marginal(t), of, shapes[stamp])
+            for t, stamp in enumerate(whole.stamps_ns)
+        }
     session.finish()
     found = [pose_mixture_of(deserialise(x.data, 'hmt_msgs/msg/PoseMixture')) for x in outputs]
-    return {x.stamp_ns: x.mixture for x in found}, offline
+    return {LIVE: {x.stamp_ns: x.mixture for x in found}, **result}
+
+
+def _published(mixture: GaussianMixture, of: SmoothedBody, shape: Array) -> GaussianMixture:
+    """A pose as the node publishes it."""
+    points = of.body.relative_joints(mixture.means)
+    return wider(led(mixture, points, SAME_MOTION, COMPONENTS)[0], shape).normalised()
 
 
 def record_of(clip: Clip, seen: Sequence[Seen], mixtures: dict[int, GaussianMixture]) -> Record:
@@ -216,22 +318,41 @@ def record_of(clip: Clip, seen: Sequence[Seen], mixtures: dict[int, GaussianMixt
     )
 
 
-def as_rows(result: dict[str, Any]) -> list[list[str]]:
-    """A table for people: means over groups of clips."""
+def error_rows(result: dict[str, Any]) -> list[list[str]]:
+    """A table for people: errors of the heaviest pose by way, means over groups of clips, mm."""
+    ways = [FILTER, LIVE, OFFLINE, RTS, POINT, VITERBI, AVERAGED, MEAN, NEAREST]
+    rows = [['inputs', 'gravity', 'images a second', *ways]]
+    for group in dict.fromkeys(x['clips'] for x in result['means']):
+        rows.append([group, *[''] * (len(rows[0]) - 1)])
+        for entry in result['means']:
+            if entry['clips'] == group:
+                found = {
+                    name.split(' over ')[0]: scores['heaviest_mm']
+                    for name, scores in entry['scores'].items()
+                }
+                rate = f'{entry["rate"]:g}' if entry['rate'] else 'all'
+                cells = [f'{found[way]:.1f}' for way in ways]
+                rows.append([entry['inputs'], entry['gravity'], rate, *cells])
+    return rows
+
+
+def motion_rows(result: dict[str, Any]) -> list[list[str]]:
+    """A table for people: what filter and smoother are besides, of all images, by group."""
     rows = [
         [
-            'inputs', 'gravity', '', 'heaviest, mm', 'best of 8', 'acceleration', 'feet, m/s',
+            'inputs', 'gravity', '', 'best of 8, mm', 'modes apart', 'acceleration', 'feet, m/s',
             'root, %', 'joint 90 %', 'in the camera',
         ]
     ]  # fmt: skip
     for group in dict.fromkeys(x['clips'] for x in result['means']):
         rows.append([group, *[''] * (len(rows[0]) - 1)])
         for entry in result['means']:
-            if entry['clips'] != group:
+            if entry['clips'] != group or entry['rate']:
                 continue
-            for way, s in entry['scores'].items():
+            for way in (FILTER, LIVE, OFFLINE):
+                s = entry['scores'][way]
                 cells = [
-                    f'{s["heaviest_mm"]:.1f}', f'{s["best_mm"]:.1f}', f'{s["acceleration"]:.1f}',
+                    f'{s["best_mm"]:.1f}', f'{s[MODES]:.1f}', f'{s["acceleration"]:.1f}',
                     f'{s["feet"]:.2f}', f'{s["root_percent"]:.1f}',
                 ]  # fmt: skip
                 cells += [

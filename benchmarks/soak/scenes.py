@@ -184,7 +184,7 @@ def _smoother() -> Scene:
         tuple(_mixture(index, MixtureKind.LIKELIHOOD) for index in range(10)),
         {},
         10**18,
-        ({}, {'reset_on_time_jump': True}, {'body_model': 'human37', 'fixed_lag': 0}),
+        ({}, {'reset_on_time_jump': True}, {'body_model': 'human37', 'fixed_lag': 0.0}),
     )
 
 

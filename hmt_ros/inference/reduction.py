@@ -13,13 +13,15 @@ so that the mean and the covariance of the whole mixture stay. What is merged di
 
 - `merged_if_close`: the closest pair, until none is closer than a distance;
 - `merged_if_alike`: what lies near a component and has its size;
+- `led`: what is near a heavier component, which stays as it is and gets the weight;
 - `reduced`: clusters of means, which then descend a bound on the divergence from the large mixture
   to the small one [Goldberger and Roweis, NIPS 2004].
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg.lapack import dtrtrs
@@ -97,6 +99,60 @@ def merged_if_alike(
         near &= np.abs(log_det[at] - log_det[i]) < log_determinant
         owner[at[near]] = i
     return merged(mixture, (owner[:, None] == np.unique(owner)).astype(np.float64))
+
+
+def leaders(
+    log_weights: Array,
+    distances: Callable[[int], Array],
+    least: float,
+    count: int | None = None,
+    kept: Sequence[int] = (),
+) -> Index:
+    """Indices of those that are apart from all heavier ones that were chosen, heaviest first.
+
+    Args:
+        log_weights: (N,).
+        distances: (N,) of all from the one of an index.
+        least: distance from which on two are apart.
+        count: how many are wanted at most; None: all.
+        kept: indices that are chosen already, and come first.
+    """
+    nearest, result = np.full(len(log_weights), np.inf), list(kept)
+    for i in result:
+        nearest = np.minimum(nearest, distances(i))
+        nearest[i] = -np.inf
+    for i in np.argsort(-log_weights, kind='stable'):
+        if count is not None and len(result) >= count:
+            break
+        if nearest[i] >= least:
+            result.append(int(i))
+            nearest = np.minimum(nearest, distances(int(i)))
+            nearest[i] = -np.inf
+    return np.array(result, dtype=np.intp)
+
+
+def led(
+    mixture: GaussianMixture, points: Array, least: float, count: int
+) -> tuple[GaussianMixture, Index]:
+    """Components that are apart, with the weights of those that are near, and their indices.
+
+    Nothing is averaged: a mean over motions trembles as their weights do.
+
+    Args:
+        mixture: N components.
+        points: (N, P, 3) of which one has to be apart, m.
+        least, count: as for `leaders`.
+    """
+
+    def distances(i: int) -> Array:
+        return np.asarray(np.linalg.norm(points - points[i], axis=2).max(1))
+
+    with np.errstate(divide='ignore'):
+        chosen = leaders(np.log(mixture.weights), distances, least, count)
+    owner = np.argmin([distances(int(i)) for i in chosen], axis=0)
+    weights = np.zeros(len(chosen))
+    np.add.at(weights, owner, mixture.weights)
+    return replace(mixture[chosen], weights=weights), chosen
 
 
 # cost(weights, means, covariances, log determinants, pairs (P, 2)) of merging each pair, (P,)

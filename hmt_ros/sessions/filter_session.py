@@ -362,6 +362,7 @@ class FilterSession(CameraSession[FilterParameters, FilterState]):
             log_likelihoods=tracker.modes.log_likelihoods,
             likelihood_values=tracker.log_likelihoods,
             likelihood_errors=tracker.likelihood_errors,
+            shape_covariance=tracker.shape_covariance,
             point=tracker.point_estimate,
             ground=tracker.ground,
             contacts=tracker.contacts,

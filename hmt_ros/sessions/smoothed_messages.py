@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +11,10 @@ import numpy as np
 from hmt_ros.body import Body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.reduction import merged_pairwise
+from hmt_ros.inference.reduction import led
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
+from hmt_ros.smoothing.mixture_smoother import SAME_MOTION
 from msg_tools import MessageFactory
 from msg_tools.messages.markers import trajectory_markers
 from msg_tools.messages.pose_mixtures import (
@@ -54,12 +55,26 @@ class SmoothedBody:
 
 
 def trajectory_content(
-    found: TrajectoryMixture, of: SmoothedBody, *, covariances: bool
+    found: TrajectoryMixture,
+    of: SmoothedBody,
+    *,
+    covariances: bool,
+    shapes: Mapping[int, Array],
 ) -> TrajectoryContent:
-    """The content of a message on a mixture over trajectories."""
+    """The content of a message on a mixture over trajectories.
+
+    Args:
+        found: trajectories, with stamps.
+        of: person of the poses.
+        covariances: whether they are part of the message.
+        shapes: (d, d) by stamp, added to covariances: what poses of all images err by alike.
+    """
     content = found.message_content() if covariances else _without_covariances(found)
     if covariances:
-        content['marginal_covariances'] = _symmetric(content['marginal_covariances'])
+        wide = _symmetric(content['marginal_covariances'])
+        for t, stamp in enumerate(content['stamps_ns']):
+            wide[:, t] += shapes.get(stamp, 0.0)
+        content['marginal_covariances'] = wide
     return TrajectoryContent(
         **content,
         body_model=of.body.name,
@@ -77,6 +92,7 @@ def window_messages(
     of: SmoothedBody,
     *,
     covariances: bool,
+    shapes: Mapping[int, Array],
     wanted: Callable[[str], bool],
     publish: Callable[[str, Any], None],
 ) -> None:
@@ -86,12 +102,12 @@ def window_messages(
         messages: factory.
         found: trajectories, with stamps.
         of: person of the poses.
-        covariances: whether they are part of the message.
+        covariances, shapes: as for `trajectory_content`.
         wanted: whether a topic is to be made.
         publish: takes the topic and the message, one after the other.
     """
     if wanted('trajectory_mixture'):
-        content = trajectory_content(found, of, covariances=covariances)
+        content = trajectory_content(found, of, covariances=covariances, shapes=shapes)
         publish('trajectory_mixture', trajectory_mixture_message(messages, content))
     if wanted('trajectory_markers'):
         assert found.stamps_ns is not None
@@ -142,7 +158,9 @@ def final_messages(
     """
     if not wanted('smoothed_pose_mixture') and not wanted('smoothed_joint_states'):
         return
-    mixture = merged_pairwise(pose.mixture, components).normalised()
+    points = of.body.relative_joints(pose.mixture.means)
+    mixture, motions = led(pose.mixture, points, SAME_MOTION, components)
+    mixture = mixture.normalised()
     content = PoseMixture.of_body(
         of.body,
         GaussianMixture(mixture.weights, mixture.means, _symmetric(np.array(mixture.covariances))),
@@ -152,7 +170,8 @@ def final_messages(
         state=state,
         track_id=of.track_id,
         existence_probability=existence_probability,
-        **_followed(pose, mixture),
+        identities=np.array(pose.identities)[motions],
+        velocities=None if pose.velocities is None else pose.velocities[motions],
     )
     if wanted('smoothed_pose_mixture'):
         publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
@@ -198,23 +217,6 @@ def nobody_messages(
             existence_probability=existence_probability,
         )
         publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
-
-
-def _followed(pose: FinalPose, reduced: GaussianMixture) -> dict[str, Any]:
-    """Identities and velocities of components: those of the trajectories that they stand for.
-
-    Each stands for the nearest trajectory, in its standard deviations, that no heavier one has.
-    """
-    trajectories = pose.mixture
-    offsets = reduced.means[:, None] - trajectories.means
-    solved = np.linalg.solve(trajectories.covariances, offsets[..., None])[..., 0]
-    distances = np.einsum('kid,kid->ki', offsets, solved)
-    stands_for = np.zeros(len(reduced), dtype=np.intp)
-    for k in np.argsort(-reduced.weights, kind='stable'):
-        stands_for[k] = np.argmin(distances[k])
-        distances[:, stands_for[k]] = np.inf
-    velocities = None if pose.velocities is None else pose.velocities[stands_for]
-    return {'identities': np.array(pose.identities)[stands_for], 'velocities': velocities}
 
 
 def _joints(means: Array, body: Body) -> Array:

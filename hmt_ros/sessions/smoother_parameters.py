@@ -73,14 +73,13 @@ class SmootherParameters(NodeParameters):
             one; if empty, that name.
         method: Smoothing method: 'paths', the most probable paths in closed form, or 'variational',
             refined as in VMS, which takes seconds for an image.
-        fixed_lag: Number of later poses after which a pose is final; 0 is filtering.
-        longest_lag: Maximum time by which a final pose is older than the newest one, s; where poses
-            are rare, fewer than fixed_lag later ones are awaited. 0 sets no limit.
+        fixed_lag: Time by which a smoothed pose is older than the newest image at most, at any rate
+            of images, s; 0 is filtering.
         window_length: Number of the newest mixtures that are kept for ~/smooth_window.
         max_trajectories: Maximum number of components of a mixture over trajectories.
         max_hypotheses: Maximum number of components of smoothed_pose_mixture.
-        merge_distance: Distance, in standard deviations of the whole evidence of an image, below
-            which two modes of it are merged.
+        merge_distance: Distance, in standard deviations of what an image counts for, below which
+            two modes of it are merged.
         random_seed: Seed of all random numbers; the same mixtures give the same results.
         longest_interval: Interval between two mixtures above which a gap is reported, s; the
             dynamics bridge it.
@@ -95,8 +94,7 @@ class SmootherParameters(NodeParameters):
 
     body_model: str = parameter_field('', NEXT_WINDOW)
     method: str = parameter_field('paths', NEXT_WINDOW)
-    fixed_lag: int = parameter_field(7, NEXT_WINDOW, (0, 1000))
-    longest_lag: float = parameter_field(0.7, NEXT_WINDOW, (0.0, 3600.0))
+    fixed_lag: float = parameter_field(0.5, NEXT_WINDOW, (0.0, 3600.0))
     window_length: int = parameter_field(47, AT_ONCE, (1, 10_000))
     max_trajectories: int = parameter_field(16, NEXT_WINDOW, (1, 1024))
     max_hypotheses: int = parameter_field(8, AT_ONCE, (1, 1024))

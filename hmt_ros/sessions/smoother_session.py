@@ -4,9 +4,9 @@ The node and offline replay give their messages to a `SmootherSession`; the same
 same order give the same bytes. The rules:
 
 - Mixtures are smoothed in the order of their stamps, in a sliding window. A pose is published as
-  smoothed once `fixed_lag` later ones have been seen, or before it is older than the newest by
-  `longest_lag`; the poses that are still open are published when the window ends: at the end of the
-  stream (`finish`), where time jumps back, at a new body.
+  smoothed before it is older than the newest by more than `fixed_lag`; those that are still open
+  when the window ends are published then: at the end of the stream (`finish`), where time jumps
+  back, at a new body.
 - A mixture that is not younger than the one before is skipped, or starts a new window with
   `reset_on_time_jump`.
 - A mixture names its body and carries the segment lengths of the person; without lengths it is
@@ -18,6 +18,10 @@ same order give the same bytes. The rules:
 - Errors of images last: an image counts with a share of its evidence, by the error model that its
   likelihood carries and the time since the image before (`error_model`). A likelihood without an
   error model, as in bags of earlier versions, and a forecast, which is no evidence, are skipped.
+- The pose may be none of the modes of an image: each image has a wide component more
+  (`or_missed`), and a motion passes over images that would turn it round and back.
+- What is not known of the person's shape is the same in all images. It is added once, to the
+  covariances that are published.
 - Angles that go round are taken from mixture to mixture without whole turns, each mode from the
   nearest one before: to the dynamics a turn more would be a jump.
 - The dynamics bridge gaps. One that is longer than `longest_interval` is reported.
@@ -27,8 +31,8 @@ same order give the same bytes. The rules:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,7 +56,7 @@ from hmt_ros.sessions.smoothed_messages import (
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.warm_up import likelihoods
 from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow, TrajectoryMixture
-from hmt_ros.smoothing.likelihood import counted
+from hmt_ros.smoothing.likelihood import counted, or_missed
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
@@ -70,6 +74,8 @@ from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 MIXTURE = 'likelihood_mixture'
 FINISH = 'finish'  # what `finish` calls the end of the stream
 NOBODY = 'nobody'  # status while nobody is in view
+# Time of the free motion that tells how far a pose may be from where an image shows it, s.
+ASTRAY = 1.0
 # Change of a length from one mixture to the next above which it is another person's, m.
 SAME_PERSON = 0.02
 
@@ -116,16 +122,28 @@ class Evidence(NamedTuple):
         stamp: of the image.
         mixture: the whole of it.
         errors: how long errors last.
+        shape: (d, d) covariance of what poses of all images err by alike; None: unknown.
     """
 
     stamp: int
     mixture: GaussianMixture
     errors: CueErrors
+    shape: Array | None
 
-    def since(self, before: int | None) -> GaussianMixture:
-        """What counts of it after an image at the stamp `before`; None: there is none."""
+    def since(self, before: int | None, rates: Array, distance: float) -> GaussianMixture:
+        """What counts of it after an image at the stamp `before`; None: there is none.
+
+        Args:
+            before: ns.
+            rates: (d,) variances of free motion, per second.
+            distance: below which modes are merged, in standard deviations of what counts.
+        """
         dt = self._interval(before)
-        return counted(self.mixture, self.errors.share(dt), self.errors.of_changes(dt))
+        share = self.errors.share(dt)
+        apart = self.mixture
+        if distance > 0:
+            apart = merged_if_close(apart, distance / math.sqrt(share))
+        return or_missed(counted(apart, share, self.errors.of_changes(dt)), ASTRAY * rates)
 
     def lasting(self, before: int | None) -> float:
         """Factor on the variance that is left after it, because its errors last."""
@@ -133,6 +151,20 @@ class Evidence(NamedTuple):
 
     def _interval(self, before: int | None) -> float:
         return math.inf if before is None else (self.stamp - before) / SECOND_NS
+
+
+class OpenPose(NamedTuple):
+    """What is told of an image besides its poses.
+
+    Attributes:
+        state: of the track in the filter.
+        existence: probability that a person is in view, in the filter.
+        shape: as of `Evidence`.
+    """
+
+    state: TrackState
+    existence: float
+    shape: Array | None
 
 
 class KeptMixtures(NamedTuple):
@@ -175,8 +207,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         self._of: SmoothedBody | None = None
         self._resolved: tuple[Any, SmoothedBody] | None = None
         self._window: SlidingWindow | None = None
-        # State and probability of existence in the filter, by stamp.
-        self._states: dict[int, tuple[TrackState, float]] = {}
+        # By stamp, of the poses of the window that have not been published.
+        self._open: dict[int, OpenPose] = {}
         self._newest: int | None = None
         self._nobody = False
         self._gaps, self._longest_gap = 0, 0.0
@@ -203,7 +235,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
 
     def _forget(self) -> None:
         self._window = None
-        self._states = {}
+        self._open = {}
         self._newest = None
         self._nobody = False
         self.kept = KeptMixtures(self._of, ())
@@ -244,18 +276,19 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
                 )
         if self._window is None:
             self._window = self._new_window(of.body)
-        used = evidence
-        if p.merge_distance > 0:
-            used = evidence._replace(mixture=merged_if_close(evidence.mixture, p.merge_distance))
         try:
-            update = self._window.step(stamp, used.since(self._newest), used.lasting(self._newest))
+            update = self._window.step(
+                stamp, self._counted(evidence, self._newest, of), evidence.lasting(self._newest)
+            )
         except (ValueError, ArithmeticError) as error:
             text = error_line(error)
             self._log.skip(Fault.ESTIMATE, f'mixture of {stamp} ns can not be smoothed: {text}')
             self._end_window()
             return
         self._newest, self._nobody = stamp, False
-        self._states[stamp] = content.state, content.existence_probability
+        self._open[stamp] = OpenPose(
+            content.state, content.existence_probability, content.shape_covariance
+        )
         self._log.counts['smoothed'] += 1
         self.kept = KeptMixtures(of, (*self.kept.items, evidence)[-p.window_length :])
         self._weights = update.trajectories.weights
@@ -264,11 +297,15 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             update.trajectories,
             of,
             covariances=p.publish_covariances,
+            shapes=_shapes((at, one.shape) for at, one in self._open.items()),
             wanted=self._wanted,
             publish=lambda topic, made: self._publish(topic, stamp, made),
         )
         for pose in update.final:
             self._publish_final(pose, of)
+
+    def _counted(self, one: Evidence, before: int | None, of: SmoothedBody) -> GaussianMixture:
+        return one.since(before, of.body.rates, self.parameters.merge_distance)
 
     def _without_turns(self, evidence: Evidence, body: Body) -> Evidence:
         """The evidence with angles that go on from those of the mixture before."""
@@ -343,8 +380,6 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             self._smoother(body, PathSmoother),
             p.fixed_lag,
             p.random_seed,
-            longest_lag=p.longest_lag or math.inf,
-            points=body.relative_joints,
             first_identity=self._first_identity,
         )
 
@@ -357,6 +392,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             *_limits(body),
             p.max_trajectories,
             through_modes=p.through_modes,
+            points=body.relative_joints,
         )
 
     def _end_window(self) -> None:
@@ -371,13 +407,15 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     # Outputs.
 
     def _publish_final(self, pose: FinalPose, of: SmoothedBody) -> None:
-        state, existence = self._states.pop(pose.stamp_ns)
+        told = self._open.pop(pose.stamp_ns)
+        if told.shape is not None:
+            pose = replace(pose, mixture=wider(pose.mixture, told.shape))
         final_messages(
             self._messages,
             pose,
             of,
-            state=state,
-            existence_probability=existence,
+            state=told.state,
+            existence_probability=told.existence,
             components=self.parameters.max_hypotheses,
             wanted=self._wanted,
             publish=lambda topic, made: self._publish(topic, pose.stamp_ns, made),
@@ -398,7 +436,8 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             ValueError: there is none in the span, or they can not be smoothed.
         """
         found, of = self.smoothed_span(MixtureSmoother, from_ns, to_ns)
-        content = trajectory_content(found, of, covariances=True)
+        shapes = _shapes((one.stamp, one.shape) for one in self.kept.items)
+        content = trajectory_content(found, of, covariances=True, shapes=shapes)
         return trajectory_mixture_message(self._messages, content)
 
     def smoothed_span(
@@ -421,7 +460,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             raise ValueError(f'no mixture from {from_ns} to {to_ns} ns: {kept}')
         stamps = [item.stamp for item in chosen]
         pairs = list(zip([None, *stamps], chosen))
-        mixtures = [item.since(before) for before, item in pairs]
+        mixtures = [self._counted(item, before, of) for before, item in pairs]
         smoother = self._smoother(of.body, closed_form)
         found = smoother.smooth(mixtures, self.parameters.random_seed, stamps_ns=stamps)
         lasting = [item.lasting(before) for before, item in pairs]
@@ -466,7 +505,7 @@ def _evidence(content: PoseMixture) -> Evidence:
                 MessageFault.ERRORS,
             )
         share, time = 1.0, 0.0
-    return Evidence(content.stamp_ns, mixture, CueErrors(share, time))
+    return Evidence(content.stamp_ns, mixture, CueErrors(share, time), content.shape_covariance)
 
 
 def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
@@ -480,6 +519,16 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
     except OSError as error:
         text = error_line(error)
         raise ValueError(f'{text}; body_model names it, or a file with it') from error
+
+
+def _shapes(items: Iterable[tuple[int, Array | None]]) -> dict[int, Array]:
+    """Those that are known, by stamp."""
+    return {stamp: shape for stamp, shape in items if shape is not None}
+
+
+def wider(mixture: GaussianMixture, covariance: Array) -> GaussianMixture:
+    """The mixture with a covariance (d, d) added to that of every component."""
+    return replace(mixture, covariances=mixture.covariances + covariance)
 
 
 def _limits(body: Body) -> tuple[Array, Array]:

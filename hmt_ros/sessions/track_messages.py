@@ -70,6 +70,7 @@ class TrackedImage:
         log_likelihoods: (K,) of the image at the means of the posterior.
         likelihood_values: (L,) the same at the means of the likelihood.
         likelihood_errors: how the errors of the likelihood last, which is undiscounted.
+        shape_covariance: (d, d) of what poses of all images err by alike, see `Tracker`.
         point: (d,) the point estimate, for those who want one pose.
         ground: gravity and the floor, as far as they are known.
         contacts: probabilities that the feet stand on the floor, by name.
@@ -97,6 +98,7 @@ class TrackedImage:
     log_likelihoods: Array
     likelihood_values: Array
     likelihood_errors: CueErrors
+    shape_covariance: Array
     point: Array
     ground: Ground
     contacts: Mapping[str, float]
@@ -257,10 +259,12 @@ def nobody_messages(
 def _mixtures(track: TrackedImage, joints: Array) -> tuple[PoseMixture, PoseMixture]:
     """Posterior and likelihood, with joints (K, J, 3) of the posterior in the camera frame."""
     posterior, likelihood, velocities = track.posterior, track.likelihood, track.velocities
-    frame, positions = track.frame_id, joints
+    frame, positions, shape = track.frame_id, joints, track.shape_covariance
     if (fixed := track.fixed) is not None:
         posterior, velocities = fixed.placed(track.body, posterior, velocities)
         likelihood, _ = fixed.placed(track.body, likelihood)
+        at_best = GaussianMixture(np.ones(1), track.posterior.means[:1], shape[None])
+        shape = fixed.placed(track.body, at_best)[0].covariances[0]
         frame, positions = fixed.optical, fixed.motion.points(joints)
     return (
         PoseMixture.of_body(
@@ -290,6 +294,7 @@ def _mixtures(track: TrackedImage, joints: Array) -> tuple[PoseMixture, PoseMixt
             log_likelihoods=track.likelihood_values,
             error_share=track.likelihood_errors.independent,
             error_time=track.likelihood_errors.time,
+            shape_covariance=shape,
         ),
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -45,6 +45,9 @@ MARGIN = 8
 SAME_DISTANCE = 0.3
 # Modes closer than so many standard deviations are merged, as alternatives to the optima.
 MERGE_DISTANCES = (1.75, 2.5)
+# Motions are one as long as no point of theirs is farther apart than this, m: half the length of a
+# forearm, which a flip turns over.
+SAME_MOTION = 0.12
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +78,9 @@ class MixtureSmoother:
         start: 'laplace' weighs optima by their mass, 'peak' by their height, as VMS does.
         max_iterations: of the descent of the free energy.
         through_modes: whether, besides the best paths between the ends, those through every single
-            mode are starts: more alternatives for each pose, fewer for the whole motion.
+            single mode are starts: more alternatives for each pose, fewer for the whole motion.
+        points: maps poses (N, d) to points (N, P, 3), m: paths then are motions of which some point
+            is `SAME_MOTION` apart; None: paths that visit different modes.
 
     Raises:
         ValueError: settings out of range.
@@ -89,6 +94,7 @@ class MixtureSmoother:
     start: str = 'laplace'
     max_iterations: int = 15
     through_modes: bool = False
+    points: Callable[[Array], Array] | None = None
 
     def __post_init__(self) -> None:
         if self.max_trajectories < 1:
@@ -153,6 +159,8 @@ class MixtureSmoother:
 
     def paths(self, sequence: ModeSequence) -> Paths:
         """The paths that trajectories start from."""
+        if self.points is not None:
+            return sequence.distinct_motions(self.max_trajectories, self.points, SAME_MOTION)
         return sequence.paths(self.max_trajectories, through_modes=self.through_modes)
 
     def optima(self, sequence: ModeSequence, likelihood: SequenceLikelihood) -> Candidates:

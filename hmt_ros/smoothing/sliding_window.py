@@ -8,8 +8,7 @@ next one has the component
 
 where C takes the pose out of the state. The window is smoothed with that density in the place of
 the first likelihood, so that a new image costs the same however long the sequence is. A pose is
-final once as many later ones have been seen as the lag says, or earlier, before it is older than
-the newest pose by a longest time.
+final before it is older than the newest one by more than the lag.
 """
 
 from __future__ import annotations
@@ -22,13 +21,13 @@ import numpy as np
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.gaussian_pairs import pair_log_densities
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
-from hmt_ros.inference.reduction import merged_if_alike
+from hmt_ros.inference.reduction import led, merged_if_alike
 from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, embedded_network
 from hmt_ros.smoothing.likelihood import MixtureLikelihood
-from hmt_ros.smoothing.mixture_smoother import MixtureSmoother, intervals_of
+from hmt_ros.smoothing.mixture_smoother import SAME_MOTION, MixtureSmoother, intervals_of
 from hmt_ros.smoothing.mode_sequence import KnownModes, ModeSequence
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 
@@ -38,9 +37,8 @@ SECOND_NS = 10**9
 NEGLIGIBLE = 25.0
 MERGE_DISTANCE = 0.6
 MERGE_LOG_DETERMINANT = 0.5
-# A motion goes on as long as no point of it moves by more than this from window to window, in the
-# mean over the times that both have, m: half the length of a forearm, which a flip turns over.
-SAME_MOTION = 0.12
+# Intervals between poses tremble by this share of their length.
+TREMBLE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,38 +79,30 @@ class SlidingWindow:
 
     Args:
         smoother: how a window is smoothed.
-        fixed_lag: how many later poses are seen before a pose is final.
+        fixed_lag: time by which a pose is older than the newest one at most when it is final, s:
+            the next one, expected as long after the last as that after the one before, would make
+            it older. 0 is filtering; infinite: nothing is final before the end.
         seed: of all randomness.
-        longest_lag: time by which a final pose may be older than the newest one, s; where poses are
-            rare, fewer later ones are seen.
-        points: maps poses (N, d) to points (N, P, 3) by whose distances motions are told apart, m;
-            None: each variable is a point on a line.
         first_identity: of the first trajectory.
 
     Attributes:
         next_identity: that no trajectory has had.
 
     Raises:
-        ValueError: a lag that is negative.
+        ValueError: a lag that is negative or not a number.
     """
 
     def __init__(
         self,
         smoother: MixtureSmoother,
-        fixed_lag: int = 12,
+        fixed_lag: float = 0.5,
         seed: int = 0,
         *,
-        longest_lag: float = math.inf,
-        points: Callable[[Array], Array] | None = None,
         first_identity: int = 1,
     ) -> None:
-        if fixed_lag < 0:
-            raise ValueError(f'fixed_lag must not be negative, saw {fixed_lag}')
-        if not longest_lag >= 0:
-            raise ValueError(f'longest_lag must not be negative, saw {longest_lag}')
+        if not fixed_lag >= 0:
+            raise ValueError(f'fixed_lag must be a time that is not negative, saw {fixed_lag} s')
         self.smoother, self.fixed_lag, self.seed = smoother, fixed_lag, seed
-        self.longest_lag = longest_lag
-        self.points = points or _variables
         self.first_identity = first_identity
         self.reset()
 
@@ -185,12 +175,17 @@ class SlidingWindow:
     def _number_of_final(self) -> int:
         """How many poses of the window, the oldest, are not to be revised."""
         stamps = self._stamps
-        by_number = max(len(stamps) - self.fixed_lag, 0)
-        if len(stamps) < 2 or self.longest_lag == math.inf:
-            return by_number
-        # Until the next pose comes they would grow too old.
-        until = 2 * stamps[-1] - stamps[-2] - round(self.longest_lag * SECOND_NS)
-        return max(by_number, sum(stamp < until for stamp in stamps[:-1]))
+        if self.fixed_lag == math.inf:
+            return 0
+        lag = round(self.fixed_lag * SECOND_NS)
+        if lag == 0:
+            return len(stamps)
+        if len(stamps) < 2:
+            return 0
+        # Until the next pose comes they would grow too old; stamps tremble.
+        interval = stamps[-1] - stamps[-2]
+        until = stamps[-1] + interval - lag - round(TREMBLE * interval)
+        return sum(stamp < until for stamp in stamps[:-1])
 
     def finish(self) -> tuple[FinalPose, ...]:
         """The poses that are still open, as final as they will be, and forgets everything."""
@@ -222,6 +217,7 @@ class SlidingWindow:
             interval,
             self.smoother.max_trajectories,
             followed,
+            self.smoother.points,
         )
         del self._stamps[0], self._mixtures[0], self._likelihoods[0], self._lasting[0]
         self._network = self._network.later()
@@ -275,7 +271,8 @@ class SlidingWindow:
 
     def _points(self, poses: Array) -> Array:
         """Points (M, T, P, 3) of poses (M, T, d)."""
-        points = self.points(poses.reshape(-1, poses.shape[2]))
+        chosen = self.smoother.points or _variables
+        points = chosen(poses.reshape(-1, poses.shape[2]))
         return points.reshape(*poses.shape[:2], *points.shape[1:])
 
 
@@ -328,13 +325,14 @@ def filtered_state(
     interval: float,
     count: int,
     followed: tuple[Array, Array] | None = None,
+    points: Callable[[Array], Array] | None = None,
 ) -> GaussianMixture:
     """The density of the next state given its likelihood, with at most `count` components.
 
         N(x; A m_i, A S_i A' + Q) N(C x; mu_k, S_k) w_i w_k, for all pairs i, k
 
-    Pairs that tell the same are merged. Of the others those are kept that the trajectories of the
-    window follow, and then the heaviest.
+    Pairs that tell the same are merged. Of the others those are kept that are apart, then those
+    that the trajectories of the window follow, and then the heaviest.
 
     Args:
         state: before.
@@ -343,6 +341,8 @@ def filtered_state(
         interval: s.
         count: components at most.
         followed: weights (M,) of trajectories and their states (M, n) at the new time.
+        points: maps poses (N, d) to points (N, P, 3), m: half of the components, the heaviest such,
+            have some point `SAME_MOTION` apart. None: none have to.
     """
     d = dynamics.dimension
     means, covariances = dynamics.predict(state.means, state.covariances, interval)
@@ -351,8 +351,15 @@ def filtered_state(
         means[:, :d], covariances[:, :d, :d], mixture.means, mixture.covariances, pairs
     )
     log += np.log(state.weights)[pairs[:, 0]] + np.log(mixture.weights)[pairs[:, 1]]
-    order = np.argsort(-log, kind='stable')[: 4 * count]
-    order = order[log[order] > log[order[0]] - NEGLIGIBLE]
+    order = np.argsort(-log, kind='stable')
+    several = order[: 4 * count]
+    several = several[log[several] > log[order[0]] - NEGLIGIBLE]
+    if points is not None:
+        # Of every mode the best pair, however light: the rest is what leads there otherwise.
+        _, first = np.unique(pairs[order, 1], return_index=True)
+        several = np.union1d(first, np.arange(len(several)))
+        several = order[several]
+    order = several
     i, k = pairs[order].T
     gain = np.linalg.solve(
         covariances[i][:, :d, :d] + mixture.covariances[k], covariances[i][:, :d, :]
@@ -367,10 +374,15 @@ def filtered_state(
     found = merged_if_alike(found, MERGE_DISTANCE, MERGE_LOG_DETERMINANT)
     if len(found) <= count:
         return found.normalised()
+    kept: Index = np.empty(0, dtype=np.intp)
+    if points is not None:
+        places = points(found.means[:, :d])
+        kept = led(found, places, SAME_MOTION, count // 2)[1]
     score = found.weights.copy()
     if followed is not None:
         each = found.component_log_densities(followed[1])
         share = np.exp(each - logsumexp(each, axis=1, keepdims=True))
         score += followed[0] @ share
+    score[kept] = np.inf
     chosen = np.sort(np.argsort(-score, kind='stable')[:count])
     return found[chosen].normalised()

@@ -320,7 +320,9 @@ class MixtureFilter:
 
     def likelihood(self, observation: Observation) -> Likelihood:
         """See `likelihood_modes`."""
-        return likelihood_modes(self.modes, self._posterior, self._believed(observation))
+        return likelihood_modes(
+            self.modes, self._posterior, self._believed(observation), self.shape
+        )
 
     # The steps.
 

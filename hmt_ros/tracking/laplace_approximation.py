@@ -10,7 +10,8 @@ leave T of what one leaves by itself (`inference.error_model`). What is not know
 not known of the pose: J P J' (`shape_estimation`). A variable on its limit hardly varies.
 
 The likelihood alone is passed on whole, with how its errors last beside it: who puts images
-together discounts them, once.
+together discounts them, once. What is not known of the shape is the same in all images: it is
+passed on beside the likelihood, too.
 """
 
 from __future__ import annotations
@@ -47,11 +48,13 @@ class Likelihood:
         mixture: whole curvature as covariances, raw energies as weights; heaviest mode first.
         values: (K,) log likelihoods of the image at its means, nats.
         errors: how its errors last, all cues together.
+        shape_covariance: (d, d) J P J' at the heaviest mode of the posterior.
     """
 
     mixture: GaussianMixture
     values: Array
     errors: CueErrors
+    shape_covariance: Array
 
 
 def posterior_modes(
@@ -116,7 +119,9 @@ def posterior_modes(
     )
 
 
-def likelihood_modes(modes: Modes, posterior: Posterior, observation: Observation) -> Likelihood:
+def likelihood_modes(
+    modes: Modes, posterior: Posterior, observation: Observation, shape: ShapeEstimate
+) -> Likelihood:
     """The modes of the likelihood alone, without what was known from the images before.
 
     Around each mode of the posterior the energy of the image and of the body's prior is a
@@ -125,9 +130,10 @@ def likelihood_modes(modes: Modes, posterior: Posterior, observation: Observatio
     and experts: what these tell in a second counts as much as it does in the filter.
 
     Args:
-        modes: of the posterior, K.
+        modes: of the posterior, K, heaviest first.
         posterior: of the image.
         observation: of the image.
+        shape: of the person, as far as it is known.
     """
     body, poses = posterior.body, modes.poses
     fit = posterior.fit(poses, observation, LIFTED_AS_KEYPOINTS)
@@ -140,7 +146,9 @@ def likelihood_modes(modes: Modes, posterior: Posterior, observation: Observatio
     weights = np.exp(at_least(normalised(-fit.energy.value), LEAST_LOG_WEIGHT))
     mixture = GaussianMixture(weights, means, covariances).sorted()
     values = posterior.log_likelihoods(mixture.means, observation)
-    return Likelihood(mixture, values, _errors(fit, covariances, weights))
+    gives_way = covariances[:1] * (fit.free[:1, :, None] & fit.free[:1, None, :])
+    unknown = shape.considered(posterior.likelihood, observation, poses[:1], gives_way)[0]
+    return Likelihood(mixture, values, _errors(fit, covariances, weights), unknown)
 
 
 def _errors(fit: ImageFit, covariances: Array, weights: Array) -> CueErrors:

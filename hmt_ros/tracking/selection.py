@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 
 from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.reduction import leaders
 
 
 class Kept(NamedTuple):
@@ -70,13 +71,11 @@ def distinct_hypotheses(joints: Array, log_weights: Array, same: float) -> Index
         log_weights: (N,).
         same: mean distance below which two hypotheses are one, m.
     """
-    order = np.argsort(-log_weights, kind='stable')
-    kept: list[int] = []
-    for i in order:
-        apart = np.linalg.norm(joints[kept] - joints[i], axis=2).mean(1)
-        if not (apart < same).any():
-            kept.append(int(i))
-    return np.array(kept, dtype=np.intp)
+
+    def distances(i: int) -> Array:
+        return np.asarray(np.linalg.norm(joints - joints[i], axis=2).mean(1))
+
+    return leaders(log_weights, distances, same)
 
 
 @njit(cache=True, nogil=True)

@@ -75,6 +75,8 @@ class Tracker:
         log_likelihoods: (K,) of the last tracked image at the means of its likelihood mixture, nats
             up to a constant of the image.
         likelihood_errors: how the errors of that likelihood last, which is undiscounted.
+        shape_covariance: (d, d) of the errors that poses of all images share, because the lengths
+            and the flesh of the person are not known exactly; that likelihood does not hold them.
         track_id: number of the present track, or of the last one; 0 before the first.
         started_from: what that track began from; None before the first.
     """
@@ -99,6 +101,7 @@ class Tracker:
         self.evaluations = 0
         self.log_likelihoods: Array = np.empty(0)
         self.likelihood_errors = ERRORS['image']
+        self.shape_covariance: Array = np.zeros((body.dimension, body.dimension))
         self.track_id = 0
         self.started_from: Source | None = None
         self._seed = seed
@@ -448,6 +451,7 @@ class Tracker:
     def _likelihood(self, observation: Observation) -> GaussianMixture:
         found = self._track.likelihood(observation)
         self.log_likelihoods, self.likelihood_errors = found.values, found.errors
+        self.shape_covariance = found.shape_covariance
         return found.mixture
 
     def _start_track(

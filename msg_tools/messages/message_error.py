@@ -115,8 +115,14 @@ def check_weights(weights: Array, what: str) -> None:
         )
 
 
-def check_covariances(covariances: Array, what: str) -> None:
-    """Raises MessageError where a covariance (..., d, d) is not symmetric and positive definite."""
+def check_covariances(covariances: Array, what: str, *, singular: bool = False) -> None:
+    """Raises MessageError where a covariance (..., d, d) is not symmetric and positive definite.
+
+    Args:
+        covariances: (..., d, d).
+        what: they are of, for messages.
+        singular: whether they may be positive semidefinite.
+    """
     check_finite(covariances, f'covariance of {what}')
     if covariances.size == 0:
         return
@@ -125,6 +131,11 @@ def check_covariances(covariances: Array, what: str) -> None:
         scale = np.abs(covariances).max(axis=(-1, -2), keepdims=True)
         if (np.abs(asymmetry) > SYMMETRY_TOLERANCE * scale).any():
             raise MessageError(f'covariance of {what} is not symmetric', MessageFault.COVARIANCES)
+    if singular:
+        size = covariances.shape[-1]
+        largest = np.abs(covariances).max(axis=(-1, -2), keepdims=True)
+        margin = SYMMETRY_TOLERANCE * largest + np.finfo(np.float64).tiny
+        covariances = covariances + margin * np.eye(size)
     try:
         np.linalg.cholesky(covariances)
     except np.linalg.LinAlgError:

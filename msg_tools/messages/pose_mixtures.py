@@ -100,6 +100,9 @@ class PoseMixture:
         error_share: share of the evidence of one image that is independent, in (0, 1], beside a
             likelihood; NaN: unknown, as in bags older than this field.
         error_time: time for which errors last, s; NaN: unknown.
+        shape_covariance: (d, d) of what poses of all images err by alike, because the lengths and
+            the flesh of the person are not known exactly, beside a likelihood; None: unknown, as in
+            bags older than this field.
 
     Raises:
         MessageError: shapes or values that a message must not have.
@@ -128,6 +131,7 @@ class PoseMixture:
     error_share: float = math.nan
     error_time: float = math.nan
     cue_probabilities: Mapping[str, float] = field(default_factory=dict)
+    shape_covariance: Array | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, 'dof_names', names_of(self.dof_names, 'mixture: dof_names'))
@@ -144,6 +148,7 @@ class PoseMixture:
             'joint_velocities': (components, joints, 3),
             'log_likelihoods': (components,),
             'degrees_of_freedom': (components,),
+            'shape_covariance': (d, d),
         }
         if self.log_likelihoods is None:
             object.__setattr__(self, 'log_likelihoods', np.full(components, np.nan))
@@ -151,7 +156,9 @@ class PoseMixture:
             object.__setattr__(self, 'degrees_of_freedom', np.zeros(components))
         identities = np.zeros(components) if self.identities is None else self.identities
         object.__setattr__(self, 'identities', identities_of(identities, components, 'mixture'))
-        freeze_arrays(self, shapes, 'mixture', optional=('covariances', *OF_JOINTS))
+        freeze_arrays(
+            self, shapes, 'mixture', optional=('covariances', 'shape_covariance', *OF_JOINTS)
+        )
         check_finite(self.means, 'mixture: mean')
         for name in ('joint_positions', *OF_JOINTS):
             if (values := getattr(self, name)) is not None:
@@ -178,6 +185,8 @@ class PoseMixture:
             )
         if self.covariances is not None:
             check_covariances(self.covariances, 'mixture')
+        if self.shape_covariance is not None:
+            check_covariances(self.shape_covariance, 'the shape', singular=True)
 
     @classmethod
     def of_body(
@@ -198,6 +207,7 @@ class PoseMixture:
         error_share: float = math.nan,
         error_time: float = math.nan,
         cue_probabilities: Mapping[str, float] | None = None,
+        shape_covariance: Array | None = None,
     ) -> PoseMixture:
         """A mixture over the poses of a body at its present lengths.
 
@@ -212,7 +222,8 @@ class PoseMixture:
             mixture: K Gaussians over its poses; None: nobody was seen.
             joint_positions: (K, J, 3) m, of the means; None: computed here.
             kind, stamp_ns, frame_id, log_likelihoods, state, track_id, identities,
-                existence_probability, error_share, error_time: see the attributes.
+                existence_probability, error_share, error_time, shape_covariance: see the
+                attributes.
             velocities: (K, d) of the poses, per second; None: unknown.
             cue_probabilities: see the attributes; None: unknown.
 
@@ -253,6 +264,7 @@ class PoseMixture:
             error_share=error_share,
             error_time=error_time,
             cue_probabilities=cue_probabilities or {},
+            shape_covariance=shape_covariance,
         )
 
     @cached_property
@@ -319,6 +331,11 @@ def pose_mixture_message(messages: MessageFactory, content: PoseMixture) -> Any:
         cue_probabilities=np.array(list(content.cue_probabilities.values()), dtype=np.float64),
         error_share=content.error_share,
         error_time=content.error_time,
+        shape_covariance=(
+            np.empty(0)
+            if content.shape_covariance is None
+            else content.shape_covariance.reshape(-1)
+        ),
         components=components,
         segment_names=list(content.segment_lengths),
         segment_lengths=np.array(list(content.segment_lengths.values()), dtype=np.float64),
@@ -398,6 +415,7 @@ def pose_mixture_of(
             components, 'joint_covariances_relative', (len(joints), 3, 3)
         ),
         cue_probabilities=named_numbers(message, 'cue_names', 'cue_probabilities', 'mixture'),
+        shape_covariance=_shape_covariance(message, d),
         **_errors(message),
     )
 
@@ -416,6 +434,12 @@ def _errors(message: Any) -> dict[str, float]:
         # ROS sets fields to 0 that a publisher leaves alone.
         return {}
     return {'error_share': share, 'error_time': float(getattr(message, 'error_time', math.nan))}
+
+
+def _shape_covariance(message: Any, d: int) -> Array | None:
+    """The field (d, d); None where a publisher or an older definition lacks it."""
+    values = getattr(message, 'shape_covariance', ())
+    return numbers(values, (d, d), 'mixture: shape_covariance') if len(values) else None
 
 
 def _optional(components: Sequence[Any], name: str, shape: tuple[int, ...]) -> Array | None:

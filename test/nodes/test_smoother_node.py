@@ -28,7 +28,7 @@ def world(world_of):
     inputs = {'likelihood_mixture': PoseMixture}
 
     def make(**values):
-        values = {'fixed_lag': 1, 'max_trajectories': 4, **values}
+        values = {'fixed_lag': 0.1, 'max_trajectories': 4, **values}
         return world_of(SmootherNode, 'smoother_node', inputs, **values)
 
     return make
@@ -89,7 +89,7 @@ def test_mixtures_become_smoothed_poses(running, likelihoods):
 def test_parameters_are_those_of_the_file(running):
     running.assert_described(SmootherParameters())
     running.assert_refused(
-        ({'fixed_lag': -1}, 'out of range'),
+        ({'fixed_lag': -1.0}, 'out of range'),
         ({'method': 'guess'}, "saw 'guess'"),
         ({'body_model': 'nobody'}, "no body 'nobody'"),
         ({'autostart': False}, 'read-only'),
@@ -218,7 +218,7 @@ def test_ends_cleanly(executable):
 
 def test_parameter_file_reaches_the_node(tmp_path, executable):
     path = tmp_path / 'smoother.yaml'
-    path.write_text(CONFIG.read_text().replace('fixed_lag: 7', 'fixed_lag: -7'))
+    path.write_text(CONFIG.read_text().replace('fixed_lag: 0.5', 'fixed_lag: -7.0'))
     line = executable('smoother_node', '--params-file', str(path)).refusal()
     assert line.startswith('smoother_node: ')
     assert 'fixed_lag' in line

@@ -58,6 +58,7 @@ class StubTracker:
         self.existence_probability = 0.875
         self.log_likelihoods = np.array([-1.5, -2.5])
         self.likelihood_errors = CueErrors(0.25, 0.125)
+        self.shape_covariance = np.zeros((body.dimension, body.dimension))
         self.known_ground = known_ground
         up = np.array([0.0, -1.0, 0.0]) if known_ground.up is None else known_ground.up
         self.ground = Ground(up, 0.1, known_ground.camera_height, 0.02)

@@ -234,7 +234,7 @@ def test_the_smoother_smooths_a_person_before_a_camera_that_moves(outputs):
     for in_room in (True, False):
         one = SmootherSession(
             SmootherParameters(
-                dynamics=SmootherDynamics(model='random_walk'), fixed_lag=3, max_trajectories=1
+                dynamics=SmootherDynamics(model='random_walk'), fixed_lag=0.3, max_trajectories=1
             ),
             outputs.append,
         )

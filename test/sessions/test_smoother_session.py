@@ -11,13 +11,13 @@ from hmt_ros.sessions.smoothed_messages import TOPICS
 from hmt_ros.sessions.smoother_parameters import SmootherDynamics, SmootherParameters
 from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
 from hmt_ros.smoothing import MixtureSmoother
-from hmt_ros.smoothing.likelihood import counted
+from hmt_ros.smoothing.likelihood import counted, or_missed
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.headers import EARLIEST_NS, header_message, time_ns
 from msg_tools.messages.pose_mixtures import MixtureKind, TrackState, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
 
-LAG = 2
+LAG, SECONDS = 2, 0.2
 INDEPENDENT, UNKNOWN = CueErrors(1.0, 0.0), CueErrors(np.nan, np.nan)
 WINDOW = ['trajectory_mixture', 'trajectory_markers']
 FINAL = ['smoothed_pose_mixture', 'smoothed_joint_states']
@@ -28,7 +28,7 @@ RANDOM_WALK = SmootherDynamics(model='random_walk')
 @pytest.fixture
 def session(outputs):
     def make(wanted=lambda topic: True, dynamics=RANDOM_WALK, **values):
-        values.setdefault('fixed_lag', LAG)
+        values.setdefault('fixed_lag', SECONDS)
         parameters = with_values(SmootherParameters(dynamics=dynamics), values)
         return SmootherSession(parameters, outputs.append, wanted)
 
@@ -96,7 +96,8 @@ def test_final_poses_are_mixtures_that_need_no_kinematics(session, outputs, like
 @pytest.mark.parametrize('method', ['paths', 'variational'])
 def test_errors_that_last_are_discounted_once(session, outputs, likelihoods, method):
     """The first of three poses, by the dense joint precision of each variable."""
-    body, one = likelihoods.body, session(max_trajectories=1, method=method)
+    body = likelihoods.body
+    one = session(max_trajectories=1, method=method, fixed_lag=0.3)
     errors, stamps, means = CueErrors(0.5, 0.1), (0, 1, 3), []
     for index in stamps:
         mixture = likelihoods.mixture(index)[:1].normalised()
@@ -115,7 +116,7 @@ def test_errors_that_last_are_discounted_once(session, outputs, likelihoods, met
     lasting = np.mean(1.0 / (1.0 - kept) ** 2)
     pulls = shares[:, None] / 1e-3 * np.array(means)
     wanted = np.einsum('dij,jd->id', covariances, pulls)
-    (first,) = (pose_mixture_of(m).mixture for m in read(outputs, 'smoothed_pose_mixture'))
+    first, *_ = (pose_mixture_of(m).mixture for m in read(outputs, 'smoothed_pose_mixture'))
     exact = method == 'paths'
     np.testing.assert_allclose(first.means[0], wanted[0], atol=1e-6 if exact else 0.01)
     found = np.diagonal(first.covariances[0])
@@ -158,15 +159,16 @@ def test_forecasts_are_no_evidence(session, outputs, likelihoods):
 
 
 def test_a_span_is_discounted_from_its_first_image_on(session, likelihoods):
-    """As `MixtureSmoother` of what counts of each image."""
+    """As `MixtureSmoother` of what counts of each image, and of what may have been missed."""
     errors, one = CueErrors(0.5, 0.1), session(max_trajectories=2)
     for index in range(4):
         one.take(MIXTURE, likelihoods.message(index, errors=errors))
     first, last = likelihoods.stamp(1), likelihoods.stamp(3)
     found = trajectory_mixture_of(one.smooth_span(first, last))
     share, changes = 0.5 * np.tanh(0.5), 0.5 / (1.0 - np.exp(-2.0))
-    mixtures = [counted(likelihoods.mixture(1), 0.5)]
-    mixtures += [counted(likelihoods.mixture(i), share, changes) for i in (2, 3)]
+    counts = [counted(likelihoods.mixture(1), 0.5)]
+    counts += [counted(likelihoods.mixture(i), share, changes) for i in (2, 3)]
+    mixtures = [or_missed(one, likelihoods.body.rates) for one in counts]
     smoother = one._smoother(likelihoods.body, MixtureSmoother)
     wanted = smoother.smooth(mixtures, stamps_ns=[likelihoods.stamp(i) for i in (1, 2, 3)])
     np.testing.assert_allclose(found.means, wanted.means, atol=1e-9)
@@ -193,7 +195,7 @@ def test_smoothed_poses_tell_state_track_and_motion(session, outputs, likelihood
     wrist, elbow = body.joint_names.index('left_wrist'), body.dof_names.index('left_elbow')
     for content in found:
         assert content.track_id == 3
-        assert sorted(content.identities) == [1, 2]
+        assert len(set(content.identities)) == 2
         assert np.linalg.eigvalsh(content.joint_covariances).min() > 0
         # The elbow bends by half a radian a second, and nothing else moves.
         swing = body.joint_jacobians(content.means)[:, wrist, :, elbow]
@@ -206,14 +208,60 @@ def test_smoothed_poses_tell_state_track_and_motion(session, outputs, likelihood
     assert len(set(bent)) == 1
 
 
-def test_components_that_were_merged_go_on_as_the_heaviest(session, outputs, likelihoods):
-    one = session(max_trajectories=4, max_hypotheses=1)
-    for index in range(4):
-        one.take(MIXTURE, likelihoods.message(index))
-    for message in read(outputs, 'smoothed_pose_mixture'):
-        content = pose_mixture_of(message)
-        assert content.joint_velocities.shape == (1, 19, 3)
-        assert content.identities[0] > 0
+def test_what_is_published_are_states_of_motions(session, outputs, likelihoods):
+    """Of more motions than are wanted the heaviest; none is an average."""
+    for wanted in (1, 8):
+        one = session(max_trajectories=4, max_hypotheses=wanted)
+        outputs.clear()
+        for index in range(4):
+            one.take(MIXTURE, likelihoods.message(index))
+        windows = [trajectory_mixture_of(m) for m in read(outputs, 'trajectory_mixture')]
+        found = [pose_mixture_of(m) for m in read(outputs, 'smoothed_pose_mixture')]
+        for window, content in zip(windows[LAG:], found, strict=True):
+            count = min(wanted, 2)
+            assert content.joint_velocities.shape == (count, 19, 3)
+            for mean, identity in zip(content.means, content.identities, strict=True):
+                motion = window.identities.tolist().index(identity)
+                np.testing.assert_array_equal(mean, window.means[motion, 0])
+
+
+def test_an_unknown_shape_is_added_once(session, outputs, likelihoods):
+    """To what is published, whatever the number of images that have the same error."""
+    one = session(publish_covariances=True)
+    d = likelihoods.body.dimension
+    shape = np.zeros((d, d))
+    shape[2, 2] = 0.04
+    for index in range(6):
+        message = likelihoods.message(index)
+        message.shape_covariance = shape.reshape(-1)
+        assert one.take(MIXTURE, message).faults == ()
+    one.finish()
+    for content in map(pose_mixture_of, read(outputs, 'smoothed_pose_mixture')):
+        assert 0.04 < content.covariances[0, 2, 2] < 0.041
+        assert content.covariances[0, 3, 3] < 1e-3
+        assert content.shape_covariance is None
+    window = trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1])
+    assert (window.marginal_covariances[:, :, 2, 2] > 0.04).all()
+    one.take(MIXTURE, change(likelihoods.message(7), shape_covariance=shape.reshape(-1)))
+    span = trajectory_mixture_of(one.smooth_span())
+    assert 0.04 < span.marginal_covariances[0, 0, 2, 2] < 0.042
+
+
+def test_a_motion_passes_over_an_image_that_is_all_wrong(session, outputs, likelihoods):
+    """Its modes show somebody who faces the other way."""
+    yaw = likelihoods.body.dof_names.index('root_z')
+    one = session(fixed_lag=1.5, dynamics=SmootherDynamics())
+    for index in range(30):
+        mixture = likelihoods.mixture(index)
+        means = mixture.means.copy()
+        means[:, yaw] += np.pi * (index == 10)
+        one.take(MIXTURE, likelihoods.message(index, mixture=replace(mixture, means=means)))
+    one.finish()
+    found = [pose_mixture_of(m) for m in read(outputs, 'smoothed_pose_mixture')]
+    start = likelihoods.mixture(0).means[0, yaw]
+    turned = [abs(content.means[0, yaw] - start) for content in found]
+    assert len(turned) == 30
+    assert max(turned) < 0.3
 
 
 def test_another_track_is_another_window(session, outputs, likelihoods):
@@ -238,13 +286,15 @@ def test_motions_have_the_same_numbers_in_both_messages(session, outputs, likeli
     elbow = likelihoods.body.dof_names.index('left_elbow')
     for window, pose in zip(windows[LAG:], poses, strict=True):
         bent = window.identities[window.means[:, 0, elbow].argmax()]
-        assert sorted(window.identities) == [1, 2]
+        assert sorted(window.identities) == sorted(windows[LAG].identities)
+        assert len(window.identities) == 2
         assert bent == pose.identities[pose.means[:, elbow].argmax()]
         assert bent == windows[LAG].identities[windows[LAG].means[:, 0, elbow].argmax()]
     # Another window of the same track takes other numbers, another track begins with 1 again.
     one.finish()
     one.take(MIXTURE, likelihoods.message(6))
-    assert min(trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1]).identities) == 3
+    newest = trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1])
+    assert min(newest.identities) > max(max(window.identities) for window in windows)
     one.take(MIXTURE, change(likelihoods.message(7), track_id=8))
     one.take(MIXTURE, change(likelihoods.message(8), track_id=9))
     assert min(trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1]).identities) == 1
@@ -258,7 +308,7 @@ def test_trajectories_need_no_kinematics(session, outputs, likelihoods):
     content = trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1])
     assert content.joint_names == body.joint_names
     joints = body.joint_positions(content.means.reshape(-1, body.dimension))
-    assert content.joint_positions.shape == (3, 3, len(body.joint_names), 3)
+    assert content.joint_positions.shape == (2, 3, len(body.joint_names), 3)
     np.testing.assert_allclose(content.joint_positions.reshape(joints.shape), joints, atol=1e-12)
 
 
@@ -270,16 +320,17 @@ def test_trajectories(session, outputs, likelihoods):
     content = trajectory_mixture_of(last, likelihoods.body.dof_names)
     assert content.stamps_ns == tuple(likelihoods.stamp(index) for index in (1, 2, 3))
     assert content.final_until_ns == likelihoods.stamp(1)
-    assert content.means.shape == (3, 3, likelihoods.body.dimension)
+    assert content.means.shape == (2, 3, likelihoods.body.dimension)
     assert content.marginal_covariances is None
     one.parameters = with_values(one.parameters, {'publish_covariances': True})
     one.take(MIXTURE, likelihoods.message(4))
     *_, last = read(outputs, 'trajectory_mixture')
-    assert trajectory_mixture_of(last).marginal_covariances.shape == (3, 3, 37, 37)
+    assert trajectory_mixture_of(last).marginal_covariances.shape == (2, 3, 37, 37)
     (final,) = read(outputs, 'smoothed_pose_mixture')[-1:]
-    found = pose_mixture_of(final).mixture
-    covariances = trajectory_mixture_of(last).marginal_covariances[:, 0]
-    np.testing.assert_allclose(found.covariances, covariances, atol=1e-12)
+    found, window = pose_mixture_of(final), trajectory_mixture_of(last)
+    for identity, covariance in zip(found.identities, found.covariances, strict=True):
+        own = window.marginal_covariances[window.identities.tolist().index(identity), 0]
+        np.testing.assert_allclose(covariance, own, atol=1e-12)
 
 
 def test_same_messages_same_bytes(session, outputs, likelihoods):
@@ -302,7 +353,7 @@ def test_what_nobody_wants_is_not_made(session, outputs, likelihoods):
 
 
 def test_variational_smoothing_is_chosen_by_a_parameter(session, likelihoods):
-    one = session(method='variational', max_trajectories=2, fixed_lag=1)
+    one = session(method='variational', max_trajectories=2, fixed_lag=0.1)
     one.take(MIXTURE, likelihoods.message(0))
     assert type(one._window.smoother) is MixtureSmoother
     assert one.state.counts['smoothed'] == 1
@@ -440,6 +491,23 @@ def test_bad_mixtures_are_skipped(session, outputs, likelihoods, name):
     assert smoothed(outputs) == [likelihoods.stamp(0), likelihoods.stamp(3)]
 
 
+@pytest.mark.parametrize(
+    ('shape', 'text'),
+    [
+        (np.zeros(36), 'mixture: shape_covariance has 36 values, wanted 1369'),
+        (-np.eye(37), 'covariance of the shape is not positive definite'),
+        (np.full((37, 37), np.nan), 'covariance of the shape has values that are not finite'),
+    ],
+)
+def test_unknown_shapes_that_can_not_be(session, likelihoods, shape, text):
+    one = session()
+    one.take(MIXTURE, likelihoods.message(0))
+    message = change(likelihoods.message(1), shape_covariance=shape.reshape(-1))
+    (fault,) = one.take(MIXTURE, message).faults
+    assert text in fault
+    assert one.take(MIXTURE, likelihoods.message(2)).faults == ()
+
+
 def test_every_kind_of_fault_is_told_once(session, likelihoods):
     one = session()
     one.take(MIXTURE, likelihoods.message(0))
@@ -551,7 +619,7 @@ def test_a_span_is_smoothed_on_demand(session, likelihoods):
         ({'method': 'guess'}, "method must be one of .* saw 'guess'"),
         ({'dynamics.model': 'jump'}, 'there is no parameter dynamics.model'),
         ({'max_trajectories': 0}, 'between 1 and 1024'),
-        ({'fixed_lag': 1.5}, 'whole number'),
+        ({'fixed_lag': -0.5}, 'between 0'),
     ],
 )
 def test_parameters_that_can_not_be(values, message):

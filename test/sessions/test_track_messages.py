@@ -48,6 +48,7 @@ def track(body):
         log_likelihoods=np.array([-3.0, -2.0, -1.0]),
         likelihood_values=np.array([-2.5, -1.5]),
         likelihood_errors=CueErrors(0.25, 0.125),
+        shape_covariance=0.01 * np.eye(body.dimension),
         point=poses[1],
         ground=Ground(np.array([0.0, -0.8, -0.6]), 0.05, 1.5, 0.1),
         contacts={'left_foot': 0.75, 'right_foot': 0.25},
@@ -96,6 +97,9 @@ def test_mixtures(track, body):
     likelihood, posterior = found['likelihood_mixture'], found['pose_mixture']
     assert (likelihood.error_share, likelihood.error_time) == (0.25, 0.125)
     assert np.isnan([posterior.error_share, posterior.error_time]).all()
+    # So is what all images err by alike.
+    assert np.array_equal(likelihood.shape_covariance, track.shape_covariance.reshape(-1))
+    assert len(posterior.shape_covariance) == 0
     # The posterior tells what the cues are believed.
     assert (posterior.cue_names, list(posterior.cue_probabilities)) == (
         ['depth', 'track'],
@@ -181,6 +185,7 @@ def test_urdf_joint_states_transforms_and_joint_positions_agree(name, track):
                 'likelihood': mixture,
                 'log_likelihoods': np.zeros(2),
                 'likelihood_values': np.zeros(2),
+                'shape_covariance': np.zeros((body.dimension, body.dimension)),
                 'point': poses[1],
             }
         )

@@ -13,6 +13,8 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.smoothing import LinearGaussianDynamics
 from hmt_ros.smoothing.embedded_network import embedded_network
+from hmt_ros.smoothing.likelihood import or_missed
+from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.paths import (
     diverse_subset,
@@ -151,3 +153,55 @@ def test_paths_through_every_node_are_the_best_that_visit_it(modes, walk):
         visiting = np.array([path[t] == k for path in every])
         best = found.log_values[found.nodes[:, t] == k].max()
         assert best == pytest.approx(values[visiting].max())
+
+
+def test_distinct_motions_are_apart(modes, walk):
+    """Two of three modes are near: their paths are one motion, whatever they visit."""
+    rng = np.random.default_rng(0)
+    mixtures = tuple(
+        GaussianMixture(
+            np.array([0.5, 0.3, 0.2]),
+            np.array([[0.0, 0.0], [0.05, 0.0], [1.0, 0.0]]) + 0.01 * rng.normal(size=(3, 2)),
+            np.tile(0.04 * np.eye(2), (3, 1, 1)),
+        )
+        for _ in range(4)
+    )
+    sequence = ModeSequence(mixtures, walk, 0.1 * np.ones(3))
+    found = sequence.distinct_motions(
+        6, lambda poses: np.pad(poses, ((0, 0), (0, 1)))[:, None], 0.5
+    )
+    sides = [tuple((path == 2).tolist()) for path in found.nodes]
+    assert len(found) > 2
+    for i, one in enumerate(sides):
+        for other in sides[:i]:
+            assert np.mean(np.not_equal(one, other)) >= 0.5 or one[0] != other[0]
+    # The best of all comes first, then one that is on the other side for half of the time.
+    assert found.log_values[0] == most_probable_paths(sequence.network).log_values[0]
+    assert not any(sides[0])
+    assert np.mean(sides[1]) >= 0.5
+    # With room for two there is one of each.
+    few = sequence.distinct_motions(2, lambda poses: np.pad(poses, ((0, 0), (0, 1)))[:, None], 0.5)
+    assert len(few) == 2
+
+
+def test_a_mode_that_was_missed_is_wide():
+    mixture = GaussianMixture([0.4, 0.6], [[0.0], [1.0]], [[[0.01]], [[0.02]]])
+    found = or_missed(mixture, np.array([4.0]))
+    np.testing.assert_allclose(found.weights, [0.396, 0.594, 0.01])
+    np.testing.assert_allclose(found.means[:, 0], [0.0, 1.0, 1.0])
+    np.testing.assert_allclose(found.covariances[:, 0, 0], [0.01, 0.02, 4.02])
+
+
+def test_an_image_that_missed_the_pose_is_passed_over(walk):
+    """All modes of one image are far away: without a wide one the path has to go there."""
+    place = np.array([0.0, 0.0])
+
+    def image(at):
+        return GaussianMixture([1.0], [at], [1e-3 * np.eye(2)])
+
+    images = [image(place), image(place), image(place + 30.0), image(place), image(place)]
+    torn = PathSmoother(walk, max_trajectories=8).smooth(images)
+    assert np.abs(torn.means[0, 2]).min() > 25.0
+    wide = [or_missed(one, np.full(2, 1e3)) for one in images]
+    whole = PathSmoother(walk, max_trajectories=8).smooth(wide)
+    assert np.abs(whole.means[0]).max() < 0.2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -97,6 +98,7 @@ def test_likelihoods_are_smoothed_live_and_together():
     body = load_body('human37')
     rng = np.random.default_rng(0)
     pose, spread = body.prior_mean, 0.05
+    unknown = np.zeros((body.dimension, body.dimension))
     seen = []
     for t in range(12):
         near = pose + spread * rng.normal(size=(2, body.dimension))
@@ -104,8 +106,11 @@ def test_likelihoods_are_smoothed_live_and_together():
             np.array([0.6, 0.4]), near, np.tile(spread**2 * np.eye(body.dimension), (2, 1, 1))
         )
         stamp = 33_000_000 * (t + 1)
-        seen.append(smoothing_clips.Seen(stamp, body, mixture, mixture, CueErrors(1.0, 0.0)))
-    live, offline = smoothing_clips.smoothed(seen)
+        seen.append(
+            smoothing_clips.Seen(stamp, body, mixture, mixture, CueErrors(1.0, 0.0), unknown)
+        )
+    found = smoothing_clips.smoothed(seen)
+    live, offline = found['live'], found['offline']
     assert list(live) == list(offline) == [x.stamp for x in seen]
     first = seen[0].stamp
 
@@ -118,13 +123,49 @@ def test_likelihoods_are_smoothed_live_and_together():
 
 
 def test_the_kernel_that_is_best_in_the_mean_is_shown():
-    names = [f'{smoothing_clips.AVERAGED} over {width} images' for width in (1, 2)]
-    numbers = dict.fromkeys(smoothing_clips.SCORES, 1.0)
-    one = {'filter': numbers, names[0]: numbers | {'heaviest_mm': 5.0}, names[1]: numbers}
-    other = {'filter': numbers, names[0]: numbers, names[1]: numbers | {'heaviest_mm': 4.0}}
+    ways = ('AVERAGED', 'MEAN', 'NEAREST')
+    numbers = dict.fromkeys((*smoothing_clips.SCORES, smoothing_clips.MODES), 1.0)
+    names = [
+        f'{getattr(smoothing_clips, way)} over {width} images' for way in ways for width in (1, 2)
+    ]
+    plain = dict.fromkeys(
+        ('filter', 'live', 'offline', 'one path, smoothed', 'point estimate', 'Viterbi path'),
+        numbers,
+    )
+    one = plain | dict.fromkeys(names, numbers) | {names[0]: numbers | {'heaviest_mm': 5.0}}
+    other = plain | dict.fromkeys(names, numbers) | {names[1]: numbers | {'heaviest_mm': 4.0}}
     found = smoothing_clips.mean([one, other])
-    assert list(found) == ['filter', names[1]]
+    assert list(found) == [*plain, names[1], names[2], names[4]]
     assert found[names[1]]['heaviest_mm'] == 2.5
-    entry = {'clips': 'all', 'inputs': 'images', 'gravity': 'given', 'scores': found}
-    rows = smoothing_clips.as_rows({'means': [entry]})
-    assert [len(row) for row in rows] == [10] * 4
+    entry = {'clips': 'all', 'inputs': 'images', 'gravity': 'given', 'rate': 0.0, 'scores': found}
+    low = entry | {'rate': 3.0}
+    rows = smoothing_clips.error_rows({'means': [entry, low]})
+    assert [len(row) for row in rows] == [12] * 4
+    assert rows[2][:4] == ['images', 'given', 'all', '1.0']
+    assert rows[3][2] == '3'
+    rows = smoothing_clips.motion_rows({'means': [entry, low]})
+    assert [len(row) for row in rows] == [10] * 5
+
+
+def record(joints, weights, true):
+    """Of joints (T, K, 3) that lie on a line, besides a pelvis at the origin."""
+    t, k = np.shape(joints)[:2]
+    some = np.zeros((t, k, 2, 3))
+    some[:, :, 1, 0] = joints
+    truth = np.zeros((t, 2, 3))
+    truth[:, 1, 0] = true
+    return SimpleNamespace(joints=some, weights=np.array(weights), true=truth)
+
+
+def test_paths_through_modes():
+    """The heavier mode jumps for one image; the truth is with the lighter one there."""
+    joints = [[0.0, 0.4], [0.02, 0.4], [0.41, 0.0], [0.01, 0.4]]
+    one = record(joints, [[0.9, 0.1]] * 4, [0.0, 0.0, 0.3, 0.0])
+    found = smoothing_clips.viterbi_joints(one)[:, 1, 0]
+    np.testing.assert_allclose(found, [0.0, 0.02, 0.0, 0.01])
+    nearest = smoothing_clips.nearest_joints(one)[:, 1, 0]
+    np.testing.assert_allclose(nearest, [0.0, 0.02, 0.41, 0.01])
+    # In the mean of two joints the modes are 0.2 m apart; a mode without weight is none.
+    assert smoothing_clips.modes_apart(one) == 2.0
+    near = record([[0.0, 0.02], [0.0, 0.2]], [[0.5, 0.5], [1.0, 0.0]], [0.0, 0.0])
+    assert smoothing_clips.modes_apart(near) == 1.0

@@ -88,6 +88,7 @@ class StandingStill:
         self.status, self.misfit, self.evaluations = Status.TRACKING, 0.0, 1
         self.existence_probability = 1.0
         self.likelihood_errors = CueErrors(0.25, 0.125)
+        self.shape_covariance = np.zeros((body.dimension, body.dimension))
         self.track_id, self.started_from = 1, None
         self.keypoints, self.positions, self.predictions, self.masks = [], [], [], []
         self.depths = []

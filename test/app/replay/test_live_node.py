@@ -143,7 +143,7 @@ def test_same_of_a_person_who_leaves_and_returns(tmp_path, capsys):
     ]
     bag = write(tmp_path / 'bag', [camera, *pictures])
     options = ['--set', 'max_hypotheses=2', '--set', 'evaluation_budget=100']
-    options += ['--set', 'smoother.fixed_lag=1']
+    options += ['--set', 'smoother.fixed_lag=0.1']
     (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
     assert one == other
     assert one[0] == 0
@@ -198,7 +198,7 @@ def test_same_of_raw_images_with_keypoints_masks_and_faults(tmp_path, capsys):
     entries.append(('image', entries[-1][1] + 10_000, again))
     bag = write(tmp_path / 'bag', sorted(entries, key=lambda entry: entry[1]))
     options = ['--keep-going', '--set', 'reset_on_time_jump=true', '--set', 'frame_prefix=x']
-    options += ['--set', 'smoother.reset_on_time_jump=true', '--set', 'smoother.fixed_lag=1']
+    options += ['--set', 'smoother.reset_on_time_jump=true', '--set', 'smoother.fixed_lag=0.1']
     options += ['--set', 'max_hypotheses=2', '--set', 'evaluation_budget=100']
     (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
     assert one == other
