@@ -52,8 +52,8 @@ The ending of OUT selects the format.
   .npz         arrays: poses, joint positions, covariances, weights, lengths
 
 Skeletons (the first three) stand upright, y up, the floor at y = 0, where the bag knows gravity and
-floor; else they are in the axes of the camera, turned so that y is up and z towards it. Tables and
-arrays stay in the frame of the mixtures.
+floor; else they are in the axes of the mixtures, x right, turned from y down and z forward to y up
+and z back. Tables and arrays stay in the frame of the mixtures.
 
 Without --identity each pose is the heaviest mode of its time, which may leap from one motion to
 another; with it all poses are of one motion, for as long as that lasts.
@@ -312,7 +312,7 @@ def read_tracked_motion(
     chosen = _track(f'{path}: {name}', steps, motions, track, identity)
     ordered = [steps[chosen][stamp] for stamp in sorted(steps[chosen])]
     of = last[chosen]
-    room, height, told = CAMERA_TO_ROOM, 0.0, 'in the axes of the camera, as chosen'
+    room, height, told = CAMERA_TO_ROOM, 0.0, 'in the axes of the camera'
     if not camera_axes:
         room, height, told = _room(path, name, of.frame_id)
     what = 'heaviest modes' if identity is None else f'motion {identity}'
@@ -406,7 +406,8 @@ def _room(path: Path, topic: str, frame_id: str) -> tuple[Array, float, str]:
     """Axes with y up: rotation, height of the camera in them, and what they are."""
     grounds = read_grounds(path, topic, frame_id).values()
     if not grounds:
-        return CAMERA_TO_ROOM, 0.0, 'in the axes of the camera: the bag does not know gravity'
+        told = f'in the axes of {frame_id}, turned to y up: its gravity is not known'
+        return CAMERA_TO_ROOM, 0.0, told
     ups = np.array([ground.up for ground in grounds])
     up = ups.mean(axis=0) / np.linalg.norm(ups.mean(axis=0))
     # z is against the direction of view, as far as that is level; of a camera that looks straight

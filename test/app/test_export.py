@@ -253,7 +253,7 @@ def test_skeletons_stand_on_the_floor(body, poses, tmp_path, capsys):
 @pytest.mark.parametrize(
     ('grounds', 'told'),
     [
-        ((), 'in the axes of the camera: the bag does not know gravity'),
+        ((), 'in the axes of camera_optical_frame, turned to y up: its gravity is not known'),
         (((STAMPS[0], UP, None),), 'upright, the camera at y = 0\n'),
         (
             ((STAMPS[0], UP, None), (STAMPS[1], UP * [1, 1, -1], None)),
