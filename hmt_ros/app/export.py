@@ -142,7 +142,7 @@ def _parser() -> CommandParser:
     parser.add_output('OUT', 'file', f'file to write, one of {" ".join(FORMATS)}')
     parser.add_argument(
         '--topic', metavar='NAME',
-        help='mixtures over poses (default: the smoothed ones, else the posterior)',
+        help='mixtures over poses (default: smoothed, else the posterior, else predictions)',
     )  # fmt: skip
     parser.add_argument(
         '--identity', type=whole_number(1), metavar='N',
@@ -280,7 +280,8 @@ def read_tracked_motion(
 
     Args:
         path: path of the bag.
-        topic: of mixtures over poses; None: of smoothed ones, else of the posterior.
+        topic: of mixtures over poses; None: of smoothed ones, else of the posterior, else of
+            predictions.
         identity: of the motion; None: the heaviest mode at each time.
         track: its number; None: the one with most poses.
         body_model: name or file of the body model, for a bag whose own name for it is unknown.
@@ -331,13 +332,13 @@ def _topic(bag: BagReader, wanted: str | None) -> str:
     for name in mixture_topics(bag):
         kinds.setdefault(int(next(bag.messages([name])).message.kind), []).append(name)
     named = ', '.join(name for names in kinds.values() for name in names)
-    for kind in (MixtureKind.SMOOTHED, MixtureKind.POSTERIOR):
+    for kind in (MixtureKind.SMOOTHED, MixtureKind.POSTERIOR, MixtureKind.PREDICTION):
         if len(kinds.get(kind, [])) > 1:
             raise ValueError(f'{bag.path} has several motions: --topic one of {named}')
         if kind in kinds:
             return kinds[kind][0]
     raise ValueError(
-        f'{bag.path} has neither smoothed poses nor a posterior: '
+        f'{bag.path} has no smoothed poses, no posterior and no predictions: '
         + (f'--topic one of {named}' if named else 'it has no mixtures over poses')
     )
 

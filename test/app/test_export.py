@@ -111,10 +111,12 @@ def test_smoothed_poses_are_the_first_choice_and_the_posterior_the_second(
     assert (found['body_model'], found['frame_id']) == ('human37', FRAME_ID)
     posterior = arrays(made.out, tmp_path / 'b', '--topic', 'pose_mixture')
     assert not np.array_equal(posterior['joints'], found['joints'])
-    alone = write_run(tmp_path / 'alone', body, poses, STEPS, kind=MixtureKind.POSTERIOR)
-    np.testing.assert_array_equal(
-        arrays(alone, tmp_path / 'c')['joints'], arrays(run, tmp_path / 'd')['joints']
-    )
+    wanted = arrays(run, tmp_path / 'c')['joints']
+    for kind in (MixtureKind.POSTERIOR, MixtureKind.PREDICTION):
+        alone = write_run(tmp_path / kind.name, body, poses, STEPS, kind=kind)
+        np.testing.assert_array_equal(
+            arrays(alone, tmp_path / 'd', '--overwrite')['joints'], wanted
+        )
 
 
 def test_arrays_hold_what_the_messages_hold(run, body, poses, tmp_path):
@@ -340,7 +342,7 @@ def test_recordings_without_a_motion(made, body, poses, tmp_path, capsys):
                 bag.write(f'{name}/smoothed', content.stamp_ns, message)
     for bag, options, said in (
         (nobody, [], r'nobody is seen in any mixture$'),
-        (likely, [], r'neither smoothed poses nor a posterior: --topic one of /likelihood$'),
+        (likely, [], r'no posterior and no predictions: --topic one of /likelihood$'),
         (made.images, [], r'it has no mixtures over poses$'),
         (plain, ['--identity', '1'], r'its modes have no identities$'),
         (two, [], r'has several motions: --topic one of /p1/smoothed, /p2/smoothed$'),

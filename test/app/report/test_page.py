@@ -313,7 +313,8 @@ def test_filter_and_smoother_are_drawn_side_by_side(page, made, tmp_path):
     given = visit(page, "look('beside');", tmp_path, '#show=0,1,truth,beside')
     assert given['beside'] == seen['beside']
     alone = make(made.out, tmp_path / 'alone', '--topic', 'pose_mixture')
-    assert visit(alone, "seen.hidden = get('beside-label').hidden;", tmp_path)['hidden'] is True
+    steps = "seen.hidden = get('beside-label').hidden;"
+    assert visit(alone, steps, tmp_path, '#show=0,beside')['hidden'] is True
 
 
 @in_a_browser

@@ -397,7 +397,7 @@ element('follow').addEventListener('change', () => { space.follow = element('fol
 element('align').addEventListener('change', () => { space.together = element('align').checked; space.draw(); });
 element('beside-label').hidden = compared.length < 2;
 element('beside').addEventListener('change', () => {
-  shown.beside = element('beside').checked;
+  shown.beside = element('beside').checked && compared.length === 2;
   if (shown.beside) compared.map((layer) => element(`layer-${layers.indexOf(layer)}`)).forEach((input) => { if (!input.checked) input.click(); });
   space.draw();
 });
