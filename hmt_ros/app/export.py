@@ -317,7 +317,8 @@ def read_tracked_motion(
     if not camera_axes:
         room, height, told = _room(path, name, of.frame_id)
     what = 'heaviest modes' if identity is None else f'motion {identity}'
-    notes = [f'{what} of track {chosen}, {told}', *_notes(ordered, end)]
+    whose = f' of track {chosen}' if chosen else ''
+    notes = [f'{what}{whose}, {told}', *_notes(ordered, end)]
     if len(steps) > 1:
         others = ', '.join(f'{key} ({len(steps[key])} poses)' for key in sorted(steps))
         notes.append(f'there are several tracks, {others}: --track chooses one')
@@ -412,7 +413,7 @@ def _room(path: Path, topic: str, frame_id: str) -> tuple[Array, float, str]:
     ups = np.array([ground.up for ground in grounds])
     up = ups.mean(axis=0) / np.linalg.norm(ups.mean(axis=0))
     # z is against the direction of view, as far as that is level; of a camera that looks straight
-    # up or down, the top of the image.
+    # down, it goes to the bottom of the image.
     back = np.array([0.0, 0.0, -1.0]) if abs(up[2]) < 0.99 else np.array([0.0, 1.0, 0.0])
     back -= (back @ up) * up
     back /= np.linalg.norm(back)
@@ -445,15 +446,8 @@ def _notes(steps: Sequence[TrackedPose], end: int) -> list[str]:
             f'it ends {(end - steps[-1].stamp_ns) / SECOND_NS:.2f} s before the topic does'
         )
     lengths = [step.segment_lengths for step in steps]
-    change = max(
-        (
-            abs(own[name] - lengths[-1][name])
-            for own in lengths
-            for name in own
-            if name in lengths[-1]
-        ),
-        default=0.0,
-    )
+    pairs = [(x, lengths[-1].get(name, x)) for own in lengths for name, x in own.items()]
+    change = max((abs(a - b) for a, b in pairs), default=0.0)
     if change > 5e-4:
         notes.append(
             f'lengths of segments change by up to {1e3 * change:.0f} mm: skeletons have the last'

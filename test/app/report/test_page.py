@@ -369,6 +369,6 @@ def test_a_height_or_an_angle_is_drawn_over_time(page, body, made, tmp_path):
     assert len({seen[name] for name in ('height', 'angle', 'later')}) == 3
     assert min(seen[f'{name} drawn'] for name in ('height', 'angle')) > 1000
     assert seen['clock'] == f'0.60 s, {FRAMES} of {FRAMES}'
-    assert 'Heights are above the camera, taken to be level.' in seen['caption']
+    assert 'Heights are above the origin, the camera as a rule,' in seen['caption']
     ways = make(made.out, tmp_path / 'ways', '--topic', 'trajectory_mixture')
     assert visit(ways, "seen.hidden = get('bands-section').hidden;", tmp_path)['hidden'] is True

@@ -194,7 +194,7 @@ function buildBands() {
   const first = [...element('banded').options].find((option) => option.value === 'joints right_wrist');
   if (first) first.selected = true;
   element('banded').addEventListener('change', () => charts.bands.draw());
-  const from = floors.some(Boolean) ? 'the floor' : 'the camera, taken to be level';
+  const from = floors.some(Boolean) ? 'the floor' : 'the origin, the camera as a rule, which is taken to be level';
   element('bands-caption').replaceChildren(
     ...keys(compared.filter((layer) => layer.bands).map((layer) => ({ name: `${layer.kind} (${layer.topic})`, series: comparedColour(layer) }))),
     ...(truth ? keys([{ name: 'truth (heights)', series: 'ink' }]) : []),
