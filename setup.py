@@ -220,6 +220,7 @@ setup(
             'learn-lifter = hmt_ros.app.learn_lifter:main',
             'learn-lengths = hmt_ros.app.learn_lengths:main',
             'report = hmt_ros.app.report.command:main',
+            'export = hmt_ros.app.export:main',
             'evaluate = hmt_ros.app.evaluate:main',
         ],
     },

@@ -51,6 +51,10 @@ COMMANDS = {
         'hmt_ros.app.report.command',
         'show the mixtures in a bag: pictures, and a page with a 3D view',
     ),
+    'export': (
+        'hmt_ros.app.export',
+        'write the motion of a recorded run as BVH, a table or arrays',
+    ),
     'evaluate': ('hmt_ros.app.evaluate', 'compare the mixtures in a bag with ground truth'),
 }
 

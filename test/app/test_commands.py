@@ -34,14 +34,17 @@ def test_unknown_commands_are_one_line(arguments, message, capsys):
     assert main(arguments) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
-    assert 'train, learn-prior, learn-motion, learn-lifter, learn-lengths, report, evaluate' in line
+    assert (
+        'train, learn-prior, learn-motion, learn-lifter, learn-lengths, report, export, evaluate'
+        in line
+    )
 
 
 @pytest.mark.parametrize(
     'command',
     [
         'track-video', 'import-video', 'lift', 'subject', 'replay', 'recover', 'make-bag',
-        'learn-motion', 'learn-lifter', 'learn-lengths', 'report', 'evaluate',
+        'learn-motion', 'learn-lifter', 'learn-lengths', 'report', 'export', 'evaluate',
     ],
 )  # fmt: skip
 def test_commands_explain_themselves(command, capsys):

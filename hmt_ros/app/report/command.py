@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from hmt_ros.app.bag_scores import chosen_topics, score_bag
 from hmt_ros.app.command_line import CommandParser, run_command, whole_number
@@ -15,7 +14,7 @@ from hmt_ros.app.progress import Progress, show_progress
 from hmt_ros.app.recorded_bodies import body_topics
 from hmt_ros.app.report.grounds import read_grounds
 from hmt_ros.app.report.images import FilmStrip, ImageSource, film_strip, image_source
-from hmt_ros.app.report.mixtures import Layer, RecordedMixtures, read_mixtures
+from hmt_ros.app.report.mixtures import RecordedMixtures, read_mixtures
 from hmt_ros.app.report.page import Content, data_size, page_html
 from hmt_ros.app.report.pictures import PICTURES, draw_pictures, shown_in_pictures
 from hmt_ros.app.truth import read_truth, recorded_truth
@@ -142,12 +141,15 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) 
     with BagReader(options.bag) as bag:
         topics = chosen_topics(bag, options.topics)
         total = bag.message_count({*topics, *body_topics(bag)}) * (1 if truth is None else 2)
+        first = next(bag.messages(topics[:1]), None)
+    frame = '' if first is None else first.message.header.frame_id
+    grounds = read_grounds(options.bag, topics[0], frame)
     if source is not None:
         with BagReader(source.bag) as bag:
             total += bag.message_count([source.topic])
     bar.total = total
     everything = read_mixtures(
-        options.bag, topics=topics, body_model=options.body, progress=bar.update
+        options.bag, topics=topics, body_model=options.body, grounds=grounds, progress=bar.update
     )
     scores = {}
     if truth is not None:
@@ -183,8 +185,6 @@ def _content(options: ReportOptions, source: ImageSource | None, bar: Progress) 
         if len(images.jpegs) < len(stamps):
             notes.append(f'{len(stamps) - len(images.jpegs)} times are shown without an image')
     title = f'{options.bag.resolve().name}: mixtures over poses'
-    shown: list[Layer[Any]] = [*mixtures.layers, *mixtures.trajectories]
-    grounds = read_grounds(options.bag, shown[0].topic, shown[0].frame_id)
     return Content(title, stamps, mixtures, images, truth, scores, notes, grounds)
 
 

@@ -12,8 +12,10 @@ import numpy as np
 
 from hmt_ros.app.bag_scores import chosen_topics
 from hmt_ros.app.recorded_bodies import BODY, RecordedBodies, body_topics
+from hmt_ros.app.report.bands import angles_of, ground_at, marginals_of
 from hmt_ros.inference.arrays import Array
 from msg_tools import BagMessage, BagReader
+from msg_tools.messages.ground import GroundState
 from msg_tools.messages.message_error import MessageError
 from msg_tools.messages.pose_mixtures import POSE_MIXTURE, pose_mixture_of
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
@@ -21,6 +23,8 @@ from msg_tools.messages.trajectory_mixtures import trajectory_mixture_of
 # Joints whose paths are drawn of trajectories, and how many trajectories are kept.
 ENDS = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
 KEPT_TRAJECTORIES = 8
+# Kinds whose heights and angles are shown over time.
+BANDED = ('posterior', 'smoothed')
 _TRAJECTORIES = 'trajectories'
 _ORDER = (
     'posterior', 'smoothed', 'forecast', 'likelihood', 'prediction', 'ground_truth', _TRAJECTORIES,
@@ -37,6 +41,8 @@ class Moment:
         joints: (K, J, 3) camera optical frame, m.
         existence: probability that a person is in view; NaN: unknown.
         cues: probability that each cue of the images shows the person, by its name; empty: unknown.
+        identities: (K,) of the modes; 0: none.
+        marginals: (2, K, J + A) of heights and angles, see `marginals_of`; (2, K, 0): unknown.
     """
 
     stamp_ns: int
@@ -44,6 +50,8 @@ class Moment:
     joints: Array
     existence: float = math.nan
     cues: Mapping[str, float] = field(default_factory=dict)
+    identities: Array = field(default_factory=lambda: np.empty(0))
+    marginals: Array = field(default_factory=lambda: np.empty((2, 0, 0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +87,7 @@ class Layer(Generic[Mixture]):
         frame_id: frame of the positions.
         joint_names: (J,) of the positions.
         mixtures: by stamp in ns, in the order of time.
+        angles: (A,) names of the angles of the body; empty: the body is not known.
     """
 
     topic: str
@@ -86,6 +95,7 @@ class Layer(Generic[Mixture]):
     frame_id: str
     joint_names: tuple[str, ...]
     mixtures: dict[int, Mixture]
+    angles: tuple[str, ...] = ()
 
     def at(self, stamps: Collection[int]) -> Layer[Mixture]:
         """The mixtures at some times only."""
@@ -139,6 +149,7 @@ def read_mixtures(
     *,
     topics: Sequence[str] = (),
     body_model: str | None = None,
+    grounds: Mapping[int, GroundState] | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> RecordedMixtures:
     """The mixtures in a bag; of several on one topic with the same stamp, the first.
@@ -147,6 +158,7 @@ def read_mixtures(
         path: path of the bag.
         topics: names of the topics to read; empty: all with mixtures except ground truth.
         body_model: name or file of the body model, for a bag whose own name for it is unknown.
+        grounds: what is known of the floor, by stamp, for heights.
         progress: called with the number of messages that were read.
 
     Raises:
@@ -160,7 +172,7 @@ def read_mixtures(
             if stored.msgtype == BODY:
                 bodies.learn(stored)
             else:
-                _take(found, stored, bodies)
+                _take(found, stored, bodies, grounds or {})
             if progress is not None:
                 progress(1)
     for name, layer in found.items():
@@ -181,11 +193,16 @@ def read_mixtures(
     return result
 
 
-def _take(found: dict[str, Layer[Any]], stored: BagMessage, bodies: RecordedBodies) -> None:
+def _take(
+    found: dict[str, Layer[Any]],
+    stored: BagMessage,
+    bodies: RecordedBodies,
+    grounds: Mapping[int, GroundState],
+) -> None:
     """Adds a message to the layer of its topic."""
     try:
         if stored.msgtype == POSE_MIXTURE:
-            new: Layer[Any] | None = _pose_layer(stored.topic, stored.message)
+            new: Layer[Any] | None = _pose_layer(stored.topic, stored.message, bodies, grounds)
         else:
             new = _trajectory_layer(stored.topic, stored.message, bodies)
         if new is None:
@@ -205,21 +222,31 @@ def _take(found: dict[str, Layer[Any]], stored: BagMessage, bodies: RecordedBodi
         known.mixtures.setdefault(stamp, mixture)
 
 
-def _pose_layer(topic: str, message: Any) -> Layer[Moment] | None:
+def _pose_layer(
+    topic: str, message: Any, bodies: RecordedBodies, grounds: Mapping[int, GroundState]
+) -> Layer[Moment] | None:
     """A layer of one mixture; None: nobody was seen."""
     content = pose_mixture_of(message)
     if not len(content.weights):
         return None
+    assert content.identities is not None
     order = np.argsort(-content.weights, kind='stable')
     stamp, kind = content.stamp_ns, content.kind.name.lower()
+    body, marginals = None, np.empty((2, len(order), 0))
+    if kind in BANDED:
+        body = bodies.of(topic, content)
+        marginals = marginals_of(content, body, ground_at(grounds, stamp))
     moment = Moment(
         stamp,
         content.weights[order],
         content.joint_positions[order],
         content.existence_probability,
         content.cue_probabilities,
+        content.identities[order].astype(np.float64),
+        marginals[:, order].astype(np.float32),
     )
-    return Layer(topic, kind, content.frame_id, content.joint_names, {stamp: moment})
+    names = content.joint_names
+    return Layer(topic, kind, content.frame_id, names, {stamp: moment}, angles_of(body))
 
 
 def _trajectory_layer(topic: str, message: Any, bodies: RecordedBodies) -> Layer[Window]:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.app.evaluate import as_json
+from hmt_ros.app.report.bands import ground_at, heights_of, intervals
 from hmt_ros.app.report.grounds import ground_data
 from hmt_ros.app.report.images import FilmStrip
 from hmt_ros.app.report.mixtures import Layer, Moment, RecordedMixtures, Window
@@ -72,6 +73,8 @@ def data_size(mixtures: RecordedMixtures) -> int:
         for moment in layer.mixtures.values():
             # Probabilities as text.
             size += len(moment.weights) * each + 8 * (1 + len(moment.cues))
+            # Intervals of 6 bytes in base64, and identities as text.
+            size += 8 * moment.marginals.shape[2] + 8 * len(moment.weights)
     for topic in mixtures.trajectories:
         for window in topic.mixtures.values():
             ways = 0 if window.ways is None else window.ways[..., 0].size
@@ -179,6 +182,8 @@ def _layer(layer: Layer[Moment], content: Content, grid: _Grid) -> dict[str, Any
         if errors
         else None,
         **_beliefs([moments.get(stamp) for stamp in content.stamps]),
+        'identities': _identities([moments.get(stamp) for stamp in content.stamps]),
+        'bands': _bands(layer, content.stamps),
         'positions': grid.encoded(everything),
         'pixels': _pixels(content.images, everything),
     }
@@ -198,6 +203,43 @@ def _beliefs(moments: Sequence[Moment | None]) -> dict[str, Any]:
             for name in names
         },
     }
+
+
+def _identities(moments: Sequence[Moment | None]) -> list[list[int]] | None:
+    """Identities of the modes at each time; None: there are none."""
+    result = [[] if one is None else one.identities.astype(int).tolist() for one in moments]
+    return result if any(map(any, result)) else None
+
+
+def _bands(layer: Layer[Moment], stamps: Sequence[int]) -> dict[str, Any] | None:
+    """Intervals of 90 % over time, None where covariances are not known.
+
+    Returns:
+        Names of `joints` and `angles`; `values`, `int16` (times, joints and angles, 3) of lower
+        end, middle and upper end: mm of heights, tenths of a degree of angles.
+    """
+    names = [*layer.joint_names, *layer.angles]
+    values = np.full((len(stamps), len(names), 3), np.nan)
+    for t, stamp in enumerate(stamps):
+        moment = layer.mixtures.get(stamp)
+        if moment is not None and moment.marginals.shape[2] == len(names):
+            values[t] = intervals(moment.weights, moment.marginals)
+    joints = len(layer.joint_names)
+    known = np.isfinite(values).all(axis=(1, 2))
+    if not joints or not known.any():
+        return None
+    values[:, :joints] *= 1e3
+    # Angles go on beyond a whole turn.
+    middles = values[known, joints:, 1]
+    values[known, joints:] += (np.unwrap(middles, axis=0, period=360.0) - middles)[..., None]
+    values[:, joints:] *= 10.0
+    joint_names, angles = list(layer.joint_names), list(layer.angles)
+    return {'joints': joint_names, 'angles': angles, 'values': _base64(_whole(values))}
+
+
+def _whole(values: Array) -> Array:
+    """Values as numbers of 16 bits; `_NOWHERE` for NaN."""
+    return np.where(np.isnan(values), _NOWHERE, np.clip(np.rint(values), -_LARGEST, _LARGEST))
 
 
 def _probability(value: float) -> float | None:
@@ -251,7 +293,17 @@ def _truth(truth: Truth, content: Content, grid: _Grid) -> dict[str, Any]:
         'known': [stamp in truth.joints for stamp in content.stamps],
         'positions': grid.encoded(positions),
         'pixels': _pixels(content.images, positions),
+        'heights': _base64(_whole(1e3 * _true_heights(truth, content))),
     }
+
+
+def _true_heights(truth: Truth, content: Content) -> Array:
+    """Heights (T, J) of the true joints, m; NaN where they are unknown."""
+    result = np.full((len(content.stamps), len(truth.joint_names)), np.nan)
+    for t, stamp in enumerate(content.stamps):
+        if stamp in truth.joints:
+            result[t] = heights_of(truth.joints[stamp], ground_at(content.grounds, stamp))
+    return result
 
 
 def _images(content: Content) -> dict[str, Any] | None:

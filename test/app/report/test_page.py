@@ -273,3 +273,102 @@ def test_floor_and_contacts_are_drawn(body, poses, tmp_path):
     assert seen[0]['space'] != seen[1]['space']
     # -0.8 y - 0.6 z + 1.5 = 0 at x = 1 and z = 2; the page turns y and z round.
     assert abs(seen[1]['floor'] + (1.5 - 0.6 * 2) / 0.8) < 1e-6
+
+
+def with_identities(message):
+    """Modes of two motions, which change places in every other image."""
+    swapped = message.header.stamp.nanosec // 100_000_000 % 2
+    for k, component in enumerate(message.components):
+        component.id = (5 if k == swapped else 8) if k < 2 else 0
+    return message
+
+
+@in_a_browser
+def test_filter_and_smoother_are_drawn_side_by_side(page, made, tmp_path):
+    steps = """
+        function half(side) {
+          const canvas = get('space');
+          const copy = new OffscreenCanvas(canvas.width / 2 - 4, canvas.height);
+          const context = copy.getContext('2d');
+          context.drawImage(canvas, side ? -canvas.width / 2 - 4 : 0, 0);
+          const { data } = context.getImageData(0, 0, copy.width, copy.height);
+          return data.reduce((hash, x) => (Math.imul(hash, 31) + x) | 0, 0);
+        }
+        look('first');
+        get('beside').click(); look('beside');
+        seen.smoother = get('layer-1').checked;
+        const both = [half(0), half(1)];
+        get('layer-1').click(); look('filter alone');
+        seen.sides = [half(0) === both[0], half(1) === both[1]];
+        get('layer-1').click(); look('both again');
+        get('beside').click(); look('over each other');
+    """
+    seen = visit(page, steps, tmp_path)
+    assert seen['smoother'] is True
+    views = ['first', 'beside', 'filter alone', 'over each other']
+    assert len({seen[name] for name in views}) == len(views)
+    assert seen['both again'] == seen['beside']
+    # Without the smoother the side of the filter stays as it is.
+    assert seen['sides'] == [True, False]
+    given = visit(page, "look('beside');", tmp_path, '#show=0,1,truth,beside')
+    assert given['beside'] == seen['beside']
+    alone = make(made.out, tmp_path / 'alone', '--topic', 'pose_mixture')
+    steps = "seen.hidden = get('beside-label').hidden;"
+    assert visit(alone, steps, tmp_path, '#show=0,beside')['hidden'] is True
+
+
+@in_a_browser
+def test_motions_are_switched_on_and_off(page, body, poses, tmp_path):
+    assert visit(page, "seen.hidden = get('motions-figure').hidden;", tmp_path)['hidden'] is True
+    out = write_out(tmp_path / 'out', body, poses, change=with_identities)
+    steps = """
+        seen.names = [...get('motions-boxes').children].map((label) => label.textContent);
+        const rows = [...document.querySelectorAll('#modes tbody tr')];
+        seen.motions = rows.map((row) => row.children[3].textContent);
+        const boxes = () => [...document.querySelectorAll('#motions-boxes input')];
+        const ticked = () => boxes().map((box) => box.checked);
+        look('all'); look('weights of all', 'motions');
+        get('motion-0').click(); look('without the first'); look('weights without', 'motions');
+        get('motion-1').click(); look('without both');
+        get('chosen').value = 1; get('chosen').dispatchEvent(new Event('change'));
+        seen.others = ticked();
+        get('chosen').value = 0; get('chosen').dispatchEvent(new Event('change'));
+        seen.kept = ticked();
+        get('motion-0').click(); get('motion-1').click(); look('all again');
+    """
+    seen = visit(make(out, tmp_path / 'report'), steps, tmp_path)
+    names = [name.partition(',')[0] for name in seen['names']]
+    assert (sorted(names[:2]), names[2:]) == (['motion 5', 'motion 8'], ['motion none'])
+    assert sorted(seen['motions']) == ['-', '5', '8']
+    views = ['all', 'without the first', 'without both']
+    assert len({seen[name] for name in views}) == len(views)
+    assert seen['weights of all'] != seen['weights without']
+    assert seen['others'] == [True, True]
+    assert seen['kept'] == [False, False, True]
+    assert seen['all again'] == seen['all']
+
+
+@in_a_browser
+def test_a_height_or_an_angle_is_drawn_over_time(page, body, made, tmp_path):
+    steps = """
+        seen.first = get('banded').value;
+        seen.count = get('banded').options.length;
+        look('height', 'bands');
+        get('banded').value = 'angles left_elbow';
+        get('banded').dispatchEvent(new Event('change')); look('angle', 'bands');
+        get('time').value = 5; get('time').dispatchEvent(new Event('input'));
+        look('later', 'bands');
+        const place = get('bands').getBoundingClientRect();
+        pointer(get('bands'), 'pointerdown', place.right - 12, place.top + 20);
+        seen.clock = get('clock').value;
+        seen.caption = get('bands-caption').textContent;
+    """
+    seen = visit(page, steps, tmp_path)
+    assert seen['first'] == 'joints right_wrist'
+    assert seen['count'] == len(body.joint_names) + body.dimension - 3
+    assert len({seen[name] for name in ('height', 'angle', 'later')}) == 3
+    assert min(seen[f'{name} drawn'] for name in ('height', 'angle')) > 1000
+    assert seen['clock'] == f'0.60 s, {FRAMES} of {FRAMES}'
+    assert 'Heights are above the origin, the camera as a rule,' in seen['caption']
+    ways = make(made.out, tmp_path / 'ways', '--topic', 'trajectory_mixture')
+    assert visit(ways, "seen.hidden = get('bands-section').hidden;", tmp_path)['hidden'] is True

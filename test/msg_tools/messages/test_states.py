@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hmt_ros.body import load_body
-from msg_tools import MessageError, RosbagsMessages
+from msg_tools import GeneratedMessages, MessageError, MessageFactory, RosbagsMessages
 from msg_tools.messages.bodies import message_of_body
 from msg_tools.messages.headers import header_message, time_message, time_ns
 from msg_tools.messages.message_error import lengths_of
@@ -17,9 +18,11 @@ from msg_tools.messages.pose_mixtures import PoseMixture
 from msg_tools.messages.states import (
     heaviest_joint_state,
     joint_state_message,
+    joint_trajectory,
     quaternions,
     transforms_message,
 )
+from msg_tools.messages.trajectory_mixtures import TrajectoryMixture
 
 
 @pytest.mark.parametrize('stamp', [0, 1, 999_999_999, 10**9, 1_700_000_000_123_456_789])
@@ -38,6 +41,54 @@ def test_joint_state_of_the_heaviest(pose_mixture: PoseMixture, messages: Rosbag
     assert time_ns(state.header.stamp) == pose_mixture.stamp_ns
     with pytest.raises(MessageError, match=r'joint state has 2 names, but a pose of shape \(3,\)'):
         joint_state_message(messages, ['a', 'b'], np.zeros(3), 0)
+
+
+STAMPS = (1_700_000_000_900_000_000, 1_700_000_001_000_000_000, 1_700_000_002_150_000_000)
+TRAJECTORIES = TrajectoryMixture(
+    weights=np.array([0.3, 0.6, 0.1]),
+    means=np.arange(18.0).reshape(3, 3, 2),
+    marginal_covariances=None,
+    log_joint=np.zeros(3),
+    inflation=np.ones(3),
+    stamps_ns=STAMPS,
+    final_until_ns=0,
+    free_energy=np.empty(0),
+    body_model='arm',
+    dof_names=('shoulder', 'elbow'),
+    frame_id='camera',
+    identities=np.array([4, 9, 5]),
+)
+
+
+def check_trajectory(messages: MessageFactory) -> None:
+    """The heaviest trajectory, and the one of an identity."""
+    message = joint_trajectory(messages, TRAJECTORIES)
+    assert list(message.joint_names) == ['shoulder', 'elbow']
+    assert (time_ns(message.header.stamp), message.header.frame_id) == (STAMPS[0], 'camera')
+    times = [point.time_from_start for point in message.points]
+    assert [(time.sec, time.nanosec) for time in times] == [(0, 0), (0, 10**8), (1, 250_000_000)]
+    np.testing.assert_array_equal(
+        [list(point.positions) for point in message.points], TRAJECTORIES.means[1]
+    )
+    assert all(len(x.velocities) == len(x.effort) == 0 for x in message.points)
+    other = joint_trajectory(messages, TRAJECTORIES, 5)
+    np.testing.assert_array_equal(list(other.points[0].positions), TRAJECTORIES.means[2, 0])
+    with pytest.raises(MessageError, match=r'none has the identity 6, they have \[4, 9, 5\]'):
+        joint_trajectory(messages, TRAJECTORIES, 6)
+
+
+def test_joint_trajectory(messages: RosbagsMessages) -> None:
+    check_trajectory(messages)
+
+
+@pytest.mark.ros
+def test_joint_trajectory_of_ros() -> None:
+    reason = 'trajectory_msgs is not installed'
+    trajectories = pytest.importorskip('trajectory_msgs.msg', reason=reason)
+    times = importlib.import_module('builtin_interfaces.msg')
+    headers = importlib.import_module('std_msgs.msg')
+    classes = [trajectories.JointTrajectory, trajectories.JointTrajectoryPoint]
+    check_trajectory(GeneratedMessages([*classes, times.Duration, times.Time, headers.Header]))
 
 
 def test_quaternions_agree_with_scipy() -> None:

@@ -221,6 +221,78 @@ function beliefsChart(layer) {
   };
 }
 
+/** Motions of a layer that have a colour of their own; all others share one box. */
+const TOLD_MOTIONS = 6;
+
+/** Weights of the motions of a layer over time. */
+function motionsChart(index) {
+  const y = [0, 1];
+  return {
+    x: timeRange(), y, labels: ['time, s', 'weight'],
+    draw(context, u, v) {
+      layers[index].motions.forEach(({ identity, weights }, i) => {
+        const told = i < TOLD_MOTIONS;
+        if (shown.hidden[index].has(identity)) return;
+        curve(context, u, v, TIMES, weights, { colour: colour(told ? `series-${i}` : 'grid'), width: told ? 2 : 1 });
+      });
+      drawNow(context, u, v, y);
+    },
+  };
+}
+
+/** The colour in which a layer is compared. */
+const comparedColour = (layer) => (layer.style === 'smoothed' ? 'smoothed-left' : 'posterior-right');
+
+/** Middle and ends of a height, m, or an angle, degrees, of a layer; null where nothing is known. */
+function bandOf({ bands }, { kind, name }) {
+  const place = bands ? bands[kind].indexOf(name) : -1;
+  if (place < 0) return null;
+  const row = kind === 'joints' ? place : bands.joints.length + place;
+  const width = bands.joints.length + bands.angles.length;
+  const scale = kind === 'joints' ? 1e-3 : 0.1;
+  return [0, 1, 2].map((end) => TIMES.map((_, t) => {
+    const value = bands.values[(t * width + row) * 3 + end];
+    return Number.isNaN(value) ? null : scale * value;
+  }));
+}
+
+/** The true height of a joint over time, m. */
+function trueHeight({ kind, name }) {
+  const joint = truth && kind === 'joints' ? truth.joints.indexOf(name) : -1;
+  if (joint < 0) return TIMES.map(() => null);
+  return TIMES.map((_, t) => {
+    const value = truth.heights[t * truth.joints.length + joint];
+    return Number.isNaN(value) ? null : 1e-3 * value;
+  });
+}
+
+/** A height or an angle over time with its intervals of 90 %, of filter and smoother. */
+function bandsChart(what) {
+  const found = compared.map((layer) => ({ layer, band: bandOf(layer, what) })).filter(({ band }) => band);
+  const known = trueHeight(what);
+  const y = around([...found.flatMap(({ band }) => band.flat()), ...known].filter((x) => x !== null));
+  const label = what.kind === 'joints' ? `height of ${what.name}, m` : `${what.name}, degrees`;
+  return {
+    x: timeRange(), y, labels: ['time, s', label.replaceAll('_', ' ')],
+    draw(context, u, v) {
+      found.forEach(({ layer, band: [low, , high] }) => {
+        context.fillStyle = colour(comparedColour(layer));
+        context.globalAlpha = 0.2;
+        TIMES.forEach((time, t) => {
+          if (t === LAST || [low[t], low[t + 1]].includes(null)) return;
+          context.beginPath();
+          [[t, low], [t + 1, low], [t + 1, high], [t, high]].forEach(([at, end]) => context.lineTo(u(TIMES[at]), v(end[at])));
+          context.fill();
+        });
+        context.globalAlpha = 1;
+      });
+      found.forEach(({ layer, band }) => curve(context, u, v, TIMES, band[1], { colour: colour(comparedColour(layer)) }));
+      curve(context, u, v, TIMES, known, { colour: colour('ink'), dash: [5, 4], width: 1.4 });
+      drawNow(context, u, v, y);
+    },
+  };
+}
+
 /** A range around values, which may be equal. */
 function around(values) {
   const [low, high] = [Math.min(...values), Math.max(...values)];

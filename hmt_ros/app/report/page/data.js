@@ -35,6 +35,9 @@ function shares(text) {
   return Float32Array.from(integers(text), (x) => (x === NOWHERE ? NaN : x * report.pixel));
 }
 
+/** Numbers of bands and heights; NaN where nothing is known. */
+const numbers = (text) => Float32Array.from(integers(text), (x) => (x === NOWHERE ? NaN : x));
+
 const TIMES = report.times;
 const LAST = TIMES.length - 1;
 
@@ -50,8 +53,25 @@ const layers = report.layers.map((layer) => {
     style: KINDS.includes(layer.kind) ? layer.kind : 'prediction',
     positions: metres(layer.positions),
     pixels: shares(layer.pixels),
+    bands: layer.bands && { ...layer.bands, values: numbers(layer.bands.values) },
   };
 });
+
+/** Layers that are compared: the filter's and the smoother's, as far as they are there. */
+const compared = ['posterior', 'smoothed'].map((kind) => layers.find((layer) => layer.kind === kind)).filter(Boolean);
+
+/** The motions of a layer, {identity, weights over time, total}, the heaviest in all first. */
+function motionsOf(layer) {
+  const found = new Map();
+  (layer.identities || []).forEach((identities, t) => identities.forEach((identity, rank) => {
+    if (!found.has(identity)) found.set(identity, { identity, total: 0, weights: TIMES.map(() => null) });
+    const motion = found.get(identity);
+    motion.weights[t] = (motion.weights[t] || 0) + layer.weights[t][rank];
+    motion.total += layer.weights[t][rank];
+  }));
+  return [...found.values()].sort((a, b) => b.total - a.total);
+}
+layers.forEach((layer) => { layer.motions = motionsOf(layer); });
 
 const truth = report.truth && (() => {
   const starts = [];
@@ -62,6 +82,7 @@ const truth = report.truth && (() => {
   });
   return {
     ...report.truth, starts, positions: metres(report.truth.positions), pixels: shares(report.truth.pixels),
+    heights: numbers(report.truth.heights),
   };
 })();
 

@@ -28,17 +28,27 @@ const choices = [
 ];
 const chosen = () => choices[shown.chosen];
 const errorsKnown = () => Boolean(chosen().layer && chosen().layer.errors_mm);
+const motionsKnown = () => Boolean(chosen().layer && chosen().layer.motions.length > 1);
 const beliefsKnown = () => Boolean(chosen().layer && beliefCurves(chosen().layer).length);
 
 const hasFreeEnergy = trajectories.some((topic) => topic.windows.some((w) => w.free_energy.length));
 const calibrated = report.scores
   && Object.values(report.scores.topics).some((topic) => topic.calibration.together);
 
+const hasBands = compared.some((layer) => layer.bands);
+/** The height or the angle that is shown over time. */
+function banded() {
+  const [kind, name] = element('banded').value.split(' ');
+  return { kind, name };
+}
+
 const seek = (seconds) => goTo(nearest(seconds));
 const charts = {
   weights: new Chart(element('weights'), () => weightsChart(chosen().weightsAt), seek),
   errors: new Chart(element('errors'), () => errorsChart(chosen().layer), seek),
   beliefs: new Chart(element('beliefs'), () => beliefsChart(chosen().layer), seek),
+  motions: new Chart(element('motions'), () => motionsChart(shown.chosen), seek),
+  bands: new Chart(element('bands'), () => bandsChart(banded()), seek),
   freeEnergy: new Chart(element('free-energy'), freeEnergyChart, seek),
   iterations: new Chart(element('iterations'), iterationsChart),
   together: new Chart(element('together'), () => calibrationChart('together')),
@@ -51,7 +61,9 @@ function drawAll() {
   if (film) film.draw();
   charts.weights.draw();
   if (errorsKnown()) charts.errors.draw();
+  if (motionsKnown()) charts.motions.draw();
   if (beliefsKnown()) charts.beliefs.draw();
+  if (hasBands) charts.bands.draw();
   if (hasFreeEnergy) { charts.freeEnergy.draw(); charts.iterations.draw(); }
   tellTime();
   tellModes();
@@ -78,9 +90,11 @@ function tellModes() {
   const { layer, weightsAt, what } = chosen();
   const weights = weightsAt(shown.time);
   const errors = errorsKnown() ? layer.errors_mm[shown.time] : null;
+  const motions = layer ? layer.identities : null;
   element('modes').caption.textContent = `${what === 'modes' ? 'Modes' : 'Trajectories'} at this time`;
   const head = made('tr');
-  ['', 'weight', '', ...(errorsKnown() ? ['error, mm'] : [])].forEach((text) => head.append(made('th', text, { scope: 'col' })));
+  const columns = ['', 'weight', '', ...(motions ? ['motion'] : []), ...(errorsKnown() ? ['error, mm'] : [])];
+  columns.forEach((text) => head.append(made('th', text, { scope: 'col' })));
   element('modes').tHead.replaceChildren(head);
   const rows = weights.slice(0, 16).map((weight, rank) => {
     const row = made('tr');
@@ -104,6 +118,7 @@ function tellModes() {
     bar.append(made('span'));
     bar.firstChild.style.width = `${100 * weight}%`;
     row.append(first, made('td', `${(100 * weight).toFixed(1)} %`), bar);
+    if (motions) row.append(made('td', motions[shown.time][rank] || '-'));
     if (errorsKnown()) row.append(made('td', errors ? fixed(errors[rank]) : '-'));
     return row;
   });
@@ -129,6 +144,9 @@ function choose(index) {
     );
     element('errors').setAttribute('aria-label', `Errors of ${name} over time`);
   }
+  element('motions-figure').hidden = !motionsKnown();
+  element('motions').setAttribute('aria-label', `Weights of the motions of ${name} over time`);
+  if (motionsKnown()) tellMotions();
   element('beliefs').setAttribute('aria-label', `Probabilities of the person and of the cues of ${name} over time`);
   element('beliefs-figure').hidden = !beliefsKnown();
   if (beliefsKnown()) {
@@ -139,6 +157,49 @@ function choose(index) {
     element('beliefs-caption').replaceChildren(...keys(beliefCurves(chosen().layer)), made('div', text));
   }
   drawAll();
+}
+
+/** A box for each of the heaviest motions of the chosen layer, and one for all others. */
+function tellMotions() {
+  const { layer, index, name } = chosen();
+  const hidden = shown.hidden[index];
+  const sum = layer.motions.reduce((total, motion) => total + motion.total, 0);
+  const boxes = [];
+  for (let i = 0; i < layer.motions.length; i += i < TOLD_MOTIONS ? 1 : layer.motions.length) {
+    const some = layer.motions.slice(i, i < TOLD_MOTIONS ? i + 1 : undefined);
+    const what = i < TOLD_MOTIONS ? `motion ${some[0].identity || 'none'}` : `${some.length} others`;
+    const share = some.reduce((total, motion) => total + motion.total, 0) / sum;
+    boxes.push(box(
+      `motion-${i}`, `${what}, ${percent(share)}`, !some.every(({ identity }) => hidden.has(identity)),
+      [i < TOLD_MOTIONS ? `series-${i}` : 'grid'],
+      (ticked) => some.forEach(({ identity }) => { if (ticked) hidden.delete(identity); else hidden.add(identity); }),
+    ));
+  }
+  element('motions-boxes').replaceChildren(...boxes);
+  element('motions-caption').textContent = `Weights of the motions of ${name}, which modes keep from image to image; `
+    + 'the share is of all weights. A motion without its tick is not drawn.';
+}
+
+/** The heights and angles that can be shown over time. */
+function buildBands() {
+  element('bands').setAttribute('aria-label', 'A height or an angle over time, with intervals of 90 percent');
+  element('bands-section').hidden = !hasBands;
+  if (!hasBands) return;
+  [['joints', 'height'], ['angles', 'angle']].forEach(([kind, what]) => {
+    const names = new Set(compared.flatMap((layer) => (layer.bands ? layer.bands[kind] : [])));
+    const group = made('optgroup', '', { label: `${what}s` });
+    names.forEach((name) => group.append(made('option', `${what} of ${name}`.replaceAll('_', ' '), { value: `${kind} ${name}` })));
+    if (names.size) element('banded').append(group);
+  });
+  const first = [...element('banded').options].find((option) => option.value === 'joints right_wrist');
+  if (first) first.selected = true;
+  element('banded').addEventListener('change', () => charts.bands.draw());
+  const from = floors.some(Boolean) ? 'the floor' : 'the origin, the camera as a rule, which is taken to be level';
+  element('bands-caption').replaceChildren(
+    ...keys(compared.filter((layer) => layer.bands).map((layer) => ({ name: `${layer.kind} (${layer.topic})`, series: comparedColour(layer) }))),
+    ...(truth ? keys([{ name: 'truth (heights)', series: 'ink' }]) : []),
+    made('div', `Median, and the interval between the 5th and the 95th percentile, of the whole mixture. Heights are above ${from}.`),
+  );
 }
 
 /** The names of curves, each beside its colour. */
@@ -304,7 +365,7 @@ function step() {
   timer = setTimeout(step, due - performance.now());
 }
 
-/** Applies the part of the address behind #: frame=10&yaw=30&pitch=5&zoom=1.5&show=0,1,truth,trajectories. */
+/** Applies the part of the address behind #: frame=10&yaw=30&pitch=5&zoom=1.5&show=0,1,truth,trajectories,beside. */
 function readAddress() {
   const given = new URLSearchParams(window.location.hash.slice(1));
   const number = (name, otherwise) => {
@@ -316,7 +377,7 @@ function readAddress() {
   space.zoom = Math.max(0.3, Math.min(8, number('zoom', space.zoom)));
   if (given.has('show')) {
     const names = given.get('show').split(',');
-    document.querySelectorAll('#layers input').forEach((input) => {
+    document.querySelectorAll('#layers input, #beside').forEach((input) => {
       const wanted = names.includes(input.id.replace(/^(layer|show)-/, ''));
       if (input.checked !== wanted) input.click();
     });
@@ -334,6 +395,12 @@ element('with-modes').addEventListener('change', () => {
 element('follow').checked = space.follow;
 element('follow').addEventListener('change', () => { space.follow = element('follow').checked; space.draw(); });
 element('align').addEventListener('change', () => { space.together = element('align').checked; space.draw(); });
+element('beside-label').hidden = compared.length < 2;
+element('beside').addEventListener('change', () => {
+  shown.beside = element('beside').checked && compared.length === 2;
+  if (shown.beside) compared.map((layer) => element(`layer-${layers.indexOf(layer)}`)).forEach((input) => { if (!input.checked) input.click(); });
+  space.draw();
+});
 document.querySelectorAll('[data-look]').forEach((button) => button.addEventListener('click', () => {
   const [yaw, pitch] = button.dataset.look.split(' ').map(Number);
   space.turn(yaw, pitch);
@@ -352,6 +419,7 @@ window.addEventListener('hashchange', readAddress);
 
 tell();
 buildLayers();
+buildBands();
 tellFreeEnergy();
 tellScores();
 choose(0);

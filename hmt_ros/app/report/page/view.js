@@ -5,13 +5,19 @@ const FAINTEST = 0.12;
 const DISTANCE = 5;
 const DASHES = { likelihood: [5, 3], prediction: [2, 3] };
 
-/** What is shown: indices of layers, truth, trajectories; of one layer a single mode, or all. */
+/**
+ * What is shown: indices of layers, truth, trajectories; of one layer a single mode, or all; by layer
+ * the identities of motions that are hidden; whether filter and smoother are side by side.
+ */
 const shown = {
   time: 0, layers: new Set(), truth: false, trajectories: false, chosen: 0, alone: null,
+  hidden: layers.map(() => new Set()), beside: false,
 };
 
 /** Strength of a mode, and null where it is not drawn. */
 function strength(index, rank, weights) {
+  const identities = layers[index].identities;
+  if (identities && shown.hidden[index].has(identities[shown.time][rank])) return null;
   if (shown.alone !== null && index === shown.chosen) return rank === shown.alone ? 1 : null;
   return FAINTEST + (1 - FAINTEST) * (weights[0] > 0 ? weights[rank] / weights[0] : 1);
 }
@@ -202,16 +208,41 @@ class Space {
     return this.roots.find(Boolean) || null;
   }
 
+  /** All in one view; or filter and truth on the left, smoother and truth on the right. */
   draw() {
     const { context, width, height } = prepared(this.canvas);
-    const project = this.projection(width, height);
     context.lineCap = 'round';
     context.lineJoin = 'round';
+    const panes = shown.beside ? ['filter', 'smoother'] : [''];
+    const each = width / panes.length;
+    panes.forEach((pane, i) => {
+      context.save();
+      context.translate(i * each, 0);
+      context.beginPath();
+      context.rect(0, 0, each, height);
+      context.clip();
+      this.drawPane(context, each, height, pane);
+      if (pane) {
+        context.strokeStyle = colour('line');
+        context.strokeRect(0, -1, each, height + 2);
+        context.fillStyle = colour('ink');
+        context.font = '600 13px system-ui, sans-serif';
+        context.textAlign = 'left';
+        context.textBaseline = 'top';
+        context.fillText(`${pane}: ${compared[i].topic}`, 10, 8);
+      }
+      context.restore();
+    });
+  }
+
+  drawPane(context, width, height, pane) {
+    const project = this.projection(width, height);
     this.drawFloor(context, project, width, height);
-    if (shown.trajectories) this.drawWays(context, project);
+    if (shown.trajectories && pane !== 'filter') this.drawWays(context, project);
+    const here = ({ figure, style }) => !pane || figure === truth || (style === 'smoothed') === (pane === 'smoother');
     const segments = [];
     const root = this.lastRoot() || this.centre;
-    modesNow().forEach((mode) => {
+    modesNow().filter(here).forEach((mode) => {
       const { figure, offset } = mode;
       const joints = figure.joints.length;
       const points = [];
@@ -228,7 +259,7 @@ class Space {
         points.forEach((point) => segments.push({ from: point, to: point, depth: point[2], mode, side: 'trunk' }));
       }
     });
-    this.drawContacts(context, project, root);
+    if (pane !== 'smoother') this.drawContacts(context, project, root);
     segments.sort((a, b) => b.depth - a.depth);
     segments.forEach(({ from, to, mode, side }) => {
       context.globalAlpha = mode.strength;
