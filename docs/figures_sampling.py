@@ -67,7 +67,7 @@ def main() -> int:
     with plt.rc_context(PAGE_STYLE):
         draw_distances()
         try:
-            folders = with_file({DANCE, *JUMPED, FLIPPED}, None, 'truth.npz')
+            folders = with_file(sorted({DANCE, *JUMPED, FLIPPED}), None, 'truth.npz')
         except FileNotFoundError as error:
             print(f'figures of clips: skipped, {error}')  # noqa: T201
             return 0
