@@ -17,6 +17,7 @@ BENCHMARKS = {
     'experts': 'conditional densities: a toy, motions of people apart, clips, speed',
     'flips': 'time per leaf of the interpretation trees',
     'gate': 'whether a step of the tracker costs more than a table that is checked in says',
+    'hypotheses': 'what it brings to keep more modes',
     'joint_errors': 'what joints err by in every pose, and what all images leave of a covariance',
     'keypoint_noise': 'where landmarks of a detector lie on the body, and how they err',
     'kernels': 'the compiled likelihood against vectorised numpy',

@@ -1,4 +1,4 @@
-"""What VMS reports of its sequence, on a synthetic one: numbers, and what figures are made of."""
+"""What VMS reports of its sequence, on a synthetic one: numbers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from benchmarks.arm_waving import STEP, Waving, waving
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.smoothing.likelihood import MixtureLikelihood
 from hmt_ros.smoothing.mode_sequence import ModeSequence
-from hmt_ros.smoothing.paths import Paths, most_probable_paths, visiting_probabilities
+from hmt_ros.smoothing.paths import most_probable_paths
 from hmt_ros.smoothing.trajectory_refinement import RefinedTrajectories, refine
 from hmt_ros.smoothing.variational_mixture import (
     VariationalMixture,
@@ -35,18 +35,14 @@ class Analysis:
 
     Attributes:
         sequence: the sequence.
-        paths: the best between each pair of ends.
-        starts: (P, T, d) poses along them.
+        starts: (P, T, d) poses along the best paths between each pair of ends.
         refined: the optimum that each of them leads to.
-        visiting: T arrays (K_1, K_t), how probably the paths from each first mode visit a mode.
         start_energies: (P,) -log p of the observations along the paths.
     """
 
     sequence: Waving
-    paths: Paths
     starts: Array
     refined: RefinedTrajectories
-    visiting: tuple[Array, ...]
     start_energies: Array
 
 
@@ -61,10 +57,7 @@ def analysis(times: int) -> Analysis:
     flat = starts.reshape(-1, starts.shape[2])
     observed = layers.likelihood.energy(flat, at, derivatives=Derivatives.NONE)
     energies = observed.value.reshape(len(starts), -1).sum(1)
-    visiting = visiting_probabilities(layers.network, paths)
-    return Analysis(
-        sequence, paths, starts, refined, visiting, energies.reshape(len(starts), -1).sum(1)
-    )
+    return Analysis(sequence, starts, refined, energies)
 
 
 def layers_of(sequence: Waving) -> ModeSequence:

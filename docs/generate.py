@@ -42,6 +42,7 @@ PAGES = {
     'keypoint_noise': 'keypoints.md',
     'motion_prior': 'motion_prior.md',
     'people': 'people.md',
+    'hypotheses': 'sampling.md',
     'kjs': 'sampling.md',
     'real_video': 'real_video.md',
     'smoothing': 'smoothing.md',

@@ -1,0 +1,178 @@
+"""What VMS shows of its sequence, on a clip that the tracker follows: from its modes to its optima.
+
+The modes of the likelihoods of `TIMES` images make the network; `PATHS` paths through it are
+refined, and the free energy is minimised from their optima, as in the paper (VMS 4 to 7). Errors of
+images count as independent, as they do there; `smoother_node` counts what is new of an image alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.smoothing_clips import Seen
+from hmt_ros.body import Body
+from hmt_ros.body.motion_prior import motion_prior
+from hmt_ros.body.whole_turns import endless, without_turns
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.energy import Derivatives
+from hmt_ros.smoothing.likelihood import counted
+from hmt_ros.smoothing.mode_sequence import ModeSequence
+from hmt_ros.smoothing.paths import Paths, visiting_probabilities
+from hmt_ros.smoothing.trajectory_refinement import RefinedTrajectories, limits_of_states, refine
+from hmt_ros.smoothing.variational_mixture import (
+    VariationalMixture,
+    minimise_free_energy,
+    peak_weights,
+)
+
+Array = NDArray[np.float64]
+
+# Images, and how many images of the clip lie between two of them (VMS 7: every second or third).
+TIMES, EVERY = 47, 2
+PATHS = 64
+# Of the descent of the free energy.
+SAMPLES, ITERATIONS = 16, 15
+
+
+@dataclass(frozen=True, eq=False)
+class ClipTrajectories:
+    """Images of a clip, smoothed step by step.
+
+    Attributes:
+        body: of the person, as the tracker has it at last.
+        stamps: (T,) ns.
+        sequence: the modes of the likelihoods.
+        paths: `PATHS` of them, the best between each pair of ends and, where these are fewer, more.
+        starts: (P, T, n) states along them.
+        refined: the optimum that each of them leads to.
+        visiting: T arrays (K_1, K_t), how probably the paths from each first mode visit a mode.
+        start_energies: (P,) -log p of the observations along the paths.
+        lower, upper: (d,) limits of poses.
+    """
+
+    body: Body
+    stamps: tuple[int, ...]
+    sequence: ModeSequence
+    paths: Paths
+    starts: Array
+    refined: RefinedTrajectories
+    visiting: tuple[Array, ...]
+    start_energies: Array
+    lower: Array
+    upper: Array
+
+    @property
+    def seconds(self) -> Array:
+        """Times (T,) from the first image on, s."""
+        return (np.array(self.stamps) - self.stamps[0]) * 1e-9
+
+    @cached_property
+    def distinct(self) -> RefinedTrajectories:
+        """The optima without repetitions, the most probable first."""
+        return self.refined.without_duplicates()
+
+    def joints(self, states: Array) -> Array:
+        """Joints (..., J, 3) at states (..., n), camera frame, m."""
+        d = self.sequence.dynamics.dimension
+        flat = states[..., :d].reshape(-1, d)
+        return self.body.joint_positions(flat).reshape(*states.shape[:-1], -1, 3)
+
+
+def clip_trajectories(
+    seen: Sequence[Seen], *, independent: bool = True, through_modes: bool = False
+) -> ClipTrajectories:
+    """Network, paths and optima of what the tracker says of some images.
+
+    Args:
+        seen: of T images.
+        independent: whether errors of images count as independent; else as `smoother_node` does.
+        through_modes: whether paths through every single mode are among the starts.
+
+    Raises:
+        ValueError: there are fewer than two images.
+    """
+    if len(seen) < 2:
+        raise ValueError(f'wanted at least 2 images with a likelihood, saw {len(seen)}')
+    body, dynamics = seen[-1].body, motion_prior(seen[-1].body)
+    stamps = [one.stamp for one in seen]
+    intervals = np.diff(stamps) * 1e-9
+    free = endless(body)
+    free[:3] = True
+    lower, upper = np.where(free, -np.inf, body.lower), np.where(free, np.inf, body.upper)
+    mixtures = _evidence(seen, body, intervals, independent)
+    sequence = ModeSequence(mixtures, dynamics, intervals)
+    paths = sequence.paths(PATHS, through_modes=through_modes)
+    starts = sequence.states(paths)
+    refined = refine(starts, sequence.prior, sequence.likelihood, lower, upper)
+    return ClipTrajectories(
+        body,
+        tuple(stamps),
+        sequence,
+        paths,
+        starts,
+        refined,
+        visiting_probabilities(sequence.network, paths),
+        _observed(sequence, starts),
+        lower,
+        upper,
+    )
+
+
+def _evidence(
+    seen: Sequence[Seen], body: Body, intervals: Array, independent: bool
+) -> tuple[GaussianMixture, ...]:
+    """Likelihoods, on angles that go on from image to image."""
+    result: list[GaussianMixture] = []
+    for one, dt in zip(seen, [np.inf, *intervals], strict=True):
+        mixture = one.likelihood
+        before = result[-1].means if result else mixture.means[[int(mixture.weights.argmax())]]
+        means = without_turns(body, mixture.means, before)
+        whole = GaussianMixture(mixture.weights, means, mixture.covariances)
+        shares = (one.errors.share(dt), one.errors.of_changes(dt))
+        result.append(counted(whole, 1.0) if independent else counted(whole, *shares))
+    return tuple(result)
+
+
+def _observed(sequence: ModeSequence, states: Array) -> Array:
+    """-log p (P,) of the observations along trajectories (P, T, n), nats."""
+    count, times, _ = states.shape
+    poses = states[:, :, : sequence.dynamics.dimension].reshape(count * times, -1)
+    at = np.tile(np.arange(times), count)
+    value = sequence.likelihood.energy(poses, at, derivatives=Derivatives.NONE).value
+    result: Array = value.reshape(count, times).sum(1)
+    return result
+
+
+def pose_covariance(found: ClipTrajectories, images: int) -> Array:
+    """Covariance (T d, T d) of the first T poses at the optimum of these images alone (VMS 7).
+
+    The optimum is the one next to the best one of all images; velocities are integrated out. Metres
+    and radians stand beside each other, as in the paper.
+    """
+    whole = found.sequence
+    part = ModeSequence(whole.mixtures[:images], whole.dynamics, whole.intervals[: images - 1])
+    start = found.distinct.states[:1, :images]
+    refined = refine(start, part.prior, part.likelihood, found.lower, found.upper)
+    d, n = whole.dynamics.dimension, start.shape[2]
+    units = np.zeros((images, d, images, n))
+    for t in range(images):
+        units[t, :, t, :d] = np.eye(d)
+    columns = refined.factors[0].solve(units.reshape(images * d, images, n))
+    return np.asarray(columns[:, :, :d].reshape(images * d, images * d))
+
+
+def descent(found: ClipTrajectories) -> VariationalMixture:
+    """The descent of the free energy from the distinct optima, weighed by their height (VMS 6)."""
+    prior, distinct = found.sequence.prior, found.distinct
+    low, high = limits_of_states(
+        found.lower, found.upper, prior.dimension, distinct.states.shape[2]
+    )
+    return minimise_free_energy(
+        peak_weights(distinct.energies), distinct.states, distinct.factors, prior,
+        found.sequence.likelihood, low=low, high=high, samples=SAMPLES, max_iterations=ITERATIONS,
+    )  # fmt: skip
