@@ -42,7 +42,6 @@ from hmt_ros.body.whole_turns import endless, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.error_model import CueErrors
-from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.sessions.handled import Fault, Handled, Output
 from hmt_ros.sessions.session import Order, Session, SessionState, everything
 from hmt_ros.sessions.smoothed_messages import (
@@ -56,7 +55,7 @@ from hmt_ros.sessions.smoothed_messages import (
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.warm_up import likelihoods
 from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow, TrajectoryMixture
-from hmt_ros.smoothing.likelihood import counted, or_missed
+from hmt_ros.smoothing.likelihood import counted, merged_modes, or_missed
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
@@ -140,9 +139,7 @@ class Evidence(NamedTuple):
         """
         dt = self._interval(before)
         share = self.errors.share(dt)
-        apart = self.mixture
-        if distance > 0:
-            apart = merged_if_close(apart, distance / math.sqrt(share))
+        apart = merged_modes(self.mixture, distance / math.sqrt(share))
         return or_missed(counted(apart, share, self.errors.of_changes(dt)), ASTRAY * rates)
 
     def lasting(self, before: int | None) -> float:

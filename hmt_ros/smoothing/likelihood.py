@@ -7,7 +7,7 @@ any other `EnergyTerm` whose rows are times (VMS 5).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -20,6 +20,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.energy import Derivatives, Energy, EnergyTerm
 from hmt_ros.inference.exact_sums import dot
+from hmt_ros.inference.reduction import merged_if_close
 
 if TYPE_CHECKING:
     from hmt_ros.image.likelihood import ImageLikelihood
@@ -257,12 +258,12 @@ def counted(
 ) -> GaussianMixture:
     """The likelihood of an observation of which a share is told that is new.
 
-        sum_k w_k^a N(m_k, S_k / b) / sum_k w_k^a
+        sum_k v_k N(m_k, S_k / b) / sum_k v_k,        v_k = w_k^a |S_k|^((1 - a) / 2)
 
     Where errors last, each observation repeats a part of what those before have told, and counts
-    with the share a (`inference.error_model`): log weights are a times as large, and so are
-    precisions, b = a. Between poses that move, what lasts of an error does no harm: with b of
-    changes (`CueErrors.of_changes`) they are followed as closely as observations tell, and the
+    with the share a (`inference.error_model`): near each mode the density is the power a of
+    w_k N(m_k, S_k), and b = a. Between poses that move, what lasts of an error does no harm: with b
+    of changes (`CueErrors.of_changes`) they are followed as closely as observations tell, and the
     covariances of the result are to be made b / a times as large (`SlidingWindow.step`).
 
     Args:
@@ -278,9 +279,29 @@ def counted(
     if of_changes is not None and not 0.0 < of_changes < np.inf:
         raise ValueError(f'the share of changes must be positive, saw {of_changes}')
     some = mixture[mixture.weights > 0]
-    log_weights = share * np.log(some.weights)
+    log_weights = share * np.log(some.weights) + 0.5 * (1.0 - share) * some.log_determinants
     weights = np.exp(log_weights - logsumexp(log_weights))
     return GaussianMixture(weights, some.means, some.covariances / (of_changes or share))
+
+
+def merged_modes(mixture: GaussianMixture, distance: float) -> GaussianMixture:
+    """The likelihood of an observation with modes that are close as one, led by the highest.
+
+    Modes are weighed by their heights w_k / |2 pi S_k|^(1/2) while they are merged, and what was
+    merged is as high as they are together: how wide a mode is tells how far it is to be believed,
+    not how well it explains the observation.
+
+    Args:
+        mixture: the whole evidence.
+        distance: between means, in standard deviations, below which modes are merged; 0: none.
+    """
+    if distance == 0.0:
+        return mixture
+    low = np.log(mixture.weights) - 0.5 * mixture.log_determinants
+    heights = replace(mixture, weights=np.exp(low - low.max()))
+    merged = merged_if_close(heights, distance)
+    log = np.log(merged.weights) + 0.5 * merged.log_determinants
+    return replace(merged, weights=np.exp(log - logsumexp(log)))
 
 
 def or_missed(mixture: GaussianMixture, variances: Array) -> GaussianMixture:

@@ -374,15 +374,14 @@ def filtered_state(
     found = merged_if_alike(found, MERGE_DISTANCE, MERGE_LOG_DETERMINANT)
     if len(found) <= count:
         return found.normalised()
-    kept: Index = np.empty(0, dtype=np.intp)
+    apart: Index = np.empty(0, dtype=np.intp)
     if points is not None:
-        places = points(found.means[:, :d])
-        kept = led(found, places, SAME_MOTION, count // 2)[1]
+        apart = led(found, points(found.means[:, :d]), SAME_MOTION, count // 2)[1]
     score = found.weights.copy()
     if followed is not None:
         each = found.component_log_densities(followed[1])
         share = np.exp(each - logsumexp(each, axis=1, keepdims=True))
         score += followed[0] @ share
-    score[kept] = np.inf
+    score[apart] = np.inf
     chosen = np.sort(np.argsort(-score, kind='stable')[:count])
     return found[chosen].normalised()

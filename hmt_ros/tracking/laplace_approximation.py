@@ -45,7 +45,8 @@ class Likelihood:
     """The likelihood of an image as a function of the pose, undiscounted.
 
     Attributes:
-        mixture: whole curvature as covariances, raw energies as weights; heaviest mode first.
+        mixture: exp(-E) up to a factor, E the energy of the image: whole curvature as covariances,
+            weights exp(-E) |S|^(1/2); heaviest mode first.
         values: (K,) log likelihoods of the image at its means, nats.
         errors: how its errors last, all cues together.
         shape_covariance: (d, d) J P J' at the heaviest mode of the posterior.
@@ -125,9 +126,9 @@ def likelihood_modes(
     """The modes of the likelihood alone, without what was known from the images before.
 
     Around each mode of the posterior the energy of the image and of the body's prior is a
-    parabola; its minimum and curvature make a component, its depth the weight, of at least
-    `LEAST_LOG_WEIGHT`. Nothing of it is discounted, but that one pair (s, tau) stands for keypoints
-    and experts: what these tell in a second counts as much as it does in the filter.
+    parabola; its minimum and curvature make a component, its depth and its volume the weight, of at
+    least `LEAST_LOG_WEIGHT`. Nothing of it is discounted, but that one pair (s, tau) stands for
+    keypoints and experts: what these tell in a second counts as much as it does in the filter.
 
     Args:
         modes: of the posterior, K, heaviest first.
@@ -143,7 +144,8 @@ def likelihood_modes(
     limit = 5.0 * np.sqrt(np.einsum('kii->ki', modes.covariances))
     step = np.clip(step, -limit, limit)
     means = np.clip(poses + step, body.lower, body.upper)
-    weights = np.exp(at_least(normalised(-fit.energy.value), LEAST_LOG_WEIGHT))
+    volumes = 0.5 * np.linalg.slogdet(covariances)[1]
+    weights = np.exp(at_least(normalised(volumes - fit.energy.value), LEAST_LOG_WEIGHT))
     mixture = GaussianMixture(weights, means, covariances).sorted()
     values = posterior.log_likelihoods(mixture.means, observation)
     gives_way = covariances[:1] * (fit.free[:1, :, None] & fit.free[:1, None, :])

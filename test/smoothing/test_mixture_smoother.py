@@ -216,7 +216,7 @@ def test_what_counts_of_an_observation_is_a_power_of_it():
     """Where modes are apart, log q = a log p up to a constant, near either of them."""
     spread = np.array([[0.5, 0.2], [0.2, 0.3]])
     means = np.array([[-9.0, 0.0], [9.0, 4.0]])
-    mixture = GaussianMixture([0.9, 0.1], means, [spread, spread])
+    mixture = GaussianMixture([0.9, 0.1], means, [spread, 0.2 * spread])
     rng = np.random.default_rng(0)
     points = means[[0, 1] * 5] + rng.normal(size=(10, 2))
     for share in (1.0, 0.3):

@@ -13,7 +13,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.smoothing import LinearGaussianDynamics
 from hmt_ros.smoothing.embedded_network import embedded_network
-from hmt_ros.smoothing.likelihood import or_missed
+from hmt_ros.smoothing.likelihood import merged_modes, or_missed
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.paths import (
@@ -182,6 +182,24 @@ def test_distinct_motions_are_apart(modes, walk):
     # With room for two there is one of each.
     few = sequence.distinct_motions(2, lambda poses: np.pad(poses, ((0, 0), (0, 1)))[:, None], 0.5)
     assert len(few) == 2
+
+
+def test_the_highest_mode_leads_those_that_are_merged():
+    """Two modes of one explanation: the wide one has more mass, the sharp one explains more."""
+    sharp, wide, far = [[1e-4]], [[1e-2]], [[1e-2]]
+    heights = np.array([1.0, 0.1, 0.5])
+    deviations = np.array([0.01, 0.1, 0.1])
+    masses = heights * deviations
+    mixture = GaussianMixture(masses / masses.sum(), [[0.0], [0.05], [9.0]], [sharp, wide, far])
+    assert mixture.weights[1] == pytest.approx(mixture.weights[0])
+    found = merged_modes(mixture, 3.0)
+    assert len(found) == 2
+    near = int(np.argmin(np.abs(found.means[:, 0])))
+    assert found.means[near, 0] == pytest.approx(0.05 * 0.1 / 1.1)
+    # What was merged is as high as both were, against the other one.
+    high = found.weights / np.sqrt(found.covariances[:, 0, 0])
+    assert high[near] / high[1 - near] == pytest.approx(1.1 / 0.5)
+    assert merged_modes(mixture, 0.0) is mixture
 
 
 def test_a_mode_that_was_missed_is_wide():
