@@ -49,7 +49,8 @@ from hmt_ros.sessions.handled import Output
 from hmt_ros.sessions.smoothed_messages import SmoothedBody
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession, wider
-from hmt_ros.smoothing.mixture_smoother import SAME_MOTION, PathSmoother
+from hmt_ros.smoothing.mixture_smoother import PathSmoother
+from hmt_ros.smoothing.path_hypotheses import SAME_MOTION
 from hmt_ros.tracking import TrackerSettings
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise

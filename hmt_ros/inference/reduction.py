@@ -12,7 +12,6 @@ so that the mean and the covariance of the whole mixture stay. What is merged di
       B(i, j) = 1/2 ((w_i + w_j) log|S_ij| - w_i log|S_i| - w_j log|S_j|);
 
 - `merged_if_close`: the closest pair, until none is closer than a distance;
-- `merged_if_alike`: what lies near a component and has its size;
 - `led`: what is near a heavier component, which stays as it is and gets the weight;
 - `reduced`: clusters of means, which then descend a bound on the divergence from the large mixture
   to the small one [Goldberger and Roweis, NIPS 2004].
@@ -24,7 +23,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg.lapack import dtrtrs
 
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.gaussian_pairs import pair_distances, pair_mixture_log_determinants
@@ -75,30 +73,6 @@ def merged_if_close(mixture: GaussianMixture, distance: float) -> GaussianMixtur
         distance: between means, in standard deviations of the average of two covariances.
     """
     return _merged_pairs(mixture, _squared_distances, lambda _, cost: cost < distance**2)
-
-
-def merged_if_alike(
-    mixture: GaussianMixture, distance: float, log_determinant: float
-) -> GaussianMixture:
-    """The mixture with each component merged with those after it that are nearly the same.
-
-    Args:
-        mixture: any, those first that others are compared with.
-        distance: between means, in standard deviations of the one compared with.
-        log_determinant: between the logarithms of the determinants of covariances.
-    """
-    factors = mixture.cholesky()
-    log_det = 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
-    owner: Index = np.full(len(mixture), -1)
-    for i in range(len(mixture)):
-        if owner[i] >= 0:
-            continue
-        at = np.flatnonzero(owner < 0)
-        white = dtrtrs(factors[i], (mixture.means[at] - mixture.means[i]).T, lower=1)[0]
-        near = (white * white).sum(0) < distance**2
-        near &= np.abs(log_det[at] - log_det[i]) < log_determinant
-        owner[at[near]] = i
-    return merged(mixture, (owner[:, None] == np.unique(owner)).astype(np.float64))
 
 
 def leaders(

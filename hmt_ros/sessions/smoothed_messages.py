@@ -14,7 +14,7 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.reduction import led
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
-from hmt_ros.smoothing.mixture_smoother import SAME_MOTION
+from hmt_ros.smoothing.path_hypotheses import SAME_MOTION
 from msg_tools import MessageFactory
 from msg_tools.messages.markers import trajectory_markers
 from msg_tools.messages.pose_mixtures import (

@@ -98,7 +98,7 @@ class SmootherParameters(NodeParameters):
     window_length: int = parameter_field(47, AT_ONCE, (1, 10_000))
     max_trajectories: int = parameter_field(16, NEXT_WINDOW, (1, 1024))
     max_hypotheses: int = parameter_field(8, AT_ONCE, (1, 1024))
-    merge_distance: float = parameter_field(4.0, NEXT_WINDOW, (0.0, 100.0))
+    merge_distance: float = parameter_field(1.75, NEXT_WINDOW, (0.0, 100.0))
     random_seed: int = parameter_field(0, NEXT_WINDOW, (0, 2**31 - 1))
     longest_interval: float = parameter_field(0.25, AT_ONCE, (0.0, 3600.0))
     publish_covariances: bool = parameter_field(False, AT_ONCE)

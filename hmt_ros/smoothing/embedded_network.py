@@ -44,21 +44,6 @@ class EmbeddedNetwork:
         """T."""
         return len(self.nodes)
 
-    def later(self) -> EmbeddedNetwork:
-        """The network without its first layer."""
-        return EmbeddedNetwork(self.nodes[1:], self.links[1:])
-
-    def followed_by(
-        self,
-        mixture: GaussianMixture,
-        last: GaussianMixture,
-        dynamics: LinearGaussianDynamics,
-        interval: float,
-    ) -> EmbeddedNetwork:
-        """The network with the modes of one more mixture, an interval (s) after the last one."""
-        new = embedded_network([last, mixture], dynamics, np.array([interval]))
-        return EmbeddedNetwork((*self.nodes, new.nodes[1]), (*self.links, new.links[0]))
-
     def log_value(self, path: NDArray[np.intp]) -> float:
         """Sum of the log values along a path (T,)."""
         total = sum(float(nodes[k]) for nodes, k in zip(self.nodes, path))
@@ -72,7 +57,6 @@ def embedded_network(
     dynamics: LinearGaussianDynamics,
     intervals: Array,
     first: GaussianMixture | None = None,
-    rest: EmbeddedNetwork | None = None,
 ) -> EmbeddedNetwork:
     """The network of Gaussian modes, in closed form.
 
@@ -82,13 +66,12 @@ def embedded_network(
         intervals: (T-1,) s; (T,) with `first`.
         first: a density of the state (n variables) at a time before the mixtures; its components
             are the first layer of nodes.
-        rest: with `first`: the network of the mixtures alone; None: it is to be made.
 
     Raises:
         ValueError: mixtures that can not be smoothed.
     """
     if first is not None:
-        return _with_first(first, mixtures, dynamics, intervals, rest)
+        return _with_first(first, mixtures, dynamics, intervals)
     check_mixtures(mixtures, factorise=False)
     d, n = dynamics.dimension, dynamics.state_dimension
     begin = np.concatenate([[0], np.cumsum([len(mixture) for mixture in mixtures])])
@@ -166,7 +149,6 @@ def _with_first(
     mixtures: Sequence[GaussianMixture],
     dynamics: LinearGaussianDynamics,
     intervals: Array,
-    rest: EmbeddedNetwork | None,
 ) -> EmbeddedNetwork:
     """The network with a layer of components of the state before the modes."""
     pairs = _pairs_within(len(first))
@@ -176,8 +158,7 @@ def _with_first(
     nodes = _node_values(first.weights, own, pairs)
     if len(mixtures) == 0:
         return EmbeddedNetwork((nodes,), ())
-    if rest is None:
-        rest = embedded_network(mixtures, dynamics, intervals[1:])
+    rest = embedded_network(mixtures, dynamics, intervals[1:])
     d = dynamics.dimension
     means, spread = dynamics.predict(first.means, first.covariances, float(intervals[0]))
     pairs = _pairs_across(len(first), len(mixtures[0]))

@@ -21,6 +21,7 @@ from hmt_ros.smoothing.mode_sequence import (
     path_gaussians,
     path_gaussians_from_the_end,
 )
+from hmt_ros.smoothing.path_hypotheses import probable_paths
 from hmt_ros.smoothing.paths import Paths
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states, refine
@@ -45,9 +46,6 @@ MARGIN = 8
 SAME_DISTANCE = 0.3
 # Modes closer than so many standard deviations are merged, as alternatives to the optima.
 MERGE_DISTANCES = (1.75, 2.5)
-# Motions are one as long as no point of theirs is farther apart than this, m: half the length of a
-# forearm, which a flip turns over.
-SAME_MOTION = 0.12
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +77,8 @@ class MixtureSmoother:
         max_iterations: of the descent of the free energy.
         through_modes: whether, besides the best paths between the ends, those through every single
             single mode are starts: more alternatives for each pose, fewer for the whole motion.
-        points: maps poses (N, d) to points (N, P, 3), m: paths then are motions of which some point
-            is `SAME_MOTION` apart; None: paths that visit different modes.
+        points: maps poses (N, d) to points (N, P, 3), m, by which motions are told apart
+            (`path_hypotheses`); None: nothing tells how far they are apart.
 
     Raises:
         ValueError: settings out of range.
@@ -159,8 +157,8 @@ class MixtureSmoother:
 
     def paths(self, sequence: ModeSequence) -> Paths:
         """The paths that trajectories start from."""
-        if self.points is not None:
-            return sequence.distinct_motions(self.max_trajectories, self.points, SAME_MOTION)
+        if sequence.given is not None:
+            return sequence.given
         return sequence.paths(self.max_trajectories, through_modes=self.through_modes)
 
     def optima(self, sequence: ModeSequence, likelihood: SequenceLikelihood) -> Candidates:
@@ -338,6 +336,14 @@ class PathSmoother(MixtureSmoother):
     `adapt`, `start` and `max_iterations` have no meaning here, nor has `seed`; the result has no
     free energy. Means beyond the limits are moved onto them.
     """
+
+    def paths(self, sequence: ModeSequence) -> Paths:
+        """The paths whose Gaussians are the result."""
+        if sequence.given is not None or sequence.first is not None:
+            return super().paths(sequence)
+        return probable_paths(
+            sequence.mixtures, self.dynamics, sequence.intervals, self.max_trajectories, self.points
+        )
 
     def smooth_sequence(
         self,

@@ -17,7 +17,6 @@ are few, these Gaussians stand beside them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -34,7 +33,7 @@ from hmt_ros.inference.block_tridiagonal import (
     factorise_band,
 )
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
-from hmt_ros.inference.reduction import leaders, merged_if_close
+from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, embedded_network
 from hmt_ros.smoothing.likelihood import MixtureLikelihood, WindowLikelihood
 from hmt_ros.smoothing.paths import (
@@ -50,19 +49,6 @@ CANDIDATES = 4
 
 
 @dataclass(frozen=True, eq=False)
-class KnownModes:
-    """What need not be computed of mixtures that are smoothed again with others.
-
-    Attributes:
-        network: their embedded network.
-        likelihood: -log of them.
-    """
-
-    network: EmbeddedNetwork
-    likelihood: MixtureLikelihood
-
-
-@dataclass(frozen=True, eq=False)
 class ModeSequence:
     """Mixtures at T times.
 
@@ -71,14 +57,16 @@ class ModeSequence:
         dynamics: of the state, n variables.
         intervals: (T-1,) s.
         first: a density of the first state, over n variables, in the place of a likelihood.
-        known: with `first`: of `mixtures` alone; None: nothing.
+        known: with `first`: -log of `mixtures` alone; None: it is to be made.
+        given: paths that are known to be probable; None: they are to be found.
     """
 
     mixtures: tuple[GaussianMixture, ...]
     dynamics: LinearGaussianDynamics
     intervals: Array
     first: GaussianMixture | None = None
-    known: KnownModes | None = None
+    known: MixtureLikelihood | None = None
+    given: Paths | None = None
 
     @property
     def layers(self) -> tuple[GaussianMixture, ...]:
@@ -92,7 +80,7 @@ class ModeSequence:
             return MixtureLikelihood.of(self.mixtures)
         later = None
         if self.mixtures:
-            later = self.known.likelihood if self.known else MixtureLikelihood.of(self.mixtures)
+            later = self.known or MixtureLikelihood.of(self.mixtures)
         return WindowLikelihood(MixtureLikelihood.of([self.first]), later)
 
     @cached_property
@@ -106,8 +94,7 @@ class ModeSequence:
     @cached_property
     def network(self) -> EmbeddedNetwork:
         """The embedded network."""
-        rest = self.known.network if self.known else None
-        return embedded_network(self.mixtures, self.dynamics, self.intervals, self.first, rest)
+        return embedded_network(self.mixtures, self.dynamics, self.intervals, self.first)
 
     def paths(self, count: int, *, through_modes: bool = False) -> Paths:
         """At most `count` paths that are probable and differ from each other.
@@ -128,40 +115,6 @@ class ModeSequence:
             )
         return diverse_subset(found, count)
 
-    def distinct_motions(self, count: int, points: Callable[[Array], Array], least: float) -> Paths:
-        """At most `count` paths that are apart, the most probable ones.
-
-        Candidates are the best paths of all pairs of ends and those through every single mode.
-        First are those that are apart in the mean over the times, one half at most, then those that
-        are apart at the first time, whose pose is the next to be final.
-
-        Args:
-            count: of paths.
-            points: maps poses (N, d) to points (N, P, 3), m.
-            least: distance of the farthest point from which on they are apart, m.
-        """
-        ends, through = k_best_paths(self.network, 1), paths_through_nodes(self.network)
-        found = distinct_paths(
-            Paths(
-                np.concatenate([ends.nodes, through.nodes]),
-                np.concatenate([ends.log_values, through.log_values]),
-            )
-        )
-        d, nodes = self.dynamics.dimension, found.nodes
-        gaps = [_distances(points(layer.means[:, :d])) for layer in self.layers]
-
-        def at_first(i: int) -> Array:
-            return np.asarray(gaps[0][nodes[i, 0], nodes[:, 0]])
-
-        def in_the_mean(i: int) -> Array:
-            apart = [gap[nodes[i, t], nodes[:, t]] for t, gap in enumerate(gaps)]
-            return np.asarray(np.mean(apart, axis=0))
-
-        half = max(count // 2, min(count, 2))
-        whole = leaders(found.log_values, in_the_mean, least, half)
-        chosen = leaders(found.log_values, at_first, least, count, whole.tolist())
-        return found[chosen]
-
     def states(self, paths: Paths) -> Array:
         """States (P, T, n) along the modes of paths; velocities are differences of neighbours."""
         d, n = self.dynamics.dimension, self.dynamics.state_dimension
@@ -179,7 +132,7 @@ class ModeSequence:
     def merged(self, distance: float) -> ModeSequence:
         """The sequence with modes merged that are closer than so many standard deviations."""
         mixtures = tuple(merged_if_close(mixture, distance) for mixture in self.mixtures)
-        return replace(self, mixtures=mixtures, known=None)
+        return replace(self, mixtures=mixtures, known=None, given=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,11 +217,6 @@ def path_gaussians_from_the_end(
         for ends in np.stack(owners, axis=1)
     )
     return states, log[owner] - prior.constant + 0.5 * times * n * np.log(2 * np.pi), factors
-
-
-def _distances(points: Array) -> Array:
-    """Distances (K, K) of the points of K poses (K, P, 3) that are farthest from each other."""
-    return np.asarray(np.linalg.norm(points[:, None] - points, axis=3).max(2))
 
 
 def _cholesky(matrices: Array) -> Array | None:

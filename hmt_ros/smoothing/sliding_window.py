@@ -1,42 +1,36 @@
 """Smoothing while observations arrive: a window of fixed lag.
 
-The window holds the newest poses. What came before it is a density of its first state, a mixture
-that is filtered in closed form. Of all pairs of its components i and modes k of the likelihood the
-next one has the component
-
-    w_i w_k N(x; A m_i, A S_i A' + Q) N(C x; mu_k, S_k)
-
-where C takes the pose out of the state. The window is smoothed with that density in the place of
-the first likelihood, so that a new image costs the same however long the sequence is. A pose is
+The window holds the newest poses, and the paths through their modes that are probable, which are
+filtered one by one (`path_hypotheses`). What came before it are the states of these paths at its
+first time: the window is smoothed with their density in the place of the first likelihood, so that
+a new image costs the same however long the sequence is. A pose is
 final before it is older than the newest one by more than the lag.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.arrays import Array, Index
-from hmt_ros.inference.gaussian_pairs import pair_log_densities
-from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
-from hmt_ros.inference.reduction import led, merged_if_alike
-from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, embedded_network
+from hmt_ros.inference.arrays import Array
 from hmt_ros.smoothing.likelihood import MixtureLikelihood
-from hmt_ros.smoothing.mixture_smoother import SAME_MOTION, MixtureSmoother, intervals_of
-from hmt_ros.smoothing.mode_sequence import KnownModes, ModeSequence
+from hmt_ros.smoothing.mixture_smoother import MixtureSmoother, intervals_of
+from hmt_ros.smoothing.mode_sequence import ModeSequence
+from hmt_ros.smoothing.path_hypotheses import (
+    SAME_MOTION,
+    PathHypotheses,
+    distances,
+    distances_of_paths,
+    traced,
+)
+from hmt_ros.smoothing.paths import Paths
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 
 SECOND_NS = 10**9
-# Components with a share below exp(-25) are given up, and those are merged whose means lie within
-# this many standard deviations, and whose sizes are alike.
-NEGLIGIBLE = 25.0
-MERGE_DISTANCE = 0.6
-MERGE_LOG_DETERMINANT = 0.5
 # Intervals between poses tremble by this share of their length.
 TREMBLE = 0.1
 
@@ -111,11 +105,11 @@ class SlidingWindow:
         self.next_identity = self.first_identity
         self._stamps: list[int] = []
         self._mixtures: list[GaussianMixture] = []
-        # The same of each mixture, and the network of all of them: they stay while it moves on.
+        # The same of each mixture, the paths up to it, and how far its modes are apart, m.
         self._likelihoods: list[MixtureLikelihood] = []
+        self._steps: list[PathHypotheses] = []
+        self._gaps: list[Array | None] = []
         self._lasting: list[float] = []
-        self._network: EmbeddedNetwork | None = None
-        self._first: GaussianMixture | None = None
         self._last: TrajectoryMixture | None = None
         # Poses of the window, the oldest, that are final already.
         self._final = 0
@@ -150,21 +144,23 @@ class SlidingWindow:
                 'window to go back'
             )
         mixture = mixture[mixture.weights > 0]
-        if self._first is None:
-            self._first = first_state(mixture, dynamics)
-        if self._network is None:
-            self._network = embedded_network([mixture], dynamics, np.empty(0))
+        gaps = self._distances_of(mixture.means)
+        if self._steps:
+            step = self._steps[-1].followed(
+                mixture, dynamics, (int(stamp_ns) - self._stamps[-1]) * 1e-9,
+                self.smoother.max_trajectories, gaps,
+                distances_of_paths(traced(self._steps), self._gaps),
+            )  # fmt: skip
         else:
-            interval = (int(stamp_ns) - self._stamps[-1]) * 1e-9
-            self._network = self._network.followed_by(
-                mixture, self._mixtures[-1], dynamics, interval
-            )
+            step = PathHypotheses.first(mixture, dynamics)
+        self._steps.append(step)
+        self._gaps.append(gaps)
         self._stamps.append(int(stamp_ns))
         self._mixtures.append(mixture)
         self._likelihoods.append(likelihood)
         self._lasting.append(lasting)
-        for number in range(1, self._final + 1):
-            self._advance(number)
+        for _ in range(self._final):
+            self._advance()
         found = self._smooth()
         self._final = self._number_of_final()
         if self._final:
@@ -198,42 +194,28 @@ class SlidingWindow:
         self.reset()
         return result
 
-    def _advance(self, number: int) -> None:
-        """Takes the oldest pose out: the density of the state moves on to the next one.
+    def _advance(self) -> None:
+        """Takes the oldest pose out."""
+        for every in (
+            self._stamps, self._mixtures, self._likelihoods, self._steps, self._gaps, self._lasting,
+        ):  # fmt: skip
+            del every[0]
+        d = self.smoother.dynamics.dimension
+        self._gaps[0] = self._distances_of(self._steps[0].states.means[:, :d])
 
-        Args:
-            number: of the next one among the poses of the trajectories found last.
-        """
-        assert self._first is not None
-        assert self._network is not None
-        interval = (self._stamps[1] - self._stamps[0]) * 1e-9
-        followed = None
-        if self._last is not None and self._last.times > number:
-            followed = (self._last.weights, self._last.states[:, number])
-        self._first = filtered_state(
-            self._first,
-            self._mixtures[1],
-            self.smoother.dynamics,
-            interval,
-            self.smoother.max_trajectories,
-            followed,
-            self.smoother.points,
-        )
-        del self._stamps[0], self._mixtures[0], self._likelihoods[0], self._lasting[0]
-        self._network = self._network.later()
+    def _distances_of(self, poses: Array) -> Array | None:
+        """Distances (K, K) of poses (K, d), m; None: nothing tells how far they are apart."""
+        points = self.smoother.points
+        return None if points is None else distances(points(poses))
 
     def _smooth(self) -> TrajectoryMixture:
-        assert self._first is not None
-        assert self._network is not None
         smoother, dynamics = self.smoother, self.smoother.dynamics
         intervals = intervals_of(self._stamps, len(self._stamps), dynamics.step)
-        known = None
-        if len(self._mixtures) > 1:
-            known = KnownModes(
-                self._network.later(), MixtureLikelihood.joined(self._likelihoods[1:])
-            )
-        mixtures = tuple(self._mixtures[1:])
-        sequence = ModeSequence(mixtures, dynamics, intervals, self._first, known)
+        known = MixtureLikelihood.joined(self._likelihoods[1:]) if len(self._stamps) > 1 else None
+        given = Paths(traced(self._steps), self._steps[-1].log_weights)
+        sequence = ModeSequence(
+            tuple(self._mixtures[1:]), dynamics, intervals, self._steps[0].states, known, given
+        )
         found = smoother.smooth_sequence(sequence, self.seed, self._stamps)
         found = found.widened(sum(self._lasting) / len(self._lasting))
         return replace(found, identities=self._identities(found))
@@ -294,94 +276,3 @@ def _final_poses(found: TrajectoryMixture, indices: Sequence[int]) -> tuple[Fina
         )
         for t in indices
     )
-
-
-def first_state(mixture: GaussianMixture, dynamics: LinearGaussianDynamics) -> GaussianMixture:
-    """The density of the first state: its likelihood times what the dynamics know of it."""
-    n, d = dynamics.state_dimension, dynamics.dimension
-    precisions = np.zeros((len(mixture), n, n))
-    precisions[:, :d, :d] = np.linalg.inv(mixture.covariances)
-    pull = np.zeros((len(mixture), n))
-    pull[:, :d] = np.einsum('kij,kj->ki', precisions[:, :d, :d], mixture.means)
-    pull += dynamics.initial_precision @ dynamics.initial_mean
-    covariances = np.linalg.inv(precisions + dynamics.initial_precision)
-    covariances = 0.5 * (covariances + covariances.swapaxes(1, 2))
-    means = np.einsum('kij,kj->ki', covariances, pull)
-    log = np.log(mixture.weights)
-    known = dynamics.initial_precision[:d, :d]
-    if known.any():
-        spread = np.asarray(np.linalg.inv(known), dtype=np.float64)
-        pairs = np.stack([np.arange(len(mixture)), np.zeros(len(mixture), dtype=int)], axis=1)
-        log = log + pair_log_densities(
-            mixture.means, mixture.covariances, dynamics.initial_mean[None, :d], spread[None], pairs
-        )
-    return GaussianMixture(np.exp(log - logsumexp(log)), means, covariances)
-
-
-def filtered_state(
-    state: GaussianMixture,
-    mixture: GaussianMixture,
-    dynamics: LinearGaussianDynamics,
-    interval: float,
-    count: int,
-    followed: tuple[Array, Array] | None = None,
-    points: Callable[[Array], Array] | None = None,
-) -> GaussianMixture:
-    """The density of the next state given its likelihood, with at most `count` components.
-
-        N(x; A m_i, A S_i A' + Q) N(C x; mu_k, S_k) w_i w_k, for all pairs i, k
-
-    Pairs that tell the same are merged. Of the others those are kept that are apart, then those
-    that the trajectories of the window follow, and then the heaviest.
-
-    Args:
-        state: before.
-        mixture: the likelihood of the pose.
-        dynamics: of the state.
-        interval: s.
-        count: components at most.
-        followed: weights (M,) of trajectories and their states (M, n) at the new time.
-        points: maps poses (N, d) to points (N, P, 3), m: half of the components, the heaviest such,
-            have some point `SAME_MOTION` apart. None: none have to.
-    """
-    d = dynamics.dimension
-    means, covariances = dynamics.predict(state.means, state.covariances, interval)
-    pairs = np.indices((len(state), len(mixture))).reshape(2, -1).T
-    log = pair_log_densities(
-        means[:, :d], covariances[:, :d, :d], mixture.means, mixture.covariances, pairs
-    )
-    log += np.log(state.weights)[pairs[:, 0]] + np.log(mixture.weights)[pairs[:, 1]]
-    order = np.argsort(-log, kind='stable')
-    several = order[: 4 * count]
-    several = several[log[several] > log[order[0]] - NEGLIGIBLE]
-    if points is not None:
-        # Of every mode the best pair, however light: the rest is what leads there otherwise.
-        _, first = np.unique(pairs[order, 1], return_index=True)
-        several = np.union1d(first, np.arange(len(several)))
-        several = order[several]
-    order = several
-    i, k = pairs[order].T
-    gain = np.linalg.solve(
-        covariances[i][:, :d, :d] + mixture.covariances[k], covariances[i][:, :d, :]
-    ).swapaxes(1, 2)
-    fused = means[i] + np.einsum('pij,pj->pi', gain, mixture.means[k] - means[i][:, :d])
-    # Joseph's form, (1 - G C) S (1 - G C)' + G R G', keeps them positive definite.
-    before = covariances[i]
-    kept = before - gain @ before[:, :d]
-    spread = kept + (gain @ mixture.covariances[k] - kept[:, :, :d]) @ gain.swapaxes(1, 2)
-    weights = np.exp(log[order] - logsumexp(log[order]))
-    found = GaussianMixture(weights, fused, 0.5 * (spread + spread.swapaxes(1, 2)))
-    found = merged_if_alike(found, MERGE_DISTANCE, MERGE_LOG_DETERMINANT)
-    if len(found) <= count:
-        return found.normalised()
-    apart: Index = np.empty(0, dtype=np.intp)
-    if points is not None:
-        apart = led(found, points(found.means[:, :d]), SAME_MOTION, count // 2)[1]
-    score = found.weights.copy()
-    if followed is not None:
-        each = found.component_log_densities(followed[1])
-        share = np.exp(each - logsumexp(each, axis=1, keepdims=True))
-        score += followed[0] @ share
-    score[apart] = np.inf
-    chosen = np.sort(np.argsort(-score, kind='stable')[:count])
-    return found[chosen].normalised()

@@ -16,7 +16,6 @@ from hmt_ros.inference.reduction import (
     leaders,
     led,
     merged,
-    merged_if_alike,
     merged_if_close,
     merged_pairwise,
     reduced,
@@ -90,7 +89,6 @@ def test_components_that_are_few_are_kept(rng):
         lambda mixture: merged(mixture, np.eye(5)[np.arange(12) % 5]),
         lambda mixture: merged_pairwise(mixture, 3),
         lambda mixture: merged_if_close(mixture, 3.0),
-        lambda mixture: merged_if_alike(mixture, 4.0, 3.0),
     ],
 )
 def test_moments_stay(reduce, rng):
@@ -110,13 +108,6 @@ def test_only_close_components_are_merged():
     np.testing.assert_allclose(found.weights, [0.9, 0.1])
     np.testing.assert_allclose(found.means[:, 0], [0.46 / 0.9, 9.0])
     assert merged_if_close(mixture, 0.1) == mixture
-
-
-def test_components_of_another_size_are_not_alike():
-    mixture = GaussianMixture([0.5, 0.3, 0.2], [[0.0], [0.1], [0.2]], [[[1.0]], [[9.0]], [[1.1]]])
-    found = merged_if_alike(mixture, 0.6, 0.5)
-    np.testing.assert_allclose(found.weights, [0.7, 0.3])
-    np.testing.assert_allclose(found.means[:, 0], [0.04 / 0.7, 0.1])
 
 
 def test_pairs_equal_the_written_out_formulas(rng):

@@ -211,7 +211,7 @@ def test_smoothed_poses_tell_state_track_and_motion(session, outputs, likelihood
 def test_what_is_published_are_states_of_motions(session, outputs, likelihoods):
     """Of more motions than are wanted the heaviest; none is an average."""
     for wanted in (1, 8):
-        one = session(max_trajectories=4, max_hypotheses=wanted)
+        one = session(max_hypotheses=wanted)
         outputs.clear()
         for index in range(4):
             one.take(MIXTURE, likelihoods.message(index))
@@ -308,7 +308,7 @@ def test_trajectories_need_no_kinematics(session, outputs, likelihoods):
     content = trajectory_mixture_of(read(outputs, 'trajectory_mixture')[-1])
     assert content.joint_names == body.joint_names
     joints = body.joint_positions(content.means.reshape(-1, body.dimension))
-    assert content.joint_positions.shape == (2, 3, len(body.joint_names), 3)
+    assert content.joint_positions.shape == (3, 3, len(body.joint_names), 3)
     np.testing.assert_allclose(content.joint_positions.reshape(joints.shape), joints, atol=1e-12)
 
 
@@ -320,12 +320,12 @@ def test_trajectories(session, outputs, likelihoods):
     content = trajectory_mixture_of(last, likelihoods.body.dof_names)
     assert content.stamps_ns == tuple(likelihoods.stamp(index) for index in (1, 2, 3))
     assert content.final_until_ns == likelihoods.stamp(1)
-    assert content.means.shape == (2, 3, likelihoods.body.dimension)
+    assert content.means.shape == (3, 3, likelihoods.body.dimension)
     assert content.marginal_covariances is None
     one.parameters = with_values(one.parameters, {'publish_covariances': True})
     one.take(MIXTURE, likelihoods.message(4))
     *_, last = read(outputs, 'trajectory_mixture')
-    assert trajectory_mixture_of(last).marginal_covariances.shape == (2, 3, 37, 37)
+    assert trajectory_mixture_of(last).marginal_covariances.shape == (3, 3, 37, 37)
     (final,) = read(outputs, 'smoothed_pose_mixture')[-1:]
     found, window = pose_mixture_of(final), trajectory_mixture_of(last)
     for identity, covariance in zip(found.identities, found.covariances, strict=True):

@@ -155,35 +155,6 @@ def test_paths_through_every_node_are_the_best_that_visit_it(modes, walk):
         assert best == pytest.approx(values[visiting].max())
 
 
-def test_distinct_motions_are_apart(modes, walk):
-    """Two of three modes are near: their paths are one motion, whatever they visit."""
-    rng = np.random.default_rng(0)
-    mixtures = tuple(
-        GaussianMixture(
-            np.array([0.5, 0.3, 0.2]),
-            np.array([[0.0, 0.0], [0.05, 0.0], [1.0, 0.0]]) + 0.01 * rng.normal(size=(3, 2)),
-            np.tile(0.04 * np.eye(2), (3, 1, 1)),
-        )
-        for _ in range(4)
-    )
-    sequence = ModeSequence(mixtures, walk, 0.1 * np.ones(3))
-    found = sequence.distinct_motions(
-        6, lambda poses: np.pad(poses, ((0, 0), (0, 1)))[:, None], 0.5
-    )
-    sides = [tuple((path == 2).tolist()) for path in found.nodes]
-    assert len(found) > 2
-    for i, one in enumerate(sides):
-        for other in sides[:i]:
-            assert np.mean(np.not_equal(one, other)) >= 0.5 or one[0] != other[0]
-    # The best of all comes first, then one that is on the other side for half of the time.
-    assert found.log_values[0] == most_probable_paths(sequence.network).log_values[0]
-    assert not any(sides[0])
-    assert np.mean(sides[1]) >= 0.5
-    # With room for two there is one of each.
-    few = sequence.distinct_motions(2, lambda poses: np.pad(poses, ((0, 0), (0, 1)))[:, None], 0.5)
-    assert len(few) == 2
-
-
 def test_the_highest_mode_leads_those_that_are_merged():
     """Two modes of one explanation: the wide one has more mass, the sharp one explains more."""
     sharp, wide, far = [[1e-4]], [[1e-2]], [[1e-2]]

@@ -16,6 +16,8 @@ from hmt_ros.smoothing.mode_sequence import (
     path_gaussians,
     path_gaussians_from_the_end,
 )
+from hmt_ros.smoothing.path_hypotheses import traced
+from hmt_ros.smoothing.paths import Paths
 
 
 def test_it_is_exact_where_all_paths_are_kept(modes, walk, exact):
@@ -139,7 +141,9 @@ def test_a_window_that_moves_on_computes_what_one_from_scratch_does(modes, walk)
     window = SlidingWindow(PathSmoother(walk, max_trajectories=8), fixed_lag=2)
     for t, mixture in enumerate(mixtures):
         found = window.step(t * 10**9, mixture).trajectories
-    sequence = ModeSequence(tuple(mixtures[-2:]), walk, np.ones(2), window._first)
+    steps = window._steps
+    given = Paths(traced(steps), steps[-1].log_weights)
+    sequence = ModeSequence(tuple(mixtures[-2:]), walk, np.ones(2), steps[0].states, None, given)
     wanted = PathSmoother(walk, max_trajectories=8).smooth_sequence(sequence)
     np.testing.assert_allclose(found.states, wanted.states, atol=1e-12)
     np.testing.assert_allclose(found.weights, wanted.weights, atol=1e-12)

@@ -7,7 +7,7 @@ import pytest
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.smoothing import LinearGaussianDynamics, MixtureSmoother, SlidingWindow
-from hmt_ros.smoothing.sliding_window import filtered_state, first_state
+from hmt_ros.smoothing.mixture_smoother import PathSmoother
 
 FAST = LinearGaussianDynamics.constant_velocity([2.0, 2.0], 1.0)
 
@@ -21,30 +21,6 @@ def run(window: SlidingWindow, mixtures, step=10**9):
     updates = [window.step(t * step, mixture) for t, mixture in enumerate(mixtures)]
     final = [pose for update in updates for pose in update.final]
     return updates, [*final, *window.finish()]
-
-
-@pytest.mark.parametrize('radius', [3.0, 1.0])
-def test_filtering_is_exact_where_nothing_is_given_up(modes, walk, exact, radius):
-    mixtures = modes(radius, times=4)
-    state = first_state(mixtures[0], walk)
-    for mixture in mixtures[1:]:
-        state = filtered_state(state, mixture, walk, 1.0, 81)
-    _, marginals = exact(mixtures, walk, np.ones(3))
-    np.testing.assert_allclose(state.mean(), marginals[-1].mean(), atol=1e-3)
-    np.testing.assert_allclose(state.covariance(), marginals[-1].covariance(), atol=5e-3)
-    assert abs(divergence(marginals[-1], state)) < 0.01
-
-
-def test_the_first_state_knows_what_the_dynamics_know():
-    one = GaussianMixture([1.0], [[1.0]], [[[2.0]]])
-    dynamics = LinearGaussianDynamics.random_walk(
-        [1.0], initial_mean=[0.0], initial_covariance=[[2.0]]
-    )
-    state = first_state(one, dynamics)
-    np.testing.assert_allclose(state.means, [[0.5]])
-    np.testing.assert_allclose(state.covariances, [[[1.0]]])
-    moving = first_state(GaussianMixture([1.0], [[1.0, 2.0]], [np.eye(2)]), FAST)
-    np.testing.assert_allclose(moving.covariances[0], np.eye(4))
 
 
 def test_final_marginals_are_those_given_what_the_lag_saw(modes, walk, exact):
@@ -75,10 +51,10 @@ def test_velocities_of_final_poses(walk, moving):
 
 def test_a_window_that_is_not_full_is_the_whole_sequence(modes, walk):
     mixtures = modes(3.0, times=4)
-    window = SlidingWindow(MixtureSmoother(walk, max_trajectories=12), fixed_lag=10)
+    window = SlidingWindow(PathSmoother(walk, max_trajectories=12), fixed_lag=10)
     updates, final = run(window, mixtures)
     assert all(update.final == () for update in updates)
-    whole = MixtureSmoother(walk, max_trajectories=12).smooth(mixtures)
+    whole = PathSmoother(walk, max_trajectories=12).smooth(mixtures)
     np.testing.assert_allclose(updates[-1].trajectories.means, whole.means, atol=1e-5)
     assert len(final) == 4
     assert window.stamps_ns == ()

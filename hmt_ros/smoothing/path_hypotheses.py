@@ -1,0 +1,200 @@
+"""Which paths through the modes of a sequence are probable, each filtered in closed form.
+
+A path that goes on to mode k of the next image has the state and the weight
+
+    N(x; A m, A S A' + Q) N(C x; mu_k, S_k) w_k        m, S: its state before
+
+where C takes the pose out of the state. So weights are those of the components of the posterior.
+The network of VMS 4 weighs a path by pairs of neighbours (`paths`), and a pair knows nothing of
+what was before it: where most modes are wide, a path may turn round and back. In every image few
+paths are kept of all: those whose poses are apart, and then the heaviest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array, Index
+from hmt_ros.inference.gaussian_pairs import pair_log_densities
+from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics
+from hmt_ros.inference.reduction import leaders
+from hmt_ros.smoothing.paths import Paths
+
+# Motions are one as long as no point of theirs is farther apart than this, m: half the length of a
+# forearm, which a flip turns over.
+SAME_MOTION = 0.12
+# Weight of the state of a path that is lighter, exp of it: a positive number still.
+LEAST_LOG_WEIGHT = -690.0
+
+
+@dataclass(frozen=True, eq=False)
+class PathHypotheses:
+    """H paths up to a time, heaviest first.
+
+    Attributes:
+        log_weights: (H,) normalised.
+        states: (H, n) of the last state; of its weights none is 0.
+        parents: (H,) path up to the time before that each continues; empty: there is none before.
+        modes: (H,) mode of the last mixture that each goes through.
+    """
+
+    log_weights: Array
+    states: GaussianMixture
+    parents: Index
+    modes: Index
+
+    def __len__(self) -> int:
+        return len(self.modes)
+
+    @classmethod
+    def first(cls, mixture: GaussianMixture, dynamics: LinearGaussianDynamics) -> PathHypotheses:
+        """The paths through a first mixture alone, one for each of its modes."""
+        states = first_state(mixture, dynamics)
+        return cls._of(np.log(states.weights), states, np.empty(0, dtype=np.intp), None)
+
+    @classmethod
+    def _of(
+        cls, log: Array, states: GaussianMixture, parents: Index, modes: Index | None
+    ) -> PathHypotheses:
+        log = log - logsumexp(log)
+        weights = np.exp(np.maximum(log, LEAST_LOG_WEIGHT))
+        modes = np.arange(len(log)) if modes is None else modes
+        return cls(log, replace(states, weights=weights), parents, modes)
+
+    def followed(
+        self,
+        mixture: GaussianMixture,
+        dynamics: LinearGaussianDynamics,
+        interval: float,
+        count: int,
+        gaps: Array | None = None,
+        past: Array | None = None,
+    ) -> PathHypotheses:
+        """The paths that go on through the modes of the next mixture.
+
+        Args:
+            mixture: the likelihood of the next pose, K modes of positive weight.
+            dynamics: of the state.
+            interval: to the next pose, s.
+            count: paths at most. Half of them were apart before, a quarter are apart now, if there
+                are so many; the others are the heaviest.
+            gaps: (K, K) distances of the modes, m; None: nothing is apart.
+            past: (H, H) distances of the paths, m; None: as above.
+        """
+        d = dynamics.dimension
+        means, covariances = dynamics.predict(self.states.means, self.states.covariances, interval)
+        pairs = np.indices((len(self), len(mixture))).reshape(2, -1).T
+        i, k = pairs.T
+        log = pair_log_densities(
+            means[:, :d], covariances[:, :d, :d], mixture.means, mixture.covariances, pairs
+        )
+        log += self.log_weights[i] + np.log(mixture.weights)[k]
+        chosen: Index = np.empty(0, dtype=np.intp)
+        if past is not None:
+            half = max(count // 2, min(2, count))
+            chosen = leaders(log, lambda a: past[i[a], i], SAME_MOTION, half)
+        if gaps is not None:
+            most = max(3 * count // 4, len(chosen))
+            chosen = leaders(log, lambda a: gaps[k[a], k], SAME_MOTION, most, chosen.tolist())
+        rest = np.argsort(-log, kind='stable')
+        rest = rest[~np.isin(rest, chosen)][: max(count - len(chosen), 0)]
+        chosen = np.concatenate([chosen, rest])
+        chosen = chosen[np.argsort(-log[chosen], kind='stable')]
+        i, k = i[chosen], k[chosen]
+        before, spread = covariances[i], mixture.covariances[k]
+        gain = np.linalg.solve(before[:, :d, :d] + spread, before[:, :d, :]).swapaxes(1, 2)
+        fused = means[i] + np.einsum('pij,pj->pi', gain, mixture.means[k] - means[i][:, :d])
+        # Joseph's form, (1 - G C) S (1 - G C)' + G R G', keeps them positive definite.
+        kept = before - gain @ before[:, :d]
+        left = kept + (gain @ spread - kept[:, :, :d]) @ gain.swapaxes(1, 2)
+        states = GaussianMixture(np.ones(len(i)), fused, 0.5 * (left + left.swapaxes(1, 2)))
+        return self._of(log[chosen], states, i, k)
+
+
+def probable_paths(
+    mixtures: Sequence[GaussianMixture],
+    dynamics: LinearGaussianDynamics,
+    intervals: Array,
+    count: int,
+    points: Callable[[Array], Array] | None = None,
+) -> Paths:
+    """At most `count` paths through the modes of T mixtures, the best first.
+
+    Args:
+        mixtures: over the pose, all weights positive.
+        dynamics: of the state.
+        intervals: (T-1,) s.
+        count: of paths.
+        points: maps poses (N, d) to points (N, P, 3), m: some paths are apart, see
+            `PathHypotheses.followed`; None: they are the heaviest.
+    """
+    last = PathHypotheses.first(mixtures[0], dynamics)
+    nodes = last.modes[:, None]
+    past = gaps = None if points is None else distances(points(mixtures[0].means))
+    for mixture, interval in zip(mixtures[1:], intervals):
+        if points is not None:
+            gaps = distances(points(mixture.means))
+        last = last.followed(mixture, dynamics, interval, count, gaps, past)
+        nodes = np.concatenate([nodes[last.parents], last.modes[:, None]], axis=1)
+        if past is not None and gaps is not None:
+            before, now = past[np.ix_(last.parents, last.parents)], np.ix_(last.modes, last.modes)
+            past = np.maximum(before, gaps[now])
+    return Paths(nodes, last.log_weights)
+
+
+def distances(points: Array) -> Array:
+    """Distances (K, K) of the points of K poses (K, P, 3) that are farthest from each other."""
+    return np.asarray(np.linalg.norm(points[:, None] - points, axis=3).max(2))
+
+
+def distances_of_paths(nodes: Index, gaps: Sequence[Array | None]) -> Array | None:
+    """Largest distances (H, H) at any time of paths with nodes (H, T).
+
+    Args:
+        nodes: of the paths.
+        gaps: T arrays (K_t, K_t) of distances of the nodes of each time; None: unknown.
+    """
+    result = np.zeros((len(nodes), len(nodes)))
+    for column, gap in zip(nodes.T, gaps, strict=True):
+        if gap is None:
+            return None
+        np.maximum(result, gap[np.ix_(column, column)], out=result)
+    return result
+
+
+def traced(steps: Sequence[PathHypotheses]) -> Index:
+    """Nodes (H, T) of the paths of the last of T steps: of the first, paths; of others, modes."""
+    at = np.arange(len(steps[-1]))
+    nodes = np.empty((len(at), len(steps)), dtype=np.intp)
+    for t in range(len(steps) - 1, 0, -1):
+        nodes[:, t] = steps[t].modes[at]
+        at = steps[t].parents[at]
+    nodes[:, 0] = at
+    return nodes
+
+
+def first_state(mixture: GaussianMixture, dynamics: LinearGaussianDynamics) -> GaussianMixture:
+    """The density of the first state: its likelihood times what the dynamics know of it."""
+    n, d = dynamics.state_dimension, dynamics.dimension
+    precisions = np.zeros((len(mixture), n, n))
+    precisions[:, :d, :d] = np.linalg.inv(mixture.covariances)
+    pull = np.zeros((len(mixture), n))
+    pull[:, :d] = np.einsum('kij,kj->ki', precisions[:, :d, :d], mixture.means)
+    pull += dynamics.initial_precision @ dynamics.initial_mean
+    covariances = np.linalg.inv(precisions + dynamics.initial_precision)
+    covariances = 0.5 * (covariances + covariances.swapaxes(1, 2))
+    means = np.einsum('kij,kj->ki', covariances, pull)
+    log = np.log(mixture.weights)
+    known = dynamics.initial_precision[:d, :d]
+    if known.any():
+        spread = np.asarray(np.linalg.inv(known), dtype=np.float64)
+        pairs = np.stack([np.arange(len(mixture)), np.zeros(len(mixture), dtype=int)], axis=1)
+        log = log + pair_log_densities(
+            mixture.means, mixture.covariances, dynamics.initial_mean[None, :d], spread[None], pairs
+        )
+    return GaussianMixture(np.exp(log - logsumexp(log)), means, covariances)
