@@ -221,7 +221,8 @@ def modes_apart(record: Record) -> float:
 def nearest_joints(record: Record) -> Array:
     """Joints (T, J, 3) of the modes that are nearest to the truth."""
     away = (record.joints - record.joints[:, :, :1]) - (record.true - record.true[:, :1])[:, None]
-    errors = np.nanmean(np.linalg.norm(away, axis=3), axis=2)
+    known = np.isfinite(record.true).all((0, 2))
+    errors = np.linalg.norm(away, axis=3)[:, :, known].mean(2)
     nearest = np.where(record.weights > 0, errors, np.inf).argmin(1)
     return np.asarray(record.joints[np.arange(len(nearest)), nearest])
 

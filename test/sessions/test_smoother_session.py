@@ -208,6 +208,56 @@ def test_smoothed_poses_tell_state_track_and_motion(session, outputs, likelihood
     assert len(set(bent)) == 1
 
 
+def test_a_camera_that_jumps(session, outputs, likelihoods):
+    """From one image to the next everybody is 2 m farther and turned: so are smoothed poses."""
+    body, one = likelihoods.body, session(fixed_lag=0.5, dynamics=SmootherDynamics())
+    yaw = body.dof_names.index('root_z')
+    for index in range(24):
+        mixture = likelihoods.mixture(index)
+        means = mixture.means.copy()
+        means[:, 2] += 2.0 * (index >= 12)
+        means[:, yaw] += 1.0 * (index >= 12)
+        handled = one.take(
+            MIXTURE, likelihoods.message(index, mixture=replace(mixture, means=means))
+        )
+        assert handled.faults == ()
+    one.finish()
+    found = [pose_mixture_of(message) for message in read(outputs, 'smoothed_pose_mixture')]
+    depths = [content.means[0, 2] for content in found]
+    assert len(depths) == 24
+    np.testing.assert_allclose(depths[:9], 4.0, atol=0.1)
+    np.testing.assert_allclose(depths[15:], 6.0, atol=0.1)
+
+
+def test_one_mode_at_each_time_and_gaps(session, outputs, likelihoods):
+    """There is one motion, whatever is missing of it."""
+    one = session(fixed_lag=0.5, longest_interval=0.5)
+    seen = [*range(5), *range(20, 25), 60]
+    for index in seen:
+        mixture = likelihoods.mixture(index)[np.array([0])].normalised()
+        assert one.take(MIXTURE, likelihoods.message(index, mixture=mixture)).faults == ()
+    one.finish()
+    assert smoothed(outputs) == [likelihoods.stamp(index) for index in seen]
+    assert one.state.gaps == 2
+    for message in read(outputs, 'smoothed_pose_mixture'):
+        content = pose_mixture_of(message)
+        assert len(content.weights) == 1
+        assert np.linalg.eigvalsh(content.covariances[0]).min() > 0
+
+
+def test_a_track_that_ends_and_begins_in_a_window(session, outputs, likelihoods):
+    one = session(fixed_lag=1.0)
+    for index in range(4):
+        one.take(MIXTURE, change(likelihoods.message(index), track_id=1))
+    empty = change(likelihoods.message(4), components=[], kind=int(MixtureKind.LIKELIHOOD))
+    one.take(MIXTURE, empty)
+    for index in range(6, 9):
+        one.take(MIXTURE, change(likelihoods.message(index), track_id=2))
+    one.finish()
+    found = [(m.track_id, bool(m.components)) for m in read(outputs, 'smoothed_pose_mixture')]
+    assert found == [(1, True)] * 4 + [(1, False)] + [(2, True)] * 3
+
+
 def test_what_is_published_are_states_of_motions(session, outputs, likelihoods):
     """Of more motions than are wanted the heaviest; none is an average."""
     for wanted in (1, 8):

@@ -107,6 +107,17 @@ def test_distances():
     )
 
 
+def test_two_thousand_images_and_one(modes):
+    walk = LinearGaussianDynamics.random_walk([0.5, 0.5])
+    mixtures = modes(1.5, times=5) * 400
+    found = PathSmoother(walk, max_trajectories=8, points=in_space).smooth(mixtures)
+    assert found.times == 2000
+    assert np.isfinite(found.states).all()
+    (alone,) = (PathSmoother(walk, max_trajectories=8).smooth(mixtures[:1]),)
+    assert alone.times == 1
+    assert len(alone) == 3
+
+
 def test_the_first_state_knows_what_the_dynamics_know():
     one = GaussianMixture([1.0], [[1.0]], [[[2.0]]])
     dynamics = LinearGaussianDynamics.random_walk(

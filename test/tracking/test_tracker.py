@@ -15,6 +15,7 @@ from hmt_ros.image.likelihood import ImageLikelihood, LikelihoodSettings
 from hmt_ros.image.observation import Observation
 from hmt_ros.image.terms.keypoints import Keypoints
 from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.bounded_newton import resting
 from hmt_ros.inference.energy import Derivatives, Energy
 from hmt_ros.inference.error_model import ERRORS, TOGETHER
 from hmt_ros.tracking import (
@@ -26,7 +27,7 @@ from hmt_ros.tracking import (
     TrackerSettings,
 )
 from hmt_ros.tracking.misfit import KEYPOINTS
-from hmt_ros.tracking.posterior import WIDEST
+from hmt_ros.tracking.posterior import WIDEST, free_covariances
 from hmt_ros.tracking.validity import UNDECIDED
 
 ONLY_KEYPOINTS = LikelihoodSettings.of_terms(keypoints=LikelihoodSettings().keypoints)
@@ -164,9 +165,9 @@ def test_heaviest_modes_explain_the_joints(follow, camera, human32, motion, keyp
 def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     follow, camera, human32, motion, keypoints_of
 ):
-    """exp(-energy) at the modes of the posterior, normalised, with the ground off.
+    """exp(-energy) at the modes of the posterior, times their volumes, with the ground off.
 
-    And the whole curvature: nothing is discounted.
+    And the whole curvature: nothing is discounted, so that the mixture is exp(-energy) itself.
     """
     tracker, mixtures, _ = follow(frames=4, ground=OFF)
     posterior, likelihood = mixtures[-1]
@@ -174,7 +175,10 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     seen = Observation(keypoints=keypoints_of(human32, motion[3], 1.0, 3), beliefs=used.beliefs)
     likelihood_of = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).given(seen)
     energy = likelihood_of.energy(posterior.means)
-    weights = np.exp(energy.value.min() - energy.value)
+    gradient, hessian = energy.derivatives()
+    free = ~resting(posterior.means, gradient, human32.lower, human32.upper)
+    volumes = np.sqrt(np.linalg.det(1e3 * free_covariances(hessian, free)))
+    weights = volumes * np.exp(energy.value.min() - energy.value)
     order = np.argsort(-weights, kind='stable')
     assert np.allclose(likelihood.weights, (weights / weights.sum())[order], rtol=1e-9)
     lower, upper = human32.lower + 1e-6, human32.upper - 1e-6
@@ -187,6 +191,10 @@ def test_weights_of_the_likelihood_are_those_of_the_image_alone(
     # All cues have one error model today; the mean over those that speak is among theirs.
     shares = [errors.independent for errors in ERRORS.values()]
     assert min(shares) <= tracker.likelihood_errors.independent <= max(shares)
+    # What is not known of the lengths is beside it: of the place the distance, above all.
+    unknown = tracker.shape_covariance
+    assert np.linalg.eigvalsh(unknown).min() > -1e-9
+    assert np.diagonal(unknown)[:3].argmax() == 2
     # Its log at the means is that of the image, without the prior of the body.
     frames = forward(tracker.body.skeleton, likelihood.means)
     term = ImageLikelihood(tracker.body, camera, ONLY_KEYPOINTS).keypoint_term(seen, None)
