@@ -46,9 +46,10 @@ from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.inference.reduction import leaders, led
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Output
+from hmt_ros.sessions.image_evidence import wider
 from hmt_ros.sessions.smoothed_messages import SmoothedBody
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
-from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession, wider
+from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from hmt_ros.smoothing.path_hypotheses import SAME_MOTION
 from hmt_ros.tracking import TrackerSettings

@@ -30,10 +30,9 @@ same order give the same bytes. The rules:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -41,8 +40,14 @@ from hmt_ros.body import Body, load_body, named_body
 from hmt_ros.body.whole_turns import endless, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.sessions.handled import Fault, Handled, Output
+from hmt_ros.sessions.image_evidence import (
+    Evidence,
+    KeptMixtures,
+    OpenPose,
+    evidence_of,
+    wider,
+)
 from hmt_ros.sessions.session import Order, Session, SessionState, everything
 from hmt_ros.sessions.smoothed_messages import (
     TOPICS,
@@ -55,7 +60,6 @@ from hmt_ros.sessions.smoothed_messages import (
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.warm_up import likelihoods
 from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow, TrajectoryMixture
-from hmt_ros.smoothing.likelihood import counted, merged_modes, or_missed
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
@@ -65,7 +69,6 @@ from msg_tools.messages.message_error import MessageFault
 from msg_tools.messages.pose_mixtures import (
     MixtureKind,
     PoseMixture,
-    TrackState,
     pose_mixture_of,
 )
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
@@ -73,8 +76,6 @@ from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 MIXTURE = 'likelihood_mixture'
 FINISH = 'finish'  # what `finish` calls the end of the stream
 NOBODY = 'nobody'  # status while nobody is in view
-# Time of the free motion that tells how far a pose may be from where an image shows it, s.
-ASTRAY = 1.0
 # Change of a length from one mixture to the next above which it is another person's, m.
 SAME_PERSON = 0.02
 
@@ -112,68 +113,6 @@ class SmootherState(SessionState):
             ('gaps', str(self.gaps)),
             ('longest gap, s', f'{self.longest_gap:.3f}'),
         ]
-
-
-class Evidence(NamedTuple):
-    """What an image says of the pose.
-
-    Attributes:
-        stamp: of the image.
-        mixture: the whole of it.
-        errors: how long errors last.
-        shape: (d, d) covariance of what poses of all images err by alike; None: unknown.
-    """
-
-    stamp: int
-    mixture: GaussianMixture
-    errors: CueErrors
-    shape: Array | None
-
-    def since(self, before: int | None, rates: Array, distance: float) -> GaussianMixture:
-        """What counts of it after an image at the stamp `before`; None: there is none.
-
-        Args:
-            before: ns.
-            rates: (d,) variances of free motion, per second.
-            distance: below which modes are merged, in standard deviations of what counts.
-        """
-        dt = self._interval(before)
-        share = self.errors.share(dt)
-        apart = merged_modes(self.mixture, distance / math.sqrt(share))
-        return or_missed(counted(apart, share, self.errors.of_changes(dt)), ASTRAY * rates)
-
-    def lasting(self, before: int | None) -> float:
-        """Factor on the variance that is left after it, because its errors last."""
-        return self.errors.lasting(self._interval(before))
-
-    def _interval(self, before: int | None) -> float:
-        return math.inf if before is None else (self.stamp - before) / SECOND_NS
-
-
-class OpenPose(NamedTuple):
-    """What is told of an image besides its poses.
-
-    Attributes:
-        state: of the track in the filter.
-        existence: probability that a person is in view, in the filter.
-        shape: as of `Evidence`.
-    """
-
-    state: TrackState
-    existence: float
-    shape: Array | None
-
-
-class KeptMixtures(NamedTuple):
-    """Likelihoods that have been smoothed since the window began, the newest.
-
-    Attributes:
-        of: person of the poses; None: no mixture has come.
-        items: as they were received.
-    """
-
-    of: SmoothedBody | None
-    items: tuple[Evidence, ...]
 
 
 class SmootherSession(Session[SmootherParameters, SmootherState]):
@@ -243,7 +182,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             if content.kind is MixtureKind.LIKELIHOOD and not len(content.weights):
                 self._take_nobody(stamp, content.existence_probability)
                 return
-            evidence, of = _evidence(content), self._whose(content)
+            evidence, of = evidence_of(content), self._whose(content)
         except MessageError as error:
             self._log.skip(error.fault, f'mixture of {stamp} ns: {error}')
             return
@@ -481,30 +420,6 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         )
 
 
-def _evidence(content: PoseMixture) -> Evidence:
-    """What a mixture says, and how its errors last; of a kind without errors they do not.
-
-    Raises:
-        MessageError: there are no components or no covariances; a forecast; a likelihood that does
-            not tell how its errors last.
-    """
-    if content.kind is MixtureKind.FORECAST:
-        raise MessageError(
-            'mixture is of the kind FORECAST, wanted LIKELIHOOD: no image speaks of a forecast',
-            MessageFault.KIND,
-        )
-    mixture, share, time = content.mixture, content.error_share, content.error_time
-    if math.isnan(share) or math.isnan(time):
-        if content.kind is MixtureKind.LIKELIHOOD:
-            raise MessageError(
-                f'likelihood has error_share {share:g} and error_time {time:g}, wanted numbers: '
-                'earlier versions lack them; record the bag again with this version',
-                MessageFault.ERRORS,
-            )
-        share, time = 1.0, 0.0
-    return Evidence(content.stamp_ns, mixture, CueErrors(share, time), content.shape_covariance)
-
-
 def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
     """The body of a name, or of a file where `load` takes one.
 
@@ -521,11 +436,6 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
 def _shapes(items: Iterable[tuple[int, Array | None]]) -> dict[int, Array]:
     """Those that are known, by stamp."""
     return {stamp: shape for stamp, shape in items if shape is not None}
-
-
-def wider(mixture: GaussianMixture, covariance: Array) -> GaussianMixture:
-    """The mixture with a covariance (d, d) added to that of every component."""
-    return replace(mixture, covariances=mixture.covariances + covariance)
 
 
 def _limits(body: Body) -> tuple[Array, Array]:

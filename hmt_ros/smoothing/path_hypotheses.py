@@ -7,7 +7,7 @@ A path that goes on to mode k of the next image has the state and the weight
 where C takes the pose out of the state. So weights are those of the components of the posterior.
 The network of VMS 4 weighs a path by pairs of neighbours (`paths`), and a pair knows nothing of
 what was before it: where most modes are wide, a path may turn round and back. In every image few
-paths are kept of all: those whose poses are apart, and then the heaviest.
+paths are kept of all: some that are apart, and the heaviest.
 """
 
 from __future__ import annotations

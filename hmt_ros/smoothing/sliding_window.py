@@ -68,8 +68,8 @@ class WindowUpdate:
 class SlidingWindow:
     """Smooths likelihood mixtures as they arrive.
 
-    Keeps the window's mixtures, the density of the state at its beginning, and the trajectories
-    found last. The same observations in the same order give the same numbers.
+    Keeps the window's mixtures, the paths through them, and the trajectories found last. The same
+    observations in the same order give the same numbers.
 
     Args:
         smoother: how a window is smoothed.
@@ -227,12 +227,12 @@ class SlidingWindow:
         no point of it is farther from it than `SAME_MOTION`; else it is a new motion.
         """
         numbers = np.zeros(len(found), dtype=np.int64)
-        distances, before = self._distances(found)
+        away, before = self._distances(found)
         for i in np.argsort(-found.weights, kind='stable'):
-            j = int(np.argmin(distances[i])) if len(before) else -1
-            if j >= 0 and distances[i, j] <= SAME_MOTION:
+            j = int(np.argmin(away[i])) if len(before) else -1
+            if j >= 0 and away[i, j] <= SAME_MOTION:
                 numbers[i] = before[j]
-                distances[:, j] = np.inf
+                away[:, j] = np.inf
             else:
                 numbers[i] = self.next_identity
                 self.next_identity += 1

@@ -1,0 +1,111 @@
+"""What images say of a pose, as a smoother takes it in, and what of it counts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.error_model import CueErrors
+from hmt_ros.sessions.smoothed_messages import SmoothedBody
+from hmt_ros.smoothing.likelihood import counted, merged_modes, or_missed
+from msg_tools import MessageError
+from msg_tools.messages.headers import SECOND_NS
+from msg_tools.messages.message_error import MessageFault
+from msg_tools.messages.pose_mixtures import MixtureKind, PoseMixture, TrackState
+
+# Time of the free motion that tells how far a pose may be from where an image shows it, s.
+ASTRAY = 1.0
+
+
+class Evidence(NamedTuple):
+    """What an image says of the pose.
+
+    Attributes:
+        stamp: of the image.
+        mixture: the whole of it.
+        errors: how long errors last.
+        shape: (d, d) covariance of what poses of all images err by alike; None: unknown.
+    """
+
+    stamp: int
+    mixture: GaussianMixture
+    errors: CueErrors
+    shape: Array | None
+
+    def since(self, before: int | None, rates: Array, distance: float) -> GaussianMixture:
+        """What counts of it after an image at the stamp `before`; None: there is none.
+
+        Args:
+            before: ns.
+            rates: (d,) variances of free motion, per second.
+            distance: below which modes are merged, in standard deviations of what counts.
+        """
+        dt = self._interval(before)
+        share = self.errors.share(dt)
+        apart = merged_modes(self.mixture, distance / math.sqrt(share))
+        return or_missed(counted(apart, share, self.errors.of_changes(dt)), ASTRAY * rates)
+
+    def lasting(self, before: int | None) -> float:
+        """Factor on the variance that is left after it, because its errors last."""
+        return self.errors.lasting(self._interval(before))
+
+    def _interval(self, before: int | None) -> float:
+        return math.inf if before is None else (self.stamp - before) / SECOND_NS
+
+
+class OpenPose(NamedTuple):
+    """What is told of an image besides its poses.
+
+    Attributes:
+        state: of the track in the filter.
+        existence: probability that a person is in view, in the filter.
+        shape: as of `Evidence`.
+    """
+
+    state: TrackState
+    existence: float
+    shape: Array | None
+
+
+class KeptMixtures(NamedTuple):
+    """Likelihoods that have been smoothed since the window began, the newest.
+
+    Attributes:
+        of: person of the poses; None: no mixture has come.
+        items: as they were received.
+    """
+
+    of: SmoothedBody | None
+    items: tuple[Evidence, ...]
+
+
+def evidence_of(content: PoseMixture) -> Evidence:
+    """What a mixture says, and how its errors last; of a kind without errors they do not.
+
+    Raises:
+        MessageError: there are no components or no covariances; a forecast; a likelihood that does
+            not tell how its errors last.
+    """
+    if content.kind is MixtureKind.FORECAST:
+        raise MessageError(
+            'mixture is of the kind FORECAST, wanted LIKELIHOOD: no image speaks of a forecast',
+            MessageFault.KIND,
+        )
+    mixture, share, time = content.mixture, content.error_share, content.error_time
+    if math.isnan(share) or math.isnan(time):
+        if content.kind is MixtureKind.LIKELIHOOD:
+            raise MessageError(
+                f'likelihood has error_share {share:g} and error_time {time:g}, wanted numbers: '
+                'earlier versions lack them; record the bag again with this version',
+                MessageFault.ERRORS,
+            )
+        share, time = 1.0, 0.0
+    return Evidence(content.stamp_ns, mixture, CueErrors(share, time), content.shape_covariance)
+
+
+def wider(mixture: GaussianMixture, covariance: Array) -> GaussianMixture:
+    """The mixture with a covariance (d, d) added to that of every component."""
+    return replace(mixture, covariances=mixture.covariances + covariance)
