@@ -96,6 +96,7 @@ class Seen(NamedTuple):
     likelihood: GaussianMixture
     errors: CueErrors
     shape_covariance: Array
+    point: Array
 
 
 class Work(NamedTuple):
@@ -181,7 +182,10 @@ def of_clip(work: Work) -> dict[str, dict[str, float]]:
         result[way] = {name: float(scores[name]) for name in SCORES}
         result[way][MODES] = modes_apart(record)
     own = records[FILTER]
-    result[POINT] = _scores_of_joints(own, own.point)
+    points = {
+        x.stamp: GaussianMixture([1.0], x.point[None], x.posterior.covariances[:1]) for x in seen
+    }
+    result[POINT] = _scores_of_joints(own, record_of(clip, seen, points).point)
     result[VITERBI] = _scores_of_joints(own, viterbi_joints(own))
     weights = own.weights / own.weights.sum(1, keepdims=True)
     every = np.nan_to_num(own.joints)
@@ -269,6 +273,7 @@ def tracked(clip: Clip, inputs: str, gravity: str) -> list[Seen]:
                     likelihood,
                     tracker.likelihood_errors,
                     tracker.shape_covariance,
+                    tracker.point_estimate,
                 )
             )
     return result

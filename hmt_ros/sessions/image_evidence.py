@@ -46,7 +46,9 @@ class Evidence(NamedTuple):
         dt = self._interval(before)
         share = self.errors.share(dt)
         apart = merged_modes(self.mixture, distance / math.sqrt(share))
-        return or_missed(counted(apart, share, self.errors.of_changes(dt)), ASTRAY * rates)
+        return or_missed(
+            counted(apart, self.errors.of_modes(dt), self.errors.of_changes(dt)), ASTRAY * rates
+        )
 
     def lasting(self, before: int | None) -> float:
         """Factor on the variance that is left after it, because its errors last."""

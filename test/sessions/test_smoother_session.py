@@ -166,8 +166,8 @@ def test_a_span_is_discounted_from_its_first_image_on(session, likelihoods):
     first, last = likelihoods.stamp(1), likelihoods.stamp(3)
     found = trajectory_mixture_of(one.smooth_span(first, last))
     share, changes = 0.5 * np.tanh(0.5), 0.5 / (1.0 - np.exp(-2.0))
-    counts = [counted(likelihoods.mixture(1), 0.5)]
-    counts += [counted(likelihoods.mixture(i), share, changes) for i in (2, 3)]
+    counts = [counted(likelihoods.mixture(1), 1.0, 0.5)]
+    counts += [counted(likelihoods.mixture(i), np.tanh(0.5), changes) for i in (2, 3)]
     mixtures = [or_missed(one, likelihoods.body.rates) for one in counts]
     smoother = one._smoother(likelihoods.body, MixtureSmoother)
     wanted = smoother.smooth(mixtures, stamps_ns=[likelihoods.stamp(i) for i in (1, 2, 3)])

@@ -33,7 +33,9 @@ def seen():
         means[1, elbow] += 1.0
         means = np.clip(means, body.lower, body.upper)
         mixture = GaussianMixture([0.6, 0.4], means, np.tile(1e-3 * np.eye(len(pose)), (2, 1, 1)))
-        result.append(Seen(t * 66_000_000, body, mixture, mixture, CueErrors(0.15, 0.019), unknown))
+        result.append(
+            Seen(t * 66_000_000, body, mixture, mixture, CueErrors(0.15, 0.019), unknown, pose)
+        )
     return result
 
 

@@ -107,7 +107,7 @@ def test_likelihoods_are_smoothed_live_and_together():
         )
         stamp = 33_000_000 * (t + 1)
         seen.append(
-            smoothing_clips.Seen(stamp, body, mixture, mixture, CueErrors(1.0, 0.0), unknown)
+            smoothing_clips.Seen(stamp, body, mixture, mixture, CueErrors(1.0, 0.0), unknown, pose)
         )
     found = smoothing_clips.smoothed(seen)
     live, offline = found['live'], found['offline']
