@@ -262,7 +262,7 @@ def test_data_files_are_installed() -> None:
 HEADS = {
     'smoothing/variational_mixture.py': '    F(q) = KL(q || p(X | R)) - log p(R) =',
     'smoothing/mode_sequence.py': '    w_k N(X; M_k, P_k^-1),',
-    'smoothing/sliding_window.py': "    w_i w_k N(x; A m_i, A S_i A' + Q) N(C x; mu_k, S_k)",
+    'smoothing/path_hypotheses.py': '    N(x; A m,',
     'smoothing/trajectory_refinement.py': '    E(X) = -log p(x_1) - sum_t log p(x_t | x_{t-1})',
     'inference/trust_region.py': '    rho = (E(x) - E(x + s)) / (m(0) - m(s))',
     'inference/reduction.py': '    w = sum_i w_i,   m = sum_i w_i m_i / w,',
