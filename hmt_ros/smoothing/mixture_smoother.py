@@ -331,7 +331,7 @@ class PathSmoother(MixtureSmoother):
     every path through their modes. The components of the most probable paths that differ, with the
     weights that they have in the posterior, are the result; neither optima nor the free energy are
     descended to, which costs fifty times as much. Modes that overlap share their mass among many
-    paths and should be merged before (`reduction.merged_if_close`).
+    paths and should be merged before (`likelihood.merged_modes`).
 
     `adapt`, `start` and `max_iterations` have no meaning here, nor has `seed`; the result has no
     free energy. Means beyond the limits are moved onto them.

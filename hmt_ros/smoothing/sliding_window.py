@@ -3,8 +3,8 @@
 The window holds the newest poses, and the paths through their modes that are probable, which are
 filtered one by one (`path_hypotheses`). What came before it are the states of these paths at its
 first time: the window is smoothed with their density in the place of the first likelihood, so that
-a new image costs the same however long the sequence is. A pose is
-final before it is older than the newest one by more than the lag.
+a new image costs the same however long the sequence is. A pose is final before it is older than the
+newest one by more than the lag.
 """
 
 from __future__ import annotations

@@ -374,4 +374,5 @@ def test_of_two_poses_with_one_stamp_the_first_counts(body, poses, tmp_path):
 def test_bags_of_the_report_have_a_motion(body, poses, tmp_path):
     """Whoever writes a bag in a namespace finds its topics as well."""
     bag = write_out(tmp_path / 'out', body, poses, namespace='/humans/bodies/p1')
-    exported(bag, tmp_path / 'd.bvh', '--topic', 'smoothed_pose_mixture')
+    found = exported(bag, tmp_path / 'd.bvh', '--topic', 'smoothed_pose_mixture')
+    assert found.read_text().startswith('HIERARCHY\nROOT pelvis\n')
