@@ -8,7 +8,7 @@ images count as independent, as they do there; `smoother_node` counts what is ne
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from benchmarks.smoothing_clips import Seen
 from hmt_ros.body import Body
 from hmt_ros.body.motion_prior import motion_prior
-from hmt_ros.body.whole_turns import endless, without_turns
+from hmt_ros.body.whole_turns import free_limits, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.energy import Derivatives
+from hmt_ros.sessions.image_evidence import Evidence
+from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.smoothing.likelihood import counted
 from hmt_ros.smoothing.mode_sequence import ModeSequence
 from hmt_ros.smoothing.paths import Paths, visiting_probabilities
@@ -101,10 +103,8 @@ def clip_trajectories(
     body, dynamics = seen[-1].body, motion_prior(seen[-1].body)
     stamps = [one.stamp for one in seen]
     intervals = np.diff(stamps) * 1e-9
-    free = endless(body)
-    free[:3] = True
-    lower, upper = np.where(free, -np.inf, body.lower), np.where(free, np.inf, body.upper)
-    mixtures = _evidence(seen, body, intervals, independent)
+    lower, upper = free_limits(body)
+    mixtures = _evidence(seen, body, independent)
     sequence = ModeSequence(mixtures, dynamics, intervals)
     paths = sequence.paths(PATHS, through_modes=through_modes)
     starts = sequence.states(paths)
@@ -123,19 +123,20 @@ def clip_trajectories(
     )
 
 
-def _evidence(
-    seen: Sequence[Seen], body: Body, intervals: Array, independent: bool
-) -> tuple[GaussianMixture, ...]:
+def _evidence(seen: Sequence[Seen], body: Body, independent: bool) -> tuple[GaussianMixture, ...]:
     """Likelihoods, on angles that go on from image to image."""
-    result: list[GaussianMixture] = []
-    for one, dt in zip(seen, [np.inf, *intervals], strict=True):
+    whole: list[GaussianMixture] = []
+    for one in seen:
         mixture = one.likelihood
-        before = result[-1].means if result else mixture.means[[int(mixture.weights.argmax())]]
-        means = without_turns(body, mixture.means, before)
-        whole = GaussianMixture(mixture.weights, means, mixture.covariances)
-        shares = (one.errors.share(dt), one.errors.of_changes(dt))
-        result.append(counted(whole, 1.0) if independent else counted(whole, *shares))
-    return tuple(result)
+        before = whole[-1].means if whole else mixture.means[[int(mixture.weights.argmax())]]
+        whole.append(replace(mixture, means=without_turns(body, mixture.means, before)))
+    if independent:
+        return tuple(counted(mixture, 1.0) for mixture in whole)
+    distance, befores = SmootherParameters().merge_distance, [None, *(x.stamp for x in seen)]
+    return tuple(
+        Evidence(x.stamp, mixture, x.errors, None).since(before, body.rates, distance)
+        for x, mixture, before in zip(seen, whole, befores)
+    )
 
 
 def _observed(sequence: ModeSequence, states: Array) -> Array:

@@ -19,6 +19,13 @@ def endless(body: Body) -> Mask:
     return np.asarray(body.skeleton.dof_is_rotation & (body.upper - body.lower >= TURN))
 
 
+def free_limits(body: Body) -> tuple[Array, Array]:
+    """Limits (d,) of poses in any frame: the place and the turns of the root have none."""
+    free = endless(body)
+    free[:3] = True
+    return np.where(free, -np.inf, body.lower), np.where(free, np.inf, body.upper)
+
+
 def without_turns(body: Body, poses: Array, before: Array) -> Array:
     """Poses (K, d) whose angles are within half a turn of the nearest pose before (L, d).
 

@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 
 from hmt_ros.body import Body, load_body, named_body
-from hmt_ros.body.whole_turns import endless, without_turns
+from hmt_ros.body.whole_turns import free_limits, without_turns
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
 from hmt_ros.sessions.handled import Fault, Handled, Output
@@ -325,7 +325,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         kind = closed_form if p.method == 'paths' else MixtureSmoother
         return kind(
             p.dynamics.of(body),
-            *_limits(body),
+            *free_limits(body),
             p.max_trajectories,
             through_modes=p.through_modes,
             points=body.relative_joints,
@@ -436,13 +436,6 @@ def known_body(name: str, load: Callable[[str], Body] = load_body) -> Body:
 def _shapes(items: Iterable[tuple[int, Array | None]]) -> dict[int, Array]:
     """Those that are known, by stamp."""
     return {stamp: shape for stamp, shape in items if shape is not None}
-
-
-def _limits(body: Body) -> tuple[Array, Array]:
-    """Limits (d,) of poses in any frame: the place and the turns of the root have none."""
-    free = endless(body)
-    free[:3] = True
-    return np.where(free, -np.inf, body.lower), np.where(free, np.inf, body.upper)
 
 
 def _same(one: SmoothedBody, other: SmoothedBody) -> bool:
