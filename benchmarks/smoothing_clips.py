@@ -43,15 +43,13 @@ from benchmarks.tracking_scores import heaviest_joints, scores_of
 from hmt_ros.body import Body, load_body
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
-from hmt_ros.inference.reduction import leaders, led
+from hmt_ros.inference.reduction import leaders
 from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.handled import Output
-from hmt_ros.sessions.image_evidence import wider
-from hmt_ros.sessions.smoothed_messages import SmoothedBody
+from hmt_ros.sessions.smoothed_messages import poses_apart
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
-from hmt_ros.smoothing.path_hypotheses import SAME_MOTION
 from hmt_ros.tracking import TrackerSettings
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
@@ -301,18 +299,12 @@ def smoothed(seen: Sequence[Seen]) -> dict[str, dict[int, GaussianMixture]]:
         whole, of = session.smoothed_span(PathSmoother)
         assert whole.stamps_ns is not None
         result[way] = {
-            stamp: _published(whole.marginal(t), of, shapes[stamp])
+            stamp: poses_apart(whole, t, of.body, COMPONENTS, shapes[stamp])[0]
             for t, stamp in enumerate(whole.stamps_ns)
         }
     session.finish()
     found = [pose_mixture_of(deserialise(x.data, 'hmt_msgs/msg/PoseMixture')) for x in outputs]
     return {LIVE: {x.stamp_ns: x.mixture for x in found}, **result}
-
-
-def _published(mixture: GaussianMixture, of: SmoothedBody, shape: Array) -> GaussianMixture:
-    """A pose as the node publishes it."""
-    points = of.body.relative_joints(mixture.means)
-    return wider(led(mixture, points, SAME_MOTION, COMPONENTS)[0], shape).normalised()
 
 
 def record_of(clip: Clip, seen: Sequence[Seen], mixtures: dict[int, GaussianMixture]) -> Record:

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 from numpy.lib.stride_tricks import as_strided
-from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs, dtrtri, dtrtrs
+from scipy.linalg.lapack import dpbtrf, dpbtrs, dtbtrs, dtrtri
 
 from hmt_ros.inference.arrays import Array
 from hmt_ros.inference.exact_sums import dot
@@ -163,20 +163,6 @@ class BlockCholesky:
         covariances *= 0.5
         return covariances, neighbours
 
-    def inverse_block(self, t: int, d: int) -> Array:
-        """The leading part (d, d) of block t on the diagonal of P^-1: one marginal covariance.
-
-        With E the first d columns of block t, E' P^-1 E = sum_s y_s' y_s, where L y = E: y is 0
-        before t, and fades after it.
-        """
-        own, below = self.blocks
-        y = dtrtrs(own[t], np.eye(self.size, d), lower=1)[0]
-        result: Array = y.T @ y
-        for s in range(t + 1, self.times):
-            y = dtrtrs(own[s], below[s - 1] @ y, lower=1)[0]
-            result += y.T @ y
-        return np.asarray(0.5 * (result + result.T))
-
     def matrix(self) -> BlockTridiagonal:
         """P."""
         own, below = self.blocks
@@ -205,86 +191,6 @@ class BlockCholesky:
 
     def _rows(self, solution: Array, like: Array) -> Array:
         return np.ascontiguousarray(solution.T).reshape(like.shape)
-
-
-@dataclass(frozen=True, eq=False)
-class BackwardCholesky:
-    """A factor of a block-tridiagonal matrix that is eliminated from the last time on, P = R R'.
-
-        R_t R_t' = D_t - W_t W_t',     W_t = E_t' R_{t+1}'^-1,     R upper block bidiagonal
-
-    Matrices that agree from a time on have the same blocks from there on, which are computed and
-    held once. The first state is eliminated last, so that its covariance costs least.
-
-    Attributes:
-        own: T blocks R_t (n, n), lower triangular.
-        beside: T-1 blocks W_t (n, n), to the right of R_t.
-    """
-
-    own: tuple[Array, ...]
-    beside: tuple[Array, ...]
-
-    @property
-    def times(self) -> int:
-        """T."""
-        return len(self.own)
-
-    @property
-    def size(self) -> int:
-        """n."""
-        return len(self.own[0])
-
-    @cached_property
-    def log_determinant(self) -> float:
-        """log |P|."""
-        return float(2.0 * sum(np.log(np.diagonal(block)).sum() for block in self.own))
-
-    def solve_transposed(self, right: Array) -> Array:
-        """R'^-1 b of right sides b (..., T, n): white noise becomes noise of covariance P^-1."""
-        result = np.array(right)
-        columns = result.reshape(-1, self.times, self.size)
-        for t, block in enumerate(self.own):
-            if t > 0:
-                columns[:, t] -= columns[:, t - 1] @ self.beside[t - 1]
-            columns[:, t] = dtrtrs(block, columns[:, t].T, lower=1, trans=1)[0].T
-        return result
-
-    def whiten(self, x: Array) -> Array:
-        """R' x of trajectories x (..., T, n), so that x' P x = |R' x|^2."""
-        result = np.stack([x[..., t, :] @ block for t, block in enumerate(self.own)], axis=-2)
-        for t, block in enumerate(self.beside):
-            result[..., t + 1, :] += x[..., t, :] @ block
-        return result
-
-    def inverse_blocks(self) -> tuple[Array, Array]:
-        """As `BlockCholesky.inverse_blocks`: C_{t+1} = (R_{t+1} R_{t+1}')^-1 + G_t C_t G_t'.
-
-        Cov(x_{t+1}, x_t) = -G_t C_t,     G_t = R_{t+1}'^-1 W_t'
-        """
-        inverse = np.array([dtrtri(block, lower=1)[0] for block in self.own])
-        covariances = inverse.swapaxes(1, 2) @ inverse
-        neighbours = np.empty_like(covariances[1:])
-        for t, block in enumerate(self.beside):
-            gain = inverse[t + 1].T @ block.T
-            neighbours[t] = -gain @ covariances[t]
-            covariances[t + 1] -= neighbours[t] @ gain.T
-        return 0.5 * (covariances + covariances.swapaxes(1, 2)), neighbours
-
-    def inverse_block(self, t: int, d: int) -> Array:
-        """As `BlockCholesky.inverse_block`; the later the time the more it costs."""
-        y = dtrtrs(self.own[t], np.eye(self.size, d), lower=1)[0]
-        result: Array = y.T @ y
-        for s in range(t - 1, -1, -1):
-            y = dtrtrs(self.own[s], self.beside[s] @ y, lower=1)[0]
-            result += y.T @ y
-        return np.asarray(0.5 * (result + result.T))
-
-    def matrix(self) -> BlockTridiagonal:
-        """P."""
-        own, beside = np.array(self.own), np.array(self.beside).reshape(-1, self.size, self.size)
-        diagonal = own @ own.swapaxes(1, 2)
-        diagonal[:-1] += beside @ beside.swapaxes(1, 2)
-        return BlockTridiagonal(diagonal, own[1:] @ beside.swapaxes(1, 2))
 
 
 def bandwidth(lower: Array, n: int) -> int:

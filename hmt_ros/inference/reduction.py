@@ -20,7 +20,6 @@ so that the mean and the covariance of the whole mixture stay. What is merged di
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -105,15 +104,13 @@ def leaders(
     return np.array(result, dtype=np.intp)
 
 
-def led(
-    mixture: GaussianMixture, points: Array, least: float, count: int
-) -> tuple[GaussianMixture, Index]:
-    """Components that are apart, with the weights of those that are near, and their indices.
+def led(weights: Array, points: Array, least: float, count: int) -> tuple[Array, Index]:
+    """Indices of components that are apart, and their weights with those of what is near them.
 
     Nothing is averaged: a mean over motions trembles as their weights do.
 
     Args:
-        mixture: N components.
+        weights: (N,).
         points: (N, P, 3) of which one has to be apart, m.
         least, count: as for `leaders`.
     """
@@ -122,11 +119,11 @@ def led(
         return np.asarray(np.linalg.norm(points - points[i], axis=2).max(1))
 
     with np.errstate(divide='ignore'):
-        chosen = leaders(np.log(mixture.weights), distances, least, count)
+        chosen = leaders(np.log(weights), distances, least, count)
     owner = np.argmin([distances(int(i)) for i in chosen], axis=0)
-    weights = np.zeros(len(chosen))
-    np.add.at(weights, owner, mixture.weights)
-    return replace(mixture[chosen], weights=weights), chosen
+    together = np.zeros(len(chosen))
+    np.add.at(together, owner, weights)
+    return together, chosen
 
 
 # cost(weights, means, covariances, log determinants, pairs (P, 2)) of merging each pair, (P,)

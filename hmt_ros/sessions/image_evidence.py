@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 from hmt_ros.inference import GaussianMixture
@@ -106,8 +105,3 @@ def evidence_of(content: PoseMixture) -> Evidence:
             )
         share, time = 1.0, 0.0
     return Evidence(content.stamp_ns, mixture, CueErrors(share, time), content.shape_covariance)
-
-
-def wider(mixture: GaussianMixture, covariance: Array) -> GaussianMixture:
-    """The mixture with a covariance (d, d) added to that of every component."""
-    return replace(mixture, covariances=mixture.covariances + covariance)

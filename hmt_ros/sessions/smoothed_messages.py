@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from hmt_ros.body import Body
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.reduction import led
 from hmt_ros.sessions.session import PublishedTopic
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
@@ -135,6 +135,7 @@ def final_messages(
     pose: FinalPose,
     of: SmoothedBody,
     *,
+    shape: Array | None,
     state: TrackState,
     existence_probability: float,
     components: int,
@@ -147,6 +148,7 @@ def final_messages(
         messages: factory.
         pose: its density.
         of: whose pose it is.
+        shape: (d, d) added to covariances: what poses of all images err by alike; None: nothing.
         state: of the track at that time.
         existence_probability: that a person was in view, in the filter at that time; NaN: unknown.
         components: maximum number of components of the message.
@@ -158,12 +160,10 @@ def final_messages(
     """
     if not wanted('smoothed_pose_mixture') and not wanted('smoothed_joint_states'):
         return
-    points = of.body.relative_joints(pose.mixture.means)
-    mixture, motions = led(pose.mixture, points, SAME_MOTION, components)
-    mixture = mixture.normalised()
+    mixture, motions = poses_apart(pose.trajectories, pose.t, of.body, components, shape)
     content = PoseMixture.of_body(
         of.body,
-        GaussianMixture(mixture.weights, mixture.means, _symmetric(np.array(mixture.covariances))),
+        replace(mixture, covariances=_symmetric(mixture.covariances)),
         MixtureKind.SMOOTHED,
         pose.stamp_ns,
         of.frame_id,
@@ -177,6 +177,26 @@ def final_messages(
         publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
     if wanted('smoothed_joint_states'):
         publish('smoothed_joint_states', heaviest_joint_state(messages, content))
+
+
+def poses_apart(
+    found: TrajectoryMixture, t: int, body: Body, components: int, shape: Array | None
+) -> tuple[GaussianMixture, Index]:
+    """The poses of motions that are apart at index t, and the indices of their trajectories.
+
+    Args:
+        found: M trajectories.
+        t: index of the time.
+        body: of the poses.
+        components: at most.
+        shape: (d, d) added to covariances: what poses of all images err by alike; None: nothing.
+    """
+    points = body.relative_joints(found.means[:, t])
+    weights, motions = led(found.weights, points, SAME_MOTION, components)
+    poses = replace(found.marginal(t, motions), weights=weights).normalised()
+    if shape is not None:
+        poses = replace(poses, covariances=poses.covariances + shape)
+    return poses, motions
 
 
 def nobody_messages(

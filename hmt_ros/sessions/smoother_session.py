@@ -31,7 +31,7 @@ same order give the same bytes. The rules:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,6 @@ from hmt_ros.sessions.image_evidence import (
     KeptMixtures,
     OpenPose,
     evidence_of,
-    wider,
 )
 from hmt_ros.sessions.session import Order, Session, SessionState, everything
 from hmt_ros.sessions.smoothed_messages import (
@@ -344,12 +343,11 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
 
     def _publish_final(self, pose: FinalPose, of: SmoothedBody) -> None:
         told = self._open.pop(pose.stamp_ns)
-        if told.shape is not None:
-            pose = replace(pose, mixture=wider(pose.mixture, told.shape))
         final_messages(
             self._messages,
             pose,
             of,
+            shape=told.shape,
             state=told.state,
             existence_probability=told.existence,
             components=self.parameters.max_hypotheses,

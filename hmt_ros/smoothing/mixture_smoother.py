@@ -12,17 +12,17 @@ from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array
-from hmt_ros.inference.block_tridiagonal import BackwardCholesky, BlockCholesky
+from hmt_ros.inference.block_tridiagonal import BlockCholesky
 from hmt_ros.inference.energy import Derivatives
 from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, TrajectoryPrior
 from hmt_ros.smoothing.likelihood import LikelihoodPart, SequenceLikelihood, check_mixtures
 from hmt_ros.smoothing.mode_sequence import (
     ModeSequence,
     path_gaussians,
-    path_gaussians_from_the_end,
 )
-from hmt_ros.smoothing.path_hypotheses import probable_paths
+from hmt_ros.smoothing.path_hypotheses import FilteredPaths
 from hmt_ros.smoothing.paths import Paths
+from hmt_ros.smoothing.smoothed_paths import SmoothedPath, smoothed_paths
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states, refine
 from hmt_ros.smoothing.variational_mixture import (
@@ -157,8 +157,8 @@ class MixtureSmoother:
 
     def paths(self, sequence: ModeSequence) -> Paths:
         """The paths that trajectories start from."""
-        if sequence.given is not None:
-            return sequence.given
+        if sequence.filtered is not None:
+            return sequence.filtered.paths
         return sequence.paths(self.max_trajectories, through_modes=self.through_modes)
 
     def optima(self, sequence: ModeSequence, likelihood: SequenceLikelihood) -> Candidates:
@@ -285,7 +285,7 @@ class MixtureSmoother:
         self,
         weights: Array,
         states: Array,
-        factors: Sequence[BlockCholesky | BackwardCholesky],
+        factors: Sequence[BlockCholesky | SmoothedPath],
         inflation: Array,
         prior: TrajectoryPrior,
         likelihood: SequenceLikelihood,
@@ -339,11 +339,17 @@ class PathSmoother(MixtureSmoother):
 
     def paths(self, sequence: ModeSequence) -> Paths:
         """The paths whose Gaussians are the result."""
-        if sequence.given is not None or sequence.first is not None:
-            return super().paths(sequence)
-        return probable_paths(
-            sequence.mixtures, self.dynamics, sequence.intervals, self.max_trajectories, self.points
-        )
+        return self._filtered(sequence).paths
+
+    def _filtered(self, sequence: ModeSequence) -> FilteredPaths:
+        if sequence.filtered is not None:
+            return sequence.filtered
+        paths = FilteredPaths(self.dynamics, self.max_trajectories, self.points, sequence.first)
+        # Before the very first mixture there is no interval.
+        before = [0.0] if sequence.first is None else []
+        for mixture, interval in zip(sequence.mixtures, [*before, *sequence.intervals]):
+            paths.add(mixture, float(interval))
+        return paths
 
     def smooth_sequence(
         self,
@@ -359,11 +365,10 @@ class PathSmoother(MixtureSmoother):
         """
         if observation is not None:
             raise ValueError('paths are smoothed by the mixtures alone, without an observation')
-        states, log_weights, factors = path_gaussians_from_the_end(
-            self.paths(sequence).nodes, sequence.prior, sequence.likelihood
-        )
+        steps = self._filtered(sequence).steps
+        states, factors = smoothed_paths(steps)
         return self._mixture(
-            np.exp(log_weights - logsumexp(log_weights)),
+            np.exp(steps[-1].log_weights),
             np.clip(states, *self._limits()),
             factors,
             np.ones(len(states)),

@@ -21,14 +21,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg.lapack import dtrtrs
 
 from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.block_tridiagonal import (
-    BackwardCholesky,
     BlockCholesky,
-    NotPositiveDefiniteError,
     add_diagonal,
     factorise_band,
 )
@@ -36,6 +33,7 @@ from hmt_ros.inference.linear_gaussian_dynamics import LinearGaussianDynamics, T
 from hmt_ros.inference.reduction import merged_if_close
 from hmt_ros.smoothing.embedded_network import EmbeddedNetwork, embedded_network
 from hmt_ros.smoothing.likelihood import MixtureLikelihood, WindowLikelihood
+from hmt_ros.smoothing.path_hypotheses import FilteredPaths
 from hmt_ros.smoothing.paths import (
     Paths,
     distinct_paths,
@@ -58,7 +56,7 @@ class ModeSequence:
         intervals: (T-1,) s.
         first: a density of the first state, over n variables, in the place of a likelihood.
         known: with `first`: -log of `mixtures` alone; None: it is to be made.
-        given: paths that are known to be probable; None: they are to be found.
+        filtered: paths that were filtered; None: they are to be found.
     """
 
     mixtures: tuple[GaussianMixture, ...]
@@ -66,7 +64,7 @@ class ModeSequence:
     intervals: Array
     first: GaussianMixture | None = None
     known: MixtureLikelihood | None = None
-    given: Paths | None = None
+    filtered: FilteredPaths | None = None
 
     @property
     def layers(self) -> tuple[GaussianMixture, ...]:
@@ -132,7 +130,7 @@ class ModeSequence:
     def merged(self, distance: float) -> ModeSequence:
         """The sequence with modes merged that are closer than so many standard deviations."""
         mixtures = tuple(merged_if_close(mixture, distance) for mixture in self.mixtures)
-        return replace(self, mixtures=mixtures, known=None, given=None)
+        return replace(self, mixtures=mixtures, known=None, filtered=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,85 +146,6 @@ class PathGaussians:
     states: Array
     factors: tuple[BlockCholesky, ...]
     log_weights: Array
-
-
-def path_gaussians_from_the_end(
-    nodes: Index, prior: TrajectoryPrior, likelihood: MixtureLikelihood | WindowLikelihood
-) -> tuple[Array, Array, tuple[BackwardCholesky, ...]]:
-    """States, log weights and factors as of `path_gaussians`, eliminated from the last time on.
-
-    What paths have in common from a time on is computed once: those of a window differ in its first
-    state, and few of them after it.
-
-    Raises:
-        NotPositiveDefiniteError: the precision of a path is not positive definite.
-    """
-    count, times = nodes.shape
-    n = prior.information.shape[1]
-    # From the last time to the first: of each path, which of the distinct ends it has; of these
-    # their log weights, the blocks R_t and W_{t-1}, and y_t of R y = right side.
-    owners: list[Index] = []
-    roots: list[Array] = []
-    besides: list[Array] = []
-    whites: list[Array] = []
-    owner, log = np.zeros(count, dtype=np.intp), np.zeros(1)
-    for t in range(times - 1, -1, -1):
-        _, chosen, inverse = np.unique(
-            np.stack([nodes[:, t], owner]), axis=1, return_index=True, return_inverse=True
-        )
-        mode, later, owner = nodes[chosen, t], owner[chosen], inverse.reshape(-1)
-        log_scales, means, precisions = likelihood.modes_at(t)
-        pull = (precisions @ means[:, :, None])[:, :, 0]
-        d = pull.shape[1]
-        log = log[later] + (log_scales - 0.5 * np.einsum('kd,kd->k', means, pull))[mode]
-        matrix = np.tile(prior.precision.diagonal[t], (len(mode), 1, 1))
-        matrix[:, :d, :d] += precisions[mode]
-        right = np.tile(prior.information[t], (len(mode), 1))
-        right[:, :d] += pull[mode]
-        if besides:
-            matrix -= (besides[-1] @ besides[-1].swapaxes(1, 2))[later]
-            right -= (besides[-1] @ whites[-1][:, :, None])[later, :, 0]
-        root = _cholesky(matrix)
-        if root is None:
-            raise NotPositiveDefiniteError(
-                f'the precision of a path is not positive definite at time {t} of {times}'
-            )
-        white = np.array([dtrtrs(r, y, lower=1)[0] for r, y in zip(root, right)])
-        log += 0.5 * (white * white).sum(1)
-        log -= np.log(np.diagonal(root, axis1=1, axis2=2)).sum(1)
-        owners.append(owner)
-        roots.append(root)
-        whites.append(white)
-        if t > 0:
-            coupling = prior.precision.lower[t - 1]
-            besides.append(np.array([dtrtrs(r, coupling, lower=1)[0].T for r in root]))
-    owners, roots, besides, whites = owners[::-1], roots[::-1], besides[::-1], whites[::-1]
-    states = np.empty((count, times, n))
-    for t in range(times):
-        for i, root in enumerate(roots[t]):
-            mine = owners[t] == i
-            right = np.tile(whites[t][i], (mine.sum(), 1))
-            if t > 0:
-                right -= states[mine, t - 1] @ besides[t - 1][i]
-            states[mine, t] = dtrtrs(root, right.T, lower=1, trans=1)[0].T
-    factors = tuple(
-        BackwardCholesky(
-            tuple(root[i] for root, i in zip(roots, ends)),
-            tuple(beside[i] for beside, i in zip(besides, ends[1:])),
-        )
-        for ends in np.stack(owners, axis=1)
-    )
-    return states, log[owner] - prior.constant + 0.5 * times * n * np.log(2 * np.pi), factors
-
-
-def _cholesky(matrices: Array) -> Array | None:
-    """Lower factors of matrices (K, n, n); None: one is not positive definite, or not finite."""
-    try:
-        factors = np.asarray(np.linalg.cholesky(matrices), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return None
-    # numpy lets NaN pass.
-    return factors if np.isfinite(factors[:, -1, -1]).all() else None
 
 
 def path_gaussians(

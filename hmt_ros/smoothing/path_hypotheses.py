@@ -8,6 +8,8 @@ where C takes the pose out of the state. So weights are those of the components 
 The network of VMS 4 weighs a path by pairs of neighbours (`paths`), and a pair knows nothing of
 what was before it: where most modes are wide, a path may turn round and back. In every image few
 paths are kept of all: some that are apart, and the heaviest.
+
+What a path was before, given all of it, follows backwards from its states (`smoothed_paths`).
 """
 
 from __future__ import annotations
@@ -33,6 +35,33 @@ LEAST_LOG_WEIGHT = -690.0
 
 
 @dataclass(frozen=True, eq=False)
+class Passage:
+    """From H paths up to a time to the next one: x' = A x + N(0, Q).
+
+    Attributes:
+        means: (H, n) A m.
+        covariances: (H, n, n) P = A S A' + Q.
+        gains: (H, n, n) G = S A' P^-1 of the paths that go on; 0 of others.
+        transition, noise: A and Q.
+    """
+
+    means: Array
+    covariances: Array
+    gains: Array
+    transition: Array
+    noise: Array
+
+    def __getitem__(self, index: Index) -> Passage:
+        """That of some paths."""
+        return replace(
+            self,
+            means=self.means[index],
+            covariances=self.covariances[index],
+            gains=self.gains[index],
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class PathHypotheses:
     """H paths up to a time, heaviest first.
 
@@ -41,30 +70,51 @@ class PathHypotheses:
         states: (H, n) of the last state; of its weights none is 0.
         parents: (H,) path up to the time before that each continues; empty: there is none before.
         modes: (H,) mode of the last mixture that each goes through.
+        passage: from the paths up to the time before; None: there is none before.
     """
 
     log_weights: Array
     states: GaussianMixture
     parents: Index
     modes: Index
+    passage: Passage | None = None
 
     def __len__(self) -> int:
         return len(self.modes)
 
+    def __getitem__(self, index: Index) -> PathHypotheses:
+        """Some of them, in the order of the index; weights are what they were."""
+        return replace(
+            self,
+            log_weights=self.log_weights[index],
+            states=self.states[index],
+            parents=self.parents[index],
+            modes=self.modes[index],
+        )
+
     @classmethod
     def first(cls, mixture: GaussianMixture, dynamics: LinearGaussianDynamics) -> PathHypotheses:
         """The paths through a first mixture alone, one for each of its modes."""
-        states = first_state(mixture, dynamics)
-        return cls._of(np.log(states.weights), states, np.empty(0, dtype=np.intp), None)
+        return cls.of_states(first_state(mixture, dynamics))
+
+    @classmethod
+    def of_states(cls, states: GaussianMixture) -> PathHypotheses:
+        """Paths that begin in states (H, n)."""
+        nothing = np.empty(0, dtype=np.intp)
+        return cls._of(np.log(states.weights), states, nothing, np.arange(len(states)), None)
 
     @classmethod
     def _of(
-        cls, log: Array, states: GaussianMixture, parents: Index, modes: Index | None
+        cls,
+        log: Array,
+        states: GaussianMixture,
+        parents: Index,
+        modes: Index,
+        passage: Passage | None,
     ) -> PathHypotheses:
         log = log - logsumexp(log)
         weights = np.exp(np.maximum(log, LEAST_LOG_WEIGHT))
-        modes = np.arange(len(log)) if modes is None else modes
-        return cls(log, replace(states, weights=weights), parents, modes)
+        return cls(log, replace(states, weights=weights), parents, modes, passage)
 
     def followed(
         self,
@@ -113,38 +163,96 @@ class PathHypotheses:
         kept = before - gain @ before[:, :d]
         left = kept + (gain @ spread - kept[:, :, :d]) @ gain.swapaxes(1, 2)
         states = GaussianMixture(np.ones(len(i)), fused, 0.5 * (left + left.swapaxes(1, 2)))
-        return self._of(log[chosen], states, i, k)
+        transition, noise = dynamics.transition(interval)
+        gains, go_on = np.zeros_like(covariances), np.unique(i)
+        gains[go_on] = np.linalg.solve(
+            covariances[go_on], transition @ self.states.covariances[go_on]
+        ).swapaxes(1, 2)
+        passage = Passage(means, covariances, gains, transition, noise)
+        return self._of(log[chosen], states, i, k, passage)
 
 
-def probable_paths(
-    mixtures: Sequence[GaussianMixture],
-    dynamics: LinearGaussianDynamics,
-    intervals: Array,
-    count: int,
-    points: Callable[[Array], Array] | None = None,
-) -> Paths:
-    """At most `count` paths through the modes of T mixtures, the best first.
+class FilteredPaths:
+    """The paths through the modes of images that come one after the other.
 
     Args:
-        mixtures: over the pose, all weights positive.
         dynamics: of the state.
-        intervals: (T-1,) s.
-        count: of paths.
+        count: of paths at most.
         points: maps poses (N, d) to points (N, P, 3), m: some paths are apart, see
             `PathHypotheses.followed`; None: they are the heaviest.
+        first: states (H, n) that they begin in; None: the first mixture begins them.
+
+    Attributes:
+        steps: the paths up to each time, of which those are left that go on to the end; of the
+            first time, all.
     """
-    last = PathHypotheses.first(mixtures[0], dynamics)
-    nodes = last.modes[:, None]
-    past = gaps = None if points is None else distances(points(mixtures[0].means))
-    for mixture, interval in zip(mixtures[1:], intervals):
-        if points is not None:
-            gaps = distances(points(mixture.means))
-        last = last.followed(mixture, dynamics, interval, count, gaps, past)
-        nodes = np.concatenate([nodes[last.parents], last.modes[:, None]], axis=1)
-        if past is not None and gaps is not None:
-            before, now = past[np.ix_(last.parents, last.parents)], np.ix_(last.modes, last.modes)
-            past = np.maximum(before, gaps[now])
-    return Paths(nodes, last.log_weights)
+
+    def __init__(
+        self,
+        dynamics: LinearGaussianDynamics,
+        count: int,
+        points: Callable[[Array], Array] | None = None,
+        first: GaussianMixture | None = None,
+    ) -> None:
+        self.dynamics, self.count, self.points = dynamics, count, points
+        self.steps: list[PathHypotheses] = []
+        # Distances of the modes of each time, and of the paths, m.
+        self._gaps: list[Array | None] = []
+        self._past: Array | None = None
+        if first is not None:
+            self._begin(PathHypotheses.of_states(first))
+
+    def add(self, mixture: GaussianMixture, interval: float) -> None:
+        """Goes on to the likelihood of the next pose, `interval` s after the one before."""
+        if not self.steps:
+            self._begin(PathHypotheses.first(mixture, self.dynamics))
+            return
+        gaps = self._distances(mixture.means)
+        step = self.steps[-1].followed(
+            mixture, self.dynamics, interval, self.count, gaps, self._past
+        )
+        if self._past is not None and gaps is not None:
+            before = self._past[np.ix_(step.parents, step.parents)]
+            self._past = np.maximum(before, gaps[np.ix_(step.modes, step.modes)])
+        self.steps.append(step)
+        self._gaps.append(gaps)
+        self._forget_dead_ends()
+
+    def advance(self) -> None:
+        """Takes the oldest time out; what was before the new one are the states of the paths."""
+        del self.steps[0], self._gaps[0]
+        first = self.steps[0]
+        self.steps[0] = replace(
+            first, parents=first.parents[:0], modes=np.arange(len(first)), passage=None
+        )
+        self._gaps[0] = self._distances(first.states.means[:, : self.dynamics.dimension])
+        self._past = distances_of_paths(traced(self.steps), self._gaps)
+
+    @property
+    def paths(self) -> Paths:
+        """The paths, heaviest first; nodes of the first time are its states."""
+        return Paths(traced(self.steps), self.steps[-1].log_weights)
+
+    def _begin(self, first: PathHypotheses) -> None:
+        self.steps.append(first)
+        self._past = self._distances(first.states.means[:, : self.dynamics.dimension])
+        self._gaps.append(self._past)
+
+    def _distances(self, poses: Array) -> Array | None:
+        """Distances (K, K) of poses (K, d), m; None: nothing tells how far they are apart."""
+        return None if self.points is None else distances(self.points(poses))
+
+    def _forget_dead_ends(self) -> None:
+        """Leaves out, of all times but the first, the paths that no later one continues."""
+        for t in range(len(self.steps) - 1, 1, -1):
+            after, step = self.steps[t], self.steps[t - 1]
+            go_on, parents = np.unique(after.parents, return_inverse=True)
+            if len(go_on) == len(step):
+                break
+            assert after.passage is not None
+            passage = after.passage[go_on]
+            self.steps[t] = replace(after, parents=parents.reshape(-1), passage=passage)
+            self.steps[t - 1] = step[go_on]
 
 
 def distances(points: Array) -> Array:

@@ -20,14 +20,7 @@ from hmt_ros.inference.arrays import Array
 from hmt_ros.smoothing.likelihood import MixtureLikelihood
 from hmt_ros.smoothing.mixture_smoother import MixtureSmoother, intervals_of
 from hmt_ros.smoothing.mode_sequence import ModeSequence
-from hmt_ros.smoothing.path_hypotheses import (
-    SAME_MOTION,
-    PathHypotheses,
-    distances,
-    distances_of_paths,
-    traced,
-)
-from hmt_ros.smoothing.paths import Paths
+from hmt_ros.smoothing.path_hypotheses import SAME_MOTION, FilteredPaths
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 
 SECOND_NS = 10**9
@@ -37,19 +30,33 @@ TREMBLE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class FinalPose:
-    """The density of a pose that will not be revised.
+    """A pose that will not be revised.
 
     Attributes:
         stamp_ns: its time.
-        mixture: its marginal, a component for each trajectory of the window.
-        velocities: (M, d) of the components, per second; None: unknown.
-        identities: (M,) of the trajectories.
+        trajectories: of the window, M.
+        t: its index in the window.
     """
 
     stamp_ns: int
-    mixture: GaussianMixture
-    velocities: Array | None
-    identities: tuple[int, ...]
+    trajectories: TrajectoryMixture
+    t: int
+
+    @property
+    def mixture(self) -> GaussianMixture:
+        """Its density, a component for each trajectory of the window."""
+        return self.trajectories.marginal(self.t)
+
+    @property
+    def velocities(self) -> Array | None:
+        """(M, d) per second; None: unknown."""
+        velocities = self.trajectories.velocities
+        return None if velocities is None else velocities[:, self.t]
+
+    @property
+    def identities(self) -> tuple[int, ...]:
+        """(M,) of the trajectories."""
+        return self.trajectories.identities
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +112,10 @@ class SlidingWindow:
         self.next_identity = self.first_identity
         self._stamps: list[int] = []
         self._mixtures: list[GaussianMixture] = []
-        # The same of each mixture, the paths up to it, and how far its modes are apart, m.
+        # The same of each mixture.
         self._likelihoods: list[MixtureLikelihood] = []
-        self._steps: list[PathHypotheses] = []
-        self._gaps: list[Array | None] = []
+        smoother = self.smoother
+        self._paths = FilteredPaths(smoother.dynamics, smoother.max_trajectories, smoother.points)
         self._lasting: list[float] = []
         self._last: TrajectoryMixture | None = None
         # Poses of the window, the oldest, that are final already.
@@ -144,17 +151,8 @@ class SlidingWindow:
                 'window to go back'
             )
         mixture = mixture[mixture.weights > 0]
-        gaps = self._distances_of(mixture.means)
-        if self._steps:
-            step = self._steps[-1].followed(
-                mixture, dynamics, (int(stamp_ns) - self._stamps[-1]) * 1e-9,
-                self.smoother.max_trajectories, gaps,
-                distances_of_paths(traced(self._steps), self._gaps),
-            )  # fmt: skip
-        else:
-            step = PathHypotheses.first(mixture, dynamics)
-        self._steps.append(step)
-        self._gaps.append(gaps)
+        interval = (int(stamp_ns) - self._stamps[-1]) * 1e-9 if self._stamps else 0.0
+        self._paths.add(mixture, interval)
         self._stamps.append(int(stamp_ns))
         self._mixtures.append(mixture)
         self._likelihoods.append(likelihood)
@@ -196,25 +194,17 @@ class SlidingWindow:
 
     def _advance(self) -> None:
         """Takes the oldest pose out."""
-        for every in (
-            self._stamps, self._mixtures, self._likelihoods, self._steps, self._gaps, self._lasting,
-        ):  # fmt: skip
+        for every in (self._stamps, self._mixtures, self._likelihoods, self._lasting):
             del every[0]
-        d = self.smoother.dynamics.dimension
-        self._gaps[0] = self._distances_of(self._steps[0].states.means[:, :d])
-
-    def _distances_of(self, poses: Array) -> Array | None:
-        """Distances (K, K) of poses (K, d), m; None: nothing tells how far they are apart."""
-        points = self.smoother.points
-        return None if points is None else distances(points(poses))
+        self._paths.advance()
 
     def _smooth(self) -> TrajectoryMixture:
         smoother, dynamics = self.smoother, self.smoother.dynamics
         intervals = intervals_of(self._stamps, len(self._stamps), dynamics.step)
         known = MixtureLikelihood.joined(self._likelihoods[1:]) if len(self._stamps) > 1 else None
-        given = Paths(traced(self._steps), self._steps[-1].log_weights)
+        first = self._paths.steps[0].states
         sequence = ModeSequence(
-            tuple(self._mixtures[1:]), dynamics, intervals, self._steps[0].states, known, given
+            tuple(self._mixtures[1:]), dynamics, intervals, first, known, self._paths
         )
         found = smoother.smooth_sequence(sequence, self.seed, self._stamps)
         found = found.widened(sum(self._lasting) / len(self._lasting))
@@ -265,14 +255,5 @@ def _variables(poses: Array) -> Array:
 
 def _final_poses(found: TrajectoryMixture, indices: Sequence[int]) -> tuple[FinalPose, ...]:
     """The poses at some indices."""
-    stamps, velocities = found.stamps_ns, found.velocities
-    assert stamps is not None
-    return tuple(
-        FinalPose(
-            stamps[t],
-            found.marginal(t, alone=len(indices) == 1),
-            None if velocities is None else velocities[:, t],
-            found.identities,
-        )
-        for t in indices
-    )
+    assert found.stamps_ns is not None
+    return tuple(FinalPose(found.stamps_ns[t], found, t) for t in indices)

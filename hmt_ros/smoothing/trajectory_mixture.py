@@ -19,12 +19,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
 from hmt_ros.inference import GaussianMixture
-from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.block_tridiagonal import (
-    BackwardCholesky,
     BlockCholesky,
     BlockTridiagonal,
 )
+from hmt_ros.smoothing.smoothed_paths import SmoothedPath
 
 
 class TrajectoryContent(Protocol):
@@ -66,7 +66,7 @@ class TrajectoryMixture:
 
     weights: Array
     states: Array
-    factors: tuple[BlockCholesky | BackwardCholesky, ...]
+    factors: tuple[BlockCholesky | SmoothedPath, ...]
     inflation: Array
     log_joint: Array
     free_energy: Array
@@ -114,11 +114,20 @@ class TrajectoryMixture:
     @cached_property
     def marginal_covariances(self) -> Array:
         """Covariances of each pose in each component, inflation included, (M, T, d, d)."""
-        d = self.dimension
-        result = np.empty((len(self), self.times, d, d))
-        for i, (factor, scale) in enumerate(zip(self.factors, self.inflation)):
-            result[i] = scale**2 * factor.inverse_blocks()[0][:, :d, :d]
-        return result
+        return np.array([self.covariances_of(i) for i in range(len(self))])
+
+    def covariances_of(self, i: int) -> Array:
+        """Covariances (T, d, d) of the poses of component i, inflation included."""
+        if i not in self._covariances:
+            d = self.dimension
+            blocks = self.factors[i].inverse_blocks()[0]
+            self._covariances[i] = self.inflation[i] ** 2 * blocks[:, :d, :d]
+        return self._covariances[i]
+
+    @cached_property
+    def _covariances(self) -> dict[int, Array]:
+        """Those that were asked for, by component."""
+        return {}
 
     @cached_property
     def velocities(self) -> Array | None:
@@ -134,23 +143,16 @@ class TrajectoryMixture:
         seconds = (np.array(self.stamps_ns) - self.stamps_ns[0]) * 1e-9
         return np.asarray(np.gradient(self.means, seconds, axis=1))
 
-    def marginal(self, t: int, *, alone: bool = False) -> GaussianMixture:
+    def marginal(self, t: int, which: Index | None = None) -> GaussianMixture:
         """The density of the pose at index t, a component for each trajectory.
 
         Args:
             t: index.
-            alone: whether no other pose is asked for, which costs less.
+            which: trajectories whose components are wanted, which costs less; None: all.
         """
-        if alone:
-            covariances = np.array(
-                [
-                    scale**2 * factor.inverse_block(t, self.dimension)
-                    for factor, scale in zip(self.factors, self.inflation, strict=True)
-                ]
-            )
-        else:
-            covariances = self.marginal_covariances[:, t]
-        return GaussianMixture(self.weights, self.means[:, t], covariances)
+        chosen = np.arange(len(self)) if which is None else which
+        covariances = np.array([self.covariances_of(int(i))[t] for i in chosen])
+        return GaussianMixture(self.weights[chosen], self.means[chosen, t], covariances)
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draws trajectories (n, T, d), projected onto the limits."""

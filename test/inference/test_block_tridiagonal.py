@@ -68,15 +68,6 @@ def test_the_band_is_as_narrow_as_the_coupling():
     assert example(4, 5, 'upper')[0].bandwidth == 4
 
 
-@pytest.mark.parametrize('d', [1, 3, 4])
-def test_one_block_of_the_inverse(d):
-    matrix, dense = example(4, 6, 'full')
-    factor, inverse = matrix.cholesky(), np.linalg.inv(dense)
-    for t in range(6):
-        own = slice(4 * t, 4 * t + d)
-        np.testing.assert_allclose(factor.inverse_block(t, d), inverse[own, own], atol=1e-12)
-
-
 def test_coloured_noise_has_the_inverse_as_covariance():
     matrix, dense = example(2, 3, 'full')
     noise = np.random.default_rng(2).normal(size=(100_000, 3, 2))

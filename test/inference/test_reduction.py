@@ -150,15 +150,12 @@ def test_leaders_are_apart_and_the_heaviest():
     assert leaders(log_weights, distances, 0.5, 3, [0, 2]).tolist() == [0, 2, 4]
 
 
-def test_what_is_near_a_leader_gives_it_its_weight(rng):
-    mixture = GaussianMixture(
-        [0.2, 0.3, 0.5, 0.0], rng.normal(size=(4, 2)), np.tile(np.eye(2), (4, 1, 1))
-    )
+def test_what_is_near_a_leader_gives_it_its_weight():
+    weights = np.array([0.2, 0.3, 0.5, 0.0])
     points = np.zeros((4, 2, 3))
     points[:, 1, 0] = [0.0, 0.1, 1.0, 2.0]
-    found, chosen = led(mixture, points, 0.5, 8)
+    found, chosen = led(weights, points, 0.5, 8)
     assert chosen.tolist() == [2, 1, 3]
-    np.testing.assert_allclose(found.weights, [0.5, 0.5, 0.0])
-    np.testing.assert_array_equal(found.means, mixture.means[chosen])
-    found, chosen = led(mixture, points, 0.5, 1)
-    np.testing.assert_allclose(found.weights, [1.0])
+    np.testing.assert_allclose(found, [0.5, 0.5, 0.0])
+    found, chosen = led(weights, points, 0.5, 1)
+    np.testing.assert_allclose(found, [1.0])

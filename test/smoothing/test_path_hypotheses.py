@@ -12,13 +12,21 @@ from hmt_ros.smoothing import LinearGaussianDynamics
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from hmt_ros.smoothing.mode_sequence import ModeSequence, path_gaussians
 from hmt_ros.smoothing.path_hypotheses import (
+    FilteredPaths,
     PathHypotheses,
     distances,
     distances_of_paths,
     first_state,
-    probable_paths,
     traced,
 )
+
+
+def probable_paths(mixtures, dynamics, intervals, count, points=None):
+    paths = FilteredPaths(dynamics, count, points)
+    for mixture, interval in zip(mixtures, [0.0, *intervals]):
+        paths.add(mixture, interval)
+    return paths.paths
+
 
 FAST = LinearGaussianDynamics.constant_velocity([2.0, 2.0], 1.0)
 
