@@ -16,9 +16,10 @@ the whole clip. Beside it stand
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,12 +46,15 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.error_model import CueErrors
 from hmt_ros.inference.reduction import leaders
 from hmt_ros.sessions.declared_parameters import with_values
+from hmt_ros.sessions.fixed_frame import FixedFrame
 from hmt_ros.sessions.handled import Output
 from hmt_ros.sessions.smoothed_messages import poses_apart
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
+from hmt_ros.sessions.transform_buffer import Transform
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from hmt_ros.tracking import TrackerSettings
+from hmt_ros.tracking.camera_motion import CameraMotion, propagated
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import deserialise
 from msg_tools.messages.pose_mixtures import (
@@ -172,7 +176,7 @@ def of_clip(work: Work) -> dict[str, dict[str, float]]:
     clip = at_rate(read_clip(work.folder, work.limit), work.rate)
     seen = tracked(clip, work.inputs, work.gravity)
     mixtures = {FILTER: {x.stamp: x.posterior for x in seen}}
-    mixtures |= smoothed(seen)
+    mixtures |= smoothed(seen, clip.views)
     records = {way: record_of(clip, seen, found) for way, found in mixtures.items()}
     result = {}
     for way, record in records.items():
@@ -277,22 +281,44 @@ def tracked(clip: Clip, inputs: str, gravity: str) -> list[Seen]:
     return result
 
 
-def smoothed(seen: Sequence[Seen]) -> dict[str, dict[int, GaussianMixture]]:
-    """What the node publishes, and what it makes of all images together, by way and stamp."""
+def smoothed(
+    seen: Sequence[Seen], views: Mapping[int, tuple[Array, Array]] = MappingProxyType({})
+) -> dict[str, dict[int, GaussianMixture]]:
+    """What the node publishes, and what it makes of all images together, by way and stamp.
+
+    Args:
+        seen: of the images.
+        views: stamp -> rotation (3, 3) and position (3,) of a camera that moves, in the world;
+            its node is given likelihoods in the frame of the world, as `fixed_frame` has them.
+    """
+    frames: dict[int, FixedFrame] = {}
+    turn = 0.0
+    for one in seen:
+        if one.stamp in views:
+            rotation, position = views[one.stamp]
+            frame = FixedFrame('world', Transform(rotation, position), turn)
+            turn = frame.turn_of(one.body, one.posterior.means[0])
+            frames[one.stamp] = frame
     outputs: list[Output] = []
     messages = RosbagsMessages()
     parameters = with_values(SmootherParameters(), {'window_length': KEPT})
     session = SmootherSession(parameters, outputs.append, SMOOTHED.__eq__)
+    shapes = {x.stamp: x.shape_covariance for x in seen}
     for one in seen:
+        likelihood = one.likelihood
+        if one.stamp in frames:
+            placed = frames[one.stamp].placed
+            likelihood = placed(one.body, likelihood)[0]
+            at_best = replace(one.posterior[[0]], covariances=one.shape_covariance[None])
+            shapes[one.stamp] = placed(one.body, at_best)[0].covariances[0]
         content = PoseMixture.of_body(
-            one.body, one.likelihood, MixtureKind.LIKELIHOOD, one.stamp, 'camera',
+            one.body, likelihood, MixtureKind.LIKELIHOOD, one.stamp, 'camera',
             state=TrackState.TRACKING, track_id=1, error_share=one.errors.independent,
-            error_time=one.errors.time, shape_covariance=one.shape_covariance,
+            error_time=one.errors.time, shape_covariance=shapes[one.stamp],
         )  # fmt: skip
         handled = session.take(MIXTURE, pose_mixture_message(messages, content))
         if handled.faults:
             raise ValueError(handled.faults[0])
-    shapes = {x.stamp: x.shape_covariance for x in seen}
     result = {}
     for way, most in ((OFFLINE, parameters.max_trajectories), (RTS, 1)):
         session.parameters = with_values(parameters, {'max_trajectories': most})
@@ -304,7 +330,24 @@ def smoothed(seen: Sequence[Seen]) -> dict[str, dict[int, GaussianMixture]]:
         }
     session.finish()
     found = [pose_mixture_of(deserialise(x.data, 'hmt_msgs/msg/PoseMixture')) for x in outputs]
-    return {LIVE: {x.stamp_ns: x.mixture for x in found}, **result}
+    result = {LIVE: {x.stamp_ns: x.mixture for x in found}, **result}
+    bodies = {x.stamp: x.body for x in seen}
+    return {
+        way: {t: _seen_again(x, bodies[t], frames.get(t)) for t, x in of_way.items()}
+        for way, of_way in result.items()
+    }
+
+
+def _seen_again(mixture: GaussianMixture, body: Body, frame: FixedFrame | None) -> GaussianMixture:
+    """A mixture in the frame of the camera again."""
+    if frame is None:
+        return mixture
+    back = CameraMotion(
+        frame.motion.rotation.T, -frame.motion.rotation.T @ frame.motion.translation
+    )
+    means = back.free_poses(body, mixture.means)
+    jacobians = back.jacobians(body, mixture.means, means)
+    return replace(mixture, means=means, covariances=propagated(jacobians, mixture.covariances))
 
 
 def record_of(clip: Clip, seen: Sequence[Seen], mixtures: dict[int, GaussianMixture]) -> Record:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hmt_ros.body.body import Body
-from hmt_ros.body.kinematics import forward
+from hmt_ros.body.kinematics import forward, point_jacobians
 from hmt_ros.inference.arrays import Array, Index
 
 FEET = ('left', 'right')
@@ -74,6 +74,13 @@ def sole_points(body: Body, poses: Array) -> Array:
     feet = soles(body)
     points = forward(body.skeleton, poses).points(feet.segments, feet.local)
     return np.ascontiguousarray(points.transpose(2, 0, 1))
+
+
+def sole_jacobians(body: Body, poses: Array) -> Array:
+    """Derivatives (N, P, 3, d) of the points of the soles with respect to the poses (N, d)."""
+    feet, frames = soles(body), forward(body.skeleton, poses)
+    found = point_jacobians(frames, feet.segments, frames.points(feet.segments, feet.local))
+    return np.ascontiguousarray(found.transpose(3, 0, 2, 1))
 
 
 def _down_and_ahead(body: Body, ankle: int, toe: int, carrier: int) -> tuple[Array, Array]:

@@ -80,6 +80,8 @@ class SmootherParameters(NodeParameters):
         max_hypotheses: Maximum number of components of smoothed_pose_mixture.
         merge_distance: Distance, in standard deviations of what an image counts for, below which
             two modes of it are merged.
+        resting_feet: If true, feet that rest do not slide between images; the frame of the mixtures
+            has to stand still, as that of a camera that does, or fixed_frame of the filter.
         random_seed: Seed of all random numbers; the same mixtures give the same results.
         longest_interval: Interval between two mixtures above which a gap is reported, s; the
             dynamics bridge it.
@@ -99,6 +101,7 @@ class SmootherParameters(NodeParameters):
     max_trajectories: int = parameter_field(16, NEXT_WINDOW, (1, 1024))
     max_hypotheses: int = parameter_field(8, AT_ONCE, (1, 1024))
     merge_distance: float = parameter_field(1.75, NEXT_WINDOW, (0.0, 100.0))
+    resting_feet: bool = parameter_field(True, NEXT_WINDOW)
     random_seed: int = parameter_field(0, NEXT_WINDOW, (0, 2**31 - 1))
     longest_interval: float = parameter_field(0.25, AT_ONCE, (0.0, 3600.0))
     publish_covariances: bool = parameter_field(False, AT_ONCE)

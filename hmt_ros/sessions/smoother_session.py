@@ -31,7 +31,7 @@ same order give the same bytes. The rules:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -60,6 +60,7 @@ from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.warm_up import likelihoods
 from hmt_ros.smoothing import FinalPose, MixtureSmoother, SlidingWindow, TrajectoryMixture
 from hmt_ros.smoothing.mixture_smoother import PathSmoother
+from hmt_ros.smoothing.resting_points import RestingPoints
 from msg_tools import MessageError
 from msg_tools.files.error_line import error_line
 from msg_tools.messages.bodies import body_of
@@ -322,13 +323,16 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         """The smoother that the parameters ask for, with `closed_form` for the paths."""
         p = self.parameters
         kind = closed_form if p.method == 'paths' else MixtureSmoother
-        return kind(
+        smoother = kind(
             p.dynamics.of(body),
             *free_limits(body),
             p.max_trajectories,
             through_modes=p.through_modes,
             points=body.relative_joints,
         )
+        if p.resting_feet and isinstance(smoother, PathSmoother):
+            return replace(smoother, resting=RestingPoints.of_soles(body))
+        return smoother
 
     def _end_window(self) -> None:
         """Publishes what is still open, and forgets the window."""

@@ -22,6 +22,7 @@ from hmt_ros.smoothing.mode_sequence import (
 )
 from hmt_ros.smoothing.path_hypotheses import FilteredPaths
 from hmt_ros.smoothing.paths import Paths
+from hmt_ros.smoothing.resting_points import RestingPoints
 from hmt_ros.smoothing.smoothed_paths import SmoothedPath, smoothed_paths
 from hmt_ros.smoothing.trajectory_mixture import TrajectoryMixture
 from hmt_ros.smoothing.trajectory_refinement import limits_of_states, refine
@@ -44,6 +45,8 @@ LONG = 100
 MARGIN = 8
 # A path whose Gaussian lies within so many standard deviations of an optimum says nothing new.
 SAME_DISTANCE = 0.3
+# Motions that are less probable are left as they are, whatever rests.
+LEAST_HELD = 0.05
 # Modes closer than so many standard deviations are merged, as alternatives to the optima.
 MERGE_DISTANCES = (1.75, 2.5)
 
@@ -335,7 +338,12 @@ class PathSmoother(MixtureSmoother):
 
     `adapt`, `start` and `max_iterations` have no meaning here, nor has `seed`; the result has no
     free energy. Means beyond the limits are moved onto them.
+
+    Attributes:
+        resting: points that may rest on the ground; None: nothing is made of them.
     """
+
+    resting: RestingPoints | None = None
 
     def paths(self, sequence: ModeSequence) -> Paths:
         """The paths whose Gaussians are the result."""
@@ -365,10 +373,22 @@ class PathSmoother(MixtureSmoother):
         """
         if observation is not None:
             raise ValueError('paths are smoothed by the mixtures alone, without an observation')
-        steps = self._filtered(sequence).steps
-        states, factors = smoothed_paths(steps)
+        filtered = self._filtered(sequence)
+        states, paths = smoothed_paths(filtered.steps)
+        weights = np.exp(filtered.steps[-1].log_weights)
+        factors: list[BlockCholesky | SmoothedPath] = list(paths)
+        if self.resting is not None and states.shape[1] > 1:
+            d, motions, nodes = self.dynamics.dimension, filtered.motions, filtered.paths.nodes
+            for i in np.flatnonzero((motions == np.arange(len(motions))) & (weights >= LEAST_HELD)):
+                poses = np.clip(states[i], *self._limits())[:, :d]
+                known = np.array([covariance[:d, :d] for covariance in paths[i].filtered])
+                held = self.resting.held(sequence.prior, poses, known, sequence.intervals)
+                found = path_gaussians(nodes[[i]], held, sequence.likelihood)
+                # Paths of the same motion go along.
+                states[motions == i] += found.states[0] - states[i]
+                factors[i] = found.factors[0]
         return self._mixture(
-            np.exp(steps[-1].log_weights),
+            weights,
             np.clip(states, *self._limits()),
             factors,
             np.ones(len(states)),

@@ -233,6 +233,16 @@ class FilteredPaths:
         """The paths, heaviest first; nodes of the first time are its states."""
         return Paths(traced(self.steps), self.steps[-1].log_weights)
 
+    @property
+    def motions(self) -> Index:
+        """Of each path the heaviest one that is one motion with it, (H,); itself: it leads one."""
+        log = self.steps[-1].log_weights
+        past = self._past
+        if past is None:
+            return np.arange(len(log))
+        chosen = leaders(log, lambda i: past[i], SAME_MOTION)
+        return np.asarray(chosen[np.argmin(past[chosen], axis=0)])
+
     def _begin(self, first: PathHypotheses) -> None:
         self.steps.append(first)
         self._past = self._distances(first.states.means[:, : self.dynamics.dimension])

@@ -1,0 +1,137 @@
+"""Points of a body that rest on the ground do not move from one image to the next.
+
+Each point rests or moves, a Markov chain that changes `CHANGES` times a second. How fast it seems
+to move along a trajectory tells which of both,
+
+    rests: v_across ~ N(0, 0.07^2), v_away ~ N(0, 0.17^2)    moves: N(0, 0.7^2), N(0, 0.6^2)   m/s
+
+across and along the direction in which a point is known least, about the line of sight. Between two
+images a point that rests with probability r costs
+
+    r |p(x_{t+1}) - p(x_t)|^2 / (2 q dt)                      q: what a resting point slips, m^2/s
+
+linear in the poses near a trajectory, and so added to its prior (1) as a Gaussian.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hmt_ros.body import Body
+from hmt_ros.body.soles import sole_jacobians, sole_points, soles
+from hmt_ros.inference.arrays import Array
+from hmt_ros.inference.block_tridiagonal import BlockTridiagonal
+from hmt_ros.inference.linear_gaussian_dynamics import TrajectoryPrior
+
+# Standard deviations of the speed across and along the direction known least, m/s, of points that
+# rest and of points that move, in trajectories of the smoother; from the feet of the clips.
+RESTS, MOVES = (0.07, 0.17), (0.7, 0.6)
+# How often a point changes between rest and motion, per second.
+CHANGES = 2.0
+# Variance that a resting point slips by, m^2/s: 9 mm in a second.
+SLIP = 8e-5
+# A point whose probability to rest is lower is left free.
+LEAST = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class RestingPoints:
+    """Points that may rest, in a frame that stands still.
+
+    Attributes:
+        points: maps poses (N, d) to points (N, P, 3), m.
+        jacobians: maps poses (N, d) to their derivatives (N, P, 3, d).
+    """
+
+    points: Callable[[Array], Array]
+    jacobians: Callable[[Array], Array]
+
+    @classmethod
+    def of_soles(cls, body: Body) -> RestingPoints | None:
+        """Heels and toes of a body; None: it has no feet."""
+        if not len(soles(body)):
+            return None
+        return cls(
+            lambda poses: sole_points(body, poses), lambda poses: sole_jacobians(body, poses)
+        )
+
+    def probabilities(self, poses: Array, covariances: Array, intervals: Array) -> Array:
+        """Probabilities (T-1, P) that a point rests from one pose of a trajectory to the next.
+
+        Args:
+            poses: (T, d).
+            covariances: (T, d, d) of which the directions count in which points are known least.
+            intervals: (T-1,) s.
+        """
+        jacobians = self.jacobians(poses)
+        spread = jacobians @ covariances[:, None] @ jacobians.swapaxes(2, 3)
+        least_known = np.linalg.eigh(spread[1:])[1][..., -1]
+        velocities = np.diff(self.points(poses), axis=0) / intervals[:, None, None]
+        away = np.einsum('tpi,tpi->tp', velocities, least_known)
+        across = np.linalg.norm(velocities - away[:, :, None] * least_known, axis=2)
+        log = np.stack([_log_density(across, away, sigmas) for sigmas in (RESTS, MOVES)])
+        changes = 0.5 * -np.expm1(-2.0 * CHANGES * intervals)
+        return np.asarray(_smoothed_chain(np.exp(log - log.max(0)), changes)[0])
+
+    def held(
+        self, prior: TrajectoryPrior, poses: Array, covariances: Array, intervals: Array
+    ) -> TrajectoryPrior:
+        """The prior of trajectories near one (T, d) with the points that rest there held.
+
+        Args:
+            prior: of the states, whose first d variables are the pose.
+            poses: (T, d) along which is decided what rests, and points are linear.
+            covariances, intervals: as for `probabilities`.
+        """
+        count, d = poses.shape
+        rests = self.probabilities(poses, covariances, intervals)
+        points, jacobians = self.points(poses), self.jacobians(poses)
+        diagonal, lower = prior.precision.diagonal.copy(), prior.precision.lower.copy()
+        information = prior.information.copy()
+        for t in range(count - 1):
+            some = np.flatnonzero(rests[t] >= LEAST)
+            before = jacobians[t, some].reshape(-1, d)
+            after = jacobians[t + 1, some].reshape(-1, d)
+            moved = (points[t + 1, some] - points[t, some]).reshape(-1)
+            # p(x_{t+1}) - p(x_t) as a linear function of both poses.
+            rest = moved - after @ poses[t + 1] + before @ poses[t]
+            weights = np.repeat(rests[t, some], 3) / (SLIP * intervals[t])
+            diagonal[t, :d, :d] += before.T @ (weights[:, None] * before)
+            diagonal[t + 1, :d, :d] += after.T @ (weights[:, None] * after)
+            lower[t, :d, :d] -= after.T @ (weights[:, None] * before)
+            information[t, :d] += before.T @ (weights * rest)
+            information[t + 1, :d] -= after.T @ (weights * rest)
+        return replace(prior, precision=BlockTridiagonal(diagonal, lower), information=information)
+
+
+def _log_density(across: Array, away: Array, sigmas: tuple[float, float]) -> Array:
+    """Log density of speeds across and along a direction, up to a constant."""
+    wide, deep = sigmas
+    return np.asarray(
+        -2.0 * np.log(wide) - np.log(deep) - 0.5 * ((across / wide) ** 2 + (away / deep) ** 2)
+    )
+
+
+def _smoothed_chain(likelihoods: Array, changes: Array) -> Array:
+    """Probabilities (2, T, P) of the states of P chains with two states, given all T times.
+
+    Args:
+        likelihoods: (2, T, P).
+        changes: (T,) probability that a chain changes its state before each time.
+    """
+    forwards, backwards = likelihoods.copy(), np.ones_like(likelihoods)
+    times = likelihoods.shape[1]
+    for t in range(times):
+        if t > 0:
+            before = forwards[:, t - 1]
+            forwards[:, t] *= before + changes[t] * (before[::-1] - before)
+        forwards[:, t] /= forwards[:, t].sum(0)
+    for t in range(times - 2, -1, -1):
+        after = likelihoods[:, t + 1] * backwards[:, t + 1]
+        backwards[:, t] = after + changes[t + 1] * (after[::-1] - after)
+        backwards[:, t] /= backwards[:, t].sum(0)
+    both = forwards * backwards
+    return np.asarray(both / both.sum(0))
