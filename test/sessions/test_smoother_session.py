@@ -97,7 +97,7 @@ def test_final_poses_are_mixtures_that_need_no_kinematics(session, outputs, like
 def test_errors_that_last_are_discounted_once(session, outputs, likelihoods, method):
     """The first of three poses, by the dense joint precision of each variable."""
     body = likelihoods.body
-    one = session(max_trajectories=1, method=method, fixed_lag=0.3)
+    one = session(max_trajectories=1, method=method, fixed_lag=0.3, resting_feet=False)
     errors, stamps, means = CueErrors(0.5, 0.1), (0, 1, 3), []
     for index in stamps:
         mixture = likelihoods.mixture(index)[:1].normalised()
