@@ -13,6 +13,7 @@ from hmt_ros.inference import GaussianMixture
 from hmt_ros.inference.arrays import Array, Index
 from hmt_ros.inference.reduction import led
 from hmt_ros.sessions.session import PublishedTopic
+from hmt_ros.sessions.track_messages import links_of
 from hmt_ros.smoothing import FinalPose, TrajectoryMixture
 from hmt_ros.smoothing.path_hypotheses import SAME_MOTION
 from msg_tools import MessageFactory
@@ -23,7 +24,7 @@ from msg_tools.messages.pose_mixtures import (
     TrackState,
     pose_mixture_message,
 )
-from msg_tools.messages.states import heaviest_joint_state
+from msg_tools.messages.states import heaviest_joint_state, transforms_message
 from msg_tools.messages.trajectory_mixtures import TrajectoryMixture as TrajectoryContent
 from msg_tools.messages.trajectory_mixtures import trajectory_mixture_message
 
@@ -33,6 +34,7 @@ TOPICS = {
     'trajectory_markers': PublishedTopic('visualization_msgs/msg/MarkerArray'),
     'smoothed_pose_mixture': PublishedTopic('hmt_msgs/msg/PoseMixture'),
     'smoothed_joint_states': PublishedTopic('sensor_msgs/msg/JointState'),
+    '/tf': PublishedTopic('tf2_msgs/msg/TFMessage'),
 }
 TRACED = ('pelvis', 'head', 'left_wrist', 'right_wrist', 'left_ankle', 'right_ankle')
 # The heaviest trajectories that are drawn.
@@ -139,6 +141,7 @@ def final_messages(
     state: TrackState,
     existence_probability: float,
     components: int,
+    frame_prefix: str | None,
     wanted: Callable[[str], bool],
     publish: Callable[[str, Any], None],
 ) -> None:
@@ -152,13 +155,15 @@ def final_messages(
         state: of the track at that time.
         existence_probability: that a person was in view, in the filter at that time; NaN: unknown.
         components: maximum number of components of the message.
+        frame_prefix: of the names of the links on /tf; None: there are no transforms.
         wanted: whether a topic is to be made.
         publish: takes the topic and the message, one after the other.
 
     Raises:
         MessageError: a mixture that a message must not have.
     """
-    if not wanted('smoothed_pose_mixture') and not wanted('smoothed_joint_states'):
+    shows_links = frame_prefix is not None and wanted('/tf')
+    if not (wanted('smoothed_pose_mixture') or wanted('smoothed_joint_states') or shows_links):
         return
     mixture, motions = poses_apart(pose.trajectories, pose.t, of.body, components, shape)
     content = PoseMixture.of_body(
@@ -177,6 +182,16 @@ def final_messages(
         publish('smoothed_pose_mixture', pose_mixture_message(messages, content))
     if wanted('smoothed_joint_states'):
         publish('smoothed_joint_states', heaviest_joint_state(messages, content))
+    if shows_links:
+        names, rotations, origins = links_of(
+            of.body, mixture.means[int(np.argmax(mixture.weights))]
+        )
+        children = [f'{frame_prefix}{name}' for name in names]
+        parents = [of.frame_id] * len(names)
+        publish(
+            '/tf',
+            transforms_message(messages, parents, children, rotations, origins, pose.stamp_ns),
+        )
 
 
 def poses_apart(

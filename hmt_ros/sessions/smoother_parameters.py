@@ -87,6 +87,8 @@ class SmootherParameters(NodeParameters):
             dynamics bridge it.
         publish_covariances: If true, trajectory_mixture has covariances, which make it forty times
             as large.
+        publish_tf: If true, the links of the heaviest smoothed pose are published on /tf.
+        frame_prefix: Prefix of the names of these links, beside those of the filter.
         queue_size: Maximum number of mixtures that wait; when the node is late the oldest are
             dropped.
         through_modes: whether the best path through every single mode is a candidate, besides the
@@ -105,6 +107,8 @@ class SmootherParameters(NodeParameters):
     random_seed: int = parameter_field(0, NEXT_WINDOW, (0, 2**31 - 1))
     longest_interval: float = parameter_field(0.25, AT_ONCE, (0.0, 3600.0))
     publish_covariances: bool = parameter_field(False, AT_ONCE)
+    publish_tf: bool = parameter_field(False, AT_ONCE)
+    frame_prefix: str = parameter_field('smoothed/', AT_ONCE)
     queue_size: int = parameter_field(10, AT_ONCE, (1, 1000))
     through_modes: bool = False
     dynamics: SmootherDynamics = field(default_factory=SmootherDynamics)

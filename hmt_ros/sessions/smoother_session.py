@@ -355,6 +355,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
             state=told.state,
             existence_probability=told.existence,
             components=self.parameters.max_hypotheses,
+            frame_prefix=self.parameters.frame_prefix if self.parameters.publish_tf else None,
             wanted=self._wanted,
             publish=lambda topic, made: self._publish(topic, pose.stamp_ns, made),
         )

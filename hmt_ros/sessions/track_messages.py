@@ -320,8 +320,7 @@ def _in_range(probabilities: Mapping[str, float]) -> dict[str, float]:
 
 def _link_transforms(messages: MessageFactory, track: TrackedImage, prefix: str) -> Any:
     """Every link of the URDF in the point estimate, and frames with z up, from the camera."""
-    frames = forward(track.body.skeleton, track.point[None])
-    names, rotations, origins = link_frames(track.body.skeleton, frames, track.point, 0)
+    names, rotations, origins = links_of(track.body, track.point)
     parents = [track.frame_id] * len(names)
     children = [f'{prefix}{name}' for name in names]
     if track.up is not None:
@@ -333,3 +332,8 @@ def _link_transforms(messages: MessageFactory, track: TrackedImage, prefix: str)
         rotations = np.concatenate([rotations, FROM_OPTICAL[None]])
         origins = np.concatenate([origins, np.zeros((1, 3))])
     return transforms_message(messages, parents, children, rotations, origins, track.stamp_ns)
+
+
+def links_of(body: Body, pose: Array) -> tuple[list[str], Array, Array]:
+    """Names (L), rotations (L, 3, 3) and origins (L, 3), m, of the links of the URDF in a pose."""
+    return link_frames(body.skeleton, forward(body.skeleton, pose[None]), pose, 0)

@@ -10,6 +10,7 @@ from hmt_ros.sessions.declared_parameters import with_values
 from hmt_ros.sessions.smoothed_messages import TOPICS
 from hmt_ros.sessions.smoother_parameters import SmootherDynamics, SmootherParameters
 from hmt_ros.sessions.smoother_session import FINISH, MIXTURE, SmootherSession
+from hmt_ros.sessions.track_messages import links_of
 from hmt_ros.smoothing import MixtureSmoother
 from hmt_ros.smoothing.likelihood import counted, or_missed
 from msg_tools.messages.cdr import deserialise
@@ -400,6 +401,30 @@ def test_what_nobody_wants_is_not_made(session, outputs, likelihoods):
         one.take(MIXTURE, likelihoods.message(index))
     assert {output.topic for output in outputs} == {'smoothed_joint_states'}
     assert one.state.counts['smoothed'] == 4
+
+
+def test_transforms_are_the_links_of_the_heaviest_pose(session, outputs, likelihoods):
+    one = session(publish_tf=True)
+    for index in range(4):
+        one.take(MIXTURE, likelihoods.message(index))
+    one.finish()
+    states, found = read(outputs, 'smoothed_joint_states'), read(outputs, '/tf')
+    assert len(found) == len(states) == 4
+    body = likelihoods.body
+    for message, state in zip(found, states, strict=True):
+        names, rotations, origins = links_of(body, np.array(state.position))
+        links = {link.child_frame_id: link for link in message.transforms}
+        assert set(links) == {f'smoothed/{name}' for name in names}
+        for name, origin in zip(names, origins, strict=True):
+            link = links[f'smoothed/{name}']
+            assert link.header.frame_id == 'lens'
+            place = link.transform.translation
+            np.testing.assert_allclose([place.x, place.y, place.z], origin, atol=1e-12)
+        assert rotations.shape == (len(names), 3, 3)
+    one.parameters = with_values(one.parameters, {'publish_tf': False})
+    one.take(MIXTURE, likelihoods.message(5))
+    one.finish()
+    assert len(read(outputs, '/tf')) == 4
 
 
 def test_variational_smoothing_is_chosen_by_a_parameter(session, likelihoods):

@@ -250,6 +250,9 @@ class LiveNode:
         command += ['--log-level', 'warn']
         if self._namespace:
             command += ['-r', f'__ns:={self._namespace}']
+        for topic in self._topics:
+            if topic.startswith('/'):
+                command += ['-r', f'{topic}:={self._topic(topic)}']
         with self._output.open('wb') as output:
             return subprocess.Popen(
                 command,
@@ -279,7 +282,10 @@ class LiveNode:
         return self.full_name.replace('/', '.')
 
     def _topic(self, name: str) -> str:
-        return name if name.startswith('/') else f'{self._namespace}/{name}'
+        """The topic of a name; those of all nodes that a node publishes on are its own here."""
+        if not name.startswith('/'):
+            return f'{self._namespace}/{name}'
+        return f'/{self.full_name}{name}' if name in self._topics else name
 
     def _open_topics(self, inputs: Mapping[str, tuple[str, str]]) -> None:
         from lifecycle_msgs.srv import GetState

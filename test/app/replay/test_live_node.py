@@ -79,9 +79,12 @@ def both_ways(bag, tmp_path, capsys, *options, person=PERSON):
 
 def test_same_mixtures_of_every_image(tmp_path, capsys):
     bag = write(tmp_path / 'bag', recorded(3))
-    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys)
+    # Filter and smoother tell of links on the same topic.
+    options = ['--set', 'smoother.publish_tf=true']
+    (offline, live), (one, other) = both_ways(bag, tmp_path, capsys, *options)
     assert one == other
     assert one[0] == 0
+    assert len(messages(offline, '/tf')) == 6
     mixtures = ('pose_mixture', 'likelihood_mixture', 'smoothed_pose_mixture', 'trajectory_mixture')
     for topic in mixtures:
         assert len(messages(offline, topic)) == 3
