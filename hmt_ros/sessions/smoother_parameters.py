@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from hmt_ros.smoothing import LinearGaussianDynamics
 
 MODELS = ('random_walk', 'constant_velocity', 'learned')
 METHODS = ('paths', 'variational')
+# Factor on the variance that the learned motion gains in a second. Sudden motion is more frequent
+# than a Gaussian of the mean variance has it; chosen on clips (docs/smoothing.md).
+LIVELINESS = 2.0
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,8 @@ class SmootherDynamics:
     Attributes:
         model: Motion model: 'random_walk' with the rates of the body, 'constant_velocity', whose
             state has velocities besides the pose and costs several times as much, or 'learned',
-            that of the filter: damped velocities that are coupled, where the body ships with them,
-            else the random walk. It costs twice as much as the random walk.
+            that of the filter, but livelier: damped velocities that are coupled, where the body
+            ships with them, else the random walk. It costs twice as much as the random walk.
         velocity_time: Time for which a velocity lasts at constant velocity, s; velocities then gain
             so much that after it poses have moved as far as the random walk.
     """
@@ -52,7 +55,8 @@ class SmootherDynamics:
     def of(self, body: Body) -> LinearGaussianDynamics:
         """The dynamics of the poses of a body."""
         if self.model == 'learned':
-            return motion_prior(body)
+            usual = motion_prior(body)
+            return replace(usual, diffusion=LIVELINESS * usual.diffusion)
         rates = body.rates
         if self.model == 'random_walk':
             return LinearGaussianDynamics.random_walk(rates)

@@ -374,19 +374,18 @@ class PathSmoother(MixtureSmoother):
         if observation is not None:
             raise ValueError('paths are smoothed by the mixtures alone, without an observation')
         filtered = self._filtered(sequence)
-        states, paths = smoothed_paths(filtered.steps)
+        states, factors = smoothed_paths(filtered.steps)
         weights = np.exp(filtered.steps[-1].log_weights)
-        factors: list[BlockCholesky | SmoothedPath] = list(paths)
         if self.resting is not None and states.shape[1] > 1:
             d, motions, nodes = self.dynamics.dimension, filtered.motions, filtered.paths.nodes
             for i in np.flatnonzero((motions == np.arange(len(motions))) & (weights >= LEAST_HELD)):
                 poses = np.clip(states[i], *self._limits())[:, :d]
-                known = np.array([covariance[:d, :d] for covariance in paths[i].filtered])
+                known = np.array([covariance[:d, :d] for covariance in factors[i].filtered])
                 held = self.resting.held(sequence.prior, poses, known, sequence.intervals)
                 found = path_gaussians(nodes[[i]], held, sequence.likelihood)
-                # Paths of the same motion go along.
+                # Paths of the same motion go along. Covariances are those without what rests: that
+                # it does is decided, and is the same from image to image.
                 states[motions == i] += found.states[0] - states[i]
-                factors[i] = found.factors[0]
         return self._mixture(
             weights,
             np.clip(states, *self._limits()),
