@@ -1,12 +1,13 @@
 """A camera in a process of its own: it shows the images of a clip at a rate, whoever keeps up.
 
-    python -m benchmarks.camera FOLDER TRANSPORT RATE IMAGES SUBSCRIBERS
+    python -m benchmarks.camera FOLDER TRANSPORT RATE IMAGES SUBSCRIBERS [KEYPOINTS]
 
 It publishes `camera_info` and `image`, or `image/compressed`, as drivers do, as sensor data, once
-that many subscribers listen. The first image is repeated until a line comes on standard input; from
-then on the clip moves. On standard output it then says by how much the stamps of the clip are later
-than in its bag, ns, and when its first image is due by the monotonic clock, ns. At the end it says
-how late the latest image was published, ns, and stays until another line comes.
+that many subscribers listen; behind each image `keypoints`, if a file tells them: `names` (J,) and
+`pixels` (IMAGES, J, 2). The first images are shown back and forth until a line comes on standard
+input; from then on the clip goes on. On standard output it then says by how much the stamps of the
+clip are later than in its bag, ns, and when its first image is due by the monotonic clock, ns. At
+the end it says how late the latest image was published, ns, and stays until another line comes.
 """
 
 from __future__ import annotations
@@ -16,18 +17,26 @@ import sys
 import time
 from pathlib import Path
 
-from benchmarks.clips import COMPRESSED, read_messages
+import numpy as np
+
+from benchmarks.clips import COMPRESSED, index_back_and_forth, read_messages
 from benchmarks.publisher import with_stamp
+from hmt_ros.image.terms.keypoints import Keypoints
 from msg_tools import RosbagsMessages
 from msg_tools.messages.cdr import serialise
 from msg_tools.messages.headers import time_ns
 from msg_tools.messages.images import decode_image, image_message
+from msg_tools.messages.keypoints import keypoints_message
+
+# Images that are shown before the clip goes on.
+SWAYING = 4
 
 
 def main(argv: list[str]) -> int:
     """Shows the clip once."""
     folder, transport = Path(argv[0]), argv[1]
     rate, count, subscribers = float(argv[2]), int(argv[3]), int(argv[4])
+    detected = np.load(argv[5]) if len(argv) > 5 else None
     import rclpy
     from rclpy.qos import qos_profile_sensor_data
     from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -42,33 +51,49 @@ def main(argv: list[str]) -> int:
         picture = decode_image(images[number])
         return serialise(image_message(RosbagsMessages(), picture, stamps[number], str(frame)))
 
+    def keypoints(number: int) -> bytes:
+        assert detected is not None
+        names, pixels = tuple(str(name) for name in detected['names']), detected['pixels'][number]
+        unknown = np.full((len(names), 2, 2), np.nan)
+        seen = Keypoints(names, pixels, unknown, np.ones(len(names)))
+        return serialise(keypoints_message(RosbagsMessages(), seen, stamps[number], str(frame)))
+
     rclpy.init()
     node = rclpy.create_node('camera')
     kind, topic = (Image, 'image') if transport == 'raw' else (CompressedImage, 'image/compressed')
     publisher = node.create_publisher(kind, topic, qos_profile_sensor_data)
     calibrations = node.create_publisher(CameraInfo, 'camera_info', qos_profile_sensor_data)
+    if detected is not None:
+        from hmt_msgs.msg import Keypoints2D
+
+        detections = node.create_publisher(Keypoints2D, 'keypoints', qos_profile_sensor_data)
     while publisher.get_subscription_count() < subscribers:
         time.sleep(0.01)
 
-    def publish(data: bytes, stamp: int, due: int) -> int:
+    def publish(number: int, data: bytes, stamp: int, due: int) -> int:
         """Publishes an image when it is due; how late that was, ns."""
         while (left := due - time.monotonic_ns()) > 0:
             time.sleep(left * 1e-9)
         late = time.monotonic_ns() - due
         publisher.publish(with_stamp(data, stamp))
         calibrations.publish(with_stamp(calibration, stamp))
+        if detected is not None:
+            detections.publish(with_stamp(keypoints(number), stamp))
         return late
 
-    still, start, shift = content(0), time.monotonic_ns(), 0
+    # Nobody stands as still as a picture, which is no evidence of somebody.
+    first, shown = [content(number) for number in range(min(SWAYING, len(images)))], 0
+    start, shift = time.monotonic_ns(), 0
     while not select.select([sys.stdin], [], [], 0)[0]:
-        publish(still, stamps[0] + shift, start + shift)
-        shift += step
+        number = int(index_back_and_forth(shown, len(first)))
+        publish(number, first[number], stamps[0] + shift, start + shift)
+        shown, shift = shown + 1, shift + step
     sys.stdin.readline()
     start += shift
     print(shift, start, flush=True)
     # A picture is made before it is due, as by a driver.
     late = [
-        publish(content(number), stamp + shift, start + stamp - stamps[0])
+        publish(number, content(number), stamp + shift, start + stamp - stamps[0])
         for number, stamp in enumerate(stamps)
     ]
     print(max(late), flush=True)

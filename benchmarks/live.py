@@ -1,6 +1,7 @@
 """live: filter, smoother and BME at the images of a camera that does not wait for them.
 
 A clip of a dancer with known truth is rendered, and replayed offline, where every image is used.
+Keypoints are the true joints with the noise of a detector, behind each image.
 Then a camera, in a process of its own, shows it to the real nodes at 30 images a second. Latency is
 the time from when an image is due at the camera to the arrival of its pose_mixture in another
 process; age is how much older a smoothed pose is, when it arrives, than the newest image.
@@ -13,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -22,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.clips import table
+from benchmarks.clips import COMPRESSED, read_messages, table
 from benchmarks.command import add_choice, benchmark_parser, run_stages, show
 from benchmarks.nodes import PROFILE
 from hmt_ros.app import make_bag
@@ -49,6 +50,8 @@ WITHOUT_GRAVITY = ('--set', 'gravity_frame=', '--set', 'fixed_frame=')
 START_SECONDS = 120.0  # until the person is tracked: the first images compile the kernels
 PATIENCE = 3.0  # s, after the last image
 OLDEST = 1.0  # s, of a smoothed pose
+# Standard deviation of keypoints, as a share of the height of the person in the image.
+NOISE = 0.01
 PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 
 
@@ -60,12 +63,14 @@ class Case:
         what: in words.
         transport: of the images.
         room: whether Fast DDS has room for raw images.
+        keypoints: whether there are any; then there is no BME.
         filter, bme: parameters that are not the usual ones.
     """
 
     what: str
     transport: str = 'raw'
     room: bool = True
+    keypoints: bool = False
     filter: Mapping[str, Any] = field(default_factory=dict)
     bme: Mapping[str, Any] = field(default_factory=dict)
 
@@ -76,6 +81,7 @@ CASES = {
     'predictions': Case('predictions from every image', bme={'tracked_interval': 0.0}),
     'compressed': Case('JPEG', transport='compressed'),
     'gravity': Case('gravity given', filter={'gravity': (0.0, 1.0, 0.0)}),
+    'keypoints': Case('images and keypoints', keypoints=True),
     'usual DDS': Case('without fastdds.xml', room=False),
 }
 OFFLINE = {'offline': 'offline, every image', 'upright': 'offline, gravity given'}
@@ -157,7 +163,8 @@ def live(clip: Path, target: Path, case: Case) -> dict[str, Any]:
         for node in nodes:
             node.wait_until_active()
         arrived = _listen(player)
-        camera = _Camera(opened, player.domain, clip, case.transport, len(truth.joints))
+        told = [str(_detections(clip, truth))] if case.keypoints else []
+        camera = _Camera(opened, player.domain, clip, case.transport, len(truth.joints), told)
         # The kernels are compiled and the track has started before the clip moves.
         camera.spin(player, lambda: len(arrived[POSTERIOR]) > 2, START_SECONDS)
         shift, start_ns = camera.begin(player)
@@ -212,15 +219,33 @@ def _nodes(player: Player, opened: ExitStack, clip: Path, case: Case) -> list[Li
         'image_transport': case.transport,
         'background_file': str(clip / 'background.png'),
     }
-    chosen = {
-        BME: replace(BmeParameters(), **images, **case.bme),
-        FILTER: replace(FilterParameters(), **images, use_predictions=True, **case.filter),
+    used = {'use_keypoints': True} if case.keypoints else {'use_predictions': True}
+    chosen: dict[str, Any] = {
+        FILTER: replace(FilterParameters(), **images, **used, **case.filter),
         SMOOTHER: SmootherParameters(),
     }
+    if not case.keypoints:
+        chosen[BME] = replace(BmeParameters(), **images, **case.bme)
     return [
         LiveNode(player, opened, name, parameters, inputs={}, topics={}, write=_ignored)
         for name, parameters in chosen.items()
     ]
+
+
+def _detections(clip: Path, truth: Truth) -> Path:
+    """A file of keypoints of each image, as `benchmarks.camera` reads it."""
+    info, _ = read_messages(clip, [COMPRESSED], 1)
+    camera = np.asarray(info.k).reshape(3, 3)
+    joints = np.array([truth.joints[stamp] for stamp in sorted(truth.joints)])
+    known = np.isfinite(joints).all((0, 2))
+    seen = joints[:, known] @ camera.T
+    pixels = seen[..., :2] / seen[..., 2:]
+    height = np.ptp(pixels[..., 1], axis=1)[:, None, None]
+    pixels += NOISE * height * np.random.default_rng(0).standard_normal(pixels.shape)
+    names = np.array(truth.joint_names)[known]
+    target = clip / 'keypoints.npz'
+    np.savez(target, names=names, pixels=pixels)
+    return target
 
 
 def _listen(player: Player) -> dict[str, list[tuple[int, bytes, int]]]:
@@ -245,11 +270,17 @@ class _Camera:
     """The process that shows the clip."""
 
     def __init__(
-        self, opened: ExitStack, domain: int, clip: Path, transport: str, images: int
+        self,
+        opened: ExitStack,
+        domain: int,
+        clip: Path,
+        transport: str,
+        images: int,
+        more: Sequence[str] = (),
     ) -> None:
         command = [sys.executable, '-m', 'benchmarks.camera', str(clip), transport]
         self._process = subprocess.Popen(
-            [*command, f'{RATE:g}', str(images), '2'],
+            [*command, f'{RATE:g}', str(images), '1' if more else '2', *more],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             env={**os.environ, **environment(domain)},

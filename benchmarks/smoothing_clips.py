@@ -52,7 +52,6 @@ from hmt_ros.sessions.smoothed_messages import poses_apart
 from hmt_ros.sessions.smoother_parameters import SmootherParameters
 from hmt_ros.sessions.smoother_session import MIXTURE, SmootherSession
 from hmt_ros.sessions.transform_buffer import Transform
-from hmt_ros.smoothing.mixture_smoother import PathSmoother
 from hmt_ros.tracking import TrackerSettings
 from hmt_ros.tracking.camera_motion import CameraMotion, propagated
 from msg_tools import RosbagsMessages
@@ -322,7 +321,7 @@ def smoothed(
     result = {}
     for way, most in ((OFFLINE, parameters.max_trajectories), (RTS, 1)):
         session.parameters = with_values(parameters, {'max_trajectories': most})
-        whole, of = session.smoothed_span(PathSmoother)
+        whole, of = session.smoothed_span()
         assert whole.stamps_ns is not None
         result[way] = {
             stamp: poses_apart(whole, t, of.body, COMPONENTS, shapes[stamp])[0]

@@ -313,16 +313,16 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
     def _new_window(self, body: Body) -> SlidingWindow:
         p = self.parameters
         return SlidingWindow(
-            self._smoother(body, PathSmoother),
+            self._smoother(body),
             p.fixed_lag,
             p.random_seed,
             first_identity=self._first_identity,
         )
 
-    def _smoother(self, body: Body, closed_form: type[MixtureSmoother]) -> MixtureSmoother:
-        """The smoother that the parameters ask for, with `closed_form` for the paths."""
+    def _smoother(self, body: Body) -> MixtureSmoother:
+        """The smoother that the parameters ask for."""
         p = self.parameters
-        kind = closed_form if p.method == 'paths' else MixtureSmoother
+        kind = PathSmoother if p.method == 'paths' else MixtureSmoother
         smoother = kind(
             p.dynamics.of(body),
             *free_limits(body),
@@ -361,7 +361,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         )
 
     def smooth_span(self, from_ns: int = 0, to_ns: int = 0) -> Any:
-        """Smooths the kept mixtures of a span of time, fully refined, all at once.
+        """Smooths the kept mixtures of a span of time, all at once.
 
         May be called by any thread, at any time.
 
@@ -374,20 +374,15 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         Raises:
             ValueError: there is none in the span, or they can not be smoothed.
         """
-        found, of = self.smoothed_span(MixtureSmoother, from_ns, to_ns)
+        found, of = self.smoothed_span(from_ns, to_ns)
         shapes = _shapes((one.stamp, one.shape) for one in self.kept.items)
         content = trajectory_content(found, of, covariances=True, shapes=shapes)
         return trajectory_mixture_message(self._messages, content)
 
     def smoothed_span(
-        self, closed_form: type[MixtureSmoother], from_ns: int = 0, to_ns: int = 0
+        self, from_ns: int = 0, to_ns: int = 0
     ) -> tuple[TrajectoryMixture, SmoothedBody]:
-        """The trajectories of a span of time, and whose; see `smooth_span`.
-
-        Args:
-            closed_form: smoother with the method 'paths'.
-            from_ns, to_ns: as there.
-        """
+        """The trajectories of a span of time, and whose; see `smooth_span`."""
         of, items = self.kept
         chosen = [
             item for item in items if from_ns <= item.stamp and (to_ns == 0 or item.stamp <= to_ns)
@@ -400,7 +395,7 @@ class SmootherSession(Session[SmootherParameters, SmootherState]):
         stamps = [item.stamp for item in chosen]
         pairs = list(zip([None, *stamps], chosen))
         mixtures = [self._counted(item, before, of) for before, item in pairs]
-        smoother = self._smoother(of.body, closed_form)
+        smoother = self._smoother(of.body)
         found = smoother.smooth(mixtures, self.parameters.random_seed, stamps_ns=stamps)
         lasting = [item.lasting(before) for before, item in pairs]
         return found.widened(sum(lasting) / len(lasting)), of

@@ -160,7 +160,7 @@ def test_forecasts_are_no_evidence(session, outputs, likelihoods):
 
 
 def test_a_span_is_discounted_from_its_first_image_on(session, likelihoods):
-    """As `MixtureSmoother` of what counts of each image, and of what may have been missed."""
+    """As the smoother of what counts of each image, and of what may have been missed."""
     errors, one = CueErrors(0.5, 0.1), session(max_trajectories=2)
     for index in range(4):
         one.take(MIXTURE, likelihoods.message(index, errors=errors))
@@ -170,7 +170,7 @@ def test_a_span_is_discounted_from_its_first_image_on(session, likelihoods):
     counts = [counted(likelihoods.mixture(1), 1.0, 0.5)]
     counts += [counted(likelihoods.mixture(i), np.tanh(0.5), changes) for i in (2, 3)]
     mixtures = [or_missed(one, likelihoods.body.rates) for one in counts]
-    smoother = one._smoother(likelihoods.body, MixtureSmoother)
+    smoother = one._smoother(likelihoods.body)
     wanted = smoother.smooth(mixtures, stamps_ns=[likelihoods.stamp(i) for i in (1, 2, 3)])
     np.testing.assert_allclose(found.means, wanted.means, atol=1e-9)
     np.testing.assert_allclose(found.weights, wanted.weights, atol=1e-9)
