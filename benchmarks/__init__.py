@@ -19,6 +19,7 @@ BENCHMARKS = {
     'gate': 'whether a step of the tracker costs more than a table that is checked in says',
     'hypotheses': 'what it brings to keep more modes',
     'joint_errors': 'what joints err by in every pose, and what all images leave of a covariance',
+    'keep_out': 'how often a true joint is outside the space that a robot keeps out of',
     'keypoint_noise': 'where landmarks of a detector lie on the body, and how they err',
     'kernels': 'the compiled likelihood against vectorised numpy',
     'kjs': 'kinematic jumps against random sampling at finding minima',

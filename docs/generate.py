@@ -31,6 +31,7 @@ PAGES = {
     'live': 'nodes.md',
     'soak': 'robustness.md',
     'flips': 'flips.md',
+    'keep_out': 'tracking.md',
     'kernels': 'likelihood.md',
     'contour_noise': 'likelihood.md',
     'depth': 'likelihood.md',

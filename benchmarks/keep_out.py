@@ -1,0 +1,129 @@
+"""keep_out: how often a true joint is outside the space that a robot is told to keep out of.
+
+The tracker follows all clips with known truth, gravity given, at several rates of images. In each
+image that it answers, a joint is missed that lies in none of `keep_out_capsules`. Beside the misses
+stands the volume, against that of the capsules of the heaviest mode, which are exact and wider by
+0.1 m: a curve over the probability that is asked for.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.clips import at_rate, find_clips, read_clip, table
+from benchmarks.command import benchmark_parser, show
+from benchmarks.machine import description
+from benchmarks.runs import BOTH, GIVEN, IMAGES, in_processes, true_joints
+from benchmarks.smoothing_clips import tracked
+from benchmarks.tracking_means import GROUPS, group_of
+from hmt_ros.tracking.keep_out import MARGIN, Capsules, keep_out_capsules
+
+PROBABILITIES = (0.9, 0.95, 0.99, 0.997)
+RATES = (30.0, 8.0, 3.0)
+# Images a second that are looked at, at most.
+LOOKS = 5.0
+# By how much the capsules are wider that volumes are compared with, m; random points of a volume.
+WIDER, SAMPLES = 0.1, 4_000
+QUICK = 12  # images
+
+
+class Work(NamedTuple):
+    """A clip, and how it is seen; see `smoothing_clips.Work`."""
+
+    folder: Path
+    inputs: str
+    rate: float
+    limit: int | None
+
+
+def of_clip(work: Work) -> dict[str, list[float]]:
+    """Shares of images with a missed joint, and median volumes, by probability."""
+    clip = at_rate(read_clip(work.folder, work.limit), work.rate)
+    seen = [x for x in tracked(clip, work.inputs, GIVEN) if x.stamp in clip.truth.joints]
+    seen = seen[:: max(round(work.rate / LOOKS), 1)]
+    missed: list[list[bool]] = [[] for _ in PROBABILITIES]
+    volumes: list[list[float]] = [[] for _ in PROBABILITIES]
+    for one, joints in zip(seen, true_joints(clip, [x.stamp for x in seen]), strict=True):
+        known = joints[np.isfinite(joints).all(1)]
+        heaviest = one.posterior[[int(one.posterior.weights.argmax())]].normalised()
+        exact = replace(heaviest, covariances=1e-12 * np.eye(heaviest.dimension)[None])
+        own = keep_out_capsules(one.body, exact)
+        usual = Capsules(own.starts, own.ends, own.radii - MARGIN + WIDER).volume(SAMPLES)
+        for i, probability in enumerate(PROBABILITIES):
+            capsules = keep_out_capsules(one.body, one.posterior, probability)
+            missed[i].append(not capsules.contain(known).all())
+            volumes[i].append(capsules.volume(SAMPLES) / usual)
+    return {
+        'missed': [float(np.mean(x)) for x in missed],
+        'volume': [float(np.median(x)) for x in volumes],
+    }
+
+
+def measure(clips: Path | None = None, *, quick: bool = False) -> dict[str, Any]:
+    """What `of_clip` finds on the clips, and means over groups of clips.
+
+    Raises:
+        ValueError: there are none, or one can not be read.
+    """
+    folders = find_clips(clips, moving=True)[0]
+    folders = [x for x in folders if clips is not None or (x / 'keypoints_mediapipe.npz').exists()]
+    inputs, rates, limit = (IMAGES, BOTH), RATES, None
+    if quick:
+        folders, inputs, rates, limit = folders[:1], (IMAGES,), RATES[:1], QUICK
+    work = [Work(x, given, rate, limit) for rate in rates for given in inputs for x in folders]
+    found = in_processes(of_clip, work, 0, 'keep_out')
+    means = []
+    for group in GROUPS:
+        for rate in rates:
+            for given in inputs:
+                own = [
+                    scores for one, scores in zip(work, found, strict=True)
+                    if (one.rate, one.inputs) == (rate, given)
+                    and group_of(one.folder.name) == group
+                ]  # fmt: skip
+                if own:
+                    means.append(
+                        {
+                            'clips': group, 'rate': rate, 'inputs': given,
+                            **{
+                                name: np.mean([x[name] for x in own], axis=0).tolist()
+                                for name in ('missed', 'volume')
+                            },
+                        }
+                    )  # fmt: skip
+    return {'machine': description(), 'probabilities': list(PROBABILITIES), 'means': means}
+
+
+def as_text(result: dict[str, Any], *, markdown: bool = False) -> str:
+    """A table for people."""
+    rows = [
+        ['inputs', 'images a second', *(f'{p:g}: missed, volume' for p in result['probabilities'])]
+    ]
+    for group in dict.fromkeys(x['clips'] for x in result['means']):
+        rows.append([group, *[''] * (len(rows[0]) - 1)])
+        for one in result['means']:
+            if one['clips'] == group:
+                cells = [
+                    f'{100 * missed:.1f} %, {volume:.1f}'
+                    for missed, volume in zip(one['missed'], one['volume'], strict=True)
+                ]
+                rows.append([one['inputs'], f'{one["rate"]:g}', *cells])
+    return table(rows, markdown=markdown)
+
+
+def main(argv: list[str]) -> int:
+    """Runs the benchmark."""
+    parser = benchmark_parser('keep_out', __doc__, quick=f'{QUICK} images of one clip')
+    parser.add_argument('--clips', type=Path, help='folder of clips')
+    options = parser.parse_args(argv)
+    try:
+        result = measure(options.clips, quick=options.quick)
+    except ValueError as error:
+        print(f'keep_out: {error}', file=sys.stderr)
+        return 1
+    return show(result, as_text, as_json=options.json)

@@ -1,0 +1,123 @@
+"""Capsules that hold a person over all modes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hmt_ros.body import load_body
+from hmt_ros.body.kinematics import forward
+from hmt_ros.inference import GaussianMixture
+from hmt_ros.tracking.keep_out import BARE, MARGIN, Capsules, keep_out_capsules
+
+BODY = load_body('human37')
+
+
+def posterior(depth=0.0, weights=(0.6, 0.395, 0.005)):
+    """Modes 0.5 m apart to the side; the deviation of the depth is given."""
+    means = np.zeros((len(weights), BODY.dimension))
+    means[:, 2] = 3.0
+    means[:, 0] = 0.5 * np.arange(len(weights))
+    variances = np.full(BODY.dimension, 1e-6)
+    variances[2] += depth**2
+    return GaussianMixture(
+        np.array(weights), means, np.tile(np.diag(variances), (len(means), 1, 1))
+    )
+
+
+def test_capsules_hold_points():
+    one = Capsules(np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 2.0]]), np.array([0.5]))
+    points = np.array([[0.4, 0.0, 1.0], [0.6, 0.0, 1.0], [0.0, 0.0, 2.4], [0.0, 0.4, 2.4]])
+    assert one.contain(points).tolist() == [True, False, True, False]
+    np.testing.assert_allclose(one.depths(points)[:3, 0], [0.1, -0.1, 0.1])
+    exact = np.pi * 0.25 * 2.0 + 4.0 / 3.0 * np.pi * 0.125
+    assert one.volume(100_000) == pytest.approx(exact, rel=0.02)
+    assert one.volume() == one.volume()
+
+
+def test_what_a_larger_capsule_holds_is_left_out():
+    inner, outer = [[0.0, 0.0, 0.5]], [[0.0, 0.0, 0.0]]
+    both = Capsules(
+        np.array([*inner, *outer]),
+        np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]),
+        np.array([0.2, 0.5]),
+    )
+    assert both.without_held().radii.tolist() == [0.5]
+    aside = np.array([[2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    apart = Capsules(both.starts + aside, both.ends + aside, both.radii)
+    assert len(apart.without_held()) == 2
+
+
+def test_every_joint_of_every_mode_that_counts_is_inside():
+    mixture = posterior()
+    joints = BODY.joint_positions(mixture.means)
+    inside = keep_out_capsules(BODY, mixture)
+    assert inside.contain(joints[0]).all()
+    assert inside.contain(joints[1]).all()
+    # The third is less probable than what may be outside.
+    assert not inside.contain(joints[2]).all()
+    assert keep_out_capsules(BODY, mixture, 0.9999).contain(joints[2]).all()
+
+
+def test_the_flesh_is_inside():
+    mixture = posterior(weights=(1.0,))
+    mesh = BODY.flesh.mesh()
+    frames = forward(BODY.skeleton, mixture.means)
+    points = frames.points(mesh.segments, mesh.vertices)[..., 0]
+    held = keep_out_capsules(BODY, mixture)
+    assert (held.depths(points).max(1) > 0.5 * MARGIN).all()
+
+
+@pytest.mark.parametrize('probability', [0.5, 0.9, 0.99])
+def test_drawn_joints_are_inside_as_often_as_asked_for(probability):
+    """Each joint at least; depth varies by a metre and a half."""
+    mixture = posterior(depth=0.5, weights=(0.7, 0.3))
+    drawn = mixture.sample(300, np.random.default_rng(0))
+    joints = BODY.joint_positions(drawn)
+    held = keep_out_capsules(BODY, mixture, probability)
+    inside = held.contain(joints.reshape(-1, 3)).reshape(joints.shape[:2])
+    assert inside.mean(0).min() >= probability - 0.05
+    assert inside.mean() < 1.0 or probability > 0.9
+
+
+def test_more_is_held_where_less_is_known():
+    volumes = [keep_out_capsules(BODY, posterior(depth=s)).volume() for s in (0.0, 0.2, 0.6)]
+    assert volumes[0] < volumes[1] < volumes[2]
+    # Along the line of sight, and not to all sides.
+    # A ball of this radius has 30 m^3.
+    assert volumes[2] < 8.0
+    grown = keep_out_capsules(BODY, posterior(), reach=0.3)
+    np.testing.assert_allclose(
+        grown.radii.min(), keep_out_capsules(BODY, posterior()).radii.min() + 0.3, atol=0.2
+    )
+    assert grown.volume() > volumes[0]
+
+
+def test_a_body_without_flesh_has_its_bones():
+    bare = replace(BODY, shapes=(), growth=())
+    held = keep_out_capsules(bare, posterior(weights=(1.0,)))
+    assert len(held) <= len(BODY.skeleton.bones)
+    assert held.radii.min() == pytest.approx(BARE + MARGIN, abs=0.03)
+    assert held.contain(BODY.joint_positions(posterior(weights=(1.0,)).means)[0]).all()
+
+
+@pytest.mark.parametrize(
+    ('how', 'text'),
+    [
+        ({'probability': 1.0}, 'probability must be between 0 and 1, saw 1.0'),
+        ({'probability': np.nan}, 'probability must be between 0 and 1, saw nan'),
+        ({'reach': -0.1}, 'reach must be a distance of at least 0 m, saw -0.1'),
+        ({'reach': np.nan}, 'reach must be a distance of at least 0 m, saw nan'),
+    ],
+)
+def test_what_is_refused(how, text):
+    with pytest.raises(ValueError, match=text):
+        keep_out_capsules(BODY, posterior(), **how)
+
+
+def test_of_nobody_there_is_no_place():
+    empty = posterior()[np.array([], dtype=int)]
+    with pytest.raises(ValueError, match='no modes'):
+        keep_out_capsules(BODY, empty)
