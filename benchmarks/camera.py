@@ -81,7 +81,7 @@ def main(argv: list[str]) -> int:
             detections.publish(with_stamp(keypoints(number), stamp))
         return late
 
-    # Nobody stands as still as a picture, which is no evidence of somebody.
+    # A picture that never changes is no evidence of a person, who sways.
     first, shown = [content(number) for number in range(min(SWAYING, len(images)))], 0
     start, shift = time.monotonic_ns(), 0
     while not select.select([sys.stdin], [], [], 0)[0]:

@@ -353,7 +353,7 @@ class PathSmoother(MixtureSmoother):
         if sequence.filtered is not None:
             return sequence.filtered
         paths = FilteredPaths(self.dynamics, self.max_trajectories, self.points, sequence.first)
-        # Before the very first mixture there is no interval.
+        # No interval leads to the very first mixture.
         before = [0.0] if sequence.first is None else []
         for mixture, interval in zip(sequence.mixtures, [*before, *sequence.intervals]):
             paths.add(mixture, float(interval))

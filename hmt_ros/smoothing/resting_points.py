@@ -66,10 +66,17 @@ class RestingPoints:
             covariances: (T, d, d) of which the directions count in which points are known least.
             intervals: (T-1,) s.
         """
-        jacobians = self.jacobians(poses)
+        return self._probabilities(
+            self.points(poses), self.jacobians(poses), covariances, intervals
+        )
+
+    def _probabilities(
+        self, points: Array, jacobians: Array, covariances: Array, intervals: Array
+    ) -> Array:
+        """The same, of points (T, P, 3) and their derivatives (T, P, 3, d)."""
         spread = jacobians @ covariances[:, None] @ jacobians.swapaxes(2, 3)
         least_known = np.linalg.eigh(spread[1:])[1][..., -1]
-        velocities = np.diff(self.points(poses), axis=0) / intervals[:, None, None]
+        velocities = np.diff(points, axis=0) / intervals[:, None, None]
         away = np.einsum('tpi,tpi->tp', velocities, least_known)
         across = np.linalg.norm(velocities - away[:, :, None] * least_known, axis=2)
         log = np.stack([_log_density(across, away, sigmas) for sigmas in (RESTS, MOVES)])
@@ -87,8 +94,8 @@ class RestingPoints:
             covariances, intervals: as for `probabilities`.
         """
         count, d = poses.shape
-        rests = self.probabilities(poses, covariances, intervals)
         points, jacobians = self.points(poses), self.jacobians(poses)
+        rests = self._probabilities(points, jacobians, covariances, intervals)
         diagonal, lower = prior.precision.diagonal.copy(), prior.precision.lower.copy()
         information = prior.information.copy()
         for t in range(count - 1):

@@ -37,9 +37,6 @@ BARE = 0.07
 SPACING = 1.2
 # Share of a radius that is added to it rather than covered by capsules side by side.
 LITTLE = 0.15
-# How fast a body may move whom nobody sees, m/s: the hand of somebody who strikes out while
-# walking. Volumes that are older grow by it.
-FASTEST = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,14 +128,13 @@ def keep_out_capsules(
         body: of the poses.
         mixture: over the pose (d,), the posterior of an image, or a forecast.
         probability: of each part of the person, and of the modes; below 1.
-        reach: added to all radii, m: how far the person may have moved since, at most `FASTEST`
-            times the time.
+        reach: added to all radii, m: how far the person may have moved since.
 
     Raises:
         ValueError: no modes, a probability that is not between 0 and 1, or a negative reach.
     """
     if not len(mixture):
-        raise ValueError('no modes: of nobody there is no place to keep out of')
+        raise ValueError('no modes; wanted those of a person who is tracked')
     if not 0.0 < probability < 1.0:
         raise ValueError(f'probability must be between 0 and 1, saw {probability}')
     if not reach >= 0.0:
